@@ -14,7 +14,7 @@ DOCS = Path(__file__).resolve().parents[1]
 
 
 def write_pages():
-    """Write all generated pages; a page whose content has not changed keeps its date."""
+    """Write all generated pages; a page without changes keeps its modification time."""
     pages = {
         'benchmarks.md': benchmark_page(),
         'reference/command_line.md': command_page(),

@@ -11,7 +11,7 @@ LATEST = ROOT / 'benchmarks' / 'latest.json'
 
 
 class Numbers(dict):
-    """Figures of one benchmark by name; an unknown name raises an error."""
+    """Figures of one benchmark by name; an unknown name raises KeyError."""
 
     def __missing__(self, name):
         raise KeyError(f'benchmarks/latest.json has no figure {name!r}; it has {sorted(self)}')

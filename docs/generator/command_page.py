@@ -24,7 +24,7 @@ so.
 
 
 def help_of(*words):
-    """The help text of a command."""
+    """Return the help text of a command."""
     text = io.StringIO()
     before = os.environ.get('COLUMNS')
     os.environ['COLUMNS'] = COLUMNS

@@ -1,14 +1,14 @@
-"""Figures of gallery examples: those of the package are not made by pyplot."""
+"""Scraper for the figures of gallery examples, which are created without pyplot."""
 
 from matplotlib.figure import Figure
 from sphinx_gallery.scrapers import figure_rst
 
 SAVED = 'is_in_gallery'
-"""Attribute of a figure that has been saved."""
+"""Name of the attribute that marks a saved figure."""
 
 
 def save_figures(block, block_vars, gallery_conf):
-    """Save the matplotlib Figures that a block of an example has bound to a name."""
+    """Save the matplotlib Figures that a block has bound to names; return their reST."""
     paths = []
     for value in list(block_vars['example_globals'].values()):
         if isinstance(value, Figure) and not hasattr(value, SAVED):

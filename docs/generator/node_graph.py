@@ -15,14 +15,14 @@ ROOT = Path(__file__).resolve().parents[2]
 STANDARD = re.compile(
     'describe_parameters|get_parameter|list_parameters|set_parameters|change_state|get_state|'
     'get_available|get_transition|type_description')
-"""Services that every node of ROS has."""
+"""Services that every ROS node has."""
 STANDARD_PARAMETERS = ('use_sim_time', 'start_type_description_service')
 DEFAULTS = {'network': '', 'drivers': '', 'recording': '', 'batches': False, 'publish_tf': False}
 """Defaults of the parameters that `generate_policies.nodes` sets."""
 
 
 def node_graph():
-    """Create the nodes and describe them: (name, publishers, services, parameters) of each."""
+    """Create the nodes; return [(name, publishers, services, parameters)]."""
     from generate_policies import SENSORS, nodes
 
     graph = []
@@ -36,7 +36,7 @@ def node_graph():
 
 
 def publishers_of(node, sensors):
-    """[(topic, type, QoS)] without the topics of a recording; `<sensor>` replaces the names."""
+    """[(topic, type, QoS)] without the topics of a recording; `<sensor>` replaces sensor names."""
     rows = {}
     for publisher in node.publishers:
         topic = publisher.topic_name

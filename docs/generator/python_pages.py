@@ -44,13 +44,13 @@ def rooms():
 
 
 def base_modules():
-    """Modules beside the folders."""
+    """Names of the modules at the top level of the package."""
     return [f'mag_tracking.{p.stem}' for p in sorted(PACKAGE.glob('*.py'))
             if p.stem not in (*PRIVATE, '__init__')]
 
 
 def folders_of(room):
-    """{folder: [module]} of a folder and those below it that have modules with content."""
+    """{folder: [module]} of a top-level folder and its subfolders, without empty modules."""
     found = {}
     for path in sorted((PACKAGE / room).rglob('*.py')):
         if path.stem in PRIVATE or (path.stem == '__init__' and not is_documented(path)):
@@ -63,19 +63,19 @@ def folders_of(room):
 
 
 def description_of(folder):
-    """Content of a folder, in one sentence."""
+    """First line of the docstring of a package folder."""
     tree = ast.parse((PACKAGE / folder / '__init__.py').read_text(encoding='utf-8'))
     return ast.get_docstring(tree).splitlines()[0]
 
 
 def is_documented(path):
-    """Whether a module defines something."""
+    """Whether a module defines a function or a class at its top level."""
     return any(isinstance(node, (ast.FunctionDef, ast.ClassDef))
                for node in ast.parse(path.read_text(encoding='utf-8')).body)
 
 
 def page(title, text, modules):
-    """One page of modules."""
+    """Markdown of a page that documents modules."""
     lines = [f'# {title}', '', text, '']
     for module in modules:
         lines += [f'## {module.removeprefix("mag_tracking.")}', '', '```{eval-rst}',
@@ -84,7 +84,7 @@ def page(title, text, modules):
 
 
 def interface():
-    """The names that `import mag_tracking` exports."""
+    """Markdown of the page of the names that `import mag_tracking` exports."""
     lines = [INTERFACE]
     for name in sorted(mag_tracking.__all__, key=lambda n: (n[0].isupper(), n)):
         value = getattr(mag_tracking, name)
@@ -96,7 +96,7 @@ def interface():
 
 
 def overview():
-    """Table of contents of the Python API."""
+    """Markdown of the table of contents of the Python API."""
     rows = [('interface', 'What `import mag_tracking` exports: start here.'),
             ('base', BASE)]
     names = ['interface', 'base']

@@ -44,19 +44,19 @@ Columns of the CSV and Parquet files that `mag-tracking traffic` writes ({doc}`/
 
 
 def settings_pages():
-    """{file name: Markdown}."""
+    """{file name: Markdown} of the pages of settings and table columns."""
     return {'parameters.md': parameters(), 'drivers.md': drivers(), 'doubts.md': doubts(),
             'archive_tables.md': archive_tables(), 'traffic_tables.md': traffic_tables()}
 
 
 def parameters():
-    """All settings of the pipeline, by stage."""
+    """Markdown: all settings of the pipeline, by stage."""
     lines = [PARAMETERS]
     groups = {}
     for parameter in flatten(Settings()):
         groups.setdefault(parameter.name.rpartition('.')[0], []).append(parameter)
-    for group, some in groups.items():
-        lines += [f'## {group}', '', *(line for p in some for line in entry(p))]
+    for group, members in groups.items():
+        lines += [f'## {group}', '', *(line for p in members for line in entry(p))]
     default = {p.name: p.value for p in flatten(Settings())}
     lines.append(MAGNET)
     lines += [f'| `{p.name}` | `{default[p.name]}` | `{p.value}` |'
@@ -65,7 +65,7 @@ def parameters():
 
 
 def drivers():
-    """All settings of a drivers file, by transport, framing and device."""
+    """Markdown: all settings of a drivers file, by transport, framing and device."""
     lines = [DRIVERS]
     for group, settings in settings_by_kind().items():
         lines += [f'## {group or "Every device"}', '',
@@ -74,22 +74,22 @@ def drivers():
 
 
 def entry(p):
-    """Definition list entry of a parameter."""
-    facts = [f'default `{p.value!r}`', p.unit, *(
+    """Lines of the definition list entry of a parameter."""
+    properties = [f'default `{p.value!r}`', p.unit, *(
         [f'{p.range[0]:g} to {p.range[1]:g}'] if p.range else
         [f'one of {", ".join(f"`{c}`" for c in p.choices)}'] if p.choices else []),
         'live' if p.live else '']
-    return [f'`{p.name}`', f': {"; ".join(f for f in facts if f)}', '', f'  {p.doc}', '']
+    return [f'`{p.name}`', f': {"; ".join(f for f in properties if f)}', '', f'  {p.doc}', '']
 
 
 def doubts():
-    """The reasons of an ambiguous pose."""
+    """Markdown: the reasons for an ambiguous pose."""
     return '\n'.join(
         [DOUBTS, *(f'| `{name}` | {meaning} |' for name, meaning in MEANINGS.items())]) + '\n'
 
 
 def archive_tables():
-    """The columns of an archive."""
+    """Markdown: the columns of the tables of an archive."""
     lines = [ARCHIVE]
     for table, columns in TABLES.items():
         lines += [f'## {table}', '', *column_rows(columns), '']
@@ -97,7 +97,7 @@ def archive_tables():
 
 
 def traffic_tables():
-    """The columns of the results of `mag-tracking traffic`."""
+    """Markdown: the columns of the tables of `mag-tracking traffic`."""
     lines = [TRAFFIC]
     for table, columns in tables_of(('<class>',), True).items():
         lines += [f'## {table}', '', *column_rows(columns), '']
@@ -105,6 +105,6 @@ def traffic_tables():
 
 
 def column_rows(columns):
-    """Markdown table of columns."""
+    """Lines of the Markdown table of columns."""
     return ['| column | unit | meaning |', '|---|---|---|',
             *(f'| `{c.name}` | {c.unit} | {c.meaning} |' for c in columns)]

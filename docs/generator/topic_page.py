@@ -61,7 +61,7 @@ nodes as well.
 
 
 def topic_page():
-    """Markdown."""
+    """Markdown: topics, services and parameters of each node, and all message definitions."""
     lines = [TOPICS]
     for name, publishers, services, parameters in graph():
         lines += [f'## {name}', '', '| publishes | content | rate | QoS |', '|---|---|---|---|']

@@ -44,29 +44,29 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0 for success, 1 for an error that has been printed, 130 after Ctrl-C.
         Some commands return other values, which their help texts describe.
     """
-    words = sys.argv[1:] if argv is None else argv
-    for word in words:
+    arguments = sys.argv[1:] if argv is None else argv
+    for argument in arguments:
         # Paths cannot contain NUL, but functions that take a path report this in different ways.
-        if '\0' in word:
-            print(f'mag-tracking: {word!r} contains a NUL character', file=sys.stderr)
+        if '\0' in argument:
+            print(f'mag-tracking: {argument!r} contains a NUL character', file=sys.stderr)
             return 1
     # A file name may be invalid UTF-8. By default, stderr escapes it, but stdout raises an error.
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == 'strict':
         sys.stdout.reconfigure(errors='backslashreplace')
-    if words[:1] == ['run']:
+    if arguments[:1] == ['run']:
         # Ending the nodes is not a failure, even before they have started.
         with exit_on_signals(0, signal.SIGINT, signal.SIGTERM):
-            return _run(_parse(words))
+            return _run(_parse(arguments))
     with exit_on_signals(130, signal.SIGINT, message=INTERRUPTED_MESSAGE):
-        args = _parse(words)
+        args = _parse(arguments)
     return _run(args)
 
 
-def _parse(words: Sequence[str]) -> argparse.Namespace:
-    """Parse the command line. The parser is imported here, because it takes most of a second."""
+def _parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """Import the parser, which takes almost a second, and parse the command line."""
     from mag_tracking.cli.commands import parse
 
-    return parse(words)
+    return parse(arguments)
 
 
 def _is_stdout_closed() -> bool:

@@ -92,7 +92,7 @@ def _geometry(args: argparse.Namespace) -> int:
     network = read_network(args.network) if args.sensors is None else board_of(args.sensors)
     settings = replace(GeometrySettings(), read_parameter_file(args.params) if args.params else {})
     date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
-    unknowns = 'poses and geometry' if box else 'geometry'
+    unknowns = "magnet's poses and the geometry" if box else 'geometry'
     # Ctrl-C ends the estimation immediately: nothing has been written yet.
     with _elapsed_time(f'estimating the {unknowns} of {quantity(len(network), "sensor")}'):
         survey = survey_geometry(args.table, network, args.moment, settings, date, box,
@@ -118,7 +118,10 @@ def _geometry(args: argparse.Namespace) -> int:
 
 
 def _checked_box(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[float]] | None:
-    """Check the options and return the box; raise SettingsError or OutputError."""
+    """Check the options; return the corners of the box, or None without --unknown-poses.
+
+    Raises SettingsError or OutputError if an option is invalid.
+    """
     corners = args.low, args.high
     if args.unknown_poses and None in corners:
         raise SettingsError('--unknown-poses: give the box that contains the magnet with --low and '
@@ -142,7 +145,7 @@ def _checked_box(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[fl
 
 @contextmanager
 def _elapsed_time(task: str) -> Iterator[None]:
-    """Print the task and, on a terminal, the elapsed time of the block."""
+    """Print the task and, on a terminal, the elapsed time while the context is open."""
     stop = threading.Event()
     bar = tqdm(desc=task, bar_format='{desc}: {elapsed}', disable=None)
     if bar.disable:
@@ -188,15 +191,15 @@ def _print(survey: GeometrySurvey, has_unknown_poses: bool) -> None:
         if np.isnan(g.bias[j]).all():
             print(f'  warning: {name} has no readings; its nominal geometry is kept')
     for name, axes in survey.silent_axes:
-        print(f'  warning: {name} never reported {axes}: the background on unreported axes '
-              'remains unknown')
+        print(f'  warning: {name} never reported {axes}: the background of these axes '
+              'is unknown')
     if survey.suspect_rows:
         print('  warning: rows with inconsistent poses (the header is row 1): '
               f'{", ".join(map(str, survey.suspect_rows))}')
 
 
 def _print_magnet(g: NetworkGeometry, has_unknown_poses: bool) -> None:
-    """Print the moment of the magnet and, for known poses, its offset and tilt in the tool."""
+    """Print the moment and, for known poses, the offset and tilt of the magnet in the tool."""
     def formatted(values: FloatArray, std: FloatArray, scale: float, digits: int) -> str:
         return ' '.join(f'{scale * v:.{digits}f} ({scale * s:.{digits}f})'
                         for v, s in zip(values, std, strict=True))

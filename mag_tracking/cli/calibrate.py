@@ -15,8 +15,8 @@ from mag_tracking.cli.options import (
     add_report,
     check_outputs,
     check_report,
-    now,
     recorded_network,
+    utc_timestamp,
 )
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.interrupts import recorded_signals
@@ -24,10 +24,10 @@ from mag_tracking.network.file import write_network
 from mag_tracking.recording.reader import Recording
 
 _CALIBRATE_HELP = '''
-Estimates the orientation of each sensor (from its accelerometer and as a compass), its clock
-offset (from two or more knocks, at uneven intervals, that shake all sensors) and its noise. Keep
-targets away during the first seconds of the recording. Checks that all sensors measure the same
-Earth field, and reports flipped or swapped axes and wrong units. Passing vehicles improve the
+Estimates the tilt (from the accelerometer), the heading (from the Earth's field), the clock offset
+(from two or more knocks, at uneven intervals, that shake all sensors) and the noise of each sensor.
+Keep targets away during the first seconds of the recording. Checks that all sensors measure the
+same Earth field, and reports flipped or swapped axes and wrong units. Passing vehicles improve the
 headings (disable with --no-passes). Headings remain uncertain (a bias of 0.6 uT rotates a compass
 by two degrees); the tracker uses their standard deviations, which are written to the network file.
 Nominal orientations are kept in the file, and the next calibration starts from them. The exit
@@ -73,8 +73,8 @@ def _calibrate(args: argparse.Namespace) -> int:
     with recorded_signals(signal.SIGINT) as signals:
         with tqdm(total=n_reads * recording.size, unit='B', unit_scale=True,
                   desc=args.recording.name, disable=None) as bar:
-            result = calibrate(recording, network, settings, now(), not args.no_passes, bar.update,
-                               lambda: bool(signals))
+            result = calibrate(recording, network, settings, utc_timestamp(), not args.no_passes,
+                               bar.update, lambda: bool(signals))
     _print(result, recording)
     if signals:
         print('interrupted: nothing was written')

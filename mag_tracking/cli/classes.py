@@ -30,7 +30,7 @@ trained on labelled passes identifies the class of a target by the shape of its 
 
 LABELLED is one of:
   - a CSV table with one row per sample (label, signature, time_s, x_nt, y_nt, z_nt) or one row per
-    signature (label, x0, x1, ..., y0, y1, ...). An optional column pass identifies the signatures
+    signature (label, x0, x1, ..., y0, y1, ...). An optional column `pass` identifies the signatures
     of one target at several sensors. signatures.csv of `mag-tracking events` is such a table
     without labels.
   - a recording, with --network FILE and --labels FILE, a CSV table of intervals (label, begin_s,
@@ -142,7 +142,7 @@ def _print_evaluation(evaluation: Evaluation) -> None:
 
 
 def _mean_fraction(values: 'np.ndarray[tuple[int, ...], np.dtype[np.float64]]') -> str:
-    """Format the mean, and for several values the standard deviation, over the test sets."""
+    """Format the mean and, for several values, the standard deviation; NaN is skipped."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return 'no examples'

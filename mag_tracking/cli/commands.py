@@ -13,11 +13,11 @@ ROS_COMMANDS = ('run', 'record', 'doctor', 'topics', 'echo', 'param', 'lifecycle
 
 
 class Command(NamedTuple):
-    """Description of a command that is available before its module is imported."""
+    """Description of a command; available before the module of the command is imported."""
 
     module: str
     """Module in this folder. The function `add` of the module registers all its commands."""
-    short: str
+    summary: str
     """Summary in the list of commands."""
     aliases: tuple[str, ...] = ()
     """Alternative names."""
@@ -52,12 +52,12 @@ COMMANDS = {
 }
 
 
-def parse(words: Sequence[str]) -> argparse.Namespace:
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Parse a command line.
 
     Parameters
     ----------
-    words : sequence of str
+    arguments : sequence of str
         Command-line arguments without the program name.
 
     Returns
@@ -71,16 +71,16 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
         'For the options of a command, run "mag-tracking COMMAND --help".')
     parser.add_argument('--version', action='version', version=f'mag_tracking {version(PACKAGE)}')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
-    words = list(words)
-    split = words.index(ROS_ARGUMENTS) if ROS_ARGUMENTS in words else len(words)
-    requested = _module_of(next((word for word in words[:split] if word[:1] != '-'), ''))
+    arguments = list(arguments)
+    split = arguments.index(ROS_ARGUMENTS) if ROS_ARGUMENTS in arguments else len(arguments)
+    requested = _module_of(next((word for word in arguments[:split] if word[:1] != '-'), ''))
     if requested is not None:
         import_module(f'{PACKAGE}.cli.{requested}').add(commands)
     for name, command in COMMANDS.items():
         if command.module != requested:
-            commands.add_parser(name, help=command.short, aliases=command.aliases)
-    args = parser.parse_args(words[:split])
-    args.ros_arguments = words[split:]
+            commands.add_parser(name, help=command.summary, aliases=command.aliases)
+    args = parser.parse_args(arguments[:split])
+    args.ros_arguments = arguments[split:]
     if args.ros_arguments and args.command not in ROS_COMMANDS:
         parser.error(f'{ROS_ARGUMENTS}: {args.command} runs without ROS; ROS arguments are '
                      f'accepted by {", ".join(ROS_COMMANDS)}')

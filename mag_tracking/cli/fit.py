@@ -161,7 +161,7 @@ def _print_pass(fitted_pass: FittedPass) -> None:
         if fit.bearing is not None:
             _print_bearing(fit.bearing)
         if fit.reason and fit is fitted_pass.known:
-            print(f'        still trusted: {_trusted_values(fit)}')
+            print(f'        still reliable: {_trusted_values(fit)}')
         if not fit.reason and fit.is_poor_mixture:
             print('        ambiguous: the joint fit of the vehicles is poor')
         elif not fit.reason and fit.ambiguous:
@@ -187,7 +187,7 @@ def _print_pass(fitted_pass: FittedPass) -> None:
 
 
 def _trusted_values(fit: PassFit) -> str:
-    """Format the speed, direction and time that are trusted although the fit is rejected."""
+    """Format those of speed, direction and time that are reliable although the fit is rejected."""
     speed, speed_std = fit.speed
     heading, heading_std = np.degrees(fit.heading)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
@@ -287,6 +287,7 @@ def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
     Yields
     ------
     str
+        One warning per reason.
     """
     degrees_of_freedom = 3 * n_passes - 4
     if iron.normalised_cost * degrees_of_freedom > energy_threshold(P_WARNING, degrees_of_freedom):

@@ -39,8 +39,9 @@ def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace
     -------
     argparse.ArgumentParser
     """
-    _, short, aliases = COMMANDS[name]
-    parser = commands.add_parser(name, aliases=aliases, help=short, description=short, epilog=text,
+    _, summary, aliases = COMMANDS[name]
+    parser = commands.add_parser(name, aliases=aliases, help=summary, description=summary,
+                                 epilog=text,
                                  formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.set_defaults(run_command=run, ros_arguments=[])
     return parser
@@ -122,8 +123,8 @@ def distinct_names(paths: Iterable[Path]) -> list[str]:
     return names
 
 
-def now() -> str:
-    """Return the current time as the date of a calibration.
+def utc_timestamp() -> str:
+    """Return the current time, for use as the date of a calibration.
 
     Returns
     -------

@@ -63,14 +63,14 @@ settings. Example:
 
 
 TRUTH_METRICS = {
-    'rms': ('horizontal RMS error within 5 m', ' m'),
+    'rms': ('horizontal RMS error within 5 m of the centre of the sensors', ' m'),
     'closest': ('horizontal error at the closest point of approach', ' m'),
     'closest_distance': ('distance at the closest point of approach', ' m'),
     'position_mean': ('mean position error', ' m'),
     'position_max': ('maximum position error', ' m'),
     'axis_median_deg': ('median angular error of the axis', ' deg'),
     'anees': ('average NEES per axis (1 if consistent)', ''),
-    'error_over_bound': ('ratio of the error to the path bound', '')}
+    'error_over_bound': ('ratio of the error to the Cramer-Rao bound of the path', '')}
 """Description and unit of each error measure, by its key in a track's `truth` in summary.json."""
 
 
@@ -149,7 +149,7 @@ def _print_summary(path: Path, summary: dict[str, Any], has_truth: bool) -> None
 
 
 def _overview(path: Path, summary: dict[str, Any]) -> str:
-    """Format the name of the recording and the number of tracks with each verdict."""
+    """Format the name of the recording, the number of tracks, and the number with each verdict."""
     verdicts = Counter(t['verdict'] for t in summary['tracks'])
     counts = ', '.join(f'{n} {verdict}' for verdict, n in verdicts.most_common())
     return (f'{path.name}: {quantity(len(summary["tracks"]), "track")}'

@@ -134,7 +134,7 @@ def _recordings(args: argparse.Namespace, network: SensorNetwork) -> list[Record
 
 
 def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
-    """Check --fleet and --enrol; return the fleet to match; None without one or with --enrol."""
+    """Check --fleet and --enrol; return the fleet, or None with --enrol or without --fleet."""
     if args.enrol is not None:
         if args.fleet is None:
             raise SettingsError('--enrol requires a fleet file: add --fleet FILE')

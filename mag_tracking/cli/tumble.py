@@ -13,8 +13,8 @@ from mag_tracking.cli.options import (
     add_command,
     add_recorded_network,
     check_outputs,
-    now,
     recorded_network,
+    utc_timestamp,
 )
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
@@ -23,9 +23,9 @@ from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 
 _TUMBLE_HELP = '''
-For sensors that can be held in the hand: rotate each slowly through all orientations, far from
-iron, while `mag-tracking record` runs. The readings lie on an ellipsoid; the correction to a
-sphere (hard iron, soft iron, scale factors, skewness) is written to the network file and applied
+Calibrates sensors that can be held in the hand. Rotate each sensor slowly through all orientations,
+far from iron, while `mag-tracking record` runs. The readings lie on an ellipsoid; the correction to
+a sphere (hard iron, soft iron, scale factors, skewness) is written to the network file and applied
 to all later readings. Run this calibration before others, because background and noise in the
 network file refer to uncorrected readings and are removed. The calibration of a sensor is rejected
 if its rotation did not cover enough directions.
@@ -67,8 +67,8 @@ def _tumble(args: argparse.Namespace) -> int:
         with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
                   disable=None) as bar:
             calibrated, fits, readings, _ = tumble(
-                recording, network, args.sensor, now(), args.field_size, bar.update,
-                lambda: bool(signals))
+                recording, network, args.sensor, utc_timestamp(), args.field_size,
+                bar.update, lambda: bool(signals))
     for name, fit in fits.items():
         _print_fit(name, fit)
     for cause, n in recording.losses.items():
@@ -89,7 +89,7 @@ def _tumble(args: argparse.Namespace) -> int:
 
 
 def _print_fit(name: str, fit: EllipsoidFit) -> None:
-    """Print the result of one sensor."""
+    """Print the ellipsoid fit of one sensor, or the reason for its rejection."""
     if not fit.converged:
         print(f'{name}: calibration rejected: {fit.reason}')
     else:

@@ -16,7 +16,7 @@ from mag_tracking.recording.background_file import (
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 
-WRITE_EVERY_S = 5.0
+WRITE_INTERVAL_S = 5.0
 """[s] Interval between writes, unless a quarter of `calibrate.max_resume_gap_s` is shorter."""
 
 
@@ -57,8 +57,8 @@ class BackgroundStore:
         except RecordingError as error:
             self._logger.warning(f'stored backgrounds are not used: {error}')
             return
-        for name, why in rejected.items():
-            self._logger.warning(f'{name}: the stored background is not used: {why}')
+        for name, reason in rejected.items():
+            self._logger.warning(f'{name}: the stored background is not used: {reason}')
         self._stage.resume(restored)
         if restored:
             self._logger.info(
@@ -96,7 +96,7 @@ class BackgroundStore:
         is_new = not self._entries.keys() <= self._written_sensors
         if self._path is None or not is_live or now < self._next_write and not is_new:
             return
-        self._next_write = now + min(WRITE_EVERY_S, self._settings.max_resume_gap_s / 4.0)
+        self._next_write = now + min(WRITE_INTERVAL_S, self._settings.max_resume_gap_s / 4.0)
         try:
             write_backgrounds(self._path, self._entries)
             self._written_sensors = frozenset(self._entries)

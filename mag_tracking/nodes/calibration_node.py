@@ -114,22 +114,22 @@ class CalibrationNode(StageNode):
             if imu_topic is not None:
                 self.subscription(Imu, imu_topic, partial(self._receive_acceleration, sensor),
                                   self.input_qos)
-        self._readings = self.publisher(FieldReadings, CALIBRATED_READINGS, PUBLISHER_QOS)
+        self._readings_publisher = self.publisher(FieldReadings, CALIBRATED_READINGS, PUBLISHER_QOS)
         self.subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM_QOS,
                           source='sensors', batches=True)
         if self._next_steps is None:
             self.monitor_subscriber('detection', CALIBRATED_READINGS,
                                     'mag_tracking_msgs/msg/NetworkFrame')
-        self._state = self.publisher(CalibrationState, CALIBRATION_STATE, LATCHED_QOS)
-        self._tf = SensorTransforms(self) if fixed_parameter(
+        self._state_publisher = self.publisher(CalibrationState, CALIBRATION_STATE, LATCHED_QOS)
+        self._sensor_transforms = SensorTransforms(self) if fixed_parameter(
             self, 'publish_sensor_tf', True, 'Publish static transforms from the world frame to '
             'each sensor.') else None
         self._publish_transforms()
 
     def _publish_transforms(self) -> None:
         """Publish the transforms of the sensors if `publish_sensor_tf` is set."""
-        if self._tf is not None:
-            self._tf.publish(self.network)
+        if self._sensor_transforms is not None:
+            self._sensor_transforms.publish(self.network)
 
     def _state_path(self) -> Path | None:
         """Return the path of the background file; None during a replay or if storage is off."""
@@ -226,13 +226,14 @@ class CalibrationNode(StageNode):
         if raw is None:
             return
         for calibrated in self._calibrate_readings(raw):
-            if self._next_steps is None or has_subscribers(self._readings):
-                self._readings.publish(to_message(FieldReadings, readings_dict(calibrated)))
+            if self._next_steps is None or has_subscribers(self._readings_publisher):
+                self._readings_publisher.publish(
+                    to_message(FieldReadings, readings_dict(calibrated)))
         self._health_backlog.append((raw, self.now_ns))
         self._deferred.request()
 
     def _calibrate_readings(self, raw: Readings) -> list[Readings]:
-        """Calibrate readings and return them; also pass them to the `next_steps`, if any."""
+        """Calibrate readings, return the result, and pass it to the `next_steps`, if any."""
         calibrated = self._stage.feed(raw)
         if self._next_steps is not None:
             detection, tracker = self._next_steps
@@ -242,7 +243,7 @@ class CalibrationNode(StageNode):
         return calibrated
 
     def _do_deferred_work(self) -> None:
-        """Run the stages' deferred work, health checks and a due step; report changed doubts."""
+        """Run deferred work, health checks and any due step of the round; report changed doubts."""
         self._stage.idle()
         if self._next_steps is not None:
             self._next_steps[1].idle()
@@ -261,7 +262,7 @@ class CalibrationNode(StageNode):
         message = CalibrationState(sensors=states)
         message.header.stamp = self.get_clock().now().to_msg()
         message.header.frame_id = self.network.frame
-        self._state.publish(message)
+        self._state_publisher.publish(message)
 
     def _handle_calibrate(self, request: CalibrateService.Request,
                           response: CalibrateService.Response) -> CalibrateService.Response:

@@ -16,7 +16,7 @@ namespace mag_tracking {
 namespace {
 
 constexpr double MAX_S = 1e6;
-// A writable pipe accepts this much without blocking (PIPE_BUF).
+// Number of bytes that a writable pipe accepts without blocking (PIPE_BUF).
 constexpr std::size_t MAX_MESSAGE = 4096;
 
 [[noreturn]] void end_process(int status, const std::string& message) {

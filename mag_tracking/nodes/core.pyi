@@ -1,4 +1,4 @@
-"""Deadline that ends the process even while Python is blocked; compiled."""
+"""Compiled deadline that ends the process even while Python is blocked."""
 
 class Deadline:
     """Ends the process when the time has elapsed, unless `cancel` is called before.

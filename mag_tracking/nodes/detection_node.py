@@ -70,8 +70,8 @@ class DetectionNode(StageNode):
             steady_timer(self, EVENT_INTERVAL_S, self._publish_events)
         self._event_publisher = self.publisher(PassEventMessage, '~/events', RESULT_QOS)
         self._detect = Detect(self.network, self.settings.detect)
-        self._frames = self.publisher(NetworkFrame, NETWORK_FRAME, PUBLISHER_QOS)
-        self._detections = self.publisher(DetectionMessage, '~/detections', RESULT_QOS)
+        self._frame_publisher = self.publisher(NetworkFrame, NETWORK_FRAME, PUBLISHER_QOS)
+        self._detection_publisher = self.publisher(DetectionMessage, '~/detections', RESULT_QOS)
         if tracker is None:
             self._subscribe()
         else:
@@ -143,7 +143,7 @@ class DetectionNode(StageNode):
         for frame in frames:
             for record in self._detect.feed(frame):
                 if isinstance(record, Detection):
-                    self._detections.publish(to_message(
+                    self._detection_publisher.publish(to_message(
                         DetectionMessage, detection_dict(record, self.network.frame)))
                 elif self._tracker is None:
                     self._publish_frame(record)
@@ -155,12 +155,12 @@ class DetectionNode(StageNode):
     def _publish_pending_frame(self) -> None:
         """Publish the pending frame once, after its pose, if the frame topic has subscribers."""
         frame, self._pending_frame = self._pending_frame, None
-        if frame is not None and has_subscribers(self._frames):
+        if frame is not None and has_subscribers(self._frame_publisher):
             self._publish_frame(frame)
 
     def _publish_frame(self, frame: FieldFrame) -> None:
         """Publish a frame with its detection result."""
-        self._frames.publish(to_message(NetworkFrame, frame_dict(frame, self.network)))
+        self._frame_publisher.publish(to_message(NetworkFrame, frame_dict(frame, self.network)))
 
 
 def main(arguments: list[str] | None = None) -> int:

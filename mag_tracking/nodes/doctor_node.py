@@ -18,7 +18,7 @@ from mag_tracking.messages.schema import reading_of, readings_of
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes.middleware import begin
-from mag_tracking.nodes.sensor_graph import missing_publisher, topic_findings
+from mag_tracking.nodes.sensor_graph import no_message_finding, topic_findings
 from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import SENSOR_QOS, STREAM_QOS, make_executor, spin
 from mag_tracking.pipeline import Settings
@@ -81,7 +81,7 @@ class DoctorNode(Node):
         for sensor, topic in self._topics.items():
             found += topic_findings(self, sensor, topic)
             if sensor not in self._batched_sensors and not self.count_publishers(topic):
-                found.append(missing_publisher(self, sensor, topic, self._topics))
+                found.append(no_message_finding(self, sensor, topic, self._topics))
         return found
 
 

@@ -28,14 +28,14 @@ class DriverDiagnostics:
         self._reported_counts: dict[str, dict[str, int]] = {}
         self._log = StatusLog(node.get_logger())
 
-    def statuses(self, drivers: Sequence[Driver], served: Collection[str],
+    def statuses(self, drivers: Sequence[Driver], running: Collection[str],
                  active: bool) -> list[DiagnosticStatus]:
         """Return the diagnostics of all devices, and log changes.
 
         Parameters
         ----------
         drivers : sequence of Driver
-        served : collection of str
+        running : collection of str
             Names of the drivers whose thread is running.
         active : bool
             Whether the node is active.
@@ -45,9 +45,9 @@ class DriverDiagnostics:
         list of DiagnosticStatus
             One per driver.
         """
-        return [self._status(driver, driver.name in served, active) for driver in drivers]
+        return [self._status(driver, driver.name in running, active) for driver in drivers]
 
-    def _status(self, driver: Driver, served: bool, active: bool) -> DiagnosticStatus:
+    def _status(self, driver: Driver, running: bool, active: bool) -> DiagnosticStatus:
         """Return the diagnostics of one device, and log a change."""
         counts = driver.counts()
         previous = self._reported_counts.get(driver.name, {})
@@ -58,7 +58,7 @@ class DriverDiagnostics:
         level, message = DiagnosticStatus.OK, 'open'
         if not active:
             message = 'not active'
-        elif not served:
+        elif not running:
             level, message = DiagnosticStatus.ERROR, 'the driver thread has ended: restart the node'
         elif driver.fault:
             level, message = DiagnosticStatus.ERROR, driver.fault

@@ -59,14 +59,16 @@ class DriverNode(ManagedNode):
         super().__init__('driver_node', **node_arguments)
         self._path = fixed_parameter(self, 'drivers', '', 'Path of the drivers file.')
         self._network_path = fixed_parameter(self, 'network', '', 'Path of the network file.')
-        self._readings = self.create_publisher(FieldReadings, RAW_READINGS, PUBLISHER_QOS) \
-            if fixed_parameter(self, 'batches', False, 'Publish the readings of many sensors in '
-                               'one message (FieldReadings).') else None
+        self._readings_publisher = self.create_publisher(
+            FieldReadings, RAW_READINGS, PUBLISHER_QOS) if fixed_parameter(
+                self, 'batches', False, 'Publish the readings of many sensors in one message '
+                '(FieldReadings).') else None
         self._drivers: list[Driver] = []
         self._threads: list[threading.Thread] = []
         self._publishers_by_sensor: dict[str, tuple[Publisher, Publisher]] = {}
-        self._stopping: threading.Event | None = None
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULT_QOS)
+        self._stop_event: threading.Event | None = None
+        self._diagnostics_publisher = self.create_publisher(
+            DiagnosticArray, '/diagnostics', RESULT_QOS)
         self._health = DriverDiagnostics(self)
         steady_timer(self, 1.0, self._publish_diagnostics)
         self.start_automatically()
@@ -108,9 +110,9 @@ class DriverNode(ManagedNode):
                                     'the node again later')
             return TransitionCallbackReturn.FAILURE
         # A new event for each activation, so that a thread that is still stopping does not resume.
-        self._stopping = threading.Event()
+        self._stop_event = threading.Event()
         self._threads = [threading.Thread(
-            target=serve, args=(driver, self._publish, self._stopping.is_set),
+            target=serve, args=(driver, self._publish, self._stop_event.is_set),
             name=driver.name, daemon=True) for driver in self._drivers]
         for thread in self._threads:
             thread.start()
@@ -185,19 +187,19 @@ class DriverNode(ManagedNode):
 
     def _publish(self, readings: Readings, accelerations: list[AccelerationSample]) -> None:
         """Publish each reading on its sensor topic, or all in one message if `batches` is set."""
-        if self._readings is None:
+        if self._readings_publisher is None:
             for sensor, content in magnetic_field_dicts(readings):
                 self._publishers_by_sensor[sensor][0].publish(to_message(MagneticField, content))
         elif len(readings):
-            self._readings.publish(to_message(FieldReadings, readings_dict(readings)))
+            self._readings_publisher.publish(to_message(FieldReadings, readings_dict(readings)))
         for acceleration in accelerations:
             self._publishers_by_sensor[acceleration.sensor][1].publish(
                 to_message(Imu, acceleration_dict(acceleration, acceleration.sensor)))
 
     def _stop(self) -> None:
         """Stop the threads, which close their devices."""
-        if self._stopping is not None:
-            self._stopping.set()
+        if self._stop_event is not None:
+            self._stop_event.set()
         end = time.monotonic() + STOP_TIMEOUT_S
         for thread in self._threads:
             thread.join(max(0.0, end - time.monotonic()))
@@ -217,9 +219,9 @@ class DriverNode(ManagedNode):
         """Publish the state of the devices."""
         array = DiagnosticArray(status=self._health.statuses(
             self._drivers, {thread.name for thread in self._threads if thread.is_alive()},
-            self._stopping is not None and not self._stopping.is_set()))
+            self._stop_event is not None and not self._stop_event.is_set()))
         array.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(array)
+        self._diagnostics_publisher.publish(array)
 
 
 def main(arguments: list[str] | None = None) -> int:

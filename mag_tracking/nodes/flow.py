@@ -56,23 +56,23 @@ class Flow:
         self._latest_latency_s: float | None = None
         self._busy_s, self._report_time = 0.0, time.monotonic()
 
-    def add(self, stamp_ns: int, came_ns: int, began: float) -> None:
+    def add(self, stamp_ns: int, arrival_ns: int, start_s: float) -> None:
         """Add the latency and processing time of a message to the statistics.
 
         Parameters
         ----------
         stamp_ns : int, ns
             Timestamp of the message.
-        came_ns : int, ns
+        arrival_ns : int, ns
             Time of arrival, by the clock of the node.
-        began : float, s
+        start_s : float, s
             Start of processing, by `time.monotonic()`.
         """
         self._n_messages += 1
         self.last_received = time.monotonic()
-        duration_s = self.last_received - began
+        duration_s = self.last_received - start_s
         self._busy_s += duration_s
-        self._latest_latency_s = (came_ns - stamp_ns) / NS + duration_s
+        self._latest_latency_s = (arrival_ns - stamp_ns) / NS + duration_s
         if len(self._latencies) < MAX_LATENCIES:
             self._latencies.append(self._latest_latency_s)
 
@@ -187,5 +187,5 @@ class SubscriberMonitor:
         return DiagnosticStatus(
             level=DiagnosticStatus.ERROR if is_gone else DiagnosticStatus.OK,
             name=f'{node}: to {self.role}', hardware_id='magnetometer network',
-            message=f'{", ".join(missing)} is gone: check that it is running'
+            message=f'{", ".join(missing)} has disappeared: check that it is running'
             if is_gone else message)

@@ -19,7 +19,7 @@ PROFILE = Path(__file__).with_name('fastdds.xml')
 """Fast DDS profile for fast discovery, also of nodes that were killed and restarted."""
 PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 """Environment variable that selects a profile in Fast DDS 2.14 (Jazzy)."""
-PROFILE_IN_FOLDER = 'DEFAULT_FASTRTPS_PROFILES.xml'
+WORKING_FOLDER_PROFILE = 'DEFAULT_FASTRTPS_PROFILES.xml'
 """Name of the profile that Fast DDS loads from the working folder by default."""
 ROS_ARGUMENTS, PARAMETER_FILE = '--ros-args', '--params-file'
 
@@ -42,10 +42,10 @@ def begin(arguments: list[str] | None = None) -> None:
         If the ROS arguments or a parameter file are invalid.
     """
     profile = os.environ.get(PROFILE_VARIABLE)
-    if profile is None and not Path(PROFILE_IN_FOLDER).exists():
+    if profile is None and not Path(WORKING_FOLDER_PROFILE).exists():
         os.environ[PROFILE_VARIABLE] = str(PROFILE)
     with tempfile.TemporaryDirectory(prefix='mag_tracking_') as folder:
-        _init(_with_ros_files(arguments, Path(folder)))
+        _init(_with_ros_parameter_files(arguments, Path(folder)))
     if profile and not Path(profile).exists():
         rclpy.logging.get_logger('middleware').warning(
             f'{PROFILE_VARIABLE}: file {profile} does not exist: no Fast DDS profile is active, '
@@ -62,19 +62,20 @@ def _init(arguments: list[str] | None) -> None:
         raise SettingsError(f'ROS arguments: {str(error).partition(", at /")[0]}') from error
 
 
-def _with_ros_files(arguments: list[str] | None, folder: Path) -> list[str] | None:
-    """Replace plain parameter files by converted copies; raise SettingsError for invalid files.
+def _with_ros_parameter_files(arguments: list[str] | None, folder: Path) -> list[str] | None:
+    """Return the arguments, with plain parameter files replaced by converted copies in `folder`.
 
-    None selects `sys.argv`. The copies are only needed until `rclpy.init` has returned.
+    `arguments` is None for `sys.argv`. The copies are only needed until `rclpy.init` has returned.
+    Raises SettingsError for an invalid file.
     """
-    words = list(sys.argv if arguments is None else arguments)
-    for k, word in enumerate(words[:-1]):
+    converted = list(sys.argv if arguments is None else arguments)
+    for k, argument in enumerate(converted[:-1]):
         # rclpy reports missing files and invalid arguments.
-        if word != PARAMETER_FILE or ROS_ARGUMENTS not in words[:k] \
-                or not Path(words[k + 1]).is_file():
+        if argument != PARAMETER_FILE or ROS_ARGUMENTS not in converted[:k] \
+                or not Path(converted[k + 1]).is_file():
             continue
-        content = as_ros_parameters(words[k + 1])
+        content = as_ros_parameters(converted[k + 1])
         if content is not None:
-            words[k + 1] = str(folder / f'{k}.yaml')
-            Path(words[k + 1]).write_text(content, encoding='utf-8')
-    return words
+            converted[k + 1] = str(folder / f'{k}.yaml')
+            Path(converted[k + 1]).write_text(content, encoding='utf-8')
+    return converted

@@ -82,7 +82,7 @@ class _PolledSubscription:
         self.last_number = number
 
     def set_publishers(self, infos: list[TopicEndpointInfo]) -> None:
-        """Update the publishers; if one is gone, ignore the next jump of the sequence number."""
+        """Update the publishers; if one has disappeared, ignore the next sequence number jump."""
         publishers = tuple(sorted(tuple(i.endpoint_gid) for i in infos))
         if set(self.publishers) - set(publishers):
             self.last_number = None
@@ -116,10 +116,10 @@ class RecordNode(Node):
         super().__init__('record_node', start_parameter_services=False)
         self.recorder, self._report = recorder, report
         self.selection = selection.resolved(self.resolve_topic_name)
-        self._sources: dict[str, _PolledSubscription] = {}
+        self._polled_subscriptions: dict[str, _PolledSubscription] = {}
         self._refused: dict[str, str] = {}
         self._described_topics: set[str] = set()
-        self._lost_before: Counter[str] = Counter()
+        self._n_lost_before: Counter[str] = Counter()
         # The types of these topics are known, so the subscriptions need not wait for a driver.
         for topic in self.selection.fields:
             self._subscribe(topic, MAGNETIC_FIELD, [])
@@ -129,8 +129,8 @@ class RecordNode(Node):
     @property
     def lost(self) -> 'Counter[str]':
         """Numbers of lost messages by topic; topics without losses are omitted."""
-        now = Counter({topic: s.n_lost for topic, s in self._sources.items()})
-        return +(now + self._lost_before)
+        now = Counter({topic: s.n_lost for topic, s in self._polled_subscriptions.items()})
+        return +(now + self._n_lost_before)
 
     @property
     def refused(self) -> dict[str, str]:
@@ -147,8 +147,9 @@ class RecordNode(Node):
         n_subscribed : int
             Number of subscribed topics.
         """
-        return (sum(s.subscription.get_publisher_count() > 0 for s in self._sources.values()),
-                len(self._sources))
+        return (sum(s.subscription.get_publisher_count() > 0
+                    for s in self._polled_subscriptions.values()),
+                len(self._polled_subscriptions))
 
     def discover(self) -> None:
         """Subscribe to new selected topics; update the publishers of subscribed topics."""
@@ -158,7 +159,7 @@ class RecordNode(Node):
             infos = self.get_publishers_info_by_topic(topic)
             if not infos:
                 continue
-            if topic in self._sources:
+            if topic in self._polled_subscriptions:
                 self._update_publishers(topic, infos)
             else:
                 self._subscribe(topic, infos[0].topic_type, infos)
@@ -169,42 +170,42 @@ class RecordNode(Node):
             self._refuse(topic, f'message type {type_name} is not installed')
             return
         latched = bool(infos) and all(map(_is_latched, infos))
-        self._sources[topic] = _PolledSubscription(self, topic, type_name, latched)
-        self._sources[topic].set_publishers(infos)
+        self._polled_subscriptions[topic] = _PolledSubscription(self, topic, type_name, latched)
+        self._polled_subscriptions[topic].set_publishers(infos)
 
-    def _describe(self, topic: str, source: _PolledSubscription) -> None:
+    def _describe(self, topic: str, polled: _PolledSubscription) -> None:
         """Add a topic to the recorder at its first message, when its publishers are known."""
-        definition = definition_of(source.type)
+        definition = definition_of(polled.type)
         if definition is None:
-            self._report(f'{topic}: no definition of {source.type} found: the recording of this '
+            self._report(f'{topic}: no definition of {polled.type} found: the recording of this '
                          'topic can only be read with ROS')
         infos = self.get_publishers_info_by_topic(topic)
         reliable = all(i.qos_profile.reliability == ReliabilityPolicy.RELIABLE for i in infos)
-        self.recorder.add_topic(topic, source.type, definition or '',
-                                offered_qos(reliable, source.latched),
-                                max(1, len(infos)) if source.latched else 0)
+        self.recorder.add_topic(topic, polled.type, definition or '',
+                                offered_qos(reliable, polled.latched),
+                                max(1, len(infos)) if polled.latched else 0)
         self._described_topics.add(topic)
 
-    def _refuse(self, topic: str, why: str) -> None:
+    def _refuse(self, topic: str, reason: str) -> None:
         """Report once that a topic is not recorded."""
-        self._refused[topic] = why
-        self._report(f'{topic} is not recorded: {why}')
+        self._refused[topic] = reason
+        self._report(f'{topic} is not recorded: {reason}')
 
     def _update_publishers(self, topic: str, infos: list[TopicEndpointInfo]) -> None:
         """Update a topic's publishers; resubscribe as volatile if one of them is not latched."""
-        source = self._sources[topic]
-        other_types = sorted({i.topic_type for i in infos} - {source.type})
+        polled = self._polled_subscriptions[topic]
+        other_types = sorted({i.topic_type for i in infos} - {polled.type})
         if other_types and f'{topic} as {other_types[0]}' not in self._refused:
-            self._refuse(f'{topic} as {other_types[0]}', f'the topic has type {source.type}')
-        source.set_publishers(infos)
-        if source.latched and not all(map(_is_latched, infos)):
+            self._refuse(f'{topic} as {other_types[0]}', f'the topic has type {polled.type}')
+        polled.set_publishers(infos)
+        if polled.latched and not all(map(_is_latched, infos)):
             # The latched subscription would not match the new publisher, which is not latched.
             self.poll()
-            self._lost_before[topic] += source.n_lost
-            self.destroy_subscription(source.subscription)
-            self._sources[topic] = _PolledSubscription(self, topic, source.type, False)
-        elif source.latched and topic in self._described_topics:
-            self.recorder.add_topic(topic, source.type, latched=len(infos))
+            self._n_lost_before[topic] += polled.n_lost
+            self.destroy_subscription(polled.subscription)
+            self._polled_subscriptions[topic] = _PolledSubscription(self, topic, polled.type, False)
+        elif polled.latched and topic in self._described_topics:
+            self.recorder.add_topic(topic, polled.type, latched=len(infos))
 
     def poll(self) -> int:
         """Record the messages that have arrived.
@@ -215,10 +216,10 @@ class RecordNode(Node):
             Number of messages.
         """
         records = []
-        for topic, source in self._sources.items():
-            messages = source.fetch()
+        for topic, polled in self._polled_subscriptions.items():
+            messages = polled.fetch()
             if messages and topic not in self._described_topics:
-                self._describe(topic, source)
+                self._describe(topic, polled)
             records += [(received, topic, sent, data) for received, sent, data in messages]
         for received, topic, sent, data in sorted(records, key=lambda r: r[0]):
             self.recorder.write(topic, data, received, sent)

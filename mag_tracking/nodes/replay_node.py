@@ -73,11 +73,11 @@ class ReplayNode(ManagedNode):
         self._rate = fixed_parameter(self, 'rate', 1.0,
                                      'Playback rate relative to the recorded rate.')
         self._loop = fixed_parameter(self, 'loop', False, 'Restart playback at the end.')
-        self._offset = fixed_parameter(self, 'start_offset', 0.0,
+        self._start_offset_s = fixed_parameter(self, 'start_offset', 0.0,
                                        'Start position after the first message [s].')
         self._topics = fixed_parameter(self, 'topics', [''], 'Recorded topics to play. If empty, '
                                        'all topics are played.')
-        self._delay = fixed_parameter(self, 'start_delay', 2.0, 'Delay of playback after '
+        self._start_delay_s = fixed_parameter(self, 'start_delay', 2.0, 'Delay of playback after '
                                       'activation, for discovery of the subscribers [s].')
         self._paused = fixed_parameter(self, 'paused', False, 'Start paused.')
         self._subscriber_timeout_s = fixed_parameter(
@@ -116,15 +116,15 @@ class ReplayNode(ManagedNode):
         self._begin_ns = _first_time_ns(recording)
         self._selected_topics = _selected_topics(recording, self._topics)
         end = recording.end_ns
-        if not self._offset >= 0.0 or (
-                end is not None and self._begin_ns + self._offset * 1e9 > end):
-            raise SettingsError(f'replay_node: parameter start_offset: {self._offset} s is outside '
-                                'the recording')
+        if not self._start_offset_s >= 0.0 or (
+                end is not None and self._begin_ns + self._start_offset_s * 1e9 > end):
+            raise SettingsError(f'replay_node: parameter start_offset: {self._start_offset_s} s '
+                                'is outside the recording')
         self._recording = recording
         for topic, kind in recording.types.items():
             if self._selected_topics is None or topic in self._selected_topics:
                 self._publisher_for(topic, kind)
-        self._seek(self._offset)
+        self._seek(self._start_offset_s)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
         """Start playback at the current position.
@@ -139,7 +139,7 @@ class ReplayNode(ManagedNode):
         TransitionCallbackReturn
         """
         # Messages published before discovery is complete are lost.
-        self._start_time = time.monotonic() + self._delay
+        self._start_time = time.monotonic() + self._start_delay_s
         self._is_active, self._last_tick = True, None
         return super().on_activate(state)
 

@@ -1,4 +1,4 @@
-"""Faults of the publishers of the sensor topics."""
+"""Detection of faults in the publishers of sensor topics."""
 
 from collections.abc import Mapping
 
@@ -58,8 +58,10 @@ def node_of(endpoint: TopicEndpointInfo) -> str | None:
     return absolute(endpoint.node_name, namespace) if namespace.startswith('/') else None
 
 
-def missing_publisher(node: Node, sensor: str, topic: str, known: Mapping[str, str]) -> Finding:
-    """Fault of a sensor from which no message has been received; suggests other topics.
+def no_message_finding(node: Node, sensor: str, topic: str, known: Mapping[str, str]) -> Finding:
+    """Fault of a sensor from which no message has been received.
+
+    If the topic has no publisher, the advice names other topics with magnetic fields.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from mag_tracking.apps.doctor_covariances import covariance_findings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute
 from mag_tracking.nodes.flow import SILENCE_TIMEOUT_S
-from mag_tracking.nodes.sensor_graph import missing_publisher, topic_findings
+from mag_tracking.nodes.sensor_graph import no_message_finding, topic_findings
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.stage import Calibrate
@@ -59,12 +59,12 @@ class HealthDiagnostics:
         self._index = {name: j for j, name in enumerate(network.names)}
         # Time of the latest reading by the monotonic clock [s]; NaN before the first reading.
         self._last_received = np.full(len(network), np.nan)
-        self._frozen_ns: dict[str, int] = {}
+        self._frozen_since_ns: dict[str, int] = {}
         # Time since which each background has been unknown, by the monotonic clock [s].
         self._unready_since: dict[str, float] = {}
         self._network_findings: dict[str, list[Finding]] = {}
         # Number of relearnt backgrounds at the start of the previous and the current window.
-        self._relearnt: list[dict[str, int]] = [dict.fromkeys(network.names, 0)] * 2
+        self._relearnt_counts: list[dict[str, int]] = [dict.fromkeys(network.names, 0)] * 2
         self._begin(network)
 
     def _begin(self, network: SensorNetwork) -> None:
@@ -73,8 +73,8 @@ class HealthDiagnostics:
         self._clock_ns = network.clock_offset_ns
         # Earlier timestamps were corrected with the clock offsets of the previous network.
         self._buffer = ReadingBuffer(len(network), WINDOW // 2)
-        self._previous: dict[str, SensorHealth | None] = dict.fromkeys(network.names)
-        self._current = self._new_window()
+        self._previous_window: dict[str, SensorHealth | None] = dict.fromkeys(network.names)
+        self._current_window = self._new_window()
         self._start_time = time.monotonic()
         self._window_end = self._start_time + WINDOW_S
 
@@ -115,7 +115,7 @@ class HealthDiagnostics:
         j : int
             Index of the sensor.
         """
-        self._current[self._network.names[j]].add_batch(*self._buffer.pop(j))
+        self._current_window[self._network.names[j]].add_batch(*self._buffer.pop(j))
 
     def statuses(self, node: str, calibrate: Calibrate) -> list[DiagnosticStatus]:
         """Evaluate all buffered readings and return the diagnostics of all sensors.
@@ -150,20 +150,21 @@ class HealthDiagnostics:
         self._compare(calibrate)
         if time.monotonic() > self._window_end:
             self._window_end = time.monotonic() + WINDOW_S
-            self._previous, self._current = {**self._current}, self._new_window()
-            self._relearnt = [self._relearnt[1], {
+            self._previous_window, self._current_window = \
+                {**self._current_window}, self._new_window()
+            self._relearnt_counts = [self._relearnt_counts[1], {
                 name: b.n_relearnt for name, b in calibrate.backgrounds().items()}]
 
     def _compare(self, calibrate: Calibrate) -> None:
         """Compare the sensors with each other and with the Earth's field.
 
-        Also records since when each frozen background has been frozen.
+        Also records the time at which each frozen background was frozen.
         """
         for name, background in calibrate.backgrounds().items():
             if not background.frozen:
-                self._frozen_ns.pop(name, None)
+                self._frozen_since_ns.pop(name, None)
             elif (last := calibrate.last_stamp_ns(name)) is not None:
-                self._frozen_ns.setdefault(name, last)
+                self._frozen_since_ns.setdefault(name, last)
         health = {name: self._reported_window(name) for name in self._network.names}
         self._network_findings = {name: [] for name in self._network.names}
         for finding in network_findings(self._network, self._settings.survey, calibrate, health):
@@ -172,7 +173,7 @@ class HealthDiagnostics:
 
     def _reported_window(self, name: str) -> SensorHealth:
         """Return a sensor's current window; the previous window if the current one is sparse."""
-        previous, current = self._previous[name], self._current[name]
+        previous, current = self._previous_window[name], self._current_window[name]
         return previous if previous is not None and current.counts['readings'] < MIN_READINGS \
             else current
 
@@ -192,10 +193,10 @@ class HealthDiagnostics:
         since = self._unready_since.setdefault(name, time.monotonic())
         if calibrate.backgrounds()[name].ready or time.monotonic() - since > timeout_s:
             findings.update({f.what: f for f in background_findings(
-                name, calibrate, self._frozen_ns.get(name), self._relearnt[0][name])})
+                name, calibrate, self._frozen_since_ns.get(name), self._relearnt_counts[0][name])})
         findings.update({f.what: f for f in covariance_findings(
             name, self._topics[name], calibrate)})
-        for health in (self._previous[name], self._current[name]):
+        for health in (self._previous_window[name], self._current_window[name]):
             if health is not None and health.counts['readings']:
                 for f in health.findings(name, self._network.noise_std[j],
                                          self._settings.calibrate.max_field,
@@ -215,7 +216,7 @@ class HealthDiagnostics:
         if self._node is None:
             return [Finding(True, name, 'no message received', 'check its cable, its driver and '
                             f'the topic {topic}')]
-        return [missing_publisher(self._node, name, topic, self._topics)]
+        return [no_message_finding(self._node, name, topic, self._topics)]
 
     def _clock_findings(self, name: str) -> list[Finding]:
         """Return a fault if a sensor's timestamps differ from the computer's time by over a day."""

@@ -42,7 +42,7 @@ class SensorRounds:
         self._node, self._stage, self._health, self._store = node, stage, health, store
         self._is_live = is_live
         self._publish_status, self._publish_states = publish_status, publish_states
-        self._is_due = False
+        self._is_step_due = False
         self._reported_doubts: set[tuple[int, tuple[int, int | None]]] = set()
         self.begin(network)
 
@@ -59,14 +59,14 @@ class SensorRounds:
         self._states = [self._state(j) for j in range(len(network))]
 
     def tick(self) -> None:
-        """Mark the next step as due, to run after the next readings; first run a step still due."""
-        if self._is_due:
+        """Mark the next step as due after the next readings; first run a step that is still due."""
+        if self._is_step_due:
             self._step()
-        self._is_due = True
+        self._is_step_due = True
 
     def step_if_due(self) -> None:
         """Run the next step of the round if it is due."""
-        if self._is_due:
+        if self._is_step_due:
             self._step()
 
     def report_doubts(self) -> None:
@@ -85,7 +85,7 @@ class SensorRounds:
 
     def _step(self) -> None:
         """Run the next step of the round."""
-        self._is_due = False
+        self._is_step_due = False
         next(self._steps)
 
     def publish(self) -> None:
@@ -97,7 +97,7 @@ class SensorRounds:
         return to_message(SensorCalibration, sensor_dict(self._stage, self._network, j))
 
     def _rounds(self) -> Iterator[None]:
-        """Run endless rounds and yield after each step: compare, update, report, publish, store."""
+        """Run endless rounds; yield after each step: compare, update, report, publish, store."""
         while True:
             self._health.begin_round(self._stage)
             yield

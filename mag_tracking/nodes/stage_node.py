@@ -77,7 +77,7 @@ class StageNode(Node):
         Network file.
     network : SensorNetwork
     settings : Settings
-        Settings in force.
+        Defaults of the target, overridden by parameters.
     title : str
         Name of the node in diagnostics.
     input_qos : QoSProfile
@@ -115,7 +115,8 @@ class StageNode(Node):
         if self.settings.track.target != target:
             raise SettingsError(f'{name}: parameter track.target is {self.settings.track.target!r}'
                                 f', but target is {target!r}; set target only')
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RESULT_QOS)
+        self._diagnostics_publisher = self.create_publisher(
+            DiagnosticArray, '/diagnostics', RESULT_QOS)
         self._reported_rejections: dict[tuple[str, str], int] = {}
         self.flows: dict[str, Flow] = {}
         self._subscriber_monitors: list[SubscriberMonitor] = []
@@ -235,10 +236,10 @@ class StageNode(Node):
 
         def receive(message: Any) -> None:
             assert flow is not None
-            began = time.monotonic()
+            start_s = time.monotonic()
             self.now_ns = self.get_clock().now().nanoseconds
             callback(message)
-            flow.add(stamp_ns(message.header.stamp), self.now_ns, began)
+            flow.add(stamp_ns(message.header.stamp), self.now_ns, start_s)
 
         return self.create_subscription(
             message_type, topic, callback if flow is None else receive, qos,
@@ -269,10 +270,10 @@ class StageNode(Node):
         flow.topics += map(self.resolve_topic_name, topics)
 
         def receive(record: _Record) -> None:
-            began = time.monotonic()
+            start_s = time.monotonic()
             self.now_ns = self.get_clock().now().nanoseconds
             callback(record)
-            flow.add(stamp_of(record), self.now_ns, began)
+            flow.add(stamp_of(record), self.now_ns, start_s)
 
         return receive
 
@@ -364,7 +365,7 @@ class StageNode(Node):
         if statuses:
             array = DiagnosticArray(status=statuses)
             array.header.stamp = self.get_clock().now().to_msg()
-            self._diagnostics.publish(array)
+            self._diagnostics_publisher.publish(array)
 
 
 def has_subscribers(publisher: Publisher) -> bool:

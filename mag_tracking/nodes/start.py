@@ -40,7 +40,7 @@ def run_node(name: str) -> NoReturn:
 
 
 def limit_exit_time(status: int) -> None:
-    """Limit the time until the process ends, if it has used ROS.
+    """Limit the time until the process ends, if the process has imported rclpy.
 
     Parameters
     ----------

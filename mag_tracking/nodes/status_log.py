@@ -8,7 +8,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 REPEAT_INTERVAL_S = 60.0
-"""[s] Minimum interval between log lines of one fault; a persistent error is repeated after it."""
+"""[s] Minimum interval between log lines of one fault; a persistent error is repeated
+after this interval."""
 MAX_SIMILAR_LINES = 4
 """Maximum number of lines per interval that differ only in numbers, such as sensor numbers."""
 MAX_FAULTS = 1000

@@ -87,7 +87,7 @@ class SurveyService:
                 return None
         response.success = True
         response.message = (
-            'the result is in force'
+            'the result is in use'
             + (f' and saved to {self._save_as}; use that file at the next start' if save else '')
             + f'; clock reference: {solution.reference or "none, because no knock was detected"}')
         response.warnings = solution.warnings()

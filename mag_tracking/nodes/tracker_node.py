@@ -87,7 +87,7 @@ class TrackerNode(StageNode):
     Attributes
     ----------
     after_pose : function or None
-        Publishes the frame of a pose; called after the pose and before the track are published.
+        Publishes the frame of a pose; called between the publication of the pose and of the track.
     """
 
     def __init__(self, has_direct_input: bool = False, **node_arguments: Any) -> None:
@@ -100,25 +100,25 @@ class TrackerNode(StageNode):
         self._child_frame = fixed_parameter(
             self, 'child_frame', '', 'Frame of the target in odometry and transforms, for example '
             'for robot_localization. If empty, the frame is track_<id>.')
-        self._tf = self.publisher(TFMessage, '/tf', TRANSFORM_QOS) if fixed_parameter(
+        self._tf_publisher = self.publisher(TFMessage, '/tf', TRANSFORM_QOS) if fixed_parameter(
             self, 'publish_tf', False, 'Publish the transform from the world frame to the frame '
             'of the target.') else None
-        self._pose = self.publisher(PoseWithCovarianceStamped, '~/pose', PUBLISHER_QOS)
-        self._odometry = self.publisher(Odometry, '~/odometry', RESULT_QOS)
-        self._tracks = self.publisher(TrackArray, '~/tracks', PUBLISHER_QOS)
-        self._hypotheses = self.publisher(HypothesisArray, '~/hypotheses', PUBLISHER_QOS)
+        self._pose_publisher = self.publisher(PoseWithCovarianceStamped, '~/pose', PUBLISHER_QOS)
+        self._odometry_publisher = self.publisher(Odometry, '~/odometry', RESULT_QOS)
+        self._tracks_publisher = self.publisher(TrackArray, '~/tracks', PUBLISHER_QOS)
+        self._hypotheses_publisher = self.publisher(HypothesisArray, '~/hypotheses', PUBLISHER_QOS)
         self._path_publisher = self.publisher(Path, '~/path', RESULT_QOS)
-        self._smoothed_pose = self.publisher(PoseWithCovarianceStamped, '~/pose_smoothed',
-                                             PUBLISHER_QOS)
-        self._smoothed = self.publisher(SmoothedTrack, '~/smoothed', RESULT_QOS)
-        self._smoothed_path = self.publisher(Path, '~/path_smoothed', RESULT_QOS)
-        self._disturbances = self.publisher(DisturbanceMessage, '~/disturbances', PUBLISHER_QOS)
-        self._markers = self.publisher(MarkerArray, '~/markers', RESULT_QOS)
-        self._detections_3d = self.publisher(Detection3DArray, '~/detections_3d', RESULT_QOS)
-        self._sensor_markers = self.publisher(MarkerArray, '~/sensor_markers', LATCHED_QOS)
-        self._sensor_markers.publish(to_message(MarkerArray, sensor_markers(self.network)))
-        # Poses of each running track.
-        self._paths: dict[int, deque[PoseStamped]] = {}
+        self._smoothed_pose_publisher = self.publisher(PoseWithCovarianceStamped, '~/pose_smoothed',
+                                                     PUBLISHER_QOS)
+        self._smoothed_publisher = self.publisher(SmoothedTrack, '~/smoothed', RESULT_QOS)
+        self._smoothed_path_publisher = self.publisher(Path, '~/path_smoothed', RESULT_QOS)
+        self._disturbance_publisher = self.publisher(DisturbanceMessage, '~/disturbances',
+                                                     PUBLISHER_QOS)
+        self._marker_publisher = self.publisher(MarkerArray, '~/markers', RESULT_QOS)
+        self._detection_publisher = self.publisher(Detection3DArray, '~/detections_3d', RESULT_QOS)
+        self._sensor_marker_publisher = self.publisher(MarkerArray, '~/sensor_markers', LATCHED_QOS)
+        self._sensor_marker_publisher.publish(to_message(MarkerArray, sensor_markers(self.network)))
+        self._poses_by_track: dict[int, deque[PoseStamped]] = {}
         self._is_silent, self._latest_id = False, -1
         self._doubtful_times: dict[str, DoubtfulTimes] = {}
         if has_direct_input:
@@ -174,7 +174,7 @@ class TrackerNode(StageNode):
             return
         self.network = network
         self._stage.use_network(network)
-        self._sensor_markers.publish(to_message(MarkerArray, sensor_markers(network)))
+        self._sensor_marker_publisher.publish(to_message(MarkerArray, sensor_markers(network)))
         self.get_logger().info('surveyed sensor orientations received; used from the next track on')
 
     def _receive(self, message: NetworkFrame) -> None:
@@ -199,7 +199,7 @@ class TrackerNode(StageNode):
         self._stage.set_doubtful_times(times)
 
     def idle(self) -> None:
-        """Do the work that the stage defers until the preceding step has published its results."""
+        """Run the deferred work of the stage; called after the preceding step has published."""
         self._stage.idle()
 
     def _feed(self, frame: FieldFrame) -> None:
@@ -213,7 +213,7 @@ class TrackerNode(StageNode):
         complete = []
         for record in records:
             if isinstance(record, Disturbance):
-                self._disturbances.publish(to_message(
+                self._disturbance_publisher.publish(to_message(
                     DisturbanceMessage, disturbance_dict(record, self.network.frame)))
             elif not isinstance(record, SmoothedPose):
                 self._publish(record)
@@ -221,13 +221,13 @@ class TrackerNode(StageNode):
                 complete.append(record)
             # The message has no flag for ambiguity, and other hypotheses are not smoothed.
             elif not record.ambiguous or self.settings.track.ambiguous_poses == BEST:
-                self._smoothed_pose.publish(to_message(
+                self._smoothed_pose_publisher.publish(to_message(
                     PoseWithCovarianceStamped, smoothed_pose_dict(record, self.network.frame)))
         for id in dict.fromkeys(pose.id for pose in complete):
             poses = [pose for pose in complete if pose.id == id]
-            self._smoothed.publish(to_message(
+            self._smoothed_publisher.publish(to_message(
                 SmoothedTrack, smoothed_track_dict(poses, self.network.frame)))
-            self._smoothed_path.publish(self._path_of(poses))
+            self._smoothed_path_publisher.publish(self._path_of(poses))
         self._traffic.add(TrackedFrame(frame, records))
 
     def _path_of(self, poses: list[SmoothedPose]) -> Path:
@@ -241,23 +241,24 @@ class TrackerNode(StageNode):
         frame = self.network.frame
         if not track.ended:
             # The pose comes first, because it may be used for control.
-            publish_if_any(self._pose, PoseWithCovarianceStamped, pose_message_dict(track, frame))
+            publish_if_any(self._pose_publisher, PoseWithCovarianceStamped,
+                           pose_message_dict(track, frame))
         if self.after_pose is not None:
             self.after_pose()
         if not track.ended:
             # The hypotheses come before the track, so that its subscribers already have them.
-            if has_subscribers(self._hypotheses):
-                self._hypotheses.publish(
+            if has_subscribers(self._hypotheses_publisher):
+                self._hypotheses_publisher.publish(
                     to_message(HypothesisArray, hypotheses_dict(track, frame)))
         content = track_dict(track, frame)
-        self._tracks.publish(to_message(
+        self._tracks_publisher.publish(to_message(
             TrackArray, {'header': content['header'], 'tracks': [content]}))
-        if has_subscribers(self._detections_3d):
-            self._detections_3d.publish(to_message(
+        if has_subscribers(self._detection_publisher):
+            self._detection_publisher.publish(to_message(
                 Detection3DArray, detections_3d_dict(track, frame)))
         if track.ended:
-            self._paths.pop(track.id, None)
-            self._markers.publish(to_message(MarkerArray, delete_markers(track, frame)))
+            self._poses_by_track.pop(track.id, None)
+            self._marker_publisher.publish(to_message(MarkerArray, delete_markers(track, frame)))
         else:
             self._publish_views(track, frame)
         self._log_lifecycle(track)
@@ -274,18 +275,19 @@ class TrackerNode(StageNode):
     def _publish_views(self, track: Track, frame: str) -> None:
         """Publish odometry, transform, path and markers of a running track."""
         child_frame = self._child_frame or f'track_{track.id}'
-        publish_if_any(self._odometry, Odometry, odometry_dict(track, frame, child_frame))
-        if self._tf is not None:
-            publish_if_any(self._tf, TFMessage, track_transform_dict(track, frame, child_frame))
-        path = self._paths.setdefault(track.id, deque(maxlen=MAX_PATH_POSES))
+        publish_if_any(self._odometry_publisher, Odometry, odometry_dict(track, frame, child_frame))
+        if self._tf_publisher is not None:
+            publish_if_any(self._tf_publisher, TFMessage,
+                           track_transform_dict(track, frame, child_frame))
+        path = self._poses_by_track.setdefault(track.id, deque(maxlen=MAX_PATH_POSES))
         if track.topic_uncertainty is not None:
             path.append(to_message(PoseStamped, pose_dict(
                 track.stamp_ns, frame, track.position, track.orientation)))
         # The topic carries the path of the oldest running track only.
-        if path and track.id == min(self._paths) and has_subscribers(self._path_publisher):
+        if path and track.id == min(self._poses_by_track) and has_subscribers(self._path_publisher):
             self._path_publisher.publish(Path(header=path[-1].header, poses=list(path)))
-        if has_subscribers(self._markers):
-            self._markers.publish(to_message(MarkerArray, track_markers(track, frame)))
+        if has_subscribers(self._marker_publisher):
+            self._marker_publisher.publish(to_message(MarkerArray, track_markers(track, frame)))
 
 
 def publish_if_any(publisher: Publisher, cls: Any, content: MessageDict | None) -> None:

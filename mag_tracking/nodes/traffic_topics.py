@@ -1,4 +1,4 @@
-"""Topics of the traffic statistics of the tracker node."""
+"""Traffic statistics topics of the tracker node."""
 
 from mag_tracking_msgs.msg import TrafficSummary as TrafficSummaryMessage
 from mag_tracking_msgs.msg import VehiclePassage as VehiclePassageMessage
@@ -29,8 +29,8 @@ class TrafficTopics:
         self.stage = Traffic(node.network, node.settings.traffic,
                              node.settings.track.target == 'vehicle')
         self._classes, self._frame = node.settings.traffic.class_names, node.network.frame
-        self._passages = node.publisher(VehiclePassageMessage, '~/passages', PUBLISHER_QOS)
-        self._summaries = node.publisher(TrafficSummaryMessage, '~/traffic', RESULT_QOS)
+        self._passage_publisher = node.publisher(VehiclePassageMessage, '~/passages', PUBLISHER_QOS)
+        self._summary_publisher = node.publisher(TrafficSummaryMessage, '~/traffic', RESULT_QOS)
 
     def add(self, item: TrackedFrame) -> None:
         """Process the records of a frame; publish completed passages and summaries.
@@ -41,8 +41,9 @@ class TrafficTopics:
         """
         for record in self.stage.feed(item):
             if isinstance(record, VehiclePassage):
-                self._passages.publish(to_message(VehiclePassageMessage, vehicle_passage_dict(
-                    record, self._classes, self._frame)))
+                self._passage_publisher.publish(to_message(
+                    VehiclePassageMessage,
+                    vehicle_passage_dict(record, self._classes, self._frame)))
             else:
-                self._summaries.publish(to_message(
+                self._summary_publisher.publish(to_message(
                     TrafficSummaryMessage, traffic_summary_dict(record, self._frame)))

@@ -80,7 +80,7 @@ def test_a_sensor_without_readings_keeps_its_nominal_geometry(tmp_path, capsys):
     assert '39 of 40 poses' in text
     assert 'warning: poses not used (no readings): 1\n' in text
     assert 'warning: mag_4 has no readings; its nominal geometry is kept' in text
-    assert ('warning: mag_6 never reported z: the background on unreported axes remains unknown'
+    assert ('warning: mag_6 never reported z: the background of these axes is unknown'
             in text)
     before, after = read_network(tmp_path / 'stated.yaml'), read_network(tmp_path / 'out.yaml')
     for name in ('positions', 'R_ws', 'noise_std', 'background', 'correction', 'orientation_std'):

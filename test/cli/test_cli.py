@@ -236,7 +236,7 @@ def test_a_file_name_may_be_invalid_utf8(tmp_path):
 
 
 def test_fit_of_a_single_pass_cannot_separate_hard_and_soft_iron(tmp_path, capsys):
-    """In this case, `iron` is null."""
+    """The value `iron` in fits.json is null."""
     name = str(vehicle_path('straight_car_right'))
     assert main(['fit', name, '--network', str(NETWORK_FILE), '--orders', '3', '--same-vehicle',
                  '--no-figures', '--out', str(tmp_path)]) == 0

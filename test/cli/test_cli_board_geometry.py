@@ -229,7 +229,8 @@ def test_ctrl_c_ends_the_command_without_files(tmp_path):
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         # In a background job, the process would inherit that SIGINT is ignored.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
-    assert process.stdout.readline() == 'estimating the poses and geometry of 41 sensors\n'
+    assert process.stdout.readline() == (
+        "estimating the magnet's poses and the geometry of 41 sensors\n")
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 130, err

@@ -89,11 +89,11 @@ def test_an_interrupt_while_writing_loses_no_results(tmp_path, monkeypatch, caps
     module = {'write_figures': replay, 'add': app.RunCollector}.get(step, app)
     original, calls = getattr(module, step), []
 
-    def interrupted(*args, **named):
+    def interrupted(*args, **keywords):
         calls.append(step)
         if len(calls) in (1, 2):
             signal.raise_signal(signal.SIGINT)
-        return original(*args, **named)
+        return original(*args, **keywords)
 
     monkeypatch.setattr(module, step, interrupted)
     assert replay_one(tmp_path) == 130
@@ -133,7 +133,7 @@ def test_the_command_works_outside_the_main_thread(tmp_path):
 
 @pytest.mark.parametrize('unbuffered', ['', '1'])
 def test_a_closed_pipe_ends_the_command_silently(unbuffered):
-    """With `| head`, no error is printed, and the exit status is that of SIGPIPE (141)."""
+    """The exit status with `| head` is that of SIGPIPE (141), and no error is printed."""
     command = [sys.executable, '-m', 'mag_tracking.cli', 'info', str(vehicle_path(NAME))]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                           env={**os.environ, 'PYTHONUNBUFFERED': unbuffered}) as process:

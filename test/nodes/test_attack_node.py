@@ -1,4 +1,4 @@
-"""Invalid calls to running nodes: no file is overwritten, no node ends, each call is answered."""
+"""Invalid calls to nodes: no file is overwritten, no node ends, each call gets a response."""
 
 import os
 from pathlib import Path
@@ -171,8 +171,8 @@ def test_nodes_survive_an_attack(ros, folders, tmp_path):
         assert not [name for name, p in processes.items() if p.poll() is not None]
         after = contents(network_folder, protected)
     finally:
-        codes, outputs = stop(list(processes.values()))
-    assert not any(codes), outputs
+        exit_codes, outputs = stop(list(processes.values()))
+    assert not any(exit_codes), outputs
     assert not any('Traceback' in text for text in outputs), outputs
     changed = {p for p in before.keys() | after.keys() if before.get(p) != after.get(p)}
     assert changed == {network_folder / 'network_calibrated.yaml'}

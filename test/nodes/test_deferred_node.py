@@ -74,5 +74,5 @@ def test_every_reading_of_a_message_is_evaluated(ros):
             assert 0.75 * rate_hz < float(values(name)['rate [Hz]']) < 1.33 * rate_hz
             assert [5.0 < float(v) < 30.0 for v in values(name)['noise [nT]'].split()] == [True] * 3
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs

@@ -53,8 +53,8 @@ def test_the_tracker_publishes_the_disturbance_of_a_replay(ros):
                               and stamp_ns(frames[-1].header.stamp) >= complete_ns)
         assert spin_until(lambda: messages)
     finally:
-        codes, outputs = stop(processes)
-    assert codes == [0] * 3, outputs
+        exit_codes, outputs = stop(processes)
+    assert exit_codes == [0] * 3, outputs
     offline = to_message(DisturbanceMessage, disturbance_dict(expected[0], 'map'))
     assert (np.isclose(messages[0].largest, offline.largest)
             and np.isclose(messages[0].uniform, offline.uniform))

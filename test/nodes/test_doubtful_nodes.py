@@ -44,8 +44,8 @@ def test_nodes_track_and_flag_poses_after_dense_traffic(ros):
         assert spin_until(lambda: any(track.status == track.ENDED for m in tracks
                                       for track in m.tracks))
     finally:
-        codes, outputs = stop(processes)
-    assert codes == [0] * 3, outputs
+        exit_codes, outputs = stop(processes)
+    assert exit_codes == [0] * 3, outputs
     poses = [track_of(track) for m in tracks for track in m.tracks if track.status == track.ACTIVE]
     assert len(poses) > 10 and all(pose.ambiguous for pose in poses)
     doubtful = next(s for m in states for s in m.sensors if s.doubtful)

@@ -33,7 +33,7 @@ board:
 
 
 def line_of(sensor, k, tick):
-    """Line number `k` of a level sensor at a tick of 10 ms; x [nT] encodes the tick."""
+    """Line `k` of a horizontal sensor at clock tick `tick` (10 ms); x is 2000 + `tick` [nT]."""
     body = f'{sensor},{k},{10_000 * tick},{2000 + tick},15500,-49000,0,0,1'
     checksum = 0
     for c in body.encode():
@@ -141,8 +141,8 @@ def test_a_serial_board_is_published_and_reconnected(board):
         # At first, the lost readings cause a warning.
         assert spin_until(lambda: status_of(diagnostics).level == DiagnosticStatus.OK)
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs
     assert 'open again' in outputs[0]
 
 
@@ -176,8 +176,8 @@ def test_lifecycle_transitions_start_and_stop_publishing(board):
         assert change(Transition.TRANSITION_CLEANUP)
         assert state() == State.PRIMARY_STATE_UNCONFIGURED
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs
     assert 'gauss' in outputs[0]
 
 
@@ -190,8 +190,8 @@ def test_readings_are_published_in_batches(board):
     try:
         assert spin_until(lambda: len(batches) > 20)
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs
     assert not fields
     samples = [samples_of(readings_of(m)) for _, m in batches[5:15]]
     assert np.mean([len(s) for s in samples]) > 8
@@ -222,8 +222,8 @@ def test_readings_in_batches_reach_the_frames(ros, tmp_path):
                                f'network:={network}', '-p', 'batches:=true'))
         assert spin_until(lambda: len(frames) > 30)
     finally:
-        codes, outputs = stop(processes)
-    assert codes == [0] * 3, outputs
+        exit_codes, outputs = stop(processes)
+    assert exit_codes == [0] * 3, outputs
     n = np.array([m.n_samples for _, m in frames[5:30]])
     # When the clock estimate of the device changes, a reading may fall into the adjacent frame.
     # This affects all sensors, because they share the clock.
@@ -264,5 +264,5 @@ def test_a_missing_port_is_reported_until_it_appears(board):
         state['plugged'] = True
         assert spin_until(lambda: fields, 2.0)
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs

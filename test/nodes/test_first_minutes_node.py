@@ -98,7 +98,7 @@ def node_in(namespace, user):
 
 def test_mistakes_of_a_new_user_are_reported_within_seconds(ros, capfd):
     node, spin_until = ros
-    reported, lags = {}, []
+    reported, tick_times = {}, []
 
     def check(message):
         for status in message.status:
@@ -107,7 +107,7 @@ def test_mistakes_of_a_new_user_are_reported_within_seconds(ros, capfd):
                 if CASES[case][1] in status.message:
                     reported.setdefault(case, time.monotonic())
     node.create_subscription(DiagnosticArray, '/diagnostics', check, RESULT_QOS)
-    node.create_timer(0.05, lambda: lags.append(time.monotonic()))
+    node.create_timer(0.05, lambda: tick_times.append(time.monotonic()))
     start_times, nodes = {}, []
     other_process = subprocess.Popen([sys.executable, '-c', OTHER_TYPE_PROGRAM])
     try:
@@ -135,5 +135,5 @@ def test_mistakes_of_a_new_user_are_reported_within_seconds(ros, capfd):
     delays_s = {case: reported[case] - start_times[case] for case in CASES}
     print({case: round(seconds, 1) for case, seconds in delays_s.items()})
     # Longest stall of this process.
-    stall_s = float(np.diff(lags).max())
+    stall_s = float(np.diff(tick_times).max())
     assert max(delays_s.values()) <= MAX_REPORT_S + 2.0 * stall_s

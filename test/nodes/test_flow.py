@@ -77,9 +77,9 @@ def test_a_silent_input_is_reported_until_it_returns(clock):
     # A sender that exists may have nothing to publish, so the level is not ERROR.
     assert silent.level == DiagnosticStatus.WARN
     assert silent.message == 'no message from a_node for 3 s'
-    gone = status_of(flow, sender_exists=False)
-    assert gone.level == DiagnosticStatus.ERROR
-    assert gone.message == silent.message + ', and its topics have no publisher: ' \
+    no_sender = status_of(flow, sender_exists=False)
+    assert no_sender.level == DiagnosticStatus.ERROR
+    assert no_sender.message == silent.message + ', and its topics have no publisher: ' \
         'check that it is running'
     flow.add(0, 0, clock[0])
     assert status_of(flow).message == 'running'
@@ -137,9 +137,9 @@ def test_a_subscriber_that_disappears_is_reported():
             '/other': {'its type'}, '/second': {'its type', 'more'}}.get(name, set()))
     assert status('/rviz').message == 'no tracker node has subscribed to /network_frame yet'
     assert status('/rviz', '/other').message == 'running'
-    gone = status('/rviz')
-    assert gone.level == DiagnosticStatus.ERROR and gone.name == 'me: to tracker'
-    assert gone.message == '/other is gone: check that it is running'
+    disappeared = status('/rviz')
+    assert disappeared.level == DiagnosticStatus.ERROR and disappeared.name == 'me: to tracker'
+    assert disappeared.message == '/other has disappeared: check that it is running'
     assert status('/other').level == DiagnosticStatus.OK
     # A tracker with another name may replace the first; other subscribers may disappear.
     assert status('/second').level == DiagnosticStatus.OK
@@ -218,5 +218,5 @@ def test_a_node_reports_its_queue_and_latency(ros):
                            ['latency, median [ms]']) < 1000.0
         assert spin_until(lambda: statuses['detection_node: align']['queue'] == '1')
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs

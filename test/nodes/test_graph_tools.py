@@ -67,8 +67,8 @@ def test_commands_show_a_calibration_and_a_driver(command, tmp_path):
         check_parameters(command)
         check_lifecycle(command)
     finally:
-        codes, outputs = stop(processes)
-    assert not any(codes), outputs
+        exit_codes, outputs = stop(processes)
+    assert not any(exit_codes), outputs
 
 
 def check_parameters(command):
@@ -100,8 +100,8 @@ def test_integers_are_accepted_for_floating_point_parameters(command):
         status, output = command('param', 'tracker_node', 'track.field_error', '1')
         assert status == 0 and output.startswith('track.field_error: 1.0'), output
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs
 
 
 def test_a_slow_transition_is_requested_once(command):

@@ -108,8 +108,8 @@ def test_a_relearnt_background_is_reported(publish_until, statuses):
         state = {v.key: v.value for v in statuses['calibration_node: mag_1'].values}
         assert state['backgrounds relearnt'] == '1' and state['background'] == 'ready'
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs
 
 
 def test_a_flipped_axis_is_an_error(publish_until, statuses):
@@ -132,8 +132,8 @@ def test_a_flipped_axis_is_an_error(publish_until, statuses):
         assert statuses['calibration_node: mag_1'].level == DiagnosticStatus.ERROR
         assert statuses['calibration_node: mag_2'].level != DiagnosticStatus.ERROR
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs
 
 
 def test_each_sensor_has_a_status(publish_until, statuses):
@@ -173,8 +173,8 @@ def test_each_sensor_has_a_status(publish_until, statuses):
         assert status('mag_1').level != DiagnosticStatus.ERROR
         assert publish_until(lambda: 'readings were lost' in status('mag_2').message)
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs
 
 
 def test_a_restarted_calibration_restores_its_background(ros, publish_until, tmp_path):
@@ -197,8 +197,8 @@ def test_a_restarted_calibration_restores_its_background(ros, publish_until, tmp
         running_time = time.monotonic()
         assert publish_until(lambda: len(calibrated) > n + 100, step=step)
     finally:
-        codes, outputs = stop([second])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([second])
+    assert exit_codes == [0], outputs
     recovery = max(0.0, calibrated[n][0] - running_time)
     print(f'recovery of a killed calibration without a given background: {recovery:.2f} s')
     assert recovery <= scaled(2.0, running_time - begin)

@@ -36,13 +36,13 @@ class Consumer(Node):
 
 def test_transforms_detections_and_markers_describe_the_track():
     """The nodes run in a namespace, with the parameters that `robot_localization` requires."""
-    holder = []
+    consumers = []
     run(NETWORK_FILE, settings_for('vehicle', {'align.max_wait_s': 5.0}),
         vehicle_path('straight_car_fast_left'), 3.0,
-        observers=[lambda: holder.append(Consumer()) or holder[-1]],
+        observers=[lambda: consumers.append(Consumer()) or consumers[-1]],
         ros_arguments=['--ros-args', '-r', '__ns:=/road', '-p', 'publish_tf:=true',
                        '-p', 'child_frame:=vehicle'])
-    consumer, = holder
+    consumer, = consumers
     frames = [t.child_frame_id for m in consumer.static for t in m.transforms]
     assert set(frames) == {'mag_1', 'mag_2'}
     assert {t.header.frame_id for m in consumer.static for t in m.transforms} == {'map'}

@@ -97,8 +97,8 @@ def test_every_name_in_the_launch_file_exists(launch_objects, executables):
             if isinstance(parameters, dict):
                 assert parameters.keys() <= NODE_PARAMETERS
     declared = {m.arguments[0] for m in of_class(launch_objects, 'DeclareLaunchArgument')}
-    used = {m.arguments[0] for m in of_class(launch_objects, 'LaunchConfiguration')}
-    assert declared == used
+    referenced = {m.arguments[0] for m in of_class(launch_objects, 'LaunchConfiguration')}
+    assert declared == referenced
     for join in of_class(launch_objects, 'PathJoinSubstitution'):
         package, *path = join.arguments[0]
         assert package.arguments == ('mag_tracking',) and ROOT.joinpath(*path).is_file()

@@ -35,10 +35,10 @@ node, received = Node('listener'), Future()
 executor = EventsExecutor()
 executor.add_node(node)
 # The creation of the node is not part of the measured delay.
-began = time.monotonic()
+start = time.monotonic()
 node.create_subscription(MagneticField, '/field', received.set_result, STREAM_QOS)
 executor.spin_until_future_complete(received, 60.0)
-waited = time.monotonic() - began
+waited = time.monotonic() - start
 partial = Path(sys.argv[1]).with_suffix('.partial')
 partial.write_text(str(waited))
 partial.rename(sys.argv[1])
@@ -77,13 +77,13 @@ def test_a_profile_of_the_user_is_kept(init_calls, capfd, own, is_reported):
 
 
 def test_a_profile_in_the_working_folder_is_kept(init_calls, tmp_path):
-    (tmp_path / middleware.PROFILE_IN_FOLDER).write_text('<dds/>')
+    (tmp_path / middleware.WORKING_FOLDER_PROFILE).write_text('<dds/>')
     middleware.begin()
     assert middleware.PROFILE_VARIABLE not in os.environ and len(init_calls) == 1
 
 
 def test_a_restarted_node_receives_messages_at_once(ros, tmp_path):
-    """Without the profile, the delay is often 1 to 4 s."""
+    """The delay is often 1 to 4 s without the profile."""
     node, spin_until = ros
     publisher = node.create_publisher(MagneticField, '/field', PUBLISHER_QOS)
     # Fast enough to fill the history for a killed node before the next node starts.
@@ -103,7 +103,7 @@ def test_a_restarted_node_receives_messages_at_once(ros, tmp_path):
 
 
 def test_the_history_of_each_publisher_fits_into_one_request(ros):
-    """Otherwise a restarted node needs a second request, which follows seconds later."""
+    """A longer history would require a second request, which follows seconds after a restart."""
     driver = DriverNode(parameter_overrides=[
         Parameter('drivers', value=str(ROOT / 'config' / 'drivers.yaml')),
         Parameter('network', value=str(NETWORK_FILE)), Parameter('batches', value=True),

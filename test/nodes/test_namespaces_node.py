@@ -89,11 +89,11 @@ def test_two_networks_on_one_graph_do_not_interfere(ros, tmp_path, road_network)
         killed.kill()
         killed.communicate(timeout=MAX_S)
         assert spin_until(lambda: statuses['north/watchman: to tracker'].startswith(
-            '/north/follower is gone'))
+            '/north/follower has disappeared'))
         assert statuses['a/b/watchman: to tracker'] == 'running'
     finally:
-        codes, outputs = stop(processes)
-    assert not any(codes), outputs
+        exit_codes, outputs = stop(processes)
+    assert not any(exit_codes), outputs
     assert not any('Traceback' in text for text in outputs), outputs
     assert 'waiting for /yard/first, /a/b/mag_2/imu/mag' in outputs[2], outputs[2]
     for namespace, messages in received.items():
@@ -152,10 +152,10 @@ def test_two_nodes_of_the_same_name_are_reported(ros):
     statuses = []
     node.create_subscription(DiagnosticArray, '/diagnostics', lambda m: statuses.extend(
         s.message for s in m.status if s.name == 'tracker_node: start'), RESULT_QOS)
-    twins = [start('tracker_node', '-p', f'network:={NETWORK_FILE}') for _ in range(2)]
+    duplicates = [start('tracker_node', '-p', f'network:={NETWORK_FILE}') for _ in range(2)]
     try:
         assert spin_until(lambda: any('2 nodes are named /tracker_node' in s for s in statuses))
     finally:
-        codes, outputs = stop(twins)
-    assert codes == [0, 0], outputs
+        exit_codes, outputs = stop(duplicates)
+    assert exit_codes == [0, 0], outputs
     assert any('2 nodes are named /tracker_node' in text for text in outputs), outputs

@@ -44,7 +44,7 @@ def ended_tracks(world, since_ns):
 
 
 def seconds_to_first_reading(world, sensor_back_ns):
-    """Seconds until the first reading that was measured after `sensor_back_ns`."""
+    """Seconds from `sensor_back_ns` to the first later reading, at most `MAX_RECOVERY_S`."""
     assert world.wait(lambda: any(
         m.header.stamp.sec * NS + m.header.stamp.nanosec > sensor_back_ns
         for _, m in world.since(sensor_back_ns, 'driver_node')))
@@ -55,20 +55,20 @@ def seconds_to_first_reading(world, sensor_back_ns):
     return delay_s
 
 
-def check_recovery(world, began, track, lost_ns, where):
+def check_recovery(world, vehicle_start_ns, track, lost_ns, address):
     """Assert that the driver reported the lost device and the lost readings, and recovered.
 
     The track continues across a gap shorter than `track.end_gap_s`, and no pose is wrong.
     """
     name = f'driver_node: {world.link}'
     assert world.statuses_since(lost_ns, name)[0][1].level == DiagnosticStatus.ERROR
-    assert where in world.statuses_since(lost_ns, name)[0][1].message
+    assert address in world.statuses_since(lost_ns, name)[0][1].message
     assert world.wait(lambda: world.statuses_since(lost_ns, name, 'lost: mag_1', 'lost: mag_2'))
     assert world.wait(lambda: world.statuses_since(lost_ns, name)[-1][1].message == 'open')
-    assert world.wait(lambda: ended_tracks(world, began))
-    assert {t.id for t in world.tracks(began)} == {track}
-    assert world.tracks(began)[-1].stamp_ns > lost_ns + NS
-    assert world.wrong(began) == []
+    assert world.wait(lambda: ended_tracks(world, vehicle_start_ns))
+    assert {t.id for t in world.tracks(vehicle_start_ns)} == {track}
+    assert world.tracks(vehicle_start_ns)[-1].stamp_ns > lost_ns + NS
+    assert world.wrong(vehicle_start_ns) == []
 
 
 def track_vehicle(world):
@@ -81,107 +81,107 @@ def track_vehicle(world):
         start_ns = time.time_ns()
         assert world.wait(lambda start_ns=start_ns: world.statuses_since(
             start_ns, f'driver_node: {world.link}'))
-        began = world.call()
+        vehicle_start_ns = world.call()
         world.pause(2.65)
-        if world.tracks(began):
-            first = world.tracks(began)[0]
-            print(f'first pose {(first.stamp_ns - began) / NS:.2f} s after the start')
-            return began, first.id
+        if world.tracks(vehicle_start_ns):
+            first = world.tracks(vehicle_start_ns)[0]
+            print(f'first pose {(first.stamp_ns - vehicle_start_ns) / NS:.2f} s after the start')
+            return vehicle_start_ns, first.id
     raise AssertionError('the tracker does not keep up with vehicles')
 
 
 def track_vehicle_to(world, x):
     """Start vehicles until one is tracked at `x` [m]; return its start [ns]."""
     for _ in range(MAX_VEHICLES):
-        began = world.call()
+        vehicle_start_ns = world.call()
         world.drive_to(x)
-        if world.tracks(began):
-            return began
+        if world.tracks(vehicle_start_ns):
+            return vehicle_start_ns
     raise AssertionError('the tracker does not keep up with vehicles')
 
 
 def test_a_track_survives_a_restart_of_the_broker(site):
     site.use('mqtt')
-    began, track = track_vehicle(site)
-    killed = time.time_ns()
+    vehicle_start_ns, track = track_vehicle(site)
+    killed_ns = time.time_ns()
     site.broker.kill()
     site.pause(0.5)
     site.broker.start()
-    returned = time.time_ns()
-    print(f'the broker was missing for {(returned - killed) / NS:.2f} s: readings '
-          f'{seconds_to_first_reading(site, returned):.2f} s after its return')
-    check_recovery(site, began, track, killed, f'127.0.0.1:{site.broker.port}')
+    returned_ns = time.time_ns()
+    print(f'the broker was missing for {(returned_ns - killed_ns) / NS:.2f} s: readings '
+          f'{seconds_to_first_reading(site, returned_ns):.2f} s after its return')
+    check_recovery(site, vehicle_start_ns, track, killed_ns, f'127.0.0.1:{site.broker.port}')
 
 
 @pytest.mark.parametrize('name', list(TOPICS))
 def test_a_killed_node_recovers_after_its_restart(site, name):
     site.use('mqtt')
-    began = track_vehicle_to(site, -4.0)
+    vehicle_start_ns = track_vehicle_to(site, -4.0)
     site.kill(name)
     start_s, recovery = site.recovery(name)
     print(f'{name}: up after {start_s:.2f} s, first output {recovery:.2f} s later')
     assert recovery <= scaled(MAX_RECOVERY_S, start_s)
     assert site.wait(site.roadside.is_gone)
-    assert site.wrong(began) == []
+    assert site.wrong(vehicle_start_ns) == []
 
 
 @pytest.mark.parametrize('name, reporter, words', [
     ('calibration_node', 'detection_node: from calibration', 'no message from'),
     ('detection_node', 'tracker_node: from detection', 'no message from'),
-    ('tracker_node', 'detection_node: to tracker', 'tracker_node is gone')])
+    ('tracker_node', 'detection_node: to tracker', 'tracker_node has disappeared')])
 def test_a_dead_node_is_reported_by_its_peer(site, name, reporter, words):
     """A track without frames ends."""
     site.use('mqtt')
-    began = track_vehicle_to(site, -4.0)
-    killed = time.time_ns()
+    vehicle_start_ns = track_vehicle_to(site, -4.0)
+    killed_ns = time.time_ns()
     site.kill(name)
     advice = 'check that it is running'
-    assert site.wait(lambda: site.statuses_since(killed, reporter, words, advice))
-    [(arrival_ns, status), *_] = site.statuses_since(killed, reporter, words, advice)
+    assert site.wait(lambda: site.statuses_since(killed_ns, reporter, words, advice))
+    [(arrival_ns, status), *_] = site.statuses_since(killed_ns, reporter, words, advice)
     assert status.level == DiagnosticStatus.ERROR
-    reported_s = (arrival_ns - killed) / NS
+    reported_s = (arrival_ns - killed_ns) / NS
     print(f'a dead {name}: reported after {reported_s:.1f} s')
     if name != 'tracker_node':
-        assert site.wait(lambda: ended_tracks(site, began))
-        [last] = ended_tracks(site, began)
-        assert last.stamp_ns < killed + NS
+        assert site.wait(lambda: ended_tracks(site, vehicle_start_ns))
+        [last] = ended_tracks(site, vehicle_start_ns)
+        assert last.stamp_ns < killed_ns + NS
     start_s, recovery = site.recovery(name)
     assert recovery <= scaled(MAX_RECOVERY_S, start_s) \
         and reported_s <= scaled(MAX_REPORT_S, start_s)
-    restarted = time.time_ns()
-    assert site.wait(lambda: [s for _, s in site.statuses_since(restarted, reporter, 'running')])
+    restarted_ns = time.time_ns()
+    assert site.wait(lambda: [s for _, s in site.statuses_since(restarted_ns, reporter, 'running')])
 
 
 def test_a_dead_driver_is_reported_by_the_calibration(site):
     site.use('mqtt')
-    killed = time.time_ns()
+    killed_ns = time.time_ns()
     site.kill('driver_node')
     for sensor in ('mag_1', 'mag_2'):
         name = f'calibration_node: {sensor}'
-        assert site.wait(lambda name=name: site.statuses_since(killed, name, 'silent', 'driver'))
-        [*_, (arrival_ns, status)] = site.statuses_since(killed, name, 'silent')
+        assert site.wait(lambda name=name: site.statuses_since(killed_ns, name, 'silent', 'driver'))
+        [*_, (arrival_ns, status)] = site.statuses_since(killed_ns, name, 'silent')
         assert status.level == DiagnosticStatus.ERROR
-    reported_s = (arrival_ns - killed) / NS
+    reported_s = (arrival_ns - killed_ns) / NS
     print(f'a dead driver: reported after {reported_s:.1f} s')
     # Use the other link, so that readings from before the restart do not count.
     site.link = 'serial'
     start_s, recovery = site.recovery('driver_node')
     assert recovery <= scaled(MAX_RECOVERY_S, start_s) and reported_s <= scaled(5.0, start_s)
     assert site.wait(lambda: 'silent' not in site.statuses_since(
-        killed, 'calibration_node: mag_1')[-1][1].message)
+        killed_ns, 'calibration_node: mag_1')[-1][1].message)
 
 
 def test_a_track_survives_a_missing_port(site):
     site.use('serial')
-    began, track = track_vehicle(site)
-    pulled = time.time_ns()
+    vehicle_start_ns, track = track_vehicle(site)
+    removed_ns = time.time_ns()
     site.roadside.pull_out()
     site.pause(0.5)
     site.roadside.plug_in()
-    returned = time.time_ns()
-    print(f'the port was missing for {(returned - pulled) / NS:.2f} s: readings '
-          f'{seconds_to_first_reading(site, returned):.2f} s after its return')
-    check_recovery(site, began, track, pulled, str(site.line.path))
+    returned_ns = time.time_ns()
+    print(f'the port was missing for {(returned_ns - removed_ns) / NS:.2f} s: readings '
+          f'{seconds_to_first_reading(site, returned_ns):.2f} s after its return')
+    check_recovery(site, vehicle_start_ns, track, removed_ns, str(site.line.path))
 
 
 def test_two_boards_of_one_name_are_reported(site):
@@ -189,14 +189,14 @@ def test_two_boards_of_one_name_are_reported(site):
     start_ns = time.time_ns()
     assert site.wait(lambda: site.statuses_since(start_ns, 'driver_node: mqtt'))
     assert not site.statuses_since(0, 'driver_node: mqtt', 'sequence restarts')
-    began = time.time_ns()
+    twin_start_ns = time.time_ns()
     site.roadside.twin = True
     # The sequence numbers and the clock reveal the second board, and its readings are rejected.
     for words in ('sequence restarts: mag_1', 'do not fit the clock'):
         assert site.wait(lambda words=words: site.statuses_since(
-            began, 'driver_node: mqtt', words)), words
+            twin_start_ns, 'driver_node: mqtt', words)), words
     site.roadside.twin = False
-    for _, status in site.statuses_since(began, 'driver_node: mqtt'):
+    for _, status in site.statuses_since(twin_start_ns, 'driver_node: mqtt'):
         assert status.level == DiagnosticStatus.WARN and 'mag_2' not in status.message
 
 

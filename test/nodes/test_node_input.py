@@ -83,8 +83,8 @@ def test_invalid_messages_are_counted(ros):
         refused = call(ros, Calibrate, service, Calibrate.Request(sensors=['mag_9']))
         assert not refused.success and 'mag_9' in refused.message
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs
 
 
 def test_invalid_frames_are_counted(ros):
@@ -109,5 +109,5 @@ def test_invalid_frames_are_counted(ros):
             v.key == 'rejected: bad frame' and v.value == '7'
             for m in diagnostics for s in m.status for v in s.values))
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs

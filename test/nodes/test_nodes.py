@@ -128,13 +128,13 @@ def compare_smoothed(collector, folder):
     online = np.array([[getattr(s.pose.position, a) for a in 'xyz'] for s in steps])
     expected = np.array([[float(r[a]) for a in 'xyz'] for r in offline])
     np.testing.assert_allclose(online, expected, rtol=0, atol=1e-9)
-    whole = collector.smoothed[0]
-    assert len(collector.smoothed) == 1 and whole.track_id == int(offline[0]['track_id'])
+    smoothed_track = collector.smoothed[0]
+    assert len(collector.smoothed) == 1 and smoothed_track.track_id == int(offline[0]['track_id'])
     flags = [row['ambiguous'] == '1' for row in offline]
-    assert (whole.kind, whole.ambiguous) == (offline[-1]['kind'], any(flags))
-    assert list(whole.pose_ambiguous) == flags
-    assert whole.length == float(offline[-1]['length'])
-    for p, v, row in zip(whole.poses, whole.velocities, offline, strict=True):
+    assert (smoothed_track.kind, smoothed_track.ambiguous) == (offline[-1]['kind'], any(flags))
+    assert list(smoothed_track.pose_ambiguous) == flags
+    assert smoothed_track.length == float(offline[-1]['length'])
+    for p, v, row in zip(smoothed_track.poses, smoothed_track.velocities, offline, strict=True):
         C = np.array(p.pose.covariance).reshape(6, 6)
         published = [p.pose.pose.position.x, p.pose.pose.position.y, v.x, v.y, C[0, 0]**0.5]
         np.testing.assert_allclose(
@@ -143,17 +143,17 @@ def compare_smoothed(collector, folder):
     # Ambiguous fixed-lag poses are withheld: they have no flag and no covariance of a mixture.
     assert fixed_lag.keys() <= {stamp_ns(s.header.stamp) for s in steps}
     assert len(fixed_lag) > 0.4 * len(steps)
-    position = {stamp_ns(s.header.stamp): xyz for s, xyz in zip(steps, expected, strict=True)}
+    position = {stamp_ns(s.header.stamp): point for s, point in zip(steps, expected, strict=True)}
     distances = [np.hypot(p.x - position[s][0], p.y - position[s][1]) for s, p in fixed_lag.items()]
     assert 0.01 < np.median(distances) < 2.0
 
 
 def collect_from_nodes(network_file, settings, recording, rate):
     """`Collector` of a recording that is played through all nodes."""
-    holder = []
+    collectors = []
     run(network_file, settings, recording, rate,
-        observers=[lambda: holder.append(Collector()) or holder[-1]])
-    return holder[0]
+        observers=[lambda: collectors.append(Collector()) or collectors[-1]])
+    return collectors[0]
 
 
 @pytest.mark.parametrize('name', studied(VEHICLES, ['junction_rear_turns_right']))
@@ -177,9 +177,9 @@ def test_nodes_equal_offline_on_several_vehicles(tmp_path):
     collector = collect_from_nodes(network_file, settings, recording, 2.0)
     max_difference = compare_with_offline(collector, tmp_path)
     ids = {t.id for m in collector.tracks for t in m.tracks}
-    together = [s for s, n in Counter(t.header.stamp.sec for m in collector.tracks
-                                      for t in m.tracks).items() if n > 13]
-    assert len(ids) > 5 and together
+    busy_seconds = [s for s, n in Counter(t.header.stamp.sec for m in collector.tracks
+                                          for t in m.tracks).items() if n > 13]
+    assert len(ids) > 5 and busy_seconds
     smoothed = [m.track_id for m in collector.smoothed]
     assert len(smoothed) == len(set(smoothed)) and set(smoothed) <= ids
     compare_traffic(collector, mt.traffic(recording, network, LONG_WAIT))
@@ -230,8 +230,8 @@ def play_through_processes(ros, recording, received):
     """
     node, spin_until = ros
     network = ['-p', f'network:={NETWORK_FILE}', '-p', 'reliable_input:=true']
-    patient = ['-p', 'align.max_wait_s:=5.0']
-    processes = [start('calibration_node', *network), start('detection_node', *network, *patient),
+    long_wait = ['-p', 'align.max_wait_s:=5.0']
+    processes = [start('calibration_node', *network), start('detection_node', *network, *long_wait),
                  start('tracker_node', *network)]
     try:
         sources, listeners = node.count_publishers, node.count_subscribers
@@ -246,8 +246,8 @@ def play_through_processes(ros, recording, received):
                                       for t in m.tracks))
         assert spin_until(lambda: len(received[PassEvent]) == 2)
     finally:
-        codes, outputs = stop(processes)
-    assert codes == [0, 0, 0, 0], outputs
+        exit_codes, outputs = stop(processes)
+    assert exit_codes == [0, 0, 0, 0], outputs
     assert not any('Traceback' in text for text in outputs), outputs
 
 
@@ -302,8 +302,8 @@ def test_replay_services_pause_seek_and_resume(ros):
                           and len(fields) > n)
         assert (stamp_ns(fields[n].header.stamp) - begin) / 1e9 >= 13.4
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs
 
 
 def test_parameters_have_descriptors_and_are_checked(ros):
@@ -325,8 +325,8 @@ def test_parameters_have_descriptors_and_are_checked(ros):
                             ('track.vehicle.induced_share', 0.5)):
             assert not set_parameter(name, value).successful
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs
 
 
 def test_a_track_is_unchanged_by_conversion_to_messages_and_back():
@@ -361,9 +361,9 @@ def test_ended_nodes_leave_no_shared_memory(ros, signum):
     process = start('tracker_node', '-p', f'network:={NETWORK_FILE}')
     try:
         assert spin_until(lambda: node.count_publishers('/tracker_node/tracks'))
-        used = segments_of(process.pid) - before
+        segments = segments_of(process.pid) - before
     finally:
         process.send_signal(signum)
         output, _ = process.communicate(timeout=MAX_S)
     assert (process.returncode, without_states(output)) == (0, '')
-    assert used and not left_behind(used)
+    assert segments and not left_behind(segments)

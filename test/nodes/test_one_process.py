@@ -36,7 +36,7 @@ class Listener(Node):
                                  RESULT_QOS)
 
     def _receive_tracks(self, message):
-        """Count tracks that arrive before their frame; viewers draw both together."""
+        """Count tracks that arrive before their frame; viewers draw the track with its frame."""
         stamps = {stamp_ns(f.header.stamp) for f in self.frames}
         self.n_early += any(stamp_ns(t.header.stamp) not in stamps for t in message.tracks)
 
@@ -45,11 +45,11 @@ class Listener(Node):
 
 
 def test_topics_between_the_stages_are_published():
-    holder = []
+    listeners = []
     run(NETWORK_FILE, settings_for('vehicle', {**QUICK, 'align.max_wait_s': 5.0}),
         vehicle_path('straight_car_right'), 4.0,
-        observers=[lambda: holder.append(Listener()) or holder[-1]])
-    (listener,) = holder
+        observers=[lambda: listeners.append(Listener()) or listeners[-1]])
+    (listener,) = listeners
     stamps = [stamp_ns(f.header.stamp) for f in listener.frames]
     assert len(stamps) > 100 and (np.diff(stamps) > 0).all()
     assert ({stamp_ns(p.header.stamp) for p in listener.poses} <= {*stamps}

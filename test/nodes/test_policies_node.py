@@ -17,7 +17,7 @@ def test_policies_are_up_to_date():
     assert process.returncode == 0, process.stdout
 
 
-def test_policies_of_a_namespace_contain_it_everywhere():
+def test_names_in_policies_of_a_namespace_have_its_prefix():
     process = subprocess.run([sys.executable, str(ROOT / 'tools' / 'generate_policies.py'),
                               '--namespace', '/robot1'], text=True, stdout=subprocess.PIPE,
                              stderr=subprocess.DEVNULL, timeout=MAX_S, check=False)

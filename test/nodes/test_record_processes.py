@@ -90,7 +90,7 @@ def test_a_recorded_replay_equals_the_original(ros, tmp_path, road_network):
         assert call(ros, Trigger, '/replay_node/resume', Trigger.Request()).success
         assert 'messages played' in player.stdout.readline()
         await_messages(process, sum(expected.values()))
-        used = segments_of(process.pid) - before
+        segments = segments_of(process.pid) - before
     finally:
         stop([player])
         process.send_signal(signal.SIGTERM)
@@ -109,12 +109,12 @@ def test_a_recorded_replay_equals_the_original(ros, tmp_path, road_network):
         times = [m.log_time for _, _, m in make_reader(stream).iter_messages(log_time_order=False)]
     # Messages are also ordered across topics, except within one poll.
     assert np.mean(np.diff(times) >= 0) > 0.9
-    patient = settings_for('vehicle', {'align.max_wait_s': 5.0})
+    long_wait = settings_for('vehicle', {'align.max_wait_s': 5.0})
     for path in (original, out):
-        replay(Recording(path), road_network, patient, tmp_path / f'of_{path.stem}')
+        replay(Recording(path), road_network, long_wait, tmp_path / f'of_{path.stem}')
     np.testing.assert_allclose(*(poses(tmp_path / f'of_{path.stem}') for path in (original, out)),
                                rtol=1e-9, atol=1e-12)
-    assert used and not left_behind(used)
+    assert segments and not left_behind(segments)
 
 
 def test_a_kill_of_the_command_loses_less_than_a_second(ros, tmp_path):
@@ -137,12 +137,12 @@ def test_a_kill_of_the_command_loses_less_than_a_second(ros, tmp_path):
         n = len(send_times)
         spin_until(lambda: len(send_times) > n + 150)
     finally:
-        used = segments_of(process.pid)
+        segments = segments_of(process.pid)
         process.kill()
         kill_time = time.time_ns()
         process.communicate()
         # A killed process leaves its shared memory; segments in `before` belong to this process.
-        for name in used - before & set(os.listdir('/dev/shm')):
+        for name in segments - before & set(os.listdir('/dev/shm')):
             os.unlink(f'/dev/shm/{name}')
     messages = list(Recording(tmp_path / 'a').messages())
     numbers = [decode(m).header.stamp.nanosec for m in messages]

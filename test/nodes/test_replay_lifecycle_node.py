@@ -51,8 +51,8 @@ def test_lifecycle_transitions_start_and_stop_playback(ros):
         assert change(Transition.TRANSITION_CLEANUP)
         assert spin_until(lambda: node.count_publishers('/mag_1/imu/mag') == 0)
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs
 
 
 def test_an_unreadable_recording_leaves_the_node_unconfigured(ros, tmp_path):
@@ -62,8 +62,8 @@ def test_an_unreadable_recording_leaves_the_node_unconfigured(ros, tmp_path):
             transition=Transition(id=Transition.TRANSITION_CONFIGURE)))
         assert not response.success
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0] and 'no.mcap' in outputs[0]
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0] and 'no.mcap' in outputs[0]
 
 
 @pytest.mark.parametrize('content', [PLAIN, ROS])
@@ -78,8 +78,8 @@ def test_nodes_accept_both_formats_of_parameter_files(ros, tmp_path, content):
                        GetParameters.Request(names=[parameter])).values[0]
                   for name, parameter in nodes.items()]
     finally:
-        codes, outputs = stop(processes)
-    assert codes == [0, 0], outputs
+        exit_codes, outputs = stop(processes)
+    assert exit_codes == [0, 0], outputs
     assert values[0].integer_value == 4
     assert list(values[1].string_array_value) == ['east', 'west', 'no']
 

@@ -145,7 +145,7 @@ def test_all_nodes_are_destroyed_when_one_fails():
     assert all(node.is_destroyed for node in nodes)
 
 
-def test_an_error_with_an_undecodable_name_is_not_replaced():
+def test_an_error_that_cannot_be_encoded_is_still_raised():
     node = FakeNode()
     with pytest.raises(MagTrackingError, match='no such file'):
         try:

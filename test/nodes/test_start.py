@@ -84,7 +84,7 @@ def wait_for(condition, process):
         time.sleep(0.001)
 
 
-def end_of(process, signum):
+def signal_and_wait(process, signum):
     """Send a signal to a process; return (exit status, output)."""
     process.send_signal(signum)
     output = process.communicate(timeout=MAX_START_S)[0]
@@ -102,7 +102,7 @@ def end_of(process, signum):
     for name, arguments in [*COMMANDS.items(), *((f'{n} script', w) for n, w in SCRIPTS.items())]])
 def test_a_signal_during_imports_ends_the_process(signum, arguments):
     process = launch_and_wait(arguments)
-    assert end_of(process, signum) == (0, '')
+    assert signal_and_wait(process, signum) == (0, '')
     for module in ('numpy', 'rclpy', 'mag_tracking.nodes.middleware'):
         process = launch(['-c', SIGNAL_AT_IMPORT, int(signum), module, *arguments])
         output = process.communicate(timeout=MAX_START_S)[0]
@@ -122,7 +122,7 @@ def test_a_signal_while_a_library_is_loaded_ends_the_process(library, signum):
     for name in ('tracker_node', 'run'):
         process = launch_and_wait(COMMANDS[name])
         wait_for(lambda process=process: has_loaded(process.pid, library), process)
-        assert end_of(process, signum) == (0, '')
+        assert signal_and_wait(process, signum) == (0, '')
 
 
 @pytest.fixture
@@ -132,19 +132,19 @@ def start_s(monkeypatch):
     The domain is not shared: if a process ends while its node is announced, the middleware may
     list the node until the observer ends.
     """
-    def measured(arguments):
+    def measure(arguments):
         process = launch_and_wait(arguments)
-        began = time.monotonic()
+        start = time.monotonic()
         wait_for(lambda: len(observer.get_node_names()) > 1, process)
-        duration_s = time.monotonic() - began
-        assert end_of(process, signal.SIGINT) == (0, '')
+        duration_s = time.monotonic() - start
+        assert signal_and_wait(process, signal.SIGINT) == (0, '')
         return duration_s
 
     with RosDomain() as domain:
         monkeypatch.setenv('ROS_DOMAIN_ID', str(domain.number))
         middleware.begin()
         observer = Node('observer')
-        yield measured
+        yield measure
         observer.destroy_node()
         rclpy.try_shutdown()
 
@@ -153,18 +153,18 @@ def start_s(monkeypatch):
     pytest.param('tracker_node', 0.25), pytest.param('run', 0.25, marks=pytest.mark.study),
     *(pytest.param(name, 0.05, marks=pytest.mark.study) for name in COMMANDS)])
 def test_a_signal_at_any_moment_of_the_start_ends_the_process(start_s, name, step_s):
-    """On a slow machine, the steps are longer, not more numerous."""
+    """The steps are longer on a slow machine; their number remains the same."""
     duration_s = start_s(COMMANDS[name])
     n = round(2.5 / step_s)
-    step_s, ends = max(step_s, 1.2 * duration_s / n), {}
+    step_s, results = max(step_s, 1.2 * duration_s / n), {}
     for k in range(1, 1 + int(1.2 * duration_s / step_s)):
         signum = (signal.SIGINT, signal.SIGTERM)[k % 2]
         process = launch_and_wait(COMMANDS[name])
         time.sleep(k * step_s)
-        ends[round(k * step_s, 2), signum.name] = end_of(process, signum)
-    print(f'{name}: up after {duration_s:.2f} s; {len(ends)} signals, one every {step_s:.2f} s')
+        results[round(k * step_s, 2), signum.name] = signal_and_wait(process, signum)
+    print(f'{name}: up after {duration_s:.2f} s; {len(results)} signals, one every {step_s:.2f} s')
     # A node that is up may have logged a line, for example about a missing device.
-    assert {moment: (status, output) for moment, (status, output) in ends.items()
+    assert {instant: (status, output) for instant, (status, output) in results.items()
             if status or 'Traceback' in output or output.count('\n') > 1} == {}
 
 

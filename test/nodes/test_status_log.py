@@ -71,7 +71,7 @@ def test_a_warning_is_logged_once_per_outage(log):
     assert warnings(620, 900) == [603 + REPEAT_INTERVAL_S]
 
 
-def test_the_number_of_remembered_faults_is_bounded(log):
+def test_the_number_of_stored_faults_is_bounded(log):
     for k in range(2 * MAX_FAULTS):
         log(0.0, DiagnosticStatus.WARN, 'bad', f'node: {"x" * (k % 97)}{"y" * (k // 97)}')
     assert log.statuses.n_stored <= 3 * MAX_FAULTS

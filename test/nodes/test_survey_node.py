@@ -51,8 +51,8 @@ def test_a_survey_changes_the_network_of_the_next_track(ros, tmp_path, road_netw
         assert spin_until(lambda: states[-1].sensors[1].clock_offset != 0.0)
         assert spin_until(lambda: any(t.status == t.ENDED for m in tracks for t in m.tracks))
     finally:
-        codes, outputs = stop(processes)
-    assert codes == [0] * 4, outputs
+        exit_codes, outputs = stop(processes)
+    assert exit_codes == [0] * 4, outputs
     surveyed, expected = read_network(saved), offline(road_network)
     state = states[-1].sensors
     for j in range(2):
@@ -77,5 +77,5 @@ def test_a_calibration_of_other_sensors_is_refused(ros):
         publisher.publish(CalibrationState())
         spin_until(lambda: False, 1.0)
     finally:
-        codes, outputs = stop([process])
-    assert codes == [0] and 'the network has mag_1, mag_2' in outputs[0], outputs
+        exit_codes, outputs = stop([process])
+    assert exit_codes == [0] and 'the network has mag_1, mag_2' in outputs[0], outputs

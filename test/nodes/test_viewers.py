@@ -59,11 +59,11 @@ class GraphObserver(Node):
 @pytest.fixture(scope='module')
 def demo():
     """`GraphObserver` of a recording that is played through the nodes."""
-    holder = []
+    graph_observers = []
     run(NETWORK_FILE, settings_for('vehicle', {'align.max_wait_s': 5.0}),
         vehicle_path('straight_car_fast_left'), 6.0,
-        observers=[lambda: holder.append(GraphObserver()) or holder[-1]])
-    return holder[0]
+        observers=[lambda: graph_observers.append(GraphObserver()) or graph_observers[-1]])
+    return graph_observers[0]
 
 
 def type_of(kind, fields):
