@@ -101,7 +101,10 @@ class Parameter:
 
 
 def _types_of_hint(hint: Any) -> tuple[_Class, _Class | None]:
-    """Type of an annotation, and element type of a tuple such as tuple[float, ...], else None."""
+    """Type of a setting with annotation `hint`, and type of the elements of a tuple.
+
+    The second type is None if the setting is not a tuple.
+    """
     if typing.get_origin(hint) is tuple:
         return tuple, typing.get_args(hint)[0]
     return hint, None
@@ -156,7 +159,10 @@ def _scalar(name: str, value: object, kind: _Class) -> Scalar:
 
 
 def _validated(p: Parameter, value: object) -> Value:
-    """Convert `value` to the declared type of `p`; check its length, range and choices."""
+    """Convert `value` to the declared type of `p`, and check its length, range and choices.
+
+    Raises SettingsError if the value is invalid.
+    """
     if p.element is not None:
         if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
             raise SettingsError(f'{p.name}: expected a list of {p.element.__name__}, '
@@ -183,7 +189,10 @@ def _validated(p: Parameter, value: object) -> Value:
 
 
 def _flattened(mapping: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
-    """Flatten nested mappings to one dict with dotted names; empty mappings remain values."""
+    """Flatten nested mappings to one dict with dotted names; empty mappings remain values.
+
+    Raises SettingsError if a setting has two different values.
+    """
     out: dict[str, Any] = {}
     for key, value in mapping.items():
         if isinstance(value, Mapping) and value:

@@ -32,8 +32,8 @@ def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
         horizontal position.
     """
     shortest, pair = np.inf, None
-    for j, place in enumerate(network.positions):
-        distance = np.linalg.norm((network.positions[:j] - place)[:, :2], axis=1)
+    for j, position in enumerate(network.positions):
+        distance = np.linalg.norm((network.positions[:j] - position)[:, :2], axis=1)
         distance[distance <= MIN_DELAY_BASELINE] = np.inf
         if distance.min(initial=np.inf) < shortest:
             i = int(np.argmin(distance))

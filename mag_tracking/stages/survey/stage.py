@@ -85,8 +85,8 @@ class NetworkSurvey:
         if self.reference:
             out += [f'{name}: clock: {reason}' for name, reason in reasons.items()]
         elif len(self.sensors) > 1:
-            because = ', '.join(sorted(set(reasons.values()))) or 'too few accelerometers'
-            out.append(f'clock offsets are unchanged: {because}')
+            causes = ', '.join(sorted(set(reasons.values()))) or 'too few accelerometers'
+            out.append(f'clock offsets are unchanged: {causes}')
         return out
 
 
@@ -209,7 +209,10 @@ class Survey:
     def _disagreements(self, field: FloatArray, level: Sequence[Orientation | None],
                        stated_std: FloatArray, warnings: Mapping[str, list[str]]
                        ) -> list[FieldInconsistency]:
-        """Find sensors that contradict the Earth's field; empty if this field is unknown."""
+        """Find the sensors whose field contradicts the Earth's field.
+
+        If the Earth's field is unknown, add a warning and return an empty list.
+        """
         network = self._network
         R = np.array([R if o is None else o.R_ws for o, R in zip(level, network.R_ws, strict=True)])
         std = np.array([s if o is None else o.std for o, s in zip(level, stated_std, strict=True)])
@@ -269,11 +272,14 @@ class Survey:
 
     def _lags(self, signals: Mapping[str, tuple[FloatArray, FloatArray]]
               ) -> tuple[str, dict[str, Lag]]:
-        """Find the reference sensor, and estimate {sensor: lag} of other sensors from knocks."""
-        longest = self._settings.max_clock_offset_s
+        """Find the reference sensor, and estimate {sensor: lag} of the other sensors from knocks.
+
+        The name of the reference is empty if no two sensors measured the same knock.
+        """
+        max_offset = self._settings.max_clock_offset_s
         first: dict[str, Lag] = {}
         for reference, (t, s) in signals.items():
-            lags = {name: knock_lag(t, s, *signals[name], longest)
+            lags = {name: knock_lag(t, s, *signals[name], max_offset)
                     for name in signals if name != reference}
             if any(not lag.reason for lag in lags.values()):
                 return reference, lags
@@ -287,12 +293,12 @@ class Survey:
         R_ws, clock = network.R_ws.copy(), network.clock_offset.copy()
         # The reference clock keeps its offset, so that the offsets of clocks that were not compared
         # remain valid.
-        zero = clock[network.index(reference)] if reference else 0.0
+        reference_offset = clock[network.index(reference)] if reference else 0.0
         std, calibrated = list(network.orientation_std), list(network.calibrated)
         for j, s in enumerate(sensors):
             lag = None if s.lag is None or s.lag.reason else s.lag
             if lag is not None:
-                clock[j] = zero + lag.offset
+                clock[j] = reference_offset + lag.offset
             if s.orientation is not None:
                 R_ws[j], std[j] = s.orientation.R_ws, s.orientation.std
             if s.orientation is not None or lag is not None or s.sensor == reference:
