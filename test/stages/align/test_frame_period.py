@@ -19,7 +19,7 @@ AUTO = AlignSettings()
 
 @pytest.mark.parametrize('distance, period', [(9.0, 0.08), (2.1, 0.08), (1.6, 0.04), (1.0, 0.025),
                                               (0.5, 0.02), (0.2, 0.02), (0.05, 0.08)])
-def test_the_period_is_half_the_shortest_delay_of_a_close_network(distance, period):
+def test_the_period_is_half_the_shortest_delay_in_a_compact_network(distance, period):
     network = network_of([[0.0, 0.0, 0.0], [distance, 0.0, 0.0]])
     assert frame_period(AUTO, network) == pytest.approx(period)
     assert frame_period(dataclasses.replace(AUTO, burst=True), network) == 0.08

@@ -286,7 +286,7 @@ def test_a_new_hard_iron_offset_restarts_learning():
 
 
 def ends_of_blocks(phase, times):
-    """Feed readings at `times` [s]; return (indices of those that complete a block, background)."""
+    """Feed readings at `times` [s]; return (indices of readings that end a block, background)."""
     background = FedBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0, phase=phase)
     state = background.sensors
     rng, ends, now = np.random.default_rng(0), [], 0
