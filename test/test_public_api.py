@@ -193,10 +193,10 @@ def test_result_arrays_have_the_fields_of_the_records(result):
 
 
 def test_a_long_arrival_name_is_not_truncated(recorded):
-    long = 'from the right, where the road comes over the bridge'
+    long_name = 'from the right, where the road comes over the bridge'
     found = mt.track(recorded, NETWORK_FILE, settings=QUICK | {
-        'track.vehicle.arrival_names': ['left', long, 'rear']})
-    assert long in found.poses['arrival'] and found.smoothed['complete'].all()
+        'track.vehicle.arrival_names': ['left', long_name, 'rear']})
+    assert long_name in found.poses['arrival'] and found.smoothed['complete'].all()
 
 
 @pytest.mark.parametrize('source', ['nothing', 'noise'])
@@ -230,10 +230,10 @@ def test_rejected_readings_are_counted(recorded):
 
 
 def test_losses_of_a_damaged_recording_are_reported(tmp_path):
-    cut = tmp_path / 'cut.mcap'
+    damaged = tmp_path / 'damaged.mcap'
     content = vehicle_path(NAME).read_bytes()
-    cut.write_bytes(content[:len(content) // 2])
-    assert mt.track(cut, NETWORK_FILE).lost and mt.read_recording(cut, NETWORK_FILE).lost
+    damaged.write_bytes(content[:len(content) // 2])
+    assert mt.track(damaged, NETWORK_FILE).lost and mt.read_recording(damaged, NETWORK_FILE).lost
 
 
 FIELD, STAMPS = np.zeros((3, 3)), np.arange(3)

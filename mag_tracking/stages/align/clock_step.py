@@ -146,8 +146,8 @@ class ClockStepFilter:
 
     def _majority_follows(self, stamp: int) -> bool:
         """Whether most of the active sensors have a held sample within `max_jump` of `stamp`."""
-        agree = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._max_jump}
-        return 2 * len(agree) > len(agree | self._active())
+        following = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._max_jump}
+        return 2 * len(following) > len(following | self._active())
 
     def _is_alone(self, i: int, stamp: int) -> bool:
         """Whether sensor `i` has advanced by `max_jump` since its jump with no sample accepted."""

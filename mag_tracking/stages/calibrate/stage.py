@@ -109,18 +109,19 @@ class Calibrate:
         if network.names != tuple(self._index):
             raise NetworkError(f'the new network has the sensors {", ".join(network.names)}; '
                                f'expected {", ".join(self._index)}')
-        before, self._network = self._network if self._background else None, network
+        previous, self._network = self._network if self._background else None, network
         self._decimators = {name: Decimator(self._settings.decimate_to_hz)
                             for name in network.names}
         for i, name in enumerate(network.names):
-            same = before is not None and _are_equal(before.offset[i], network.offset[i]) \
-                and _are_equal(before.correction[i], network.correction[i])
+            is_unchanged = previous is not None \
+                and _are_equal(previous.offset[i], network.offset[i]) \
+                and _are_equal(previous.correction[i], network.correction[i])
             shift = int(self._sensors[i]['clock_offset_ns'] - network.clock_offset_ns[i])
-            if before is not None and (not same or shift):
+            if previous is not None and (not is_unchanged or shift):
                 self._restoration.forget(name)
-            if not same or shift:
+            if not is_unchanged or shift:
                 self._reject_held(i, 'the calibration changed')
-            if not same:
+            if not is_unchanged:
                 self._background[name] = self._new_background(i)
             self._configure(i, shift)
         self._mark_restorable()
@@ -286,9 +287,9 @@ class Calibrate:
         """Number of readings that are held until the next reading of their sensor."""
         return int(self._sensors['n_held'].sum())
 
-    def _reject_held(self, i: int, why: str) -> None:
+    def _reject_held(self, i: int, event: str) -> None:
         """Reject the held readings of sensor `i`, which no later reading can confirm."""
-        self._reject(self._network.names[i], f'possible spike when {why}',
+        self._reject(self._network.names[i], f'possible spike when {event}',
                      int(self._sensors[i]['n_held']))
         clear_spikes(self._sensors[i])
 

@@ -157,22 +157,22 @@ class SensorHealth:
         """Count the faults in the timestamps of the `n` latest readings."""
         # The first interval starts at the preceding reading, if there is one.
         intervals = np.diff(self._stamps[-n - 1:])
-        known = self._received[-n - 1:] != NEVER
-        receipts = np.diff(np.where(known, self._received[-n - 1:], 0)) / NS
+        is_received = self._received[-n - 1:] != NEVER
+        receipts = np.diff(np.where(is_received, self._received[-n - 1:], 0)) / NS
         steps = receipts - intervals / NS
-        usual = 0.0 if np.isnan(self._interval_ns) else self._interval_ns / NS
+        median_s = 0.0 if np.isnan(self._interval_ns) else self._interval_ns / NS
         # In a clock step, the timestamp is irregular but the time of receipt is regular. A host
         # that stalls and then reads a burst causes no step.
-        stepped = known[1:] & known[:-1] & (np.abs(steps) > CLOCK_STEP_S) \
-            & (np.abs(receipts - usual) < CLOCK_STEP_S) \
-            & (np.abs(intervals / NS - usual) > CLOCK_STEP_S)
-        if stepped.any():
-            self._counts['clock steps'] += int(stepped.sum())
-            self._largest_step_s = max(self._largest_step_s, *steps[stepped].tolist(), key=abs)
+        is_step = is_received[1:] & is_received[:-1] & (np.abs(steps) > CLOCK_STEP_S) \
+            & (np.abs(receipts - median_s) < CLOCK_STEP_S) \
+            & (np.abs(intervals / NS - median_s) > CLOCK_STEP_S)
+        if is_step.any():
+            self._counts['clock steps'] += int(is_step.sum())
+            self._largest_step_s = max(self._largest_step_s, *steps[is_step].tolist(), key=abs)
         self._counts['duplicates'] += int((intervals == 0).sum())
         self._counts['backward timestamps'] += int((intervals < 0).sum())
         if self._jitter < MAX_JITTER:
-            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) & ~stepped
+            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) & ~is_step
             self._counts['lost'] += int(np.sum(np.round(intervals[gaps] / self._interval_ns) - 1))
         forward = np.diff(self._stamps)
         forward = forward[forward > 0]
@@ -207,38 +207,39 @@ class SensorHealth:
         stamps, fields = self._stamps[-n:], self._fields[-n - 1:]
         equal = (fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])
         self._has_changed |= (~equal & ~np.isnan(fields[1:]) & ~np.isnan(fields[:-1])).any(axis=0)
-        same = equal.all(axis=1)
-        if len(same) < n:
-            same = np.append(False, same)
+        is_repeated = equal.all(axis=1)
+        if len(is_repeated) < n:
+            is_repeated = np.append(False, is_repeated)
         # Index of the first reading of each run of identical readings; -1 = in an earlier batch.
-        origin = np.maximum.accumulate(np.where(same, -1, np.arange(n)))
-        since = np.where(origin < 0, self._unchanged_since_ns or 0, stamps[origin])
-        stuck = np.flatnonzero(stamps - since > STUCK_S * NS)
-        self._unchanged_since_ns = int(since[-1])
-        self._count_runs(same, since, stamps)
+        run_start = np.maximum.accumulate(np.where(is_repeated, -1, np.arange(n)))
+        unchanged_since = np.where(run_start < 0, self._unchanged_since_ns or 0, stamps[run_start])
+        stuck = np.flatnonzero(stamps - unchanged_since > STUCK_S * NS)
+        self._unchanged_since_ns = int(unchanged_since[-1])
+        self._count_runs(is_repeated, unchanged_since, stamps)
         if not self.is_coarse:
             self._counts['stuck readings'] += len(stuck)
         self._n_since_stuck = n - 1 - int(stuck[-1]) if len(stuck) else self._n_since_stuck + n
 
-    def _count_runs(self, same: BoolArray, since: IntArray, stamps: IntArray) -> None:
+    def _count_runs(self, is_repeated: BoolArray, unchanged_since: IntArray,
+                    stamps: IntArray) -> None:
         """Count repeated and changed readings.
 
-        `same` (n,) marks the readings that equal the previous reading; `since` (n,) [ns] is the
-        start of the run of identical readings to which each reading belongs.
+        `is_repeated` (n,) marks the readings that equal the previous reading. `unchanged_since`
+        (n,) [ns] is the start of the run of identical readings to which each reading belongs.
         """
-        changed = np.flatnonzero(~same)
+        changed = np.flatnonzero(~is_repeated)
         if not len(changed):
-            self._run_length += len(same)
+            self._run_length += len(is_repeated)
             return
         lengths = np.diff(changed) - 1
-        lasting = stamps[changed[1:] - 1] - since[changed[1:] - 1] > STUCK_S * NS
+        is_stuck = stamps[changed[1:] - 1] - unchanged_since[changed[1:] - 1] > STUCK_S * NS
         # A faulty run counts as one repetition, because it is not representative.
-        self._n_repeated += int(np.where(lasting, 1, lengths).sum())
+        self._n_repeated += int(np.where(is_stuck, 1, lengths).sum())
         first = self._run_length + int(changed[0])
-        usual = STUCK_S * NS / self._interval_ns if self._interval_ns > 0 else np.inf
-        self._n_repeated += 1 if first > usual else first
+        max_length = STUCK_S * NS / self._interval_ns if self._interval_ns > 0 else np.inf
+        self._n_repeated += 1 if first > max_length else first
         self._n_changed += len(changed)
-        self._run_length = len(same) - 1 - int(changed[-1])
+        self._run_length = len(is_repeated) - 1 - int(changed[-1])
 
     @property
     def is_coarse(self) -> bool:
@@ -291,8 +292,8 @@ class SensorHealth:
         present = ~np.isnan(self._fields).any(axis=0)
         unchanged = present & (self._fields == self._fields[0]).all(axis=0)
         if self.is_coarse:
-            moved = np.ptp(self._fields, axis=0) > MIN_MOVED_STEPS * smallest_steps(self._fields)
-            unchanged &= ~self._has_changed & (moved & present).any()
+            moves = np.ptp(self._fields, axis=0) > MIN_MOVED_STEPS * smallest_steps(self._fields)
+            unchanged &= ~self._has_changed & (moves & present).any()
         return ''.join(np.array(list('xyz'))[unchanged]) if unchanged.sum() < present.sum() else ''
 
     @property

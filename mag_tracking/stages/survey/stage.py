@@ -173,16 +173,16 @@ class Survey:
                                if s is None else np.maximum(s, MIN_STATED_STD)
                                for s in network.orientation_std])
         warnings: dict[str, list[str]] = {name: [] for name in names}
-        ups = [self._estimate_up(name, warnings[name]) for name in names]
+        up_directions = [self._estimate_up(name, warnings[name]) for name in names]
         level = [levelled(up, R, std) for up, R, std in
-                 zip(ups, network.R_ws, stated_std, strict=True)]
-        for name, before, now, std in zip(names, network.R_ws, level, stated_std, strict=True):
-            if now is not None:
-                warnings[name] += _tilt_warning(before, now.R_ws, std, now.std)
-        disagreeing = self._disagreements(field, level, stated_std, warnings)
+                 zip(up_directions, network.R_ws, stated_std, strict=True)]
+        for name, before, surveyed, std in zip(names, network.R_ws, level, stated_std, strict=True):
+            if surveyed is not None:
+                warnings[name] += _tilt_warning(before, surveyed.R_ws, std, surveyed.std)
+        inconsistent = self._disagreements(field, level, stated_std, warnings)
         bias_std, oriented = self._compass(
-            {j: u for j, u in enumerate(ups) if u is not None and names[j] not in
-             {d.sensor for d in disagreeing}}, field, stated_std, warnings)
+            {j: u for j, u in enumerate(up_directions) if u is not None and names[j] not in
+             {d.sensor for d in inconsistent}}, field, stated_std, warnings)
         shocks = self._shocks()
         reference, lags = self._lags(shocks)
         sensors = []
@@ -192,7 +192,7 @@ class Survey:
                 name, orientation, 'nominal orientation' if orientation is None else by,
                 lags.get(name), tuple(warnings[name])))
         return NetworkSurvey(self._updated_network(sensors, reference, date), tuple(sensors),
-                             tuple(disagreeing), bias_std, reference, shocks)
+                             tuple(inconsistent), bias_std, reference, shocks)
 
     def _estimate_up(self, name: str, warnings: list[str]) -> UpDirection | None:
         """Estimate the vertical direction of a sensor; None, with a warning, if unavailable."""

@@ -90,10 +90,10 @@ class FieldDirection:
         odds, same_side = [], []
         for j in np.flatnonzero(
                 (np.abs(left) >= MIN_LATERAL) & (np.abs(along) <= MAX_ALONG)).tolist():
-            half = np.clip(WINDOW_RATIO * abs(left[j]) / speed,
-                           MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S)
+            half_window_s = np.clip(WINDOW_RATIO * abs(left[j]) / speed,
+                                    MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S)
             value = self._log_odds(j, crossing.stamp_ns + round(along[j] / speed * NS),
-                                   round(half * NS))
+                                   round(half_window_s * NS))
             if value is not None:
                 odds.append(float(np.clip(value, -MAX_LOG_ODDS, MAX_LOG_ODDS)))
                 # From a sensor to the left of the path, the vehicle moves from right to left.

@@ -221,9 +221,9 @@ class PlainAlign:
             self.counts['rejected: no finite field'] += 1
             return []
         if t <= self.latest.get(j, -1):
-            back = self.latest[j] - t
-            if back <= self.max_jump:
-                self.counts['rejected: out of order' if back
+            jump = self.latest[j] - t
+            if jump <= self.max_jump:
+                self.counts['rejected: out of order' if jump
                             else 'rejected: duplicate timestamp'] += 1
                 return []
             out = self.flush()
@@ -243,19 +243,20 @@ class PlainAlign:
     def flush(self, final=True):
         out = []
         while self.held:
-            heads = {j: t for t, j, _ in reversed(self.held)}
-            start, length = min(heads.values()), self.period
+            oldest = {j: t for t, j, _ in reversed(self.held)}
+            start, length = min(oldest.values()), self.period
             if self.burst:
-                halves = [(t - self.taken[j]) // 2 for j, t in heads.items() if j in self.taken]
-                length = max(1, min([length, *halves]))
+                half_intervals = [(t - self.taken[j]) // 2 for j, t in oldest.items()
+                                  if j in self.taken]
+                length = max(1, min([length, *half_intervals]))
             elif self.end is not None and start < self.end + self.period:
                 start = self.end
-            if not (final or self.complete(start + length, heads)):
+            if not (final or self.complete(start + length, oldest)):
                 break
-            out.append(self.frame(start + length, heads))
+            out.append(self.frame(start + length, oldest))
         return out
 
-    def complete(self, end, heads):
+    def complete(self, end, oldest):
         newest, last, all_sensors = (
             max(self.seen), max(self.taken.values(), default=0), range(self.n))
 
@@ -263,11 +264,11 @@ class PlainAlign:
             return (self.latest[j] >= at - self.max_wait if j in self.latest
                     else newest - min(self.seen) < self.max_wait)
         return all(self.latest.get(j, -1) >= end for j in all_sensors if is_active(j, newest)) or (
-            self.burst and all(heads[j] < end if j in heads else not is_active(j, last)
+            self.burst and all(oldest[j] < end if j in oldest else not is_active(j, last)
                                for j in all_sensors))
 
-    def frame(self, end, heads):
-        taken = [h for h in self.held if h[0] < end and (not self.burst or h[0] == heads[h[1]])]
+    def frame(self, end, oldest):
+        taken = [h for h in self.held if h[0] < end and (not self.burst or h[0] == oldest[h[1]])]
         self.held = [h for h in self.held if h not in taken]
         self.taken.update({j: t for t, j, _ in taken})
         times = [t for t, *_ in taken]

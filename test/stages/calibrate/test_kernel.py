@@ -258,8 +258,8 @@ def test_flush_clears_the_history_of_spike_screening():
 def test_a_covariance_needs_no_axis_that_the_correction_ignores():
     C = np.array([[1.02, 0.03, 0.0], [-0.01, 0.97, 0.0], [0.0, 0.0, 1.0]])
     network = dataclasses.replace(line_network(1), background=(np.zeros(3),), correction=(C,))
-    own = np.diag([1e-16, 2e-16, np.nan])
+    stated = np.diag([1e-16, 2e-16, np.nan])
     (out,) = samples_of(*Calibrate(network, CalibrateSettings()).feed(one(
-        MagSample(10**18, 'mag_1', np.array([1e-8, 2e-8, np.nan]), own))))
-    np.testing.assert_allclose(out.covariance[:2, :2], C[:2, :2] @ own[:2, :2] @ C[:2, :2].T)
+        MagSample(10**18, 'mag_1', np.array([1e-8, 2e-8, np.nan]), stated))))
+    np.testing.assert_allclose(out.covariance[:2, :2], C[:2, :2] @ stated[:2, :2] @ C[:2, :2].T)
     assert np.isnan(out.field[2]) and not np.isnan(out.field[:2]).any()

@@ -35,8 +35,8 @@ def frame(k, field, network, period_ns=80_000_000):
 
 
 def detector(network, **changes):
-    exact = {'background_std': 0.0, 'background_drift': 0.0}
-    return Detect(network, replace(DetectSettings(), {**exact, **changes}))
+    without_background_error = {'background_std': 0.0, 'background_drift': 0.0}
+    return Detect(network, replace(DetectSettings(), {**without_background_error, **changes}))
 
 
 def test_thresholds_match_the_published_thresholds():
@@ -60,12 +60,13 @@ def test_the_false_alarm_rate_is_as_configured(p):
     assert low <= alarms <= high
 
 
-@pytest.mark.parametrize('per_frame, documented, tested', [
+@pytest.mark.parametrize('samples_per_frame, documented, tested', [
     (1, '3.5e-4 per frame of one sample (12.5 Hz)', 1e-3),
     (8, '1.5e-7 per frame of eight samples (100 Hz)', 0.05)])
-def test_the_default_false_alarm_probability_is_as_documented(per_frame, documented, tested):
-    """A frame averages `per_frame` samples of 12 nT noise; `background_std` is the default."""
-    settings, variance = DetectSettings(), SIGMA**2 / per_frame
+def test_the_default_false_alarm_probability_is_as_documented(
+        samples_per_frame, documented, tested):
+    """The samples have 12 nT of noise, and `background_std` has its default."""
+    settings, variance = DetectSettings(), SIGMA**2 / samples_per_frame
     variance_ratio = 1.0 + settings.background_std**2 / variance
     p = chi2.sf(chi2.isf(settings.false_alarm_probability, 6) * variance_ratio, 6)
     assert float(documented.split()[0]) == pytest.approx(p, rel=0.05)
@@ -81,10 +82,10 @@ def test_the_default_false_alarm_probability_is_as_documented(per_frame, documen
     std = np.sqrt(variance)
     for k in range(n):
         y = std * rng.standard_normal((2, 3))
-        stage.feed(FieldFrame(k * 80_000_000, y, C, np.full(2, per_frame), np.zeros(2)))
+        stage.feed(FieldFrame(k * 80_000_000, y, C, np.full(2, samples_per_frame), np.zeros(2)))
     alarms = stage.counts['frames above the threshold']
     low, high = binom.ppf([0.005, 0.995], n, p)
-    print(f'{per_frame} samples per frame: computed {p:.2e}, measured {alarms / n:.2e}')
+    print(f'{samples_per_frame} samples per frame: computed {p:.2e}, measured {alarms / n:.2e}')
     assert low <= alarms <= high
 
 

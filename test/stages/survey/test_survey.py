@@ -286,11 +286,11 @@ def test_a_jump_back_in_time_discards_earlier_accelerations():
 
 
 def test_calibration_records_are_replaced_for_surveyed_sensors_only():
-    before = CalibrationRecord('2025-01-01', 'by hand', np.nan)
-    result, _ = surveyed(nominal(calibrated=(before,) * 3),
+    earlier = CalibrationRecord('2025-01-01', 'by hand', np.nan)
+    result, _ = surveyed(nominal(calibrated=(earlier,) * 3),
                          change=lambda readings: readings.pop('mag_3'))
     assert [c.date for c in result.network.calibrated] == [DATE, DATE, '2025-01-01']
-    assert result.network.calibrated[2] is before
+    assert result.network.calibrated[2] is earlier
 
 
 def imu_network(**changes):
@@ -313,8 +313,8 @@ def test_fields_and_accelerations_are_read_together():
     fields = samples_of(*(r for r in records if isinstance(r, Readings)))
     alone = recorded(reader)
     assert [(r.stamp_ns, r.sensor) for r in fields] == [(r.stamp_ns, r.sensor) for r in alone]
-    _, without = read(replace(imu_network(), imu_topics=(None, None)))
-    assert sum(map(len, without)) == len(fields)
+    _, without_imu = read(replace(imu_network(), imu_topics=(None, None)))
+    assert sum(map(len, without_imu)) == len(fields)
 
 
 def test_an_accelerometer_that_two_sensors_share_serves_both():
@@ -361,12 +361,12 @@ def test_clocks_decades_apart_do_not_fill_the_memory():
 def test_the_result_of_an_earlier_survey_is_not_counted_as_evidence():
     """A survey with the same readings, starting from the first result, reproduces that result."""
     first, _ = surveyed(nominal(orientation_std=(np.deg2rad([4.0, 4.0, 6.0]),) * 3))
-    again, _ = surveyed(first.network)
+    second, _ = surveyed(first.network)
     for name in ('R_ws', 'clock_offset'):
-        np.testing.assert_allclose(getattr(again.network, name), getattr(first.network, name),
+        np.testing.assert_allclose(getattr(second.network, name), getattr(first.network, name),
                                    atol=1e-12)
-    np.testing.assert_allclose(again.network.orientation_std, first.network.orientation_std)
-    np.testing.assert_allclose(again.network.calibrated[0].stated_std, np.deg2rad([4, 4, 6]))
+    np.testing.assert_allclose(second.network.orientation_std, first.network.orientation_std)
+    np.testing.assert_allclose(second.network.calibrated[0].stated_std, np.deg2rad([4, 4, 6]))
 
 
 def test_large_biases_increase_the_heading_uncertainty():
