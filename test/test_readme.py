@@ -53,7 +53,7 @@ def test_make_test_runs_pytest_and_docs_builds_the_site():
 
 
 @pytest.mark.parametrize('line', [line for line in SHELL_LINES if line.startswith('mag-tracking ')])
-def test_commands_run(line, tmp_path, monkeypatch, capsys):
+def test_the_shell_commands_succeed(line, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
     words = [str(tmp_path) if word.startswith('out/') else word for word in line.split()[1:]]
     assert main(words) == 0 and capsys.readouterr().out

@@ -102,7 +102,7 @@ class ClockStepFilter:
             self._held.append((i, sample, self.newest))
             if self._ahead_since.get(i, (NEVER,))[0] != self.newest:
                 self._ahead_since[i] = self.newest, stamp
-            if not (self._majority_follows(stamp) or self._is_alone(i, stamp)):
+            if not (self._majority_follows(stamp) or self._advances_alone(i, stamp)):
                 return [], self._release_expired(i, stamp)
             # Samples that are even further ahead remain held.
             passed = self._pass(self._release(
@@ -149,7 +149,7 @@ class ClockStepFilter:
         following = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._max_jump}
         return 2 * len(following) > len(following | self._active())
 
-    def _is_alone(self, i: int, stamp: int) -> bool:
+    def _advances_alone(self, i: int, stamp: int) -> bool:
         """Whether sensor `i` has advanced by `max_jump` since its jump with no sample accepted."""
         return stamp - self._ahead_since[i][1] >= self._max_jump
 

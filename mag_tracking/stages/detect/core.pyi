@@ -18,7 +18,7 @@ def learn(field: FloatArray, memory: float, n: FloatArray, square: FloatArray) -
 
 def scaled(covariance: FloatArray, n: FloatArray, square: FloatArray, least: float, factor: float,
            most: float, allowance: float) -> FloatArray:
-    """Covariance with reduced variances of axes at rest, plus `allowance` on every axis.
+    """Reduce the variances of axes at rest, and add `allowance` to the variance of every axis.
 
     An axis is at rest if it has at least `least` values and its mean square times `factor` is
     smaller than its variance.

@@ -214,7 +214,10 @@ def _median_interval(stamp: IntArray) -> float:
 
 
 def _signature(t: FloatArray, field: FloatArray, time: float, scale: float) -> FloatArray:
-    """Field (`SIGNATURE_POINTS`, 3) [T] at equidistant times; NaN outside the readings."""
+    """Field (`SIGNATURE_POINTS`, 3) [T] at equidistant times.
+
+    NaN outside the readings, or if `scale` is not finite.
+    """
     if not np.isfinite(scale):
         return np.full((SIGNATURE_POINTS, 3), np.nan)
     times = time + scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN, SIGNATURE_POINTS)

@@ -336,7 +336,7 @@ class SensorHealth:
             if np.nanmax(noise_ratio, initial=0.0) > 3.0:
                 axis = int(np.nanargmax(noise_ratio))
                 found.append(Finding(False, name, f'{"xyz"[axis]} is {noise_ratio[axis]:.0f} times '
-                                     'as noisy as at its calibration', 'remove a new source of '
+                                     'as noisy as at its calibration', 'look for a new source of '
                                      'interference nearby (a motor, a cable), or calibrate again'))
         return sorted(found, key=lambda f: not f.serious)
 
@@ -394,8 +394,8 @@ class SensorHealth:
                           'the sensor or its driver is stuck: restart it')
         if c['saturated'] > 0.001 * n:
             yield Finding(True, name, f'{c["saturated"]} of {n} readings are at the end of the '
-                          'range of the sensor', 'set a larger range, or move the sensor further '
-                          'away')
+                          'range of the sensor', 'select a larger measuring range, or move the '
+                          'sensor further away from the targets')
         if c['spikes'] > 0.001 * n:
             yield Finding(False, name, f'{c["spikes"]} of {n} readings are spikes', 'check '
                           'connectors, power supply and checksums')

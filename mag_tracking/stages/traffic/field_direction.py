@@ -23,7 +23,7 @@ MIN_LATERAL = 1.5
 direction."""
 
 MAX_ALONG = 12.0
-"""[m] Maximum distance along the path between the crossing and the closest point of approach of a
+"""[m] Maximum distance along the path between the crossing and the closest point of approach to a
 sensor."""
 
 WINDOW_RATIO = 3.0
@@ -38,7 +38,7 @@ MAX_LOG_ODDS = float(np.log(MAX_CONFIDENCE / (1.0 - MAX_CONFIDENCE)))
 
 
 class FieldDirection:
-    """Estimates the probability that the direction of a crossing is wrong, from the latest frames.
+    """Estimates, from the latest frames, the probability that a crossing has a wrong direction.
 
     Parameters
     ----------

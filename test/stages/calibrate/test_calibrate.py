@@ -240,7 +240,7 @@ def test_a_reading_without_an_axis_that_the_correction_needs_is_rejected():
 @pytest.mark.parametrize('C', [np.diag([1.02, 0.97, 1.05]),
                                [[1.02, 0.03, 0.0], [-0.01, 0.97, 0.0], [0.0, 0.0, 1.0]]])
 def test_a_reading_without_an_axis_that_the_correction_ignores_passes(C):
-    """Only two of the axes are needed for these corrections."""
+    """In these corrections, x and y do not depend on z."""
     s, C = corrected(correction=np.array(C)), np.array(C)
     (out,) = fed(s, sample(1.0, [EARTH[0], EARTH[1], np.nan], 'mag_2'))
     np.testing.assert_allclose(out.field[:2], (C[:2, :2] - np.eye(2)) @ EARTH[:2], atol=1e-18)

@@ -40,7 +40,7 @@ def detector(network, **changes):
 
 
 def test_thresholds_match_the_published_thresholds():
-    """T10 eq. (5.18), (5.19): threshold 11.2 (exactly 11.34); detection rate 0.5 at SNR 9.2."""
+    """T10 eq. (5.18), (5.19): threshold 11.2 (exact value 11.34), detection rate 0.5 at SNR 9.2."""
     h = energy_threshold(0.01, 3)
     assert h == pytest.approx(chi2.isf(0.01, 3), rel=1e-12)
     assert false_alarm_probability(h, 3) == pytest.approx(0.01, rel=1e-12)

@@ -30,7 +30,7 @@ ONE_AXIS = 'mag_1'
 
 
 def passing(rng, noise=0.0, height=0.0, left_to_right=True, n=200):
-    """Simulate a dipole on a straight path: (t (n,), field (n, 3), time of the CPA, time scale).
+    """Simulate a dipole on a straight path; return (t, field (n, 3), time of the CPA, time scale).
 
     The target passes north of the sensor, and x points east. The unit of length is the lateral
     distance.

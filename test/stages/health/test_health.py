@@ -346,7 +346,7 @@ def test_quantiles_of_an_empty_array_are_nan():
 
 
 def test_batches_give_the_same_health_as_single_readings():
-    """The arrays of a batch may be overwritten afterwards."""
+    """The arrays of each batch are overwritten after the call."""
     rng = np.random.default_rng(3)
     stamps = np.arange(700) * NS // 100
     fields = 1e-6 + 1e-8 * rng.standard_normal((700, 3))
