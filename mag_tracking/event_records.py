@@ -40,7 +40,7 @@ class PassEvent:
     axis."""
     closest_ns: int
     """Time of the closest point of approach of a dipole on a straight line, ns since 1970. If this
-    time is unobservable: time of the largest field, or mean time of fewer than 8 readings."""
+    time is unobservable, it is the time of the largest field."""
     closest_std: float
     """Standard deviation of `closest_ns`, s. inf if unobservable."""
     time_scale: float

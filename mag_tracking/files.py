@@ -119,16 +119,16 @@ def replace_text(path: str | PathLike[str], text: str) -> None:
         If the file cannot be written.
     """
     path = checked_path(path, OutputError)
-    draft = path.parent / f'.{path.name}.{secrets.token_hex(8)}.part'
+    temporary = path.parent / f'.{path.name}.{secrets.token_hex(8)}.part'
     try:
-        with open(draft, 'x', encoding='utf-8', errors='backslashreplace') as stream:
+        with open(temporary, 'x', encoding='utf-8', errors='backslashreplace') as stream:
             stream.write(text)
             stream.flush()
             # Without fsync, a power failure could leave an empty file in place of the old one.
             os.fsync(stream.fileno())
-        draft.replace(path)
+        temporary.replace(path)
     except OSError as error:
-        draft.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise OutputError(f'cannot write {path}: {error.strerror}') from error
 
 

@@ -296,9 +296,9 @@ def propagated_path(path: FloatArray, seconds: float) -> FloatArray:
     (..., n) array
         The same paths with the new time origin.
     """
-    moved: FloatArray = path.copy()
-    moved[..., :3] += seconds * path[..., 3:6]
-    return moved
+    propagated: FloatArray = path.copy()
+    propagated[..., :3] += seconds * path[..., 3:6]
+    return propagated
 
 
 def overlap(position: FloatArray, velocity: FloatArray, need: ArrayLike,

@@ -177,7 +177,7 @@ class Pipeline:
         return self._process_detected([r for f in frames for r in self._detect.feed(f)])
 
     def _process_detected(self, records: Iterable[FieldFrame | Detection]) -> list[Output]:
-        """Track targets in the frames; return each record, followed by the records it causes."""
+        """Track targets in the frames; return each record and the records that result from it."""
         out: list[Output] = []
         for record in records:
             out.append(record)

@@ -19,7 +19,7 @@ def quantity(n: int, singular: str, plural: str = '') -> str:
     return f'{n} {singular if n == 1 else plural or singular + "s"}'
 
 
-def times(n: int) -> str:
+def occurrences(n: int) -> str:
     """Format a number of occurrences, such as 'once' or '2 times'.
 
     Parameters

@@ -101,7 +101,10 @@ class Parameter:
 
 
 def _types_of_hint(hint: Any) -> tuple[_Class, _Class | None]:
-    """Type of an annotation, and element type of a tuple such as tuple[float, ...], else None."""
+    """Type of a setting with annotation `hint`, and type of the elements of a tuple.
+
+    The second type is None if the setting is not a tuple.
+    """
     if typing.get_origin(hint) is tuple:
         return tuple, typing.get_args(hint)[0]
     return hint, None
@@ -156,7 +159,10 @@ def _scalar(name: str, value: object, kind: _Class) -> Scalar:
 
 
 def _validated(p: Parameter, value: object) -> Value:
-    """Convert `value` to the declared type of `p`; check its length, range and choices."""
+    """Convert `value` to the declared type of `p`, and check its length, range and choices.
+
+    Raises SettingsError if the value is invalid.
+    """
     if p.element is not None:
         if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
             raise SettingsError(f'{p.name}: expected a list of {p.element.__name__}, '
@@ -183,7 +189,10 @@ def _validated(p: Parameter, value: object) -> Value:
 
 
 def _flattened(mapping: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
-    """Flatten nested mappings to one dict with dotted names; empty mappings remain values."""
+    """Flatten nested mappings to one dict with dotted names; empty mappings remain values.
+
+    Raises SettingsError if a setting has two different values.
+    """
     out: dict[str, Any] = {}
     for key, value in mapping.items():
         if isinstance(value, Mapping) and value:
@@ -262,21 +271,22 @@ def _suggestion(name: str, known: Iterable[str]) -> str:
         leaves = [k for k in known if k.rpartition('.')[2] == leaf]
         if leaves:
             return f'; did you mean {" or ".join(leaves)}?'
-    near = _closest(name, [*known, *dict.fromkeys(k.partition('.')[0] for k in known)])
-    return f'; did you mean {near}?' if near else ''
+    closest = _closest(name, [*known, *dict.fromkeys(k.partition('.')[0] for k in known)])
+    return f'; did you mean {closest}?' if closest else ''
 
 
 def _group_suggestion(group: str, leaf: str, known: Iterable[str]) -> str:
     """Suggestion for the setting `leaf` of an unknown group; empty if there are no groups."""
     groups = list(dict.fromkeys(k[:i] for k in known for i, c in enumerate(k) if c == '.'))
-    near_group = _closest(group, groups)
-    if near_group:
-        near = _closest(leaf, [k.removeprefix(f'{near_group}.') for k in known
-                               if k.startswith(f'{near_group}.')])
-        return (f'; there is no group {group}; did you mean {near_group}'
-                f'{"." + near if near else ""}?')
-    top = [g for g in groups if '.' not in g]
-    return f'; there is no group {group}; the groups are {", ".join(top)}' if top else ''
+    closest_group = _closest(group, groups)
+    if closest_group:
+        closest = _closest(leaf, [k.removeprefix(f'{closest_group}.') for k in known
+                                  if k.startswith(f'{closest_group}.')])
+        return (f'; there is no group {group}; did you mean {closest_group}'
+                f'{"." + closest if closest else ""}?')
+    top_groups = [g for g in groups if '.' not in g]
+    return (f'; there is no group {group}; the groups are {", ".join(top_groups)}'
+            if top_groups else '')
 
 
 def _closest(name: str, candidates: Iterable[str]) -> str:
@@ -359,14 +369,14 @@ def _merged_sections(content: Mapping[str, Any]) -> dict[str, Any]:
     nodes = [k for k, v in content.items() if isinstance(v, Mapping) and 'ros__parameters' in v]
     if not nodes:
         return _flattened(content)
-    joined: dict[str, Any] = {}
+    merged: dict[str, Any] = {}
     for name, node in content.items():
         section = node.get('ros__parameters') if isinstance(node, Mapping) else None
         if name not in nodes or len(node) > 1 or not isinstance(section, Mapping | None):
             raise SettingsError(f'{name}: expected only a mapping under ros__parameters, as for '
                                 f'{nodes[0]}, got {short_repr(node)}')
-        _merge(joined, _flattened(section or {}))
-    return joined
+        _merge(merged, _flattened(section or {}))
+    return merged
 
 
 def _yaml_value(value: Value) -> str:

@@ -20,7 +20,7 @@ digits."""
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """Loader that rejects duplicate keys, instead of silently keeping only the last value."""
+    """Safe loader that rejects duplicate keys, and content that exceeds the limits."""
 
     def get_single_node(self) -> yaml.Node | None:
         """Return the root node after checking its expanded size; None for an empty document."""

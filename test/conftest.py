@@ -1,4 +1,4 @@
-"""Shared fixtures."""
+"""Fixtures, environment variables and order of execution of the tests."""
 
 import os
 import signal
@@ -22,8 +22,8 @@ os.environ['ROS_DOMAIN_ID'] = str(DOMAIN.number)
 # A background job of a shell ignores SIGINT, and its child processes inherit this setting.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 # Nodes must not write to the home folder of the user who runs the tests.
-_HOME = tempfile.TemporaryDirectory(prefix='mag_tracking_test_')
-os.environ['ROS_HOME'] = _HOME.name
+_ROS_HOME = tempfile.TemporaryDirectory(prefix='mag_tracking_test_')
+os.environ['ROS_HOME'] = _ROS_HOME.name
 
 
 LONGEST_FILES = (
@@ -82,7 +82,7 @@ def magnet_replays(tmp_path_factory, magnet_runs):
 
 @pytest.fixture
 def ros():
-    """Create a node in an executor: (node, spin_until)."""
+    """Yield (node, spin_until): `spin_until` waits for a condition, at most for `seconds`."""
     # Imported here because only the node tests require ROS.
     import rclpy
     from rclpy.node import Node

@@ -1,4 +1,4 @@
-"""Architecture: layering of imports, lengths of files and functions, and imports of the tests."""
+"""Architecture: layers of imports, lengths of files and functions, and structure of the tests."""
 
 import ast
 import re

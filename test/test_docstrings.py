@@ -46,7 +46,7 @@ def is_property(node):
 
 
 def numpydoc_issues(path, node, ancestors):
-    """Issues found by numpydoc."""
+    """Issues that numpydoc finds in the docstring of a definition."""
     report = validate.validate(node.name, AstValidator, ast_node=node, filename=str(path),
                                ancestry=ancestors)
     return [f'{code} {text}' for code, text in report['errors']
@@ -54,7 +54,7 @@ def numpydoc_issues(path, node, ancestors):
 
 
 def shape_issues(node, doc):
-    """Array arguments and return values without a shape."""
+    """Array arguments and return values whose shape is not documented."""
     types = {name: p.type for p in doc['Parameters'] for name in re.split(r',\s*', p.name)}
     arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
     missing = [f'no shape: {a.arg}' for a in arguments
@@ -72,7 +72,7 @@ def has_shape(text):
 
 
 def error_issues(node, doc):
-    """Errors that the function itself raises but does not document."""
+    """Exceptions that a function raises itself but does not document."""
     raised = {n.exc.func.id for n in ast.walk(node)
               if isinstance(n, ast.Raise) and isinstance(n.exc, ast.Call)
               and isinstance(n.exc.func, ast.Name) and n.exc.func.id.endswith('Error')}

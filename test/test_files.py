@@ -47,19 +47,19 @@ def write_figures(out):
         save_figure(Figure(), out / f'a.{suffix}')
 
 
-@pytest.mark.parametrize('write, more', [
+@pytest.mark.parametrize('write, extra_names', [
     (write_results, ()), (write_fits, ()), (write_recording, ()), (write_figures, ()),
     (lambda out: write_events(out, []), ()),
     (lambda out: write_network(out / 'n.yaml', line_network(2)), ()),
     (lambda out: write_backgrounds(out / 'b.json', {}), ())])
-def test_results_are_not_written_through_a_symbolic_link(tmp_path, write, more):
+def test_results_are_not_written_through_a_symbolic_link(tmp_path, write, extra_names):
     (tmp_path / 'new').mkdir()
     write(tmp_path / 'new')
     names = sorted(path.name for path in (tmp_path / 'new').iterdir())
     out, targets = tmp_path / 'out', tmp_path / 'theirs'
     out.mkdir()
     targets.mkdir()
-    for name in (*names, *more):
+    for name in (*names, *extra_names):
         # A recording is only replaced if `metadata.yaml` lists its name.
         (targets / name).write_text('- a.mcap\n- tracks.mcap\n')
         (out / name).symlink_to(targets / name)
@@ -69,16 +69,16 @@ def test_results_are_not_written_through_a_symbolic_link(tmp_path, write, more):
     assert {path.read_text() for path in targets.iterdir()} == {'- a.mcap\n- tracks.mcap\n'}
 
 
-@pytest.mark.parametrize('make', [new_text_file, new_binary_file])
-def test_a_new_file_replaces_a_link_or_pipe_of_its_name(tmp_path, make):
+@pytest.mark.parametrize('create_file', [new_text_file, new_binary_file])
+def test_a_new_file_replaces_a_link_or_pipe_of_its_name(tmp_path, create_file):
     path, other = tmp_path / 'a', tmp_path / 'other'
     other.write_text('theirs')
     for create in (lambda: path.symlink_to(other), lambda: path.symlink_to(tmp_path / 'nowhere'),
                    lambda: path.hardlink_to(other), lambda: os.mkfifo(path), lambda: None):
         path.unlink(missing_ok=True)
         create()
-        with make(path) as stream:
-            stream.write('' if make is new_text_file else b'')
+        with create_file(path) as stream:
+            stream.write('' if create_file is new_text_file else b'')
         assert path.is_file() and not path.is_symlink() and path.stat().st_size == 0
         assert other.read_text() == 'theirs' and sorted(tmp_path.iterdir()) == [path, other]
 

@@ -1,4 +1,4 @@
-"""Speed and heading against random samples of a velocity, and overlap of bodies."""
+"""Speed and heading, compared with random samples of a velocity, and overlap of bodies."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_the_heading_is_unknown_at_rest():
 
 
 def test_bodies_overlap_along_the_heading_of_the_second_but_not_across_it():
-    """The second body moves left; the first is behind it, beside it, ahead of it and near it."""
+    """The second body moves left. The first is, in turn, behind, beside, ahead of and near it."""
     position = np.array([[[2.0, 0.0], [0.0, 2.0], [-2.0, 0.1], [0.5, -1.0]], np.zeros((4, 2))])
     velocity = np.array([np.tile([9.0, 0.0], (4, 1)), np.tile([-9.0, 0.0], (4, 1))])
     np.testing.assert_allclose(overlap(position, velocity, 5.0, 1.5), [3.0, 0.0, 3.0, 4.5])

@@ -69,8 +69,8 @@ def test_type_checkers_see_the_public_names():
     seen = {alias.asname or alias.name: (node.module, alias.name)
             for node in block.body for alias in node.names}
     assert sorted(seen) == sorted(mt.__all__) and len(set(mt.__all__)) == len(mt.__all__)
-    for name, (module, there) in seen.items():
-        assert getattr(mt, name) is getattr(importlib.import_module(module), there)
+    for name, (module, original_name) in seen.items():
+        assert getattr(mt, name) is getattr(importlib.import_module(module), original_name)
 
 
 def test_no_public_name_equals_the_name_of_a_module():
@@ -193,10 +193,10 @@ def test_result_arrays_have_the_fields_of_the_records(result):
 
 
 def test_a_long_arrival_name_is_not_truncated(recorded):
-    long = 'from the right, where the road comes over the bridge'
+    long_name = 'from the right, where the road comes over the bridge'
     found = mt.track(recorded, NETWORK_FILE, settings=QUICK | {
-        'track.vehicle.arrival_names': ['left', long, 'rear']})
-    assert long in found.poses['arrival'] and found.smoothed['complete'].all()
+        'track.vehicle.arrival_names': ['left', long_name, 'rear']})
+    assert long_name in found.poses['arrival'] and found.smoothed['complete'].all()
 
 
 @pytest.mark.parametrize('source', ['nothing', 'noise'])
@@ -230,10 +230,10 @@ def test_rejected_readings_are_counted(recorded):
 
 
 def test_losses_of_a_damaged_recording_are_reported(tmp_path):
-    cut = tmp_path / 'cut.mcap'
+    damaged = tmp_path / 'damaged.mcap'
     content = vehicle_path(NAME).read_bytes()
-    cut.write_bytes(content[:len(content) // 2])
-    assert mt.track(cut, NETWORK_FILE).lost and mt.read_recording(cut, NETWORK_FILE).lost
+    damaged.write_bytes(content[:len(content) // 2])
+    assert mt.track(damaged, NETWORK_FILE).lost and mt.read_recording(damaged, NETWORK_FILE).lost
 
 
 FIELD, STAMPS = np.zeros((3, 3)), np.arange(3)
@@ -291,9 +291,9 @@ def test_invalid_readings_are_refused(readings, changes, text):
 def test_slightly_late_readings_are_tracked(recorded):
     """A recording stores readings in order of arrival, which may not be chronological."""
     r = recorded.readings
-    later = replace(r, stamp_ns=r.stamp_ns + np.where(r.sensor == 1, -30_000_000, 0))
-    assert (np.diff(later.stamp_ns) < 0).any()
-    assert len(mt.track(later, NETWORK_FILE).tracks) == 1
+    delayed = replace(r, stamp_ns=r.stamp_ns + np.where(r.sensor == 1, -30_000_000, 0))
+    assert (np.diff(delayed.stamp_ns) < 0).any()
+    assert len(mt.track(delayed, NETWORK_FILE).tracks) == 1
 
 
 def test_missing_files_are_refused(tmp_path):

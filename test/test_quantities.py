@@ -6,36 +6,36 @@ import pytest
 
 import mag_tracking as mt
 from mag_tracking.apps.replay_notes import notes_of
-from mag_tracking.quantities import quantity, times
+from mag_tracking.quantities import occurrences, quantity
 from mag_tracking.stages.track.evidence import LOST
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 
 
 @pytest.mark.parametrize('n, track, passes', [
     (0, '0 tracks', '0 passes'), (1, '1 track', '1 pass'), (2, '2 tracks', '2 passes')])
-def test_a_quantity_has_the_right_number(n, track, passes):
+def test_the_noun_agrees_with_the_number(n, track, passes):
     assert quantity(n, 'track') == track and quantity(n, 'pass', 'passes') == passes
 
 
 def test_a_single_occurrence_is_once():
-    assert [times(n) for n in (0, 1, 2)] == ['0 times', 'once', '2 times']
+    assert [occurrences(n) for n in (0, 1, 2)] == ['0 times', 'once', '2 times']
 
 
-def test_one_event_and_two_events():
+def test_the_noun_event_agrees_with_the_number():
     result = mt.events(vehicle_path('straight_car_right'), NETWORK_FILE, QUICK)
     assert 'EventsResult(2 events: ' in repr(result)
     one = dataclasses.replace(result, events=result.events[:1])
     assert 'EventsResult(1 event: ' in repr(one)
 
 
-def test_one_vehicle_and_no_vehicles():
+def test_the_noun_vehicle_agrees_with_the_number():
     result = mt.traffic(vehicle_path('straight_car_right'), NETWORK_FILE, QUICK)
     assert repr(result).startswith('TrafficResult(1 vehicle, ')
-    nothing = dataclasses.replace(result, vehicles=())
-    assert repr(nothing) == 'TrafficResult(0 vehicles, no line was crossed)'
+    no_vehicles = dataclasses.replace(result, vehicles=())
+    assert repr(no_vehicles) == 'TrafficResult(0 vehicles, no line was crossed)'
 
 
-def test_one_track():
+def test_the_nouns_track_and_detection_agree_with_the_number():
     result = mt.track(vehicle_path('straight_car_right'), NETWORK_FILE, settings=QUICK)
     assert repr(result).startswith('TrackingResult(1 track, ') and ' 1 detection)' in repr(result)
 
@@ -50,7 +50,7 @@ SUMMARY = {
     (1, ('1 track lost its target: ', '1 sensor has an ', '1 track was too long to smooth ')),
     (2, ('2 tracks lost their target: ', '2 sensors have an ',
          '2 tracks were too long to smooth '))])
-def test_notes_have_the_right_number(n, beginnings):
+def test_nouns_in_notes_agree_with_the_number(n, beginnings):
     counts = {f'tracks ended: {LOST}': n, 'sensors whose orientation is hardly known': n,
               'tracks too long to smooth': n}
     texts = [note.text for note in notes_of({**SUMMARY, 'counts': {'track': counts}})]

@@ -22,13 +22,13 @@ def recipe(target):
     return process.stdout
 
 
-def test_it_is_short_and_has_two_pictures():
+def test_the_readme_is_short_and_has_two_pictures():
     assert len(README_TEXT.split()) <= MAX_WORDS
     pictures = re.findall(r'!\[.+?\]\((.+?)\)', README_TEXT)
     assert len(pictures) == 2 and all((ROOT / p).is_file() for p in pictures)
 
 
-def test_its_links_refer_to_existing_files():
+def test_links_refer_to_existing_files():
     links = re.findall(r'\]\(((?!http)[^)]+)\)', README_TEXT)
     assert len(links) > 8 and [link for link in links if not (ROOT / link).exists()] == []
 
@@ -53,7 +53,7 @@ def test_make_test_runs_pytest_and_docs_builds_the_site():
 
 
 @pytest.mark.parametrize('line', [line for line in SHELL_LINES if line.startswith('mag-tracking ')])
-def test_commands_run(line, tmp_path, monkeypatch, capsys):
+def test_the_shell_commands_succeed(line, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
     words = [str(tmp_path) if word.startswith('out/') else word for word in line.split()[1:]]
     assert main(words) == 0 and capsys.readouterr().out
@@ -61,7 +61,7 @@ def test_commands_run(line, tmp_path, monkeypatch, capsys):
 
 
 def test_the_python_example_runs(tmp_path):
-    """The code is run unchanged, except for the path of the picture, in the project folder."""
+    """The code is run in the project folder, with another path for the picture."""
     assert len(PYTHON_EXAMPLE.split('\n\n')[1].strip().splitlines()) + 1 <= 5
     code = PYTHON_EXAMPLE.replace("'map.png'", repr(str(tmp_path / 'map.png')))
     process = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True,

@@ -137,7 +137,7 @@ def test_related_lists_are_checked_against_each_other(road_network, changes, mes
 
 
 def test_every_former_name_has_a_current_setting():
-    """The current names are sought in the pipeline settings and the drivers settings."""
+    """The current names are looked up in the settings of the pipeline and of the drivers."""
     known = {p.name.rpartition('.')[2] for group in (Settings(), *settings_by_kind().values())
              for p in flatten(group)}
     assert set(RENAMED_SETTINGS.values()) - known == set()

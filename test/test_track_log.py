@@ -1,4 +1,4 @@
-"""Track log: whether its summary reports a track as ambiguous."""
+"""Track log: verdict of its summary, unique or ambiguous."""
 
 import numpy as np
 import pytest

@@ -22,9 +22,10 @@ SHARE = 'mag_tracking-0.1.0.data/data/share'
 METADATA = {f'mag_tracking-0.1.0.dist-info/{name}' for name in (
     'METADATA', 'WHEEL', 'RECORD', 'entry_points.txt', 'top_level.txt', 'licenses/LICENSE')}
 CORE_SOURCES = sorted(str(p.relative_to(ROOT)) for p in (ROOT / 'mag_tracking').rglob('core.cpp'))
-JUNK = ('mag_tracking/notes.txt',
-        'mag_tracking/physics/__pycache__/dipole.cpython-310.pyc', 'test/test_new.py',
-        'mag_tracking.egg-info/PKG-INFO', 'out/summary.json', 'config/backup.yaml~')
+UNRELATED_FILES = (
+    'mag_tracking/notes.txt', 'mag_tracking/physics/__pycache__/dipole.cpython-310.pyc',
+    'test/test_new.py', 'mag_tracking.egg-info/PKG-INFO', 'out/summary.json',
+    'config/backup.yaml~')
 SITE_NETWORK = '''
 site: {latitude: 58.4, longitude: 15.6, height: 60, date: 2026-05-01, x_azimuth_deg: 90}
 sensors:
@@ -74,7 +75,10 @@ def expected_files():
 
 
 def contained_files(wheel):
-    """Names of the files in a wheel without the compiled modules; fails if a name is duplicated."""
+    """Names of the files in a wheel, except the compiled modules.
+
+    Fails if a name is duplicated, or if the compiled modules do not match their sources.
+    """
     with zipfile.ZipFile(wheel) as archive:
         names = [i.filename for i in archive.infolist() if not i.is_dir()]
     compiled = [name for name in names if name.endswith('.so')]
@@ -84,7 +88,7 @@ def contained_files(wheel):
 
 
 @pytest.fixture
-def copy(tmp_path):
+def tree_copy(tmp_path):
     """Copy the tracked files of the working tree to a folder; return the folder."""
     folder = tmp_path / 'tree'
     for name in tracked_files():
@@ -97,8 +101,9 @@ def copy(tmp_path):
 
 def bare_environment():
     """Environment without variables of ROS, the source tree or another interpreter."""
-    own = ('PYTHON', 'ROS_', '_ROS', 'AMENT_', 'COLCON_', 'VIRTUAL_ENV', 'LD_LIBRARY_PATH')
-    return {k: v for k, v in os.environ.items() if not k.startswith(own)}
+    excluded_prefixes = ('PYTHON', 'ROS_', '_ROS', 'AMENT_', 'COLCON_', 'VIRTUAL_ENV',
+                         'LD_LIBRARY_PATH')
+    return {k: v for k, v in os.environ.items() if not k.startswith(excluded_prefixes)}
 
 
 def run(*command, cwd, **variables):
@@ -110,7 +115,7 @@ def run(*command, cwd, **variables):
 
 
 def interpreter(version):
-    """Path of a Python interpreter of `version` with venv; skips the test if not installed."""
+    """Path of a Python interpreter of `version` with venv; skips the test if none is installed."""
     if version == RUNNING_VERSION:
         return sys.executable
     check = 'import sys, venv, ensurepip; print("%d.%d" % sys.version_info[:2])'
@@ -124,18 +129,18 @@ def interpreter(version):
     pytest.skip(f'python{version} with venv is neither on PATH nor installed by pyenv')
 
 
-def test_the_wheel_contains_all_required_files_and_no_others(tmp_path, copy):
+def test_the_wheel_contains_all_required_files_and_no_others(tmp_path, tree_copy):
     """The wheel is built without build isolation, which would need a network."""
     pytest.importorskip('setuptools', minversion='70.1', reason='builds wheels from 70.1 on')
-    for name in JUNK:
-        (copy / name).parent.mkdir(parents=True, exist_ok=True)
-        (copy / name).write_text('')
+    for name in UNRELATED_FILES:
+        (tree_copy / name).parent.mkdir(parents=True, exist_ok=True)
+        (tree_copy / name).write_text('')
     # The compiled modules are not run, so they are built without optimisation, which is faster.
     compiler = tmp_path / 'compiler'
     compiler.write_text('#!/bin/sh\nexec c++ "$@" -O0\n')
     compiler.chmod(0o755)
     run(sys.executable, '-c', 'import sys, setuptools.build_meta as b; b.build_wheel(sys.argv[1])',
-        tmp_path, cwd=copy, CC=str(compiler), CXX=str(compiler))
+        tmp_path, cwd=tree_copy, CC=str(compiler), CXX=str(compiler))
     wheel, = tmp_path.glob('*.whl')
     assert re.fullmatch(r'mag_tracking-0\.1\.0-cp3\d+-cp3\d+-linux_\w+\.whl', wheel.name)
     assert contained_files(wheel) == expected_files()
@@ -144,7 +149,7 @@ def test_the_wheel_contains_all_required_files_and_no_others(tmp_path, copy):
             f'{SHARE}/mag_tracking/launch/tracking.launch.py'} <= expected_files()
 
 
-def rows(path):
+def csv_rows(path):
     with open(path, newline='', encoding='utf-8') as stream:
         return list(csv.DictReader(stream))
 
@@ -152,7 +157,7 @@ def rows(path):
 def assert_same_track(actual, expected):
     """Assert equal poses and summaries: numbers to 1e-9 of the column maximum, strings exactly."""
     for name in ('poses.csv', 'poses_smoothed.csv', 'detections.csv'):
-        a, b = rows(actual / name), rows(expected / name)
+        a, b = csv_rows(actual / name), csv_rows(expected / name)
         assert len(a) == len(b) > 0 and a[0].keys() == b[0].keys()
         for column in a[0]:
             x, y = ([row[column] for row in table] for table in (a, b))
@@ -176,7 +181,7 @@ def assert_same_track(actual, expected):
             assert a[key] == value, key
 
 
-def install_wheel(version, tmp_path, copy):
+def install_wheel(version, tmp_path, tree_copy):
     """Install the wheel in a new virtual environment; return (bin folder, wheel)."""
     pins = ROOT / 'constraints.txt'
     run(interpreter(version), '-m', 'venv', tmp_path / 'venv', cwd=tmp_path)
@@ -185,9 +190,9 @@ def install_wheel(version, tmp_path, copy):
     run(*pip, 'install', '-c', pins, '--upgrade', 'pip', 'setuptools', 'pybind11', cwd=tmp_path)
     # Building from the source distribution, as `python -m build` does, must add or omit no file.
     run(bin_folder / 'python', '-c', 'import sys, setuptools.build_meta as b; b.build_sdist('
-        'sys.argv[1])', tmp_path / 'sdist', cwd=copy)
+        'sys.argv[1])', tmp_path / 'sdist', cwd=tree_copy)
     source, = (tmp_path / 'sdist').glob('*.tar.gz')
-    for name, project in (('wheel', copy), ('wheel_of_sdist', source)):
+    for name, project in (('wheel', tree_copy), ('wheel_of_sdist', source)):
         run(*pip, 'wheel', '--no-deps', '--build-constraint', pins, '-w', tmp_path / name, project,
             cwd=tmp_path)
     wheel, = (tmp_path / 'wheel').glob('*.whl')
@@ -202,10 +207,10 @@ def install_wheel(version, tmp_path, copy):
 @pytest.mark.alone
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize('version', VERSIONS)
-def test_the_wheel_works_without_ros_and_the_source_tree(version, tmp_path, copy,
+def test_the_wheel_works_without_ros_and_the_source_tree(version, tmp_path, tree_copy,
                                                          vehicle_replays):
-    bin_folder, wheel = install_wheel(version, tmp_path, copy)
-    shutil.rmtree(copy)
+    bin_folder, wheel = install_wheel(version, tmp_path, tree_copy)
+    shutil.rmtree(tree_copy)
     venv, home = bin_folder.parent, tmp_path / 'elsewhere'
     home.mkdir()
     assert run(bin_folder / 'python', '-c', 'from importlib.util import find_spec as f; '
@@ -225,7 +230,7 @@ def test_the_wheel_works_without_ros_and_the_source_tree(version, tmp_path, copy
     found = json.loads(run(bin_folder / 'python', '-c', TRACK_SCRIPT, vehicle_path(NAME),
                            NETWORK_FILE, home / 'site.yaml', cwd=home))
     assert Path(found['file']).parent == package and Path(found['prefix']) == venv
-    poses = rows(home / 'out' / 'poses.csv')
+    poses = csv_rows(home / 'out' / 'poses.csv')
     assert found['positions'] == [[float(row[axis]) for axis in 'xyz'] for row in poses]
     assert 'pip install mag_tracking[pandas]' in found['message']
     assert 4.5e-5 < np.linalg.norm(found['earth']) < 5.5e-5

@@ -12,7 +12,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.agreement import consensus, disagreements
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
-from mag_tracking.quantities import quantity, times
+from mag_tracking.quantities import occurrences, quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings
@@ -141,7 +141,7 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
                       'noise_std in the network file')
     if background.n_relearnt > n_reported:
         yield Finding(False, name, f'a lasting change of the field became its background '
-                      f'{times(background.n_relearnt - n_reported)}',
+                      f'{occurrences(background.n_relearnt - n_reported)}',
                       'check for a parked vehicle or an object near it; calibrate.relearn_s: 0 '
                       'disables relearning')
     if last is not None and frozen_since_ns is not None \

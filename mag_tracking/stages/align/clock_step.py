@@ -28,9 +28,10 @@ SensorSamples = list[tuple[int, HeldSample]]
 
 
 class ClockStepFilter:
-    """Holds samples whose timestamps jump ahead until other sensors confirm or refute the jump.
+    """Holds samples whose timestamps jump ahead, until other sensors confirm or refute the jump.
 
-    All other samples pass immediately.
+    All other samples pass immediately. A jump is also accepted if its sensor advances by `max_jump`
+    while no sample of another sensor is accepted.
 
     Parameters
     ----------
@@ -56,7 +57,7 @@ class ClockStepFilter:
         self.newest = NEVER
         # (sensor index, sample, newest accepted timestamp at its arrival), in order of arrival.
         self._held: list[tuple[int, HeldSample, int]] = []
-        # {index of a sensor that is ahead: (newest accepted timestamp, its own timestamp then)}
+        # {index of a sensor that is ahead: (newest accepted timestamp, timestamp of its jump)}
         self._ahead_since: dict[int, tuple[int, int]] = {}
 
     @property
@@ -101,7 +102,7 @@ class ClockStepFilter:
             self._held.append((i, sample, self.newest))
             if self._ahead_since.get(i, (NEVER,))[0] != self.newest:
                 self._ahead_since[i] = self.newest, stamp
-            if not (self._majority_follows(stamp) or self._is_alone(i, stamp)):
+            if not (self._majority_follows(stamp) or self._advances_alone(i, stamp)):
                 return [], self._release_expired(i, stamp)
             # Samples that are even further ahead remain held.
             passed = self._pass(self._release(
@@ -145,19 +146,22 @@ class ClockStepFilter:
 
     def _majority_follows(self, stamp: int) -> bool:
         """Whether most of the active sensors have a held sample within `max_jump` of `stamp`."""
-        agree = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._max_jump}
-        return 2 * len(agree) > len(agree | self._active())
+        following = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._max_jump}
+        return 2 * len(following) > len(following | self._active())
 
-    def _is_alone(self, i: int, stamp: int) -> bool:
-        """Whether sensor `i`, while ahead, has advanced by `max_jump` with no sample accepted."""
+    def _advances_alone(self, i: int, stamp: int) -> bool:
+        """Whether sensor `i` has advanced by `max_jump` since its jump with no sample accepted."""
         return stamp - self._ahead_since[i][1] >= self._max_jump
 
     def _release_expired(self, i: int, stamp: int) -> SensorSamples:
-        """Remove and return samples of sensor `i` that were held too long or exceed `max_held`."""
-        of_sensor = [s for j, s, _ in self._held if j == i]
-        first = of_sensor[0] if len(of_sensor) > self._max_held else None
+        """Remove and return samples of sensor `i` that are older than `stamp` by over `max_jump`.
+
+        The oldest sample of the sensor is also removed if more than `max_held` are held.
+        """
+        own_samples = [s for j, s, _ in self._held if j == i]
+        oldest = own_samples[0] if len(own_samples) > self._max_held else None
         return self._release(lambda j, s, _: j == i and (
-            s.stamp_ns < stamp - self._max_jump or s is first))
+            s.stamp_ns < stamp - self._max_jump or s is oldest))
 
     def _release(self, is_released: Callable[[int, HeldSample, int], bool]) -> SensorSamples:
         """Remove and return the held samples for which `is_released` returns True."""

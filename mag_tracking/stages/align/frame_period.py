@@ -32,8 +32,8 @@ def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
         horizontal position.
     """
     shortest, pair = np.inf, None
-    for j, place in enumerate(network.positions):
-        distance = np.linalg.norm((network.positions[:j] - place)[:, :2], axis=1)
+    for j, position in enumerate(network.positions):
+        distance = np.linalg.norm((network.positions[:j] - position)[:, :2], axis=1)
         distance[distance <= MIN_DELAY_BASELINE] = np.inf
         if distance.min(initial=np.inf) < shortest:
             i = int(np.argmin(distance))
@@ -91,8 +91,8 @@ def frame_period_warning(settings: AlignSettings, network: SensorNetwork) -> str
     shortest, period = shortest_delay(network), frame_period(settings, network)
     if not settings.period_s or settings.burst or shortest is None or period <= shortest[0]:
         return None
-    delay, one, other = shortest
+    delay, first, second = shortest
     return (f'align.period_s: a frame of {1e3 * period:.0f} ms is longer than the '
-            f'{1e3 * delay:.0f} ms that a target at {MAX_TARGET_SPEED:.0f} m/s takes from {one} to '
-            f'{other}, which makes speed and direction less accurate; set align.period_s to 0 for '
-            'an automatic period')
+            f'{1e3 * delay:.0f} ms that a target at {MAX_TARGET_SPEED:.0f} m/s takes from {first} '
+            f'to {second}, which makes speed and direction less accurate; set align.period_s to 0 '
+            'for an automatic period')

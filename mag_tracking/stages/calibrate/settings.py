@@ -62,8 +62,8 @@ class CalibrateSettings:
         'four output intervals. 0 disables decimation; frames average the samples in any case.',
         'Hz', (0.0, 10000.0))
     max_resume_gap_s: float = param(
-        60.0, 'Maximum gap between the timestamps before and after a restart of a node for which '
-        'the learnt background of a sensor is restored. 0 disables restoration.',
+        60.0, 'Maximum gap in the timestamps of a sensor, caused by a restart of a node, after '
+        'which the learnt background is restored. 0 disables restoration.',
         's', (0.0, 86400.0))
     max_backward_jump_s: float = param(
         1.0, 'Maximum backward jump of a timestamp. A larger jump is treated as a restart (a '

@@ -109,18 +109,19 @@ class Calibrate:
         if network.names != tuple(self._index):
             raise NetworkError(f'the new network has the sensors {", ".join(network.names)}; '
                                f'expected {", ".join(self._index)}')
-        before, self._network = self._network if self._background else None, network
+        previous, self._network = self._network if self._background else None, network
         self._decimators = {name: Decimator(self._settings.decimate_to_hz)
                             for name in network.names}
         for i, name in enumerate(network.names):
-            same = before is not None and _are_equal(before.offset[i], network.offset[i]) \
-                and _are_equal(before.correction[i], network.correction[i])
+            is_unchanged = previous is not None \
+                and _are_equal(previous.offset[i], network.offset[i]) \
+                and _are_equal(previous.correction[i], network.correction[i])
             shift = int(self._sensors[i]['clock_offset_ns'] - network.clock_offset_ns[i])
-            if before is not None and (not same or shift):
+            if previous is not None and (not is_unchanged or shift):
                 self._restoration.forget(name)
-            if not same or shift:
+            if not is_unchanged or shift:
                 self._reject_held(i, 'the calibration changed')
-            if not same:
+            if not is_unchanged:
                 self._background[name] = self._new_background(i)
             self._configure(i, shift)
         self._mark_restorable()
@@ -199,12 +200,12 @@ class Calibrate:
             are none.
         """
         rows = readings.rows(self._index)
-        own, covariances = _own_covariances(readings)
+        validity, covariances = _own_covariances(readings)
         stamps, fields = plain(readings.stamp_ns, np.int64), plain(readings.field)
         out, batch = self._new_output(len(readings)), self._batches[0]
         batch['next'] = 0
         while reason := core.calibrate_readings(
-                self._sensors, self._limits, rows, stamps, fields, own, covariances,
+                self._sensors, self._limits, rows, stamps, fields, validity, covariances,
                 self._batches, *out.arrays):
             if reason == core.UNKNOWN_SENSOR:
                 name = readings.names[readings.sensor[batch['next'] - 1]]
@@ -240,34 +241,35 @@ class Calibrate:
                                                   self._background[name])] += 1
             self._sensors[i]['is_restorable'] = False
         elif reason == core.PASSED:
-            self._use_passed(i, out)
+            self._calibrate_released(i, out)
         elif reason != core.SPIKES:
             self._reject(name, self._causes[reason])
 
-    def _use_passed(self, i: int, out: OutputBuffer) -> None:
+    def _calibrate_released(self, i: int, out: OutputBuffer) -> None:
         """Calibrate the readings of sensor `i` that the spike filter has released."""
         s, name = self._sensors[i], self._network.names[i]
         for k in range(int(s['n_released'])):
-            stamp, own = int(s['held_ns'][k]), int(s['held_own'][k])
+            stamp, validity = int(s['held_ns'][k]), int(s['held_own'][k])
             field, covariance = s['held_field'][k].copy(), s['held_covariance'][k]
             if not self._settings.decimate_to_hz:
-                self._use(i, stamp, field, own, covariance, out)
+                self._calibrate_reading(i, stamp, field, validity, covariance, out)
                 continue
             decimator = self._decimators[name]
             decimated = decimator.feed(stamp, field)
             self.counts['removed by decimation'] += 1 - len(decimated)
             s['n_averaged'] = decimator.factor or 1
             for stamp, field in decimated:
-                self._use(i, stamp, field, own, covariance * decimator.noise_gain(), out)
+                self._calibrate_reading(i, stamp, field, validity,
+                                        covariance * decimator.noise_gain(), out)
         s['n_held'] = s['n_released'] = 0
 
-    def _use(self, i: int, stamp: int, field: FloatArray, own: int, covariance: FloatArray,
-             out: OutputBuffer) -> None:
+    def _calibrate_reading(self, i: int, stamp: int, field: FloatArray, validity: int,
+                           covariance: FloatArray, out: OutputBuffer) -> None:
         """Calibrate one reading of sensor `i`, and append the result to `out`."""
         background = self._background[self._network.names[i]]
         background.evaluate_block()
         while not core.use_reading(self._sensors, self._limits, self._batches, i, stamp,
-                                   plain(field), own, plain(covariance), *out.arrays):
+                                   plain(field), validity, plain(covariance), *out.arrays):
             background.evaluate_block()
 
     def _finish(self, out: OutputBuffer) -> list[Readings]:
@@ -285,9 +287,9 @@ class Calibrate:
         """Number of readings that are held until the next reading of their sensor."""
         return int(self._sensors['n_held'].sum())
 
-    def _reject_held(self, i: int, why: str) -> None:
+    def _reject_held(self, i: int, event: str) -> None:
         """Reject the held readings of sensor `i`, which no later reading can confirm."""
-        self._reject(self._network.names[i], f'possible spike when {why}',
+        self._reject(self._network.names[i], f'possible spike when {event}',
                      int(self._sensors[i]['n_held']))
         clear_spikes(self._sensors[i])
 
@@ -359,7 +361,7 @@ class Calibrate:
             s = self._sensors[i]
             s['n_released'] = s['n_held']
             s['accepted'] += s['n_held']
-            self._use_passed(int(i), out)
+            self._calibrate_released(int(i), out)
         for s in self._sensors:
             clear_spikes(s)
         return self._finish(out)
@@ -453,7 +455,10 @@ class Calibrate:
 
 
 def _own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
-    """Validity codes (NONE, VALID, INVALID) and covariances (n, 3, 3) [T^2] of the readings."""
+    """Validity codes (NONE, VALID, INVALID) and covariances (n, 3, 3) [T²] of the readings.
+
+    If the readings have no covariances, all codes are NONE and the second array is empty.
+    """
     if readings.covariance is None:
         return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
     C = plain(readings.covariance)

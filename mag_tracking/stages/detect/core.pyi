@@ -18,7 +18,7 @@ def learn(field: FloatArray, memory: float, n: FloatArray, square: FloatArray) -
 
 def scaled(covariance: FloatArray, n: FloatArray, square: FloatArray, least: float, factor: float,
            most: float, allowance: float) -> FloatArray:
-    """Covariance with reduced variances of axes at rest, and with an allowance on all variances.
+    """Reduce the variances of axes at rest, and add `allowance` to the variance of every axis.
 
     An axis is at rest if it has at least `least` values and its mean square times `factor` is
     smaller than its variance.
@@ -31,6 +31,7 @@ def scaled(covariance: FloatArray, n: FloatArray, square: FloatArray, least: flo
     least : float
         Minimum number of values.
     factor : float
+        Minimum ratio of the variance to the mean square of an axis at rest.
     most : float
         Factor by which the variance of an axis at rest is reduced.
     allowance : float, T^2

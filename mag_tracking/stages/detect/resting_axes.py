@@ -11,8 +11,7 @@ from mag_tracking.records import plain
 from mag_tracking.stages.detect import core
 
 MEMORY_FRAMES = 100
-"""Approximate number of frames without a target over which the variance of each axis is
-averaged."""
+"""Approximate number of frames without a target over which the square of each axis is averaged."""
 
 RESTING_RATIO = 25.0
 """Minimum ratio of the nominal to the measured variance of an axis at rest."""
@@ -23,7 +22,7 @@ step of one axis, which background drift can cause, remains below the threshold.
 
 
 class RestingAxes:
-    """Mean square of each axis of a network over frames without a target.
+    """Finds axes at rest by their mean squares over frames without a target.
 
     Parameters
     ----------
@@ -32,7 +31,7 @@ class RestingAxes:
 
     def __init__(self, n_sensors: int) -> None:
         self._n: FloatArray = np.zeros((n_sensors, 3))
-        self._square: FloatArray = np.zeros((n_sensors, 3))
+        self._mean_square: FloatArray = np.zeros((n_sensors, 3))
 
     def learn(self, field: FloatArray) -> None:
         """Update the averages with a frame that contains no target.
@@ -42,7 +41,7 @@ class RestingAxes:
         field : (n_sensors, 3) array, T
             NaN for a missing axis.
         """
-        core.learn(plain(field), MEMORY_FRAMES, self._n, self._square)
+        core.learn(plain(field), MEMORY_FRAMES, self._n, self._mean_square)
 
     def covariance(self, covariance: FloatArray, allowance: float) -> FloatArray:
         """Reduce the variances of axes at rest in a covariance, and add the background variance.
@@ -58,5 +57,5 @@ class RestingAxes:
         -------
         (n_sensors, 3, 3) array, T^2
         """
-        return core.scaled(plain(covariance), self._n, self._square, MEMORY_FRAMES / 4,
+        return core.scaled(plain(covariance), self._n, self._mean_square, MEMORY_FRAMES / 4,
                            RESTING_RATIO, VARIANCE_REDUCTION, allowance)

@@ -60,8 +60,8 @@ class Detect:
         self._next_id = 1
         self._max_ratio, self._max_ratios = 0.0, np.zeros(len(network))
         # Thresholds for a single sensor, by its number of axes.
-        self._single = np.array([np.inf, *(self.threshold(settings.false_alarm_probability, k)
-                                           for k in (1, 2, 3))])
+        self._single_thresholds = np.array([np.inf, *(
+            self.threshold(settings.false_alarm_probability, k) for k in (1, 2, 3))])
         self.max_consecutive_above = 0
         self._resting = RestingAxes(len(network))
         self._reset()
@@ -69,7 +69,7 @@ class Detect:
     def _reset(self) -> None:
         """Reset to the state without a detection."""
         self._present = False
-        self._above = 0
+        self._n_above = 0
         self._last_ns: int | None = None
         self._last_active_ns: int | None = None
         self._onset_ns: int | None = None
@@ -115,7 +115,7 @@ class Detect:
         self._last_ns = frame.stamp_ns
         try:
             energy, axes = whitened_energy(frame.field, self._resting.covariance(
-                frame.covariance, self._allowance(frame.stamp_ns)))
+                frame.covariance, self._background_variance(frame.stamp_ns)))
         except np.linalg.LinAlgError:
             self.counts['rejected: frame with a covariance that is not positive definite'] += 1
             return out
@@ -126,7 +126,7 @@ class Detect:
             out += self._update_presence(frame.stamp_ns, statistic, n, energy / np.maximum(axes, 1))
         else:
             self.counts['frames without a measurement'] += 1
-        if not self._present and not self._above:
+        if not self._present and not self._n_above:
             self._resting.learn(frame.field)
         return [*out, replace(frame, target_present=self._present, statistic=statistic,
                               degrees_of_freedom=n)]
@@ -137,7 +137,8 @@ class Detect:
         if not self._present:
             ratio = statistic / self.threshold(self._settings.false_alarm_probability, n)
             self._max_ratio = max(self._max_ratio, ratio)
-            np.maximum(self._max_ratios, energy / self._single[axes], out=self._max_ratios)
+            np.maximum(self._max_ratios, energy / self._single_thresholds[axes],
+                       out=self._max_ratios)
 
     @property
     def largest_excursion(self) -> float:
@@ -155,7 +156,7 @@ class Detect:
         """
         return np.sqrt(self._max_ratios)
 
-    def _allowance(self, stamp_ns: int) -> float:
+    def _background_variance(self, stamp_ns: int) -> float:
         """Update the time since the background was frozen; return the background variance [T²]."""
         if self._present and self._onset_ns is not None:
             self._frozen_s = (stamp_ns - self._onset_ns) / NS
@@ -170,13 +171,13 @@ class Detect:
         s = self._settings
         if statistic > self.threshold(s.false_alarm_probability, n):
             self.counts['frames above the threshold'] += 1
-            self._above += 1
-            self.max_consecutive_above = max(self.max_consecutive_above, self._above)
+            self._n_above += 1
+            self.max_consecutive_above = max(self.max_consecutive_above, self._n_above)
         else:
-            self._above = 0
+            self._n_above = 0
         if statistic > self.threshold(s.release_probability, n):
             self._last_active_ns = stamp_ns
-        if not self._present and self._above >= s.onset_frames:
+        if not self._present and self._n_above >= s.onset_frames:
             self._present, self._last_active_ns = True, stamp_ns
             # If the background has not been learnt since the previous target, its uncertainty
             # continues to grow.
@@ -189,7 +190,7 @@ class Detect:
         return []
 
     def _strongest(self, per_axis: FloatArray) -> str:
-        """Name of the sensor with the largest element of `per_axis` (n_sensors,)."""
+        """Name of the sensor with the largest energy per axis, `per_axis` (n_sensors,)."""
         return self._names[int(per_axis.argmax())]
 
     def _release(self, stamp_ns: int, statistic: float, n: int, strongest: str) -> list[Detection]:

@@ -100,7 +100,10 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
 
 
 def _averaged(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Average blocks of consecutive samples (at most `MAX_SAMPLES` blocks of equal length)."""
+    """Average consecutive samples in at most `MAX_SAMPLES` blocks of equal length.
+
+    The samples after the last complete block are dropped.
+    """
     n = -(-len(t) // MAX_SAMPLES) or 1
     k = len(t) // n
     return t[:k * n].reshape(k, n).mean(axis=1), y[:k * n].reshape(k, n, -1).mean(axis=1)

@@ -107,9 +107,9 @@ class _SensorEvents:
     def feed(self, readings: Readings) -> list[PassEvent]:
         """Add readings of this sensor and return the completed events."""
         last = self._buffer[-1].stamp_ns[-1:] if self._buffer else readings.stamp_ns[:0]
-        back = np.flatnonzero(np.diff(np.concatenate([last, readings.stamp_ns])) < 0)
+        jumps_back = np.flatnonzero(np.diff(np.concatenate([last, readings.stamp_ns])) < 0)
         first, out = 0, []
-        for k in (back + 1 - len(last)).tolist():
+        for k in (jumps_back + 1 - len(last)).tolist():
             # In a looped recording, the buffered readings belong to the previous loop.
             out += [*self._feed_chronological(readings.part(slice(first, k))), *self.flush()]
             self._reset()
@@ -156,10 +156,10 @@ class _SensorEvents:
         onset_ns, self._onset_ns = self._onset_ns, None
         assert onset_ns is not None
         readings = Readings.joined(self._buffer)
-        pad = int(PAD_S * NS)
-        begin_ns = max(onset_ns, release_ns - int(MAX_DURATION_S * NS)) - pad
+        margin_ns = int(PAD_S * NS)
+        begin_ns = max(onset_ns, release_ns - int(MAX_DURATION_S * NS)) - margin_ns
         readings = readings.part((begin_ns <= readings.stamp_ns)
-                                 & (readings.stamp_ns <= release_ns + pad))
+                                 & (readings.stamp_ns <= release_ns + margin_ns))
         if not len(readings) or np.isnan(readings.field).all():
             return []
         self._n += 1
@@ -172,21 +172,22 @@ class _SensorEvents:
         stamp, field = readings.stamp_ns, readings.field
         t = (stamp - onset_ns) / NS
         noise = _median_noise(readings)
-        squared = np.nansum(field**2, axis=1)
-        peak = int(np.argmax(squared))
-        inside = (onset_ns <= stamp) & (stamp <= release_ns)
+        squared_field = np.nansum(field**2, axis=1)
+        peak = int(np.argmax(squared_field))
+        is_detected = (onset_ns <= stamp) & (stamp <= release_ns)
         present = ~np.all(np.isnan(field), axis=0)
         closest = closest_point(t, field, noise)
         horizontal = horizontal_field(field, self._R_ws)
         known = ~np.isnan(horizontal).any(axis=1)
-        left = _left_to_right(horizontal[known], float(np.nanmean(noise)) if known.any() else 0.0,
-                              int(np.count_nonzero(stamp < onset_ns)))
+        left_to_right = _left_to_right(
+            horizontal[known], float(np.nanmean(noise)) if known.any() else 0.0,
+            int(np.count_nonzero(stamp < onset_ns)))
         return PassEvent(
             self._name, self._n, ended, onset_ns, release_ns, int(stamp[peak]), field[peak],
-            float(np.sum(squared[inside]) * _median_interval(stamp)),
+            float(np.sum(squared_field[is_detected]) * _median_interval(stamp)),
             ''.join(np.array(list('xyz'))[present]), noise,
-            onset_ns + int(round(closest.time * NS)), closest.time_std, closest.time_scale, left,
-            _signature(t, field, closest.time, closest.time_scale))
+            onset_ns + int(round(closest.time * NS)), closest.time_std, closest.time_scale,
+            left_to_right, _signature(t, field, closest.time, closest.time_scale))
 
 
 def _left_to_right(horizontal: FloatArray, noise_std: float, n_quiet: int) -> float:
@@ -213,7 +214,10 @@ def _median_interval(stamp: IntArray) -> float:
 
 
 def _signature(t: FloatArray, field: FloatArray, time: float, scale: float) -> FloatArray:
-    """Field (`SIGNATURE_POINTS`, 3) [T] at equidistant times; NaN outside the readings."""
+    """Field (`SIGNATURE_POINTS`, 3) [T] at equidistant times.
+
+    NaN outside the readings, or if `scale` is not finite.
+    """
     if not np.isfinite(scale):
         return np.full((SIGNATURE_POINTS, 3), np.nan)
     times = time + scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN, SIGNATURE_POINTS)

@@ -11,7 +11,7 @@ from mag_tracking.stages.health import core
 
 
 class ReadingBuffer:
-    """Raw readings of several sensors, each in order of arrival.
+    """Buffer for the raw readings of several sensors, in order of arrival for each sensor.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE, MIN_CHANGES
-from mag_tracking.quantities import times
+from mag_tracking.quantities import occurrences
 from mag_tracking.stages.health.window import median_field, quantiles, sample_noise_std
 from mag_tracking.units import NEVER, NS
 
@@ -27,9 +27,10 @@ MAX_LIVE_DELAY_S = 86400.0
 """[s] Maximum age of live timestamps. Older timestamps come from a replay or an unsynchronised
 clock; `apps.doctor` compares the clocks of the sensors."""
 GAP_RATIO = 1.5
-"""Ratio of an interval to the median interval above which readings have been lost."""
+"""Readings are counted as lost if the ratio of an interval to the median interval exceeds this."""
 MAX_JITTER = 0.3
-"""Maximum relative scatter of the intervals; above it, lost readings are not counted."""
+"""Maximum median absolute deviation of the intervals, relative to their median. Above it, lost
+readings are not counted."""
 STUCK_S = 1.0
 """[s] A sensor is stuck if its readings are identical for longer than this."""
 MIN_MOVED_STEPS = 10.0
@@ -71,11 +72,11 @@ class SensorHealth:
         self._update_interval = update_interval
         self._counts: Counter[str] = Counter()
         self._largest_step_s = 0.0
-        self._new: list[tuple[int, FloatArray, int]] = []
+        self._buffered: list[tuple[int, FloatArray, int]] = []
         self._stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._received: IntArray = np.zeros(0, dtype=np.int64)
         self._fields: FloatArray = np.zeros((0, 3))
-        self._interval_ns, self._spread = float('nan'), float('inf')
+        self._interval_ns, self._jitter = float('nan'), float('inf')
         self._noise: FloatArray = np.full(3, np.nan)
         # Results for the current window; cleared when readings are added.
         self._cache: dict[str, FloatArray] = {}
@@ -86,7 +87,7 @@ class SensorHealth:
         self._n_since_stuck = WINDOW
         # Length of the current run of identical readings; number of readings that repeated the
         # previous reading; number of readings that changed; whether each axis has ever changed.
-        self._run, self._repeats, self._changes = 0, 0, 0
+        self._run_length, self._n_repeated, self._n_changed = 0, 0, 0
         self._has_changed = np.zeros(3, dtype=bool)
         self._steps: FloatArray = np.full(3, np.inf)
 
@@ -101,8 +102,8 @@ class SensorHealth:
         received_ns : int, ns, optional
             Time of receipt by the clock of the host.
         """
-        self._new.append((stamp_ns, field, NEVER if received_ns is None else received_ns))
-        if len(self._new) == self._update_interval:
+        self._buffered.append((stamp_ns, field, NEVER if received_ns is None else received_ns))
+        if len(self._buffered) == self._update_interval:
             self.update()
 
     @property
@@ -118,9 +119,9 @@ class SensorHealth:
 
     def update(self) -> None:
         """Add the buffered readings to the window, and update the statistics."""
-        if self._new:
-            stamps, fields, received = zip(*self._new, strict=True)
-            self._new = []
+        if self._buffered:
+            stamps, fields, received = zip(*self._buffered, strict=True)
+            self._buffered = []
             self.add_batch(np.array(stamps, dtype=np.int64), np.array(fields, dtype=float),
                            np.array(received, dtype=np.int64))
 
@@ -152,28 +153,28 @@ class SensorHealth:
         """Count the faults in the timestamps of the `n` latest readings."""
         # The first interval starts at the preceding reading, if there is one.
         intervals = np.diff(self._stamps[-n - 1:])
-        known = self._received[-n - 1:] != NEVER
-        receipts = np.diff(np.where(known, self._received[-n - 1:], 0)) / NS
+        is_received = self._received[-n - 1:] != NEVER
+        receipts = np.diff(np.where(is_received, self._received[-n - 1:], 0)) / NS
         steps = receipts - intervals / NS
-        usual = 0.0 if np.isnan(self._interval_ns) else self._interval_ns / NS
+        median_s = 0.0 if np.isnan(self._interval_ns) else self._interval_ns / NS
         # In a clock step, the timestamp is irregular but the time of receipt is regular. A host
         # that stalls and then reads a burst causes no step.
-        stepped = known[1:] & known[:-1] & (np.abs(steps) > CLOCK_STEP_S) \
-            & (np.abs(receipts - usual) < CLOCK_STEP_S) \
-            & (np.abs(intervals / NS - usual) > CLOCK_STEP_S)
-        if stepped.any():
-            self._counts['clock steps'] += int(stepped.sum())
-            self._largest_step_s = max(self._largest_step_s, *steps[stepped].tolist(), key=abs)
+        is_step = is_received[1:] & is_received[:-1] & (np.abs(steps) > CLOCK_STEP_S) \
+            & (np.abs(receipts - median_s) < CLOCK_STEP_S) \
+            & (np.abs(intervals / NS - median_s) > CLOCK_STEP_S)
+        if is_step.any():
+            self._counts['clock steps'] += int(is_step.sum())
+            self._largest_step_s = max(self._largest_step_s, *steps[is_step].tolist(), key=abs)
         self._counts['duplicates'] += int((intervals == 0).sum())
         self._counts['backward timestamps'] += int((intervals < 0).sum())
-        if self._spread < MAX_JITTER:
-            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) & ~stepped
+        if self._jitter < MAX_JITTER:
+            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) & ~is_step
             self._counts['lost'] += int(np.sum(np.round(intervals[gaps] / self._interval_ns) - 1))
         forward = np.diff(self._stamps)
         forward = forward[forward > 0]
         if len(forward) >= 8:
             self._interval_ns = quantiles(forward, 0.5)[0]
-            self._spread = quantiles(np.abs(forward - self._interval_ns), 0.5)[0] \
+            self._jitter = quantiles(np.abs(forward - self._interval_ns), 0.5)[0] \
                 / self._interval_ns
 
     def _check_fields(self, n: int) -> None:
@@ -202,44 +203,45 @@ class SensorHealth:
         stamps, fields = self._stamps[-n:], self._fields[-n - 1:]
         equal = (fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])
         self._has_changed |= (~equal & ~np.isnan(fields[1:]) & ~np.isnan(fields[:-1])).any(axis=0)
-        same = equal.all(axis=1)
-        if len(same) < n:
-            same = np.append(False, same)
+        is_repeated = equal.all(axis=1)
+        if len(is_repeated) < n:
+            is_repeated = np.append(False, is_repeated)
         # Index of the first reading of each run of identical readings; -1 = in an earlier batch.
-        origin = np.maximum.accumulate(np.where(same, -1, np.arange(n)))
-        since = np.where(origin < 0, self._unchanged_since_ns or 0, stamps[origin])
-        stuck = np.flatnonzero(stamps - since > STUCK_S * NS)
-        self._unchanged_since_ns = int(since[-1])
-        self._count_runs(same, since, stamps)
+        run_start = np.maximum.accumulate(np.where(is_repeated, -1, np.arange(n)))
+        unchanged_since = np.where(run_start < 0, self._unchanged_since_ns or 0, stamps[run_start])
+        stuck = np.flatnonzero(stamps - unchanged_since > STUCK_S * NS)
+        self._unchanged_since_ns = int(unchanged_since[-1])
+        self._count_runs(is_repeated, unchanged_since, stamps)
         if not self.is_coarse:
             self._counts['stuck readings'] += len(stuck)
         self._n_since_stuck = n - 1 - int(stuck[-1]) if len(stuck) else self._n_since_stuck + n
 
-    def _count_runs(self, same: BoolArray, since: IntArray, stamps: IntArray) -> None:
+    def _count_runs(self, is_repeated: BoolArray, unchanged_since: IntArray,
+                    stamps: IntArray) -> None:
         """Count repeated and changed readings.
 
-        `same` (n,) marks the readings that equal the previous reading; `since` (n,) [ns] is the
-        start of the run of identical readings to which each reading belongs.
+        `is_repeated` (n,) marks the readings that equal the previous reading. `unchanged_since`
+        (n,) [ns] is the start of the run of identical readings to which each reading belongs.
         """
-        changed = np.flatnonzero(~same)
+        changed = np.flatnonzero(~is_repeated)
         if not len(changed):
-            self._run += len(same)
+            self._run_length += len(is_repeated)
             return
         lengths = np.diff(changed) - 1
-        lasting = stamps[changed[1:] - 1] - since[changed[1:] - 1] > STUCK_S * NS
+        is_stuck = stamps[changed[1:] - 1] - unchanged_since[changed[1:] - 1] > STUCK_S * NS
         # A faulty run counts as one repetition, because it is not representative.
-        self._repeats += int(np.where(lasting, 1, lengths).sum())
-        first = self._run + int(changed[0])
-        usual = STUCK_S * NS / self._interval_ns if self._interval_ns > 0 else np.inf
-        self._repeats += 1 if first > usual else first
-        self._changes += len(changed)
-        self._run = len(same) - 1 - int(changed[-1])
+        self._n_repeated += int(np.where(is_stuck, 1, lengths).sum())
+        first = self._run_length + int(changed[0])
+        max_length = STUCK_S * NS / self._interval_ns if self._interval_ns > 0 else np.inf
+        self._n_repeated += 1 if first > max_length else first
+        self._n_changed += len(changed)
+        self._run_length = len(is_repeated) - 1 - int(changed[-1])
 
     @property
     def is_coarse(self) -> bool:
         """Whether the sensor repeats readings at rest, or readings changed too rarely to decide."""
-        return self._changes < MIN_CHANGES \
-            or self._repeats >= COARSE * (self._repeats + self._changes)
+        return self._n_changed < MIN_CHANGES \
+            or self._n_repeated >= COARSE * (self._n_repeated + self._n_changed)
 
     @property
     def unchanged_since_ns(self) -> int | None:
@@ -255,7 +257,10 @@ class SensorHealth:
 
     @property
     def noise_std(self) -> FloatArray:
-        """Noise standard deviation (3,) [T], from second differences, which suppress targets."""
+        """Noise standard deviation, (3,) T; NaN for a missing axis or too few readings.
+
+        It is computed from second differences, which suppress targets.
+        """
         return self._cached('noise', sample_noise_std)
 
     @property
@@ -283,8 +288,8 @@ class SensorHealth:
         present = ~np.isnan(self._fields).any(axis=0)
         unchanged = present & (self._fields == self._fields[0]).all(axis=0)
         if self.is_coarse:
-            moved = np.ptp(self._fields, axis=0) > MIN_MOVED_STEPS * smallest_steps(self._fields)
-            unchanged &= ~self._has_changed & (moved & present).any()
+            moves = np.ptp(self._fields, axis=0) > MIN_MOVED_STEPS * smallest_steps(self._fields)
+            unchanged &= ~self._has_changed & (moves & present).any()
         return ''.join(np.array(list('xyz'))[unchanged]) if unchanged.sum() < present.sum() else ''
 
     @property
@@ -323,28 +328,28 @@ class SensorHealth:
         found = [*(self._clock_findings(name) if is_live else ()),
                  *self._time_findings(name, n), *self._value_findings(name, n, max_field)]
         if noise_std is not None and not np.nanmax(np.abs(self.field), initial=0.0) > max_field:
-            worse = self.noise_std / noise_std
-            if np.nanmax(worse, initial=0.0) > 3.0:
-                axis = int(np.nanargmax(worse))
-                found.append(Finding(False, name, f'{"xyz"[axis]} is {worse[axis]:.0f} times as '
-                                     'noisy as at its calibration', 'remove a new source of '
+            noise_ratio = self.noise_std / noise_std
+            if np.nanmax(noise_ratio, initial=0.0) > 3.0:
+                axis = int(np.nanargmax(noise_ratio))
+                found.append(Finding(False, name, f'{"xyz"[axis]} is {noise_ratio[axis]:.0f} times '
+                                     'as noisy as at its calibration', 'look for a new source of '
                                      'interference nearby (a motor, a cable), or calibrate again'))
         return sorted(found, key=lambda f: not f.serious)
 
     def _clock_findings(self, name: str) -> Iterator[Finding]:
         """Yield findings about clock steps and backward timestamps."""
         if n := self.counts['clock steps']:
-            yield Finding(True, name, f'its clock stepped {times(n)} relative to the '
+            yield Finding(True, name, f'its clock stepped {occurrences(n)} relative to the '
                           f'host, by up to {self._largest_step_s:+.2f} s', 'synchronise the '
                           'clocks (chrony, PTP), and take timestamps from a monotonic clock')
         if n := self.counts['backward timestamps']:
-            yield Finding(True, name, f'timestamps went back {times(n)}', 'check for two '
+            yield Finding(True, name, f'timestamps went back {occurrences(n)}', 'check for two '
                           'publishers on one topic, a clock that was set, or a looped replay')
 
     def _time_findings(self, name: str, n: int) -> Iterator[Finding]:
         """Yield findings about duplicate timestamps, lost readings and delays."""
         c = self.counts
-        middle, low, high = self.delay_s
+        median, low, high = self.delay_s
         if c['duplicates'] > 0.001 * n:
             yield Finding(False, name, f'{c["duplicates"]} of {n} readings repeat the previous '
                           'timestamp', 'check whether the driver publishes readings twice, or '
@@ -352,13 +357,13 @@ class SensorHealth:
         if c['lost'] > 0.01 * n:
             yield Finding(c['lost'] > 0.2 * n, name, f'{c["lost"]} readings were lost, {n} were '
                           'received', 'check the link, and the queue size of the recorder')
-        if c['clock steps'] or abs(middle) > MAX_LIVE_DELAY_S:
+        if c['clock steps'] or abs(median) > MAX_LIVE_DELAY_S:
             return
         if high - low > 0.05:
             yield Finding(False, name, f'readings take {1e3 * low:.0f} to {1e3 * high:.0f} ms to '
                           'arrive', 'use timestamps of the sensor instead of the time of receipt')
-        elif abs(middle) > 1.0:
-            yield Finding(False, name, f'the delay from timestamp to receipt is {middle:.1f} s',
+        elif abs(median) > 1.0:
+            yield Finding(False, name, f'the delay from timestamp to receipt is {median:.1f} s',
                           'synchronise the clocks of sensor and host (chrony, PTP)')
 
     def _value_findings(self, name: str, n: int, max_field: float) -> Iterator[Finding]:
@@ -385,8 +390,8 @@ class SensorHealth:
                           'the sensor or its driver is stuck: restart it')
         if c['saturated'] > 0.001 * n:
             yield Finding(True, name, f'{c["saturated"]} of {n} readings are at the end of the '
-                          'range of the sensor', 'set a larger range, or move the sensor further '
-                          'away')
+                          'range of the sensor', 'select a larger measuring range, or move the '
+                          'sensor further away from the targets')
         if c['spikes'] > 0.001 * n:
             yield Finding(False, name, f'{c["spikes"]} of {n} readings are spikes', 'check '
                           'connectors, power supply and checksums')

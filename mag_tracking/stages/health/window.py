@@ -64,7 +64,7 @@ def sample_noise_std(fields: FloatArray) -> FloatArray:
     Returns
     -------
     (3,) array, T
-        NaN for a missing axis.
+        NaN for an axis with fewer than eight second differences.
     """
     out, steps = np.full(3, np.nan), smallest_steps(fields)
     for axis, d in enumerate(np.abs(np.diff(fields, n=2, axis=0)).T):

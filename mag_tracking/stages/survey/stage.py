@@ -85,8 +85,8 @@ class NetworkSurvey:
         if self.reference:
             out += [f'{name}: clock: {reason}' for name, reason in reasons.items()]
         elif len(self.sensors) > 1:
-            because = ', '.join(sorted(set(reasons.values()))) or 'too few accelerometers'
-            out.append(f'clock offsets are unchanged: {because}')
+            causes = ', '.join(sorted(set(reasons.values()))) or 'too few accelerometers'
+            out.append(f'clock offsets are unchanged: {causes}')
         return out
 
 
@@ -173,16 +173,16 @@ class Survey:
                                if s is None else np.maximum(s, MIN_STATED_STD)
                                for s in network.orientation_std])
         warnings: dict[str, list[str]] = {name: [] for name in names}
-        ups = [self._estimate_up(name, warnings[name]) for name in names]
+        up_directions = [self._estimate_up(name, warnings[name]) for name in names]
         level = [levelled(up, R, std) for up, R, std in
-                 zip(ups, network.R_ws, stated_std, strict=True)]
-        for name, before, now, std in zip(names, network.R_ws, level, stated_std, strict=True):
-            if now is not None:
-                warnings[name] += _tilt_warning(before, now.R_ws, std, now.std)
-        disagreeing = self._disagreements(field, level, stated_std, warnings)
+                 zip(up_directions, network.R_ws, stated_std, strict=True)]
+        for name, before, surveyed, std in zip(names, network.R_ws, level, stated_std, strict=True):
+            if surveyed is not None:
+                warnings[name] += _tilt_warning(before, surveyed.R_ws, std, surveyed.std)
+        inconsistent = self._disagreements(field, level, stated_std, warnings)
         bias_std, oriented = self._compass(
-            {j: u for j, u in enumerate(ups) if u is not None and names[j] not in
-             {d.sensor for d in disagreeing}}, field, stated_std, warnings)
+            {j: u for j, u in enumerate(up_directions) if u is not None and names[j] not in
+             {d.sensor for d in inconsistent}}, field, stated_std, warnings)
         shocks = self._shocks()
         reference, lags = self._lags(shocks)
         sensors = []
@@ -192,7 +192,7 @@ class Survey:
                 name, orientation, 'nominal orientation' if orientation is None else by,
                 lags.get(name), tuple(warnings[name])))
         return NetworkSurvey(self._updated_network(sensors, reference, date), tuple(sensors),
-                             tuple(disagreeing), bias_std, reference, shocks)
+                             tuple(inconsistent), bias_std, reference, shocks)
 
     def _estimate_up(self, name: str, warnings: list[str]) -> UpDirection | None:
         """Estimate the vertical direction of a sensor; None, with a warning, if unavailable."""
@@ -209,7 +209,10 @@ class Survey:
     def _disagreements(self, field: FloatArray, level: Sequence[Orientation | None],
                        stated_std: FloatArray, warnings: Mapping[str, list[str]]
                        ) -> list[FieldInconsistency]:
-        """Find sensors that contradict the Earth's field; empty if this field is unknown."""
+        """Find the sensors whose field contradicts the Earth's field.
+
+        If the Earth's field is unknown, add a warning and return an empty list.
+        """
         network = self._network
         R = np.array([R if o is None else o.R_ws for o, R in zip(level, network.R_ws, strict=True)])
         std = np.array([s if o is None else o.std for o, s in zip(level, stated_std, strict=True)])
@@ -269,11 +272,14 @@ class Survey:
 
     def _lags(self, signals: Mapping[str, tuple[FloatArray, FloatArray]]
               ) -> tuple[str, dict[str, Lag]]:
-        """Find the reference sensor, and estimate {sensor: lag} of other sensors from knocks."""
-        longest = self._settings.max_clock_offset_s
+        """Find the reference sensor, and estimate {sensor: lag} of the other sensors from knocks.
+
+        The name of the reference is empty if no two sensors measured the same knock.
+        """
+        max_offset = self._settings.max_clock_offset_s
         first: dict[str, Lag] = {}
         for reference, (t, s) in signals.items():
-            lags = {name: knock_lag(t, s, *signals[name], longest)
+            lags = {name: knock_lag(t, s, *signals[name], max_offset)
                     for name in signals if name != reference}
             if any(not lag.reason for lag in lags.values()):
                 return reference, lags
@@ -287,12 +293,12 @@ class Survey:
         R_ws, clock = network.R_ws.copy(), network.clock_offset.copy()
         # The reference clock keeps its offset, so that the offsets of clocks that were not compared
         # remain valid.
-        zero = clock[network.index(reference)] if reference else 0.0
+        reference_offset = clock[network.index(reference)] if reference else 0.0
         std, calibrated = list(network.orientation_std), list(network.calibrated)
         for j, s in enumerate(sensors):
             lag = None if s.lag is None or s.lag.reason else s.lag
             if lag is not None:
-                clock[j] = zero + lag.offset
+                clock[j] = reference_offset + lag.offset
             if s.orientation is not None:
                 R_ws[j], std[j] = s.orientation.R_ws, s.orientation.std
             if s.orientation is not None or lag is not None or s.sensor == reference:

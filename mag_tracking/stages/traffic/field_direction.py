@@ -23,7 +23,7 @@ MIN_LATERAL = 1.5
 direction."""
 
 MAX_ALONG = 12.0
-"""[m] Maximum distance along the path between the crossing and the closest point of approach of a
+"""[m] Maximum distance along the path between the crossing and the closest point of approach to a
 sensor."""
 
 WINDOW_RATIO = 3.0
@@ -38,7 +38,7 @@ MAX_LOG_ODDS = float(np.log(MAX_CONFIDENCE / (1.0 - MAX_CONFIDENCE)))
 
 
 class FieldDirection:
-    """Estimates the probability that the direction of a crossing is wrong, from the latest frames.
+    """Estimates, from the latest frames, the probability that a crossing has a wrong direction.
 
     Parameters
     ----------
@@ -90,10 +90,10 @@ class FieldDirection:
         odds, same_side = [], []
         for j in np.flatnonzero(
                 (np.abs(left) >= MIN_LATERAL) & (np.abs(along) <= MAX_ALONG)).tolist():
-            half = np.clip(WINDOW_RATIO * abs(left[j]) / speed,
-                           MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S)
+            half_window_s = np.clip(WINDOW_RATIO * abs(left[j]) / speed,
+                                    MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S)
             value = self._log_odds(j, crossing.stamp_ns + round(along[j] / speed * NS),
-                                   round(half * NS))
+                                   round(half_window_s * NS))
             if value is not None:
                 odds.append(float(np.clip(value, -MAX_LOG_ODDS, MAX_LOG_ODDS)))
                 # From a sensor to the left of the path, the vehicle moves from right to left.

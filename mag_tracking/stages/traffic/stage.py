@@ -33,7 +33,7 @@ from mag_tracking.units import NS
 
 AMBIGUOUS, CONTRADICTED, EXTRAPOLATED = 'ambiguous', 'direction_contradicted', 'extrapolated'
 """Doubts about a passage: the track is ambiguous at the line; the rotation of the fields
-contradicts its direction; the track does not reach the line."""
+contradicts the direction of the crossing; the track does not reach the line."""
 
 MAX_DIRECTION_ERROR = 0.9
 """Error probability above which the fields contradict the direction of a crossing."""
@@ -181,8 +181,8 @@ class Traffic:
     def _complete_before(self, now_ns: int) -> int:
         """Time [ns] before which no further crossing can be found."""
         oldest = now_ns - round(MAX_WAIT_S * NS)
-        begins = [max(history.begin_ns, oldest) for history in self._open.values()]
-        return min([now_ns, *begins]) - round(SMOOTHED_LEAD_S * NS)
+        begin_times = [max(history.begin_ns, oldest) for history in self._open.values()]
+        return min([now_ns, *begin_times]) - round(SMOOTHED_LEAD_S * NS)
 
     def _add_records(self, records: Iterable[Track | SmoothedPose | Disturbance]) -> None:
         """Add track records and smoothed poses to the histories of their tracks."""
@@ -237,9 +237,9 @@ class Traffic:
 
     def _direction_error(self, crossing: Crossing, track: _TrackHistory) -> float:
         """Probability that a direction is wrong; NaN if unknown or if other vehicles interfere."""
-        near = round(INTERFERENCE_S * NS)
+        margin_ns = round(INTERFERENCE_S * NS)
         if any(other is not track
-               and other.overlaps(crossing.stamp_ns - near, crossing.stamp_ns + near)
+               and other.overlaps(crossing.stamp_ns - margin_ns, crossing.stamp_ns + margin_ns)
                for other in (*self._open.values(), *self._ended)):
             return float('nan')
         return self._direction.error_probability(crossing)
@@ -260,14 +260,14 @@ class Traffic:
             (AMBIGUOUS, pose.ambiguous),
             (CONTRADICTED, pending.direction_error > MAX_DIRECTION_ERROR),
             (EXTRAPOLATED, crossing.is_extrapolated)) if applies)
-        moving = pose.velocity[:2], pose.covariance[3:5, 3:5]
-        speed, speed_std = speed_of(*moving)
+        velocity_estimate = pose.velocity[:2], pose.covariance[3:5, 3:5]
+        speed, speed_std = speed_of(*velocity_estimate)
         posterior = _class_of(pose, self._settings)
         passage = VehiclePassage(
             crossing.stamp_ns, self.counts['passages'], line.name, pending.track_id,
             crossing.forward, pending.direction_error, crossing.position,
             line.lateral(crossing.position), pose.velocity, speed, speed_std,
-            heading_of(*moving)[1], pose.length, pose.length_std, pose.moment,
+            heading_of(*velocity_estimate)[1], pose.length, pose.length_std, pose.moment,
             pose.moment_covariance, posterior.name, posterior.probabilities,
             headway if headway >= 0.0 else float('nan'), bool(doubts), doubts)
         self._intervals.add(passage)

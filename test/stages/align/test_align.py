@@ -88,7 +88,7 @@ def test_sensors_of_different_rates_and_with_a_missing_axis_share_frames():
     assert np.isnan(frames[0].field[1, 1]) and np.isfinite(frames[0].field[1, [0, 2]]).all()
 
 
-def test_a_sensor_that_stops_becomes_a_nan_row_and_delays_no_frames():
+def test_a_sensor_that_stops_becomes_a_nan_row_and_delays_frames_only_once():
     samples = [s for s in stream(2, 4000) if s.sensor == 'mag_1' or s.stamp_ns < 1e9]
     align = stage(max_wait_s=0.5)
     delays, frames = [], []
@@ -147,7 +147,7 @@ def test_the_number_of_held_samples_is_bounded():
     assert rejected(align.counts) == {'too many pending samples': 950}
 
 
-def test_burst_mode_closes_a_round_at_its_last_sensor():
+def test_burst_mode_completes_a_round_with_the_sample_of_its_last_sensor():
     align = stage(4, burst=True, period_s=0.5)
     for k in range(5):
         for j in range(4):
@@ -166,8 +166,8 @@ def test_burst_mode_does_not_mix_rounds_after_a_lost_sample():
     assert len(frames) == 100
 
 
-def test_burst_mode_compares_silent_sensors_with_the_newest_used_sample():
-    """The sample at 10 ms forms a separate frame, after a frame with the sample at 150 ms."""
+def test_burst_mode_measures_silence_from_the_newest_sample_in_a_frame():
+    """The first frame contains the samples at 0 and 150 ms, the second only the sample at 10 ms."""
     align = stage(2, burst=True, period_s=1.0, max_wait_s=0.05)
     arrivals = [(0, 0), (10, 0), (150, 1), (155, 1)]
     assert [len(align.feed(one(sample(ms, j)))) for ms, j in arrivals] == [0, 0, 2, 1]
@@ -221,9 +221,9 @@ class PlainAlign:
             self.counts['rejected: no finite field'] += 1
             return []
         if t <= self.latest.get(j, -1):
-            back = self.latest[j] - t
-            if back <= self.max_jump:
-                self.counts['rejected: out of order' if back
+            jump = self.latest[j] - t
+            if jump <= self.max_jump:
+                self.counts['rejected: out of order' if jump
                             else 'rejected: duplicate timestamp'] += 1
                 return []
             out = self.flush()
@@ -243,29 +243,32 @@ class PlainAlign:
     def flush(self, final=True):
         out = []
         while self.held:
-            heads = {j: t for t, j, _ in reversed(self.held)}
-            start, length = min(heads.values()), self.period
+            oldest = {j: t for t, j, _ in reversed(self.held)}
+            start, length = min(oldest.values()), self.period
             if self.burst:
-                halves = [(t - self.taken[j]) // 2 for j, t in heads.items() if j in self.taken]
-                length = max(1, min([length, *halves]))
+                half_intervals = [(t - self.taken[j]) // 2 for j, t in oldest.items()
+                                  if j in self.taken]
+                length = max(1, min([length, *half_intervals]))
             elif self.end is not None and start < self.end + self.period:
                 start = self.end
-            if not (final or self.complete(start + length, heads)):
+            if not (final or self.complete(start + length, oldest)):
                 break
-            out.append(self.frame(start + length, heads))
+            out.append(self.frame(start + length, oldest))
         return out
 
-    def complete(self, end, heads):
-        newest, last, every = max(self.seen), max(self.taken.values(), default=0), range(self.n)
-        def alive(j, at):
+    def complete(self, end, oldest):
+        newest, last, all_sensors = (
+            max(self.seen), max(self.taken.values(), default=0), range(self.n))
+
+        def is_active(j, at):
             return (self.latest[j] >= at - self.max_wait if j in self.latest
                     else newest - min(self.seen) < self.max_wait)
-        return all(self.latest.get(j, -1) >= end for j in every if alive(j, newest)) or (
-            self.burst and all(heads[j] < end if j in heads else not alive(j, last)
-                               for j in every))
+        return all(self.latest.get(j, -1) >= end for j in all_sensors if is_active(j, newest)) or (
+            self.burst and all(oldest[j] < end if j in oldest else not is_active(j, last)
+                               for j in all_sensors))
 
-    def frame(self, end, heads):
-        taken = [h for h in self.held if h[0] < end and (not self.burst or h[0] == heads[h[1]])]
+    def frame(self, end, oldest):
+        taken = [h for h in self.held if h[0] < end and (not self.burst or h[0] == oldest[h[1]])]
         self.held = [h for h in self.held if h not in taken]
         self.taken.update({j: t for t, j, _ in taken})
         times = [t for t, *_ in taken]

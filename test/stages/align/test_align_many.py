@@ -42,7 +42,7 @@ def test_batches_give_the_same_frames_as_single_samples(seed):
         np.testing.assert_array_equal(a, b)
 
 
-def steady(n, n_readings, start=0, without=()):
+def steady_batches(n, n_readings, start=0, without=()):
     """Batches at 10 ms intervals, each with a sample of every sensor except those in `without`."""
     names = tuple(f'mag_{j + 1}' for j in range(n))
     present = np.array([j for j in range(n) if j not in without])
@@ -63,26 +63,26 @@ class CountedAlignment(core.Alignment):
 
 
 def reasons_of(stage, readings):
-    """Feed readings; return the number of returns from compiled code by reason code."""
+    """Feed readings; return the number of each reason code that compiled code returned."""
     CountedAlignment.reasons.clear()
     for r in readings:
         stage.feed(r)
     return Counter(CountedAlignment.reasons)
 
 
-def test_a_clock_step_leaves_the_compiled_path_only_temporarily(monkeypatch):
+def test_samples_are_aligned_by_compiled_code_again_after_a_clock_step(monkeypatch):
     """The clock of a sensor steps ahead, the sensor falls silent, and later it resumes."""
     monkeypatch.setattr(core, 'Alignment', CountedAlignment)
     stage = Align(line_network(4), replace(AlignSettings(), {'max_buffered': 40,
                                                              'max_wait_s': 2.0}))
     compiled_only = {core.DONE, core.COMPLETE}
-    assert set(reasons_of(stage, steady(4, 100))) == compiled_only
+    assert set(reasons_of(stage, steady_batches(4, 100))) == compiled_only
     ahead = [Readings(('mag_4',), np.array([0]), np.array([10**18 + 10**10 + k]), np.ones((1, 3)),
                       np.eye(3)[None]) for k in range(3)]
     assert reasons_of(stage, ahead)[core.CLOCK_STEP] == 3
-    for r in steady(4, 300, 100, without=(3,)):
+    for r in steady_batches(4, 300, 100, without=(3,)):
         stage.feed(r)
-    assert set(reasons_of(stage, steady(4, 100, 400, without=(3,)))) == compiled_only
-    for r in steady(4, 200, 500):
+    assert set(reasons_of(stage, steady_batches(4, 100, 400, without=(3,)))) == compiled_only
+    for r in steady_batches(4, 200, 500):
         stage.feed(r)
-    assert set(reasons_of(stage, steady(4, 100, 700))) == compiled_only
+    assert set(reasons_of(stage, steady_batches(4, 100, 700))) == compiled_only

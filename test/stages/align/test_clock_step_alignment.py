@@ -52,8 +52,8 @@ def test_every_sample_is_used_rejected_or_held(seed):
     assert n_fed == n_used + sum(rejected(stage.counts).values())
 
 
-def test_a_jump_back_with_held_samples_that_jump_back_themselves():
-    """Held samples are aligned before the restart, and may cause further restarts."""
+def test_held_samples_are_aligned_before_a_restart_and_may_cause_restarts():
+    """The held samples are at 60, 30 and 20 s; the samples after them begin at 0.1 s."""
     stage = align(3)
     frames = frames_of(stage, [*stream(3, 0, 5000), (1, 60_000), (1, 30_000), (1, 20_000)])
     assert stage.n_held_ahead == 3
@@ -107,7 +107,7 @@ def test_the_number_of_held_samples_with_equal_timestamps_is_bounded():
         assert rejected(stage.counts)['ahead of all other sensors: mag_2'] == 100 - expected
 
 
-def test_counts_name_each_sensor():
+def test_rejections_by_clock_steps_are_counted_for_each_sensor():
     stage = align(6)
     frames_of(stage, stepped(stream(6, 0, 4000), {0, 5}, 1000, 2000, by=5000))
     assert Counter(rejected(stage.counts)) == {

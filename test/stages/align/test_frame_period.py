@@ -19,7 +19,7 @@ AUTO = AlignSettings()
 
 @pytest.mark.parametrize('distance, period', [(9.0, 0.08), (2.1, 0.08), (1.6, 0.04), (1.0, 0.025),
                                               (0.5, 0.02), (0.2, 0.02), (0.05, 0.08)])
-def test_the_period_is_half_the_shortest_delay_of_a_close_network(distance, period):
+def test_the_period_is_half_the_shortest_delay_in_a_compact_network(distance, period):
     network = network_of([[0.0, 0.0, 0.0], [distance, 0.0, 0.0]])
     assert frame_period(AUTO, network) == pytest.approx(period)
     assert frame_period(dataclasses.replace(AUTO, burst=True), network) == 0.08
@@ -39,16 +39,17 @@ def test_a_single_sensor_has_no_delay():
 
 
 def test_a_configured_period_is_used_and_warned_about():
-    close = network_of([[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]])
-    long = dataclasses.replace(AUTO, period_s=0.08)
-    assert frame_period(long, close) == 0.08
-    warning = frame_period_warning(long, close)
+    compact = network_of([[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]])
+    long_period = dataclasses.replace(AUTO, period_s=0.08)
+    assert frame_period(long_period, compact) == 0.08
+    warning = frame_period_warning(long_period, compact)
     assert '80 ms' in warning and '25 ms' in warning and 'mag_1 to mag_2' in warning
-    assert frame_period_warning(dataclasses.replace(long, burst=True), close) is None
-    assert frame_period_warning(long, ROAD) is None
+    assert frame_period_warning(dataclasses.replace(long_period, burst=True), compact) is None
+    assert frame_period_warning(long_period, ROAD) is None
     # There is no warning about an automatic period.
-    nearer = network_of([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0]])
-    assert frame_period_warning(AUTO, close) is None and frame_period_warning(AUTO, nearer) is None
+    more_compact = network_of([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0]])
+    assert frame_period_warning(AUTO, compact) is None \
+        and frame_period_warning(AUTO, more_compact) is None
 
 
 def test_a_period_below_the_minimum_is_refused():

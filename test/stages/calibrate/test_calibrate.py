@@ -152,25 +152,26 @@ def test_a_jump_back_in_time_is_accepted_and_counted():
 
 
 def test_implausible_message_covariances_are_overruled_unless_trusted():
-    own = np.diag([1e-16, 2e-16, 3e-16])
+    stated = np.diag([1e-16, 2e-16, 3e-16])
     s = stage()
-    np.testing.assert_array_equal(fed(s, sample(1.0, covariance=own))[0].covariance, own)
+    np.testing.assert_array_equal(fed(s, sample(1.0, covariance=stated))[0].covariance, stated)
     # A missing covariance is replaced by the covariance from the network file.
     np.testing.assert_allclose(fed(s, sample(2.0))[0].covariance, 1.44e-16 * np.eye(3))
     # Rounding errors make all eigenvalues of half of the rank-one products positive.
-    bad = [-own, np.zeros((3, 3)), np.diag([1e-16, 2e-16, np.nan]),
-           own + np.triu(np.ones((3, 3)), 1), 100.0 * own, 0.01 * own,
-           *(1e-16 * np.outer(v, v) for v in np.random.default_rng(0).standard_normal((20, 3)))]
-    correlated = own.copy()
+    implausible = [
+        -stated, np.zeros((3, 3)), np.diag([1e-16, 2e-16, np.nan]),
+        stated + np.triu(np.ones((3, 3)), 1), 100.0 * stated, 0.01 * stated,
+        *(1e-16 * np.outer(v, v) for v in np.random.default_rng(0).standard_normal((20, 3)))]
+    correlated = stated.copy()
     correlated[0, 1] = correlated[1, 0] = 0.99 * np.sqrt(2.0) * 1e-16
-    for k, C in enumerate([*bad, correlated]):
+    for k, C in enumerate([*implausible, correlated]):
         (out,) = fed(s, sample(3.0 + k, covariance=C))
         np.testing.assert_allclose(out.covariance, 1.44e-16 * np.eye(3))
     assert s.counts[OVERRULED] == 27 and not rejected(s.counts)
     s = stage(trust_covariances=True)
-    for k, C in enumerate((100.0 * own, 0.01 * own, correlated)):
+    for k, C in enumerate((100.0 * stated, 0.01 * stated, correlated)):
         np.testing.assert_array_equal(fed(s, sample(1.0 + k, covariance=C))[0].covariance, C)
-    for C in (*bad[:4], *bad[6:]):
+    for C in (*implausible[:4], *implausible[6:]):
         assert fed(s, sample(9.0, covariance=C)) == []
     assert rejected(s.counts) == {'covariance is not positive definite': 24}
 
@@ -217,12 +218,12 @@ def test_hard_and_soft_iron_of_a_sensor_are_corrected():
 
 
 def test_the_covariance_is_transformed_by_the_correction():
-    own = np.diag([1e-16, 2e-16, 3e-16])
-    (out,) = fed(corrected(correction=SOFT_IRON), sample(1.0, sensor='mag_2', covariance=own))
-    np.testing.assert_allclose(out.covariance, SOFT_IRON @ own @ SOFT_IRON.T)
+    stated = np.diag([1e-16, 2e-16, 3e-16])
+    (out,) = fed(corrected(correction=SOFT_IRON), sample(1.0, sensor='mag_2', covariance=stated))
+    np.testing.assert_allclose(out.covariance, SOFT_IRON @ stated @ SOFT_IRON.T)
     rng = np.random.default_rng(0)
-    drawn = (rng.standard_normal((20000, 3)) * np.sqrt(np.diagonal(own))) @ SOFT_IRON.T
-    np.testing.assert_allclose(out.covariance, np.cov(drawn.T), atol=0.03 * 3e-16)
+    samples = (rng.standard_normal((20000, 3)) * np.sqrt(np.diagonal(stated))) @ SOFT_IRON.T
+    np.testing.assert_allclose(out.covariance, np.cov(samples.T), atol=0.03 * 3e-16)
 
 
 def test_a_reading_without_an_axis_that_the_correction_needs_is_rejected():
@@ -239,7 +240,7 @@ def test_a_reading_without_an_axis_that_the_correction_needs_is_rejected():
 @pytest.mark.parametrize('C', [np.diag([1.02, 0.97, 1.05]),
                                [[1.02, 0.03, 0.0], [-0.01, 0.97, 0.0], [0.0, 0.0, 1.0]]])
 def test_a_reading_without_an_axis_that_the_correction_ignores_passes(C):
-    """Only two of the axes are needed for these corrections."""
+    """In these corrections, x and y do not depend on z."""
     s, C = corrected(correction=np.array(C)), np.array(C)
     (out,) = fed(s, sample(1.0, [EARTH[0], EARTH[1], np.nan], 'mag_2'))
     np.testing.assert_allclose(out.field[:2], (C[:2, :2] - np.eye(2)) @ EARTH[:2], atol=1e-18)
@@ -252,10 +253,10 @@ def test_a_new_calibration_keeps_a_background_that_a_target_has_frozen():
     stage = Calibrate(network, CalibrateSettings())
     rng = np.random.default_rng(3)
 
-    def feed(first, last, extra=0.0):
+    def feed(first, last, target_field=0.0):
         out = []
         for k in range(first, last):
-            out += fed(stage, MagSample(k * 10**7, 'mag_1', EARTH + extra
+            out += fed(stage, MagSample(k * 10**7, 'mag_1', EARTH + target_field
                                         + SIGMA * rng.standard_normal(3)))
         return out
 
@@ -286,7 +287,7 @@ def test_a_new_hard_iron_offset_restarts_learning():
 
 
 def ends_of_blocks(phase, times):
-    """Feed readings at `times` [s]; return (indices of those that complete a block, background)."""
+    """Feed readings at `times` [s]; return (indices of readings that end a block, background)."""
     background = FedBackground(3.0, 20.0, 1.5, 0.25, 2.0, 60.0, phase=phase)
     state = background.sensors
     rng, ends, now = np.random.default_rng(0), [], 0

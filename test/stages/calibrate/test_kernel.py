@@ -1,4 +1,4 @@
-"""Compiled calibration: independence of batches, and agreement with a Python implementation."""
+"""Compiled calibration: results do not depend on batches, and match a Python implementation."""
 
 import dataclasses
 
@@ -25,7 +25,7 @@ def assert_equal(found, expected):
 
 
 def batches(samples, size, rng):
-    """Split samples into batches of about `size` readings each."""
+    """Split samples into batches of `size` readings on average."""
     ends = np.cumsum(rng.integers(1, 2 * size, len(samples)))
     return [batch(list(some)) for some in np.split(
         np.array(samples, dtype=object), ends[ends < len(samples)])]
@@ -34,7 +34,7 @@ def batches(samples, size, rng):
 def calibrated(stage, items, idles=False):
     """Calibrate batches and flush the stage; return [MagSample].
 
-    With `idles`, `idle` is called between batches, as by the nodes.
+    If `idles` is true, `idle` is called after two of three batches. Nodes call it between batches.
     """
     out = []
     for k, readings in enumerate(items):
@@ -200,7 +200,7 @@ def test_repeated_readings_of_a_coarse_sensor_match_plain_python():
 
 @pytest.mark.parametrize('is_recalibrated', [False, True])
 def test_decimated_samples_do_not_depend_on_batches(is_recalibrated):
-    """A decimator measures the rate over 32 samples and returns them together."""
+    """A decimator measures the rate over 32 samples, and then returns these samples together."""
     network = dataclasses.replace(line_network(2), background=(np.zeros(3),) * 2,
                                   noise_std=(np.full(3, 1e-8),) * 2)
     rng = np.random.default_rng(0)
@@ -222,8 +222,8 @@ def test_corrupt_timestamps_do_not_confirm_each_other():
     """Each corrupt timestamp is followed by a valid one; two in a row would be a clock step."""
     stage = Calibrate(dataclasses.replace(line_network(1), background=(np.zeros(3),)),
                       CalibrateSettings())
-    at_s = [1, 2, 1000, 3, 1001, 4, 1000.5, 5]
-    for k, t in enumerate(at_s):
+    times_s = [1, 2, 1000, 3, 1001, 4, 1000.5, 5]
+    for k, t in enumerate(times_s):
         stage.feed(one(MagSample(int(t * 1e9), 'mag_1', np.full(3, 1e-8 * (k + 1)))))
     assert stage.counts['rejected: timestamp too far ahead'] == 3
     assert stage.counts['calibrated'] == 5
@@ -258,8 +258,8 @@ def test_flush_clears_the_history_of_spike_screening():
 def test_a_covariance_needs_no_axis_that_the_correction_ignores():
     C = np.array([[1.02, 0.03, 0.0], [-0.01, 0.97, 0.0], [0.0, 0.0, 1.0]])
     network = dataclasses.replace(line_network(1), background=(np.zeros(3),), correction=(C,))
-    own = np.diag([1e-16, 2e-16, np.nan])
+    stated = np.diag([1e-16, 2e-16, np.nan])
     (out,) = samples_of(*Calibrate(network, CalibrateSettings()).feed(one(
-        MagSample(10**18, 'mag_1', np.array([1e-8, 2e-8, np.nan]), own))))
-    np.testing.assert_allclose(out.covariance[:2, :2], C[:2, :2] @ own[:2, :2] @ C[:2, :2].T)
+        MagSample(10**18, 'mag_1', np.array([1e-8, 2e-8, np.nan]), stated))))
+    np.testing.assert_allclose(out.covariance[:2, :2], C[:2, :2] @ stated[:2, :2] @ C[:2, :2].T)
     assert np.isnan(out.field[2]) and not np.isnan(out.field[:2]).any()

@@ -37,7 +37,7 @@ def feed(stage, y, first=0, rate=100.0):
             for c in fed(stage, MagSample(round((first + k) * NS / rate), 'mag_1', field))]
 
 
-def total(stage):
+def n_counted(stage):
     c = stage.counts_of('mag_1')
     return c['accepted'] + c['rejected']
 
@@ -53,7 +53,7 @@ def test_spikes_and_repeated_readings_are_rejected_and_counted():
     assert 24 <= n_stuck <= 27 and len(out) == 400 - 3 - n_stuck
     assert np.abs([c.field for c in out]).max() < 6 * SIGMA
     assert (np.diff([c.stamp_ns for c in out]) > 0).all()
-    assert total(stage) == 400
+    assert n_counted(stage) == 400
 
 
 def test_zero_disables_spike_rejection():
@@ -82,7 +82,7 @@ def test_readings_held_at_a_jump_back_in_time_are_counted():
     feed_a_spike_that_is_held(stage)
     assert len(feed(stage, noise(50), first=-1000)) == 50
     assert rejected(stage.counts) == {'possible spike when time jumped back': 2}
-    assert total(stage) == 102
+    assert n_counted(stage) == 102
 
 
 @pytest.mark.parametrize('attribute', ['offset', 'correction', 'clock_offset'])
@@ -95,7 +95,7 @@ def test_readings_held_at_a_new_calibration_are_counted(attribute):
     stage.update_network(dataclasses.replace(network, **{attribute: new}))
     assert rejected(stage.counts) == {'possible spike when the calibration changed': 2}
     out = feed(stage, noise(50), first=100)
-    assert len(out) == 50 and total(stage) == 102
+    assert len(out) == 50 and n_counted(stage) == 102
 
 
 def test_an_identical_calibration_keeps_held_readings():
@@ -103,7 +103,7 @@ def test_an_identical_calibration_keeps_held_readings():
     feed_a_spike_that_is_held(stage)
     stage.update_network(dataclasses.replace(network))
     assert len(feed(stage, noise(1), first=52)) == 1
-    assert rejected(stage.counts) == {'spike': 2} and total(stage) == 53
+    assert rejected(stage.counts) == {'spike': 2} and n_counted(stage) == 53
 
 
 def test_readings_held_when_relearning_starts_are_still_screened():

@@ -35,12 +35,12 @@ def frame(k, field, network, period_ns=80_000_000):
 
 
 def detector(network, **changes):
-    exact = {'background_std': 0.0, 'background_drift': 0.0}
-    return Detect(network, replace(DetectSettings(), {**exact, **changes}))
+    without_background_error = {'background_std': 0.0, 'background_drift': 0.0}
+    return Detect(network, replace(DetectSettings(), {**without_background_error, **changes}))
 
 
 def test_thresholds_match_the_published_thresholds():
-    """T10 eq. (5.18), (5.19): threshold 11.2 (exactly 11.34); detection rate 0.5 at SNR 9.2."""
+    """T10 eq. (5.18), (5.19): threshold 11.2 (exact value 11.34), detection rate 0.5 at SNR 9.2."""
     h = energy_threshold(0.01, 3)
     assert h == pytest.approx(chi2.isf(0.01, 3), rel=1e-12)
     assert false_alarm_probability(h, 3) == pytest.approx(0.01, rel=1e-12)
@@ -60,14 +60,15 @@ def test_the_false_alarm_rate_is_as_configured(p):
     assert low <= alarms <= high
 
 
-@pytest.mark.parametrize('per_frame, documented, tested', [
+@pytest.mark.parametrize('samples_per_frame, documented, tested', [
     (1, '3.5e-4 per frame of one sample (12.5 Hz)', 1e-3),
     (8, '1.5e-7 per frame of eight samples (100 Hz)', 0.05)])
-def test_the_default_false_alarm_probability_is_as_documented(per_frame, documented, tested):
-    """A frame averages `per_frame` samples of 12 nT noise; `background_std` is the default."""
-    settings, variance = DetectSettings(), SIGMA**2 / per_frame
-    wider = 1.0 + settings.background_std**2 / variance
-    p = chi2.sf(chi2.isf(settings.false_alarm_probability, 6) * wider, 6)
+def test_the_default_false_alarm_probability_is_as_documented(
+        samples_per_frame, documented, tested):
+    """The samples have 12 nT of noise, and `background_std` has its default."""
+    settings, variance = DetectSettings(), SIGMA**2 / samples_per_frame
+    variance_ratio = 1.0 + settings.background_std**2 / variance
+    p = chi2.sf(chi2.isf(settings.false_alarm_probability, 6) * variance_ratio, 6)
     assert float(documented.split()[0]) == pytest.approx(p, rel=0.05)
     text, = (f.metadata['doc'] for f in fields(DetectSettings)
              if f.name == 'background_std')
@@ -76,20 +77,20 @@ def test_the_default_false_alarm_probability_is_as_documented(per_frame, documen
     network, rng, n = line_network(2), np.random.default_rng(12), 60_000
     stage = Detect(network, replace(settings, {'false_alarm_probability': tested,
                                                'release_probability': 0.05}))
-    p = chi2.sf(chi2.isf(tested, 6) * wider, 6)
+    p = chi2.sf(chi2.isf(tested, 6) * variance_ratio, 6)
     C = np.repeat(variance * np.eye(3)[None], 2, axis=0)
     std = np.sqrt(variance)
     for k in range(n):
         y = std * rng.standard_normal((2, 3))
-        stage.feed(FieldFrame(k * 80_000_000, y, C, np.full(2, per_frame), np.zeros(2)))
+        stage.feed(FieldFrame(k * 80_000_000, y, C, np.full(2, samples_per_frame), np.zeros(2)))
     alarms = stage.counts['frames above the threshold']
     low, high = binom.ppf([0.005, 0.995], n, p)
-    print(f'{per_frame} samples per frame: computed {p:.2e}, measured {alarms / n:.2e}')
+    print(f'{samples_per_frame} samples per frame: computed {p:.2e}, measured {alarms / n:.2e}')
     assert low <= alarms <= high
 
 
 @pytest.mark.parametrize('n', studied([40_000, 160_000], [40_000]))
-def test_false_alarm_rate_through_calibration_and_alignment(n):
+def test_the_false_alarm_rate_is_as_configured_after_calibration_and_alignment(n):
     """Raw noise at 100 Hz is calibrated with learnt backgrounds and aligned to 12.5 Hz frames."""
     network, rng = line_network(2), np.random.default_rng(8)
     calibrate = Calibrate(network, replace(CalibrateSettings(), {'memory_s': 300.0,
@@ -149,8 +150,8 @@ def test_the_smallest_pivot_identifies_invalid_covariances():
     C = 0.5 * (C + np.swapaxes(C, 1, 2)) + np.eye(3)
     y = np.where(rng.random((n, 3)) < 0.2, np.nan, 1.0)
     present = ~np.isnan(y)
-    of_present = np.where(present[:, :, None] & present[:, None, :], C, np.eye(3))
-    is_valid = np.linalg.eigvalsh(of_present)[:, 0] > 0.0
+    present_part = np.where(present[:, :, None] & present[:, None, :], C, np.eye(3))
+    is_valid = np.linalg.eigvalsh(present_part)[:, 0] > 0.0
     assert 0.1 < is_valid.mean() < 0.9
     C = C * std * np.swapaxes(std, 1, 2)
     np.testing.assert_array_equal(smallest_pivots(y, C) > 0.0, is_valid)
@@ -169,18 +170,19 @@ def test_the_smallest_pivot_identifies_invalid_covariances():
 def test_a_frame_with_an_invalid_covariance_is_rejected_and_counted(invalid):
     network = line_network(2)
     stage = detector(network, onset_frames=1)
-    loud = frame(0, np.full((2, 3), 10 * SIGMA), network)
-    loud.covariance[1] = invalid
-    assert stage.feed(loud) == []
+    strong = frame(0, np.full((2, 3), 10 * SIGMA), network)
+    strong.covariance[1] = invalid
+    assert stage.feed(strong) == []
     assert stage.counts['rejected: frame with a covariance that is not positive definite'] == 1
-    assert [type(r) for r in stage.feed(frame(1, loud.field, network))] == [Detection, FieldFrame]
+    assert [type(r) for r in stage.feed(frame(1, strong.field, network))] == [Detection, FieldFrame]
 
 
 def test_onset_needs_consecutive_frames_and_the_hold_bridges_gaps():
     network = line_network(2)
     stage = detector(network, onset_frames=3, hold_s=0.4)
-    loud, quiet = np.full((2, 3), 10 * SIGMA), np.zeros((2, 3))
-    pattern = [quiet] * 3 + [loud] * 2 + [quiet] + [loud] * 4 + [quiet] * 3 + [loud] + [quiet] * 8
+    strong, quiet = np.full((2, 3), 10 * SIGMA), np.zeros((2, 3))
+    pattern = ([quiet] * 3 + [strong] * 2 + [quiet] + [strong] * 4 + [quiet] * 3 + [strong]
+               + [quiet] * 8)
     events, present = [], []
     for k, field in enumerate(pattern):
         for r in stage.feed(frame(k, field, network)):

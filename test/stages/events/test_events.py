@@ -30,7 +30,7 @@ ONE_AXIS = 'mag_1'
 
 
 def passing(rng, noise=0.0, height=0.0, left_to_right=True, n=200):
-    """Simulate a dipole on a straight path: (t (n,), field (n, 3), time of the CPA, time scale).
+    """Simulate a dipole on a straight path; return (t, field (n, 3), time of the CPA, time scale).
 
     The target passes north of the sensor, and x points east. The unit of length is the lateral
     distance.
@@ -152,7 +152,7 @@ def test_a_single_sensor_gives_the_time_and_direction_of_a_pass(name, sensor):
 @pytest.mark.parametrize('name', studied(VEHICLES, kept=('straight_truck_right',)))
 @pytest.mark.parametrize('axis', ['x', 'z'])
 def test_a_single_axis_gives_an_event_without_a_direction(name, axis):
-    """The sensor closer to the vehicle is used; the signal of the other may be too weak."""
+    """The sensor with the larger signal is used, because the other signal may be too weak."""
     peak = {s: np.abs(f - np.median(f, axis=0)).max() for s in NETWORK.names for f in [
         recorded(name).readings.field[np.array(recorded(name).readings.sensor_names()) == s]]}
     sensor = max(peak, key=peak.get)
@@ -169,7 +169,7 @@ def test_a_single_axis_gives_an_event_without_a_direction(name, axis):
     assert len(result.poses) == 0 and len(result.detections)
 
 
-def test_a_single_sensor_tracks_only_with_a_prior_and_ambiguously():
+def test_a_single_sensor_tracks_only_with_a_prior_and_its_poses_are_ambiguous():
     single = NETWORK.part(np.array([0]))
     readings = spoiler.only_sensor('mag_1')(recorded('straight_car_right').readings)
     result = mt.track(readings, single)
@@ -181,7 +181,7 @@ def test_a_single_sensor_tracks_only_with_a_prior_and_ambiguously():
     assert result.smoothed['ambiguous'].all()
 
 
-def test_two_sensors_with_one_dead_track_only_with_a_prior():
+def test_a_network_with_a_single_active_sensor_tracks_only_with_a_prior():
     readings = spoiler.only_sensor('mag_2')(recorded('straight_car_right').readings)
     result = mt.track(readings, NETWORK)
     assert len(result.detections) and not len(result.poses)
@@ -194,8 +194,8 @@ def test_a_track_that_begins_when_a_sensor_returns_is_ambiguous():
     readings = recorded('straight_car_right').readings
     seconds = (readings.stamp_ns - readings.stamp_ns.min()) / NS
     silent = (np.array(readings.sensor_names()) == 'mag_2') & (seconds > 4.0) & (seconds < 8.5)
-    whole = mt.track(readings, NETWORK, settings=LINEARISED_ONCE).poses['stamp_ns'][0]
-    assert whole < readings.stamp_ns[silent].max(), 'no track begins during the dropout'
+    begin_ns = mt.track(readings, NETWORK, settings=LINEARISED_ONCE).poses['stamp_ns'][0]
+    assert begin_ns < readings.stamp_ns[silent].max(), 'no track begins during the dropout'
     result = mt.track(readings.part(~silent), NETWORK, settings=LINEARISED_ONCE)
     assert result.counts['track'][ALONE] > 0
     assert len(result.poses) and result.poses['ambiguous'].all()
@@ -204,10 +204,10 @@ def test_a_track_that_begins_when_a_sensor_returns_is_ambiguous():
 
 def test_events_do_not_depend_on_batches():
     readings = recorded('straight_car_right').readings
-    whole = events_of(readings)
+    expected = events_of(readings)
     for size in (1, 37, 1000):
-        parts = events_of(readings, batch=size)
-        for a, b in zip(*(sorted(events, key=lambda e: e.sensor) for events in (whole, parts)),
+        found = events_of(readings, batch=size)
+        for a, b in zip(*(sorted(events, key=lambda e: e.sensor) for events in (expected, found)),
                         strict=True):
             for field in dataclasses.fields(PassEvent):
                 np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name))
@@ -216,18 +216,19 @@ def test_events_do_not_depend_on_batches():
 @pytest.mark.parametrize('size', [1, 256, 10**6])
 def test_a_looped_recording_gives_each_event_again(size):
     readings = recorded('straight_car_right').readings
-    whole = {e.sensor: e for e in events_of(readings)}
+    expected = {e.sensor: e for e in events_of(readings)}
     # The second part ends while the car is present.
     t = (readings.stamp_ns - readings.stamp_ns[0]) / 1e9
     joined = Readings.joined([readings, readings.part(t < 8.6), readings])
     events = events_of(joined, batch=size)
-    for name, event in whole.items():
-        of_sensor = [e for e in events if e.sensor == name]
-        assert [e.ended for e in of_sensor] == [True, False, True]
-        assert of_sensor[0].left_to_right == event.left_to_right
-        assert of_sensor[0].energy == pytest.approx(event.energy)
-        assert of_sensor[2].left_to_right == event.left_to_right
-        assert of_sensor[1].release_ns > of_sensor[1].onset_ns and of_sensor[1].energy > 0.0
+    for name, event in expected.items():
+        sensor_events = [e for e in events if e.sensor == name]
+        assert [e.ended for e in sensor_events] == [True, False, True]
+        assert sensor_events[0].left_to_right == event.left_to_right
+        assert sensor_events[0].energy == pytest.approx(event.energy)
+        assert sensor_events[2].left_to_right == event.left_to_right
+        assert sensor_events[1].release_ns > sensor_events[1].onset_ns \
+            and sensor_events[1].energy > 0.0
 
 
 @pytest.mark.parametrize('name', studied(VEHICLES, kept=('straight_car_right',)))

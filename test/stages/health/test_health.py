@@ -116,7 +116,7 @@ def faulty(fault):
     ('gauss', True, 'a field component of 0.49 T exceeds the limit of 0.001 T'),
     ('noisy', False, 'y is 10 times as noisy as at its calibration'),
 ])
-def test_each_fault_is_named(fault, serious, message):
+def test_each_fault_is_reported(fault, serious, message):
     health = examined(*faulty(fault))
     findings = health.findings('mag_1', noise_std=np.full(3, SIGMA))
     match = [f for f in findings if message in str(f)]
@@ -261,7 +261,7 @@ def test_without_an_earth_field_sensors_are_compared_with_each_other():
         assert len(findings) == 1 and findings[0].startswith(message), findings
 
 
-def test_clocks_far_apart_are_named_and_the_age_of_a_replay_is_not():
+def test_clocks_far_apart_are_reported_and_the_age_of_a_replay_is_not():
     for offset_ns, n in ((120 * NS, 1), (0, 0)):
         network = line_network(2)
         doctor = Doctor(network, settings_for('vehicle'))
@@ -346,7 +346,7 @@ def test_quantiles_of_an_empty_array_are_nan():
 
 
 def test_batches_give_the_same_health_as_single_readings():
-    """The arrays of a batch may be overwritten afterwards."""
+    """The arrays of each batch are overwritten after the call."""
     rng = np.random.default_rng(3)
     stamps = np.arange(700) * NS // 100
     fields = 1e-6 + 1e-8 * rng.standard_normal((700, 3))

@@ -55,8 +55,8 @@ def surveyed(network=None, rotations=ROTATIONS, change=None, fields=None, settin
     if change is not None:
         change(readings)
     survey = Survey(network, settings or SurveySettings())
-    for name, of_sensor in readings.items():
-        for stamp, a in of_sensor:
+    for name, accelerations in readings.items():
+        for stamp, a in accelerations:
             assert survey.feed(AccelerationSample(stamp, name, a)) == []
     if fields is None:
         fields = {name: R.inv().apply(EARTH) for name, R in
@@ -75,12 +75,12 @@ def test_orientations_and_clock_offsets_are_found():
     assert warnings(result) == {} and result.disagreements == ()
     assert result.reference == 'mag_1' and result.sensors[0].lag is None
     for j, R in enumerate(ROTATIONS):
-        off = Rotation.from_matrix(result.network.R_ws[j] @ R.as_matrix().T).as_rotvec()
+        error = Rotation.from_matrix(result.network.R_ws[j] @ R.as_matrix().T).as_rotvec()
         # The tilt is the mean of 400 readings; the heading is biased towards the network file.
-        assert np.abs(off[:2]).max() < 1e-3
+        assert np.abs(error[:2]).max() < 1e-3
         std = result.network.orientation_std[j]
         # Three sensors that agree reduce the compass uncertainty below its prior.
-        assert abs(off[2]) < std[2] < np.deg2rad(2.5)
+        assert abs(error[2]) < std[2] < np.deg2rad(2.5)
         np.testing.assert_allclose(std[:2], 0.05 / 9.81, rtol=0.01)
         assert result.network.clock_offset[j] == pytest.approx(CLOCK_OFFSETS[j], abs=1e-3)
         record = result.network.calibrated[j]
@@ -155,7 +155,7 @@ def changed(name, function):
     return change
 
 
-def test_accelerations_in_g_are_named():
+def test_accelerations_in_g_are_reported():
     result, _ = surveyed(change=changed('mag_3', lambda a: a / 9.81))
     assert list(warnings(result)) == ['mag_3']
     assert 'is its unit g?' in result.sensors[2].warnings[0]
@@ -173,7 +173,7 @@ def test_clock_offsets_are_unchanged_without_a_knock():
     assert np.isnan(result.network.calibrated[1].clock_offset_std)
 
 
-def test_a_sensor_that_measured_no_knock_is_named():
+def test_a_sensor_that_measured_no_knock_is_reported():
     def quiet(readings):
         readings['mag_1'] = readings_of(ROTATIONS[0], 0.0, ())
     result, _ = surveyed(change=quiet)
@@ -186,7 +186,7 @@ def test_a_sensor_that_measured_no_knock_is_named():
     assert result.network.calibrated[1].clock_offset_std == 0.0
 
 
-def test_known_clock_offsets_keep_their_common_zero():
+def test_known_clock_offsets_keep_their_common_reference():
     """mag_1 has no accelerations, so its offset relative to the other sensors must not change."""
     network = nominal(clock_offset=CLOCK_OFFSETS)
     result, _ = surveyed(network, change=lambda readings: readings.pop('mag_1'))
@@ -194,7 +194,7 @@ def test_known_clock_offsets_keep_their_common_zero():
     np.testing.assert_allclose(offset - offset[0], CLOCK_OFFSETS, atol=1e-3)
 
 
-def test_a_tilted_sensor_is_named_and_levelled():
+def test_a_tilted_sensor_is_reported_and_levelled():
     rotations = (ROTATIONS[0], Rotation.from_euler('x', 30.0, True), ROTATIONS[2])
     result, _ = surveyed(rotations=rotations)
     assert warnings(result) == {
@@ -205,7 +205,7 @@ def test_a_tilted_sensor_is_named_and_levelled():
     assert result.sensors[1].by == 'accelerometer, compass and nominal heading'
 
 
-def test_a_compass_heading_far_from_the_stated_heading_is_named():
+def test_a_compass_heading_far_from_the_stated_heading_is_reported():
     rotations = (ROTATIONS[0], Rotation.from_euler('z', 25.0, True), ROTATIONS[2])
     result, _ = surveyed(rotations=rotations)
     assert warnings(result) == {'mag_2': (
@@ -233,19 +233,19 @@ def test_a_sensor_with_a_flipped_axis_keeps_its_stated_heading():
 
 
 def test_a_vertical_field_gives_one_warning_per_sensor():
-    up = {name: R.inv().apply([0.0, 0.0, -5e-5]) for name, R in
+    fields = {name: R.inv().apply([0.0, 0.0, -5e-5]) for name, R in
           zip(('mag_1', 'mag_2', 'mag_3'), ROTATIONS, strict=True)}
-    result, _ = surveyed(nominal(earth=np.array([0.0, 0.0, -5e-5])), fields=up)
+    result, _ = surveyed(nominal(earth=np.array([0.0, 0.0, -5e-5])), fields=fields)
     for s in result.sensors:
         assert s.by == 'accelerometer, nominal heading'
         assert len(s.warnings) == 1 and 'heading is not observable' in s.warnings[0]
 
 
 @pytest.mark.parametrize('stated_yaw', [0.0, 165.0, 180.0, 190.0])
-@pytest.mark.parametrize('off', [-3.0, 2.0])
-def test_the_stated_heading_decides_between_two_headings_that_fit(stated_yaw, off):
-    """For a sensor with a single horizontal axis across the field, two headings fit."""
-    yaw = stated_yaw + off
+@pytest.mark.parametrize('offset_deg', [-3.0, 2.0])
+def test_the_stated_heading_decides_between_two_headings_that_fit(stated_yaw, offset_deg):
+    """mag_2 has one horizontal axis, nearly perpendicular to the field, so two headings fit."""
+    yaw = stated_yaw + offset_deg
     network = nominal()
     network.R_ws[1] = rotation_about_z(np.deg2rad(stated_yaw))
     rotations = (ROTATIONS[0], Rotation.from_euler('z', yaw, True), ROTATIONS[2])
@@ -286,11 +286,11 @@ def test_a_jump_back_in_time_discards_earlier_accelerations():
 
 
 def test_calibration_records_are_replaced_for_surveyed_sensors_only():
-    before = CalibrationRecord('2025-01-01', 'by hand', np.nan)
-    result, _ = surveyed(nominal(calibrated=(before,) * 3),
+    earlier = CalibrationRecord('2025-01-01', 'by hand', np.nan)
+    result, _ = surveyed(nominal(calibrated=(earlier,) * 3),
                          change=lambda readings: readings.pop('mag_3'))
     assert [c.date for c in result.network.calibrated] == [DATE, DATE, '2025-01-01']
-    assert result.network.calibrated[2] is before
+    assert result.network.calibrated[2] is earlier
 
 
 def imu_network(**changes):
@@ -313,8 +313,8 @@ def test_fields_and_accelerations_are_read_together():
     fields = samples_of(*(r for r in records if isinstance(r, Readings)))
     alone = recorded(reader)
     assert [(r.stamp_ns, r.sensor) for r in fields] == [(r.stamp_ns, r.sensor) for r in alone]
-    _, without = read(replace(imu_network(), imu_topics=(None, None)))
-    assert sum(map(len, without)) == len(fields)
+    _, without_imu = read(replace(imu_network(), imu_topics=(None, None)))
+    assert sum(map(len, without_imu)) == len(fields)
 
 
 def test_an_accelerometer_that_two_sensors_share_serves_both():
@@ -332,8 +332,8 @@ def test_sensors_on_their_side_are_surveyed():
     result, _ = surveyed(network, rotations)
     assert warnings(result) == {}
     for R, truth in zip(result.network.R_ws, rotations, strict=True):
-        off = Rotation.from_matrix(R @ truth.as_matrix().T).as_rotvec()
-        assert np.abs(off[:2]).max() < 1e-3 and abs(off[2]) < np.deg2rad(1.5)
+        error = Rotation.from_matrix(R @ truth.as_matrix().T).as_rotvec()
+        assert np.abs(error[:2]).max() < 1e-3 and abs(error[2]) < np.deg2rad(1.5)
 
 
 def test_the_result_rotates_with_the_world_frame():
@@ -361,19 +361,19 @@ def test_clocks_decades_apart_do_not_fill_the_memory():
 def test_the_result_of_an_earlier_survey_is_not_counted_as_evidence():
     """A survey with the same readings, starting from the first result, reproduces that result."""
     first, _ = surveyed(nominal(orientation_std=(np.deg2rad([4.0, 4.0, 6.0]),) * 3))
-    again, _ = surveyed(first.network)
+    second, _ = surveyed(first.network)
     for name in ('R_ws', 'clock_offset'):
-        np.testing.assert_allclose(getattr(again.network, name), getattr(first.network, name),
+        np.testing.assert_allclose(getattr(second.network, name), getattr(first.network, name),
                                    atol=1e-12)
-    np.testing.assert_allclose(again.network.orientation_std, first.network.orientation_std)
-    np.testing.assert_allclose(again.network.calibrated[0].stated_std, np.deg2rad([4, 4, 6]))
+    np.testing.assert_allclose(second.network.orientation_std, first.network.orientation_std)
+    np.testing.assert_allclose(second.network.calibrated[0].stated_std, np.deg2rad([4, 4, 6]))
 
 
 def test_large_biases_increase_the_heading_uncertainty():
     fields = {f'mag_{j + 1}': R.inv().apply(EARTH) + 2e-6 * R.inv().apply([0.0, 0.0, 1.0])
               for j, R in enumerate(ROTATIONS)}
     biased, _ = surveyed(fields=fields)
-    usual, _ = surveyed()
-    assert biased.bias_std > 1.3 * usual.bias_std
-    for a, b in zip(biased.network.orientation_std, usual.network.orientation_std, strict=True):
+    unbiased, _ = surveyed()
+    assert biased.bias_std > 1.3 * unbiased.bias_std
+    for a, b in zip(biased.network.orientation_std, unbiased.network.orientation_std, strict=True):
         assert a[2] > 1.1 * b[2]

@@ -25,7 +25,10 @@ STEP = 0.1
 
 
 def drive(begin_s, end_s, at_s, v=10.0, y=-1.5, **changes):
-    """Simulate a vehicle that crosses the line at `at_s`: {step: [Track]}, including the end."""
+    """Simulate the track of a vehicle that crosses the line at `at_s` [s]; return {step: [Track]}.
+
+    The last step also contains the record with which the track ends.
+    """
     steps = range(round(begin_s / STEP), round(end_s / STEP) + 1)
     out = {k: [track_pose(k * STEP, v * (k * STEP - at_s), y, v, **changes)] for k in steps}
     out[steps[-1]].append(replace(out[steps[-1]][0], ended=True))
@@ -51,7 +54,7 @@ def summaries(records):
 
 
 @pytest.mark.parametrize('v', [10.0, -10.0])
-def test_a_passage_has_the_time_place_and_speed_of_the_crossing(v):
+def test_a_passage_has_the_time_position_and_speed_of_the_crossing(v):
     (p,) = passages(counted(drive(2.0, 6.0, 4.037, v))[0])
     assert p.stamp_ns == pytest.approx(4.037 * NS, abs=1000) and p.forward == (v > 0)
     assert p.position == pytest.approx([0.0, -1.5, 0.5]) and p.lateral == pytest.approx(-1.5)
@@ -190,7 +193,10 @@ def test_tracks_that_end_without_a_frame_are_counted():
 
 
 def field_of(direction):
-    """Field of a dipole that moves along x (`direction` 1 or -1) and crosses the line at 4 s."""
+    """Create the function of time [s] that returns the field of a moving dipole at each sensor.
+
+    The dipole moves along x (`direction` 1) or against it (-1), and crosses the line at 4 s.
+    """
     def at(t):
         r = NETWORK.positions - [direction * 10.0 * (t - 4.0), -1.5, 0.2]
         return dipole_field(r, np.array([300.0, 200.0, -300.0])) + 1e-9 * np.sin(50.0 * t)
@@ -268,7 +274,7 @@ def test_passages_do_not_wait_indefinitely_for_a_standing_vehicle():
     assert 25 <= n < 40
 
 
-def test_a_gap_in_the_frames_gives_no_intervals():
+def test_no_intervals_are_returned_for_a_gap_in_the_frames():
     stage, out = Traffic(NETWORK, TrafficSettings(interval_s=10.0)), []
     for t in [*np.arange(0.0, 15.0, STEP), *np.arange(1003.0, 1012.0, STEP)]:
         out += stage.feed(TrackedFrame(frame(t), []))
