@@ -17,7 +17,7 @@ ROW_INTERVAL_S = 600.0
 
 
 class HealthRows:
-    """Creates rows of the table `health`: one per sensor every ten minutes, and on request.
+    """Creates the rows of the table `health`, at intervals (`due`) or on request (`rows`).
 
     Parameters
     ----------
@@ -33,8 +33,8 @@ class HealthRows:
     def due(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
         """Create one row per sensor if `ROW_INTERVAL_S` has passed since the previous rows.
 
-        The first interval begins with the first frame, or with the first frame after the time
-        jumped back.
+        The first interval begins with the first frame. If the time jumps back to before the
+        current interval, a new interval begins.
 
         Parameters
         ----------
@@ -54,7 +54,7 @@ class HealthRows:
             yield from self.rows(stamp_ns, calibrate)
 
     def rows(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
-        """Create one row per sensor, with the number of readings since the previous row.
+        """Create one row per sensor, which counts its readings since its previous row.
 
         Parameters
         ----------

@@ -43,7 +43,7 @@ class SegmentTables:
     Attributes
     ----------
     n_tracks, n_passes : int
-        Number of written tracks, and number of written passes, one per vehicle.
+        Numbers of written tracks and passes. A pass of several vehicles counts once per vehicle.
     """
 
     def __init__(self, recording: Path, paths: dict[str, Path], n_dipoles: int,
@@ -158,8 +158,8 @@ class SegmentTables:
 
     def _add_pass(self, number: int, data: PassData, notes: tuple[str, ...]) -> None:
         """Fit a pass as a whole and write one row per vehicle."""
-        single = (fit_pass(data, self._n_dipoles),)
-        for vehicle in fitted_vehicles(self._recording.stem, number, data, single,
+        single_fits = (fit_pass(data, self._n_dipoles),)
+        for vehicle in fitted_vehicles(self._recording.stem, number, data, single_fits,
                                        self._tracks.paths(data), self._ground,
                                        (self._n_dipoles - 1, self._n_dipoles), notes):
             rows = pass_rows(vehicle)

@@ -42,7 +42,7 @@ N_DIPOLES = 3
 """Number of dipoles in the row that models a vehicle."""
 
 CUT_FILE, TRACKED_FILE = 'columns.json', 'tracked.pickle'
-"""Files with the result of a task for later tasks, stored in the folder that the task writes."""
+"""Names of the files in which `cut` and `track_segment` store results for later tasks."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Job:
         return self.work / 'cut'
 
     def segment(self, k: int) -> Path:
-        """Folder written by `track_segment`.
+        """Return the folder that `track_segment` writes for a segment.
 
         Parameters
         ----------
@@ -115,8 +115,8 @@ class RecordedEvidence(ClockComparison):
 
 
 @dataclass
-class _Tracked:
-    """Counts and clock evidence of a segment that was tracked."""
+class _SegmentResult:
+    """Numbers of tracks and passes in a tracked segment, and its clock comparison."""
 
     n_tracks: int
     n_passes: int
@@ -151,7 +151,7 @@ def cut(job: Job) -> dict[str, Any]:
 
 @contextmanager
 def _atomic_folder(final: Path) -> Iterator[Path]:
-    """Yield a folder to write to and rename it to `final` at the end; raises OutputError.
+    """Yield a temporary folder, then rename it to `final`; raises OutputError.
 
     Another process may run the same task: a worker considered lost, or a worker of a killed run.
     The first result is kept; all results are equal.
@@ -257,7 +257,7 @@ def _track_into(folder: Path, job: Job, k: int, evidence: RecordedEvidence) -> N
             tables.track(chunk, tracker)
         tables.finish(tracker)
     with _output_errors(folder / TRACKED_FILE), open(folder / TRACKED_FILE, 'wb') as stream:
-        pickle.dump(_Tracked(tables.n_tracks, tables.n_passes, evidence), stream)
+        pickle.dump(_SegmentResult(tables.n_tracks, tables.n_passes, evidence), stream)
 
 
 def join(job: Job) -> dict[str, Any]:
@@ -310,13 +310,13 @@ def join(job: Job) -> dict[str, Any]:
     return {**columns, 'tracks': n_tracks, 'passes': n_passes, 'error': ''}
 
 
-def _read_result(folder: Path) -> _Tracked:
+def _read_result(folder: Path) -> _SegmentResult:
     """Read the result that `track_segment` stored in a folder."""
     with open(folder / TRACKED_FILE, 'rb') as stream:
-        result: _Tracked = pickle.load(stream)
+        result: _SegmentResult = pickle.load(stream)
     return result
 
 
 def _format_counts(counts: Mapping[str, int]) -> str:
-    """Format counts {cause: number} as a string."""
+    """Format counts {cause: number} as `number cause; number cause`."""
     return '; '.join(f'{n} {cause}' for cause, n in counts.items())

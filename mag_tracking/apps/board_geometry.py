@@ -24,8 +24,8 @@ from mag_tracking.recording.pose_table import (
 )
 
 ASSUMED_NOISE = 1e-7
-"""Noise assumed for sensors without a configured noise [T]. Near a magnet, the field error is
-larger."""
+"""Noise assumed for sensors without a configured noise [T]. Near a magnet, the error of the
+field model is larger."""
 
 MIN_ROTATION_STD = 1e-7
 """Standard deviation below which an orientation is considered fixed, not estimated [rad]."""
@@ -234,7 +234,7 @@ def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
 
 
 def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwork:
-    """Return `network` with `noise_std` [T] where no noise is configured; unchanged if None."""
+    """Return `network` with `noise_std` [T] for sensors without a noise; None changes nothing."""
     if noise_std is None:
         return network
     return replace(network, noise_std=tuple(

@@ -83,8 +83,9 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
     scene = scene_of(network, 0, int(max(ends) * NS), tracks) if tracks else None
     n_estimates = len(tracks)
     n_passes = len({(fitted.recording, fitted.number) for fitted in passes})
-    several = f', {quantity(len(passes), "vehicle")}' if len(passes) > n_passes else ''
-    return Page(f'{quantity(n_passes, "pass", "passes")}{several}, {n_estimates} with an estimate',
+    vehicles_text = f', {quantity(len(passes), "vehicle")}' if len(passes) > n_passes else ''
+    return Page(f'{quantity(n_passes, "pass", "passes")}{vehicles_text}, '
+                f'{n_estimates} with an estimate',
                 'each fitted as a row of dipoles at constant velocity', notes, scene,
                 [_order_chart(passes)] if passes else [], [_table(passes)])
 
@@ -155,11 +156,11 @@ def _table(passes: Sequence[FittedPass]) -> Table:
         for fit in fitted.fits:
             row: list[str | float | None] = [fitted.recording, fitted.label.removeprefix('pass '),
                                              fit.n_dipoles]
-            known = bool(len(fit.x)) and not fit.reason
+            has_estimate = bool(len(fit.x)) and not fit.reason
             row += [float(fit.normalised_cost) if len(fit.x) else None]
             row += [*map(float, fit.position), float(fit.speed[0]),
                     float(np.degrees(fit.heading[0])), float(fit.length[0]),
-                    float(np.linalg.norm(fit.moment[0]))] if known else [None] * 7
+                    float(np.linalg.norm(fit.moment[0]))] if has_estimate else [None] * 7
             row += ['chosen' if fit is fitted.chosen else fit.reason]
             rows.append(row)
     return Table('All fits', ['recording', 'pass', 'dipoles', 'cost', 'x [m]', 'y [m]', 'z [m]',

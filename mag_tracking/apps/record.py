@@ -20,7 +20,7 @@ RESULTS = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
 
 
 class RecorderState(Protocol):
-    """State of a recorder, as described by `progress_line` and `summary`."""
+    """State of a recorder, from which `progress_line` and `summary` create their texts."""
 
     counts: Counter[str]
     """Number of messages written per topic."""
@@ -37,7 +37,7 @@ class RecorderState(Protocol):
 
 
 class Selection(NamedTuple):
-    """Topics to record, with names as given by the user or, after `resolved`, absolute names."""
+    """Topics to record; names may be relative, but are absolute in the result of `resolved`."""
 
     fields: tuple[str, ...] = ()
     """Magnetic-field topics of the network."""
@@ -75,7 +75,7 @@ class Selection(NamedTuple):
             result_topics=tuple(map(resolve, self.result_topics)))
 
     def includes(self, topic: str) -> bool:
-        """Whether to record a topic.
+        """Return whether to record a topic.
 
         Parameters
         ----------

@@ -80,7 +80,7 @@ class TrackingResult:
     """Sensors that were not used because their background was not learnt. To use them, record a
     quiet interval, or set `background` and `noise_std` in the network file."""
     disturbances: tuple[Disturbance, ...]
-    """Field changes that a disturbance explains better than a target does."""
+    """Field changes that are explained better by a disturbance than by a target."""
 
     def __repr__(self) -> str:
         unused = {**self.rejections, **self.lost}

@@ -71,7 +71,7 @@ class TrafficResult:
     no_detection_reason: str | None
     """Explanation, in one sentence, of why nothing was detected; None if a target was detected."""
     no_track_reason: str | None
-    """Explanation if nothing was tracked because only one sensor measured; otherwise None."""
+    """Explanation if nothing was tracked because only one sensor measured the target, else None."""
 
     def __repr__(self) -> str:
         lines = dict(Counter(v.passage.line for v in self.vehicles))
@@ -192,7 +192,7 @@ class _Counter:
         self._tracks_before_jump = set(self._frames) if jumped else set()
 
     def _delay_motion(self, track_id: int) -> CorrelatedMotion:
-        """Compute the velocity of a track from sensor delays, or the reason why it is missing."""
+        """Compute the velocity of a track from sensor delays; `reason` explains a missing value."""
         frames = self._frames.get(track_id)
         if not frames:
             return CorrelatedMotion('the fields of the track are no longer stored')

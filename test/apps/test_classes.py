@@ -19,7 +19,7 @@ ROAD = DATA / 'two_way_road'
 
 @pytest.fixture(scope='module')
 def tables(tmp_path_factory):
-    """Folder with the same signatures as a table by sample and as a table by signature."""
+    """Folder with two tables of the same signatures: a row per sample, and a row per signature."""
     folder, found = tmp_path_factory.mktemp('classes'), signatures(COUNTS, 'boxes')
     write_by_sample(folder / 'by_sample.csv', found)
     write_by_row(folder / 'by_row.csv', found)
@@ -31,9 +31,9 @@ def test_commands_train_evaluate_and_predict(tables, tmp_path, capsys, name):
     table, model = str(tables / f'{name}.csv'), str(tmp_path / 'classes.json')
     assert main(['classes', 'evaluate', table, '--splits', '3']) == 0
     printed = capsys.readouterr().out
-    for what in ('largest class: 7', 'balanced accuracy: ', 'recall of truck: ',
+    for text in ('largest class: 7', 'balanced accuracy: ', 'recall of truck: ',
                  'calibration error'):
-        assert what in printed
+        assert text in printed
     assert main(['classes', 'train', table, '--out', model]) == 0
     assert '25 of car, 10 of truck' in capsys.readouterr().out
     assert main(['classes', 'evaluate', table, '--model', model]) == 0
@@ -55,7 +55,7 @@ def write_intervals(path, rows, header=('label', 'begin_s', 'end_s')):
     return path
 
 
-def test_labelled_intervals_give_a_signature_of_each_sensor(tmp_path):
+def test_a_labelled_interval_gives_one_signature_per_sensor(tmp_path):
     truth = json.loads((ROAD / 'two_way_road.truth.json').read_text())
     vehicles = [v for k, v in enumerate(truth['vehicles'])
                 if all(abs(v['cpa_time_s'] - w['cpa_time_s']) > 5.0
@@ -70,10 +70,10 @@ def test_labelled_intervals_give_a_signature_of_each_sensor(tmp_path):
     epoch = truth['epoch_s']
     absolute = [(label, round((epoch + a) * 1e9), round((epoch + b) * 1e9), 'mag_2')
                 for label, a, b in rows]
-    of_one = labelled_signatures(ROAD / 'two_way_road.mcap', write_intervals(
+    of_mag_2 = labelled_signatures(ROAD / 'two_way_road.mcap', write_intervals(
         tmp_path / 'b.csv', absolute, ('label', 'begin_ns', 'end_ns', 'sensor')), network)
-    assert len(of_one) == len(rows) and all('mag_2' in s.source for s in of_one)
-    assert {s.label for s in of_one} == {'car', 'truck'}
+    assert len(of_mag_2) == len(rows) and all('mag_2' in s.source for s in of_mag_2)
+    assert {s.label for s in of_mag_2} == {'car', 'truck'}
 
 
 @pytest.mark.parametrize(('rows', 'error'), [

@@ -38,7 +38,7 @@ def test_a_description_identifies_its_cause(reason):
 
 
 def quiet(n, network):
-    """Samples of sensor `mag_1` at 100 Hz without a target."""
+    """Return `n` samples of sensor `mag_1` at 100 Hz without a target."""
     rng = np.random.default_rng(0)
     field = network.R_sw[0] @ network.earth_field
     return [MagSample(10**18 + k * STEP_NS, 'mag_1', field + 1.2e-8 * rng.standard_normal(3))
