@@ -76,7 +76,7 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
             glob.glob(str(path), recursive=True))]
         recordings = [r for p in matches for r in _recordings_at(p, set())]
         if not recordings:
-            raise RecordingError(f'{path}: no recording found; recordings end in '
+            raise RecordingError(f'{path}: no recording found; supported file types: '
                                  f'{", ".join(SUFFIXES)}')
         selected.update(dict.fromkeys(recordings))
     # A pattern may match both a recording and the files inside it.
@@ -263,7 +263,7 @@ class _Scheduler:
             self._fail(path, str(result) if isinstance(result, MagTrackingError)
                        else f'{type(result).__name__}: {result}')
         elif kind == 'join':
-            self._dataset.complete(path, job.work, self._states[path], result)
+            self._dataset.complete(path, job.work_folder, self._states[path], result)
             self._run.done.append(path)
             self._run.tracks += result['tracks']
             self._run.passes += result['passes']

@@ -17,7 +17,7 @@ ROW_INTERVAL_S = 600.0
 
 
 class HealthRows:
-    """Creates the rows of the table `health`, at intervals (`due`) or on request (`rows`).
+    """Creates the rows of the table `health`, at intervals (`due_rows`) or on request (`rows`).
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class HealthRows:
         self._previous_counts = {name: (0, 0) for name in network.names}
         self._next_ns: int | None = None
 
-    def due(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
+    def due_rows(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
         """Create one row per sensor if `ROW_INTERVAL_S` has passed since the previous rows.
 
         The first interval begins with the first frame. If the time jumps back to before the
@@ -54,7 +54,7 @@ class HealthRows:
             yield from self.rows(stamp_ns, calibrate)
 
     def rows(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
-        """Create one row per sensor, which counts its readings since its previous row.
+        """Create one row per sensor, with its accepted and rejected readings since the last row.
 
         Parameters
         ----------

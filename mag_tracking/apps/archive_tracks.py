@@ -179,16 +179,17 @@ _STATE_COLUMNS = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_v
 def _track_columns(log: TrackLog, smoothed: SmoothedLog | None) -> dict[str, Any]:
     """Columns of a track in the table `tracks`."""
     summary = log.summary()
-    out = {name: summary[name] for name in (
+    columns = {name: summary[name] for name in (
         'end_ns', 'poses', 'arrival', 'kind', 'verdict', 'kind_weight', 'ambiguous_share',
         'nis_per_axis', 'length', 'smallest_sd', 'speed', 'heading_deg', 'moment_size')}
-    out |= dict(zip(('mx', 'my', 'mz'), summary['moment'], strict=True))
-    out |= {'doubts': ' '.join(summary['doubts']),
-            'arrival_weight': summary['arrival_weights'][summary['arrival']]}
+    columns |= dict(zip(('mx', 'my', 'mz'), summary['moment'], strict=True))
+    columns |= {'doubts': ' '.join(summary['doubts']),
+                'arrival_weight': summary['arrival_weights'][summary['arrival']]}
     if smoothed is not None:
         values = smoothed.summary()
-        out |= {'smoothed_speed': values['speed'], 'smoothed_moment_size': values['moment_size']}
-    return {name: _nullable(v) if isinstance(v, float) else v for name, v in out.items()}
+        columns |= {'smoothed_speed': values['speed'],
+                    'smoothed_moment_size': values['moment_size']}
+    return {name: _nullable(v) if isinstance(v, float) else v for name, v in columns.items()}
 
 
 def _nullable(value: float) -> float | None:

@@ -181,7 +181,7 @@ def corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
 
 
 def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: str,
-                       by: str) -> SensorNetwork:
+                       method: str) -> SensorNetwork:
     """Return a network with the estimated positions, orientations, gains and biases.
 
     A reading is gain * field + bias. The stage Calibrate applies the correction before it removes
@@ -195,7 +195,7 @@ def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: 
     geometry : NetworkGeometry
     date : str
         Date of the calibration.
-    by : str
+    method : str
         Method of the calibration.
 
     Returns
@@ -219,7 +219,7 @@ def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: 
             columns['orientation_std'][j] = std
         record = network.calibrated[j]
         columns['calibrated'][j] = network.calibration_record(
-            j, date, by, np.nan if record is None else record.clock_offset_std)
+            j, date, method, np.nan if record is None else record.clock_offset_std)
     changes: dict[str, Any] = {name: tuple(column) for name, column in columns.items()}
     return replace(network, positions=estimated.positions, R_ws=estimated.R_ws, **changes)
 

@@ -152,7 +152,7 @@ def _track_passes(recording: Recording, network: SensorNetwork, settings: Settin
 
 def _with_pass_records(network: SensorNetwork, surveyed: SensorNetwork, date: str,
                        n_tracks: int) -> SensorNetwork:
-    """Return `network` with the calibration records of `surveyed`, extended by the passes."""
+    """Return `network` with the records of `surveyed`, plus the date and number of passes."""
     passes = quantity(n_tracks, 'pass', 'passes')
     return replace(network, calibrated=tuple(
         surveyed.calibration_record(j, date, f'nominal orientation; {passes}') if record is None

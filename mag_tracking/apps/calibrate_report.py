@@ -58,8 +58,8 @@ def calibration_page(calibration: Calibration, nominal: SensorNetwork, name: str
     Page
     """
     survey = calibration.survey
-    level = ERROR if survey.disagreements else WARNING
-    notes = [Note(level, text) for text in survey.warnings()]
+    severity = ERROR if survey.disagreements else WARNING
+    notes = [Note(severity, text) for text in survey.warnings()]
     notes += [Note(WARNING, f'{sensor}: no background was learnt')
               for sensor in calibration.without_background]
     notes += [Note(WARNING, f'{cause}: {n}') for cause, n in calibration.rejected.items()]

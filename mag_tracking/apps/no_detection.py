@@ -11,7 +11,7 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
 
 MAX_NOISE_RATIO = 3.0
-"""Ratio to the scatter of the readings above which a configured noise is considered too large."""
+"""Ratio to the scatter of readings above which a configured standard deviation is too large."""
 
 
 def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: Calibrate,

@@ -48,12 +48,12 @@ class FittedPass:
 
     @property
     def label(self) -> str:
-        """Pass, and vehicle if there are several, as named in messages and file names."""
+        """Name for messages and file names, such as `pass 3` or `pass 3, vehicle 2`."""
         return f'pass {self.number}' + (f', vehicle {self.vehicle}' if self.n_vehicles > 1 else '')
 
     @property
     def chosen(self) -> PassFit | None:
-        """Fit with the number of dipoles that the measurements support; None if it was rejected."""
+        """Fit with the number of dipoles that the measurements support; None if it is rejected."""
         return choose_order(self.fits)
 
     @property
@@ -82,12 +82,12 @@ class FittedPass:
         chosen = self.chosen
         if chosen is None or not chosen.cost > energy_threshold(1e-3, chosen.degrees_of_freedom):
             return np.nan, np.nan
-        similar = [f for f in self.fits if f is not chosen and not f.reason
+        similar_fits = [f for f in self.fits if f is not chosen and not f.reason
                    and f.normalised_cost <= MAX_COST_RATIO * chosen.normalised_cost]
-        if not similar:
+        if not similar_fits:
             return np.nan, np.nan
-        return (max(float(np.linalg.norm(f.position - chosen.position)) for f in similar),
-                max(float(np.linalg.norm(f.velocity - chosen.velocity)) for f in similar))
+        return (max(float(np.linalg.norm(f.position - chosen.position)) for f in similar_fits),
+                max(float(np.linalg.norm(f.velocity - chosen.velocity)) for f in similar_fits))
 
 
 class PassFitter:
@@ -109,6 +109,7 @@ class PassFitter:
     Attributes
     ----------
     collector : PassCollector
+        Extracts the passes.
     """
 
     def __init__(self, recording: str, network: SensorNetwork, settings: Settings,

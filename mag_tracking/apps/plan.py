@@ -309,20 +309,21 @@ def _added_sensor_bounds(network: SensorNetwork, target: PlannedTarget, sampling
     upright = np.tile(np.eye(3), (len(candidates), 1, 1))
     added_sampling = replace(sampling, noise_std=float(np.median(sampling.noise_std)))
     prior = target.prior()
-    base, extended = [], []
+    bounds_without, bounds_with = [], []
     for heading, points in near_lanes:
         if not len(candidates):
             continue
         J = pass_information(network.positions, network.R_sw, target, sampling, points,
                              heading).sum(axis=2)
-        base.append(bounds_of(J, prior)[..., 0].ravel())
+        bounds_without.append(bounds_of(J, prior)[..., 0].ravel())
         added = pass_information(candidate_positions, upright, target, added_sampling, points,
                                  heading)
-        extended.append(
+        bounds_with.append(
             bounds_of(J[:, :, None] + added, prior)[..., 0].reshape(-1, len(candidates)))
-    if not base:
+    if not bounds_without:
         return float('nan'), np.zeros(0)
-    return float(np.median(np.concatenate(base))), np.median(np.concatenate(extended), axis=0)
+    return (float(np.median(np.concatenate(bounds_without))),
+            np.median(np.concatenate(bounds_with), axis=0))
 
 
 def _miss_probabilities(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
@@ -333,12 +334,12 @@ def _miss_probabilities(network: SensorNetwork, target: PlannedTarget, sampling:
     u = np.array([np.cos(lane.heading), np.sin(lane.heading)])
     n = int(np.clip(4.0 * half_length / (target.speed * sampling.period), 1, MAX_FRAMES))
     along = np.linspace(-2.0 * half_length, 2.0 * half_length, n)[:, None]
-    detect, out = settings.detect, []
+    detect, rows = settings.detect, []
     for offset in offsets:
         points = network.centre[:2] + offset * np.array([-u[1], u[0]]) + along * u
         probability = detection_probabilities(
             network.positions, network.R_sw, target, sampling, points,
             detect.false_alarm_probability, detect.background_std)
-        out.append((offset, float(np.mean(
+        rows.append((offset, float(np.mean(
             missed_detection_probability(probability, detect.onset_frames)))))
-    return np.array(out)
+    return np.array(rows)

@@ -68,12 +68,12 @@ def summary_lines(p: Plan) -> list[str]:
         lines.append(f'  bounds at the closest point, {name}: position {length_text(r)}, '
                      f'velocity {v:.3g} m/s, moment {m:.3g} A m^2')
     for lane in p.lanes:
-        good = np.flatnonzero(lane.detection >= GOOD_PD)
-        first = (f'at {-lane.along[good[0]]:.3g} m before the centre' if len(good)
+        detectable = np.flatnonzero(lane.detection >= GOOD_PD)
+        first_text = (f'at {-lane.along[detectable[0]]:.3g} m before the centre' if len(detectable)
                  else 'nowhere')
         closest = int(np.argmin(np.abs(lane.along)))
         lines.append(f'lane {lane.name}: the detection probability of a frame reaches '
-                     f'{GOOD_PD:.0%} {first}; position bound at the centre '
+                     f'{GOOD_PD:.0%} {first_text}; position bound at the centre '
                      f'{length_text(lane.filter_std[closest])} (filter), '
                      f'{length_text(lane.pass_std[closest, 0])} (whole pass)')
     detected = p.missed[p.missed[:, 1] < 0.01, 0]

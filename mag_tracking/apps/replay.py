@@ -303,7 +303,7 @@ def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline
 
 
 def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
-    """Return speed and heading from the delays between sensors, or why both are unknown."""
+    """Create the entry `delay` of a track: speed and heading, or why both are missing."""
     motion = correlated_motion(PassData.of_frames(network, log.stamp_ns, log.measured, log.noise))
     if motion.reason:
         return {'reason': motion.reason}
@@ -340,12 +340,12 @@ def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Configured,
     dict or None
         Entry `truth` of a track in `summary.json`; None if no ground truth covers the track.
     """
-    best: tuple[float, dict[str, Any]] | None = None
+    best_match: tuple[float, dict[str, Any]] | None = None
     for name, arrays in truth.items():
         errors = _errors_of(log, pipeline, arrays)
-        if errors is not None and (best is None or errors[0] < best[0]):
-            best = errors[0], {'name': name, **errors[1]}
-    return None if best is None else best[1]
+        if errors is not None and (best_match is None or errors[0] < best_match[0]):
+            best_match = errors[0], {'name': name, **errors[1]}
+    return None if best_match is None else best_match[1]
 
 
 def _errors_of(log: TrackLog | SmoothedLog, pipeline: Configured,

@@ -104,7 +104,7 @@ def test_clock_differences_carry_over_between_segments(
 
 
 def test_an_archive_contains_all_valid_recordings(tmp_path, recordings, capsys):
-    """Two workers report and skip the invalid recording. A second run changes nothing."""
+    """The invalid recording is reported and skipped. A second run changes nothing."""
     out, lines = tmp_path / 'out', []
     settings = settings_for('vehicle', QUICK)
     run = archive([recordings], NETWORK_FILE, settings, out, workers=2, report=lines.append)

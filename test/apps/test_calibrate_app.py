@@ -105,11 +105,11 @@ def test_heading_errors_are_within_three_stds(name):
 def test_heading_errors_are_consistent_with_their_stds():
     z = np.concatenate([errors(name)[1] / orientation_stds(name)[:, 2]
                         for name in FILES])
-    high = chi2.ppf(0.99, len(z)) / len(z)
+    limit = chi2.ppf(0.99, len(z)) / len(z)
     print(f'{len(z)} headings: mean square of normalised errors {np.mean(z**2):.3f}, '
-          f'limit {high:.3f}')
+          f'limit {limit:.3f}')
     assert len(z) == 26
-    assert np.mean(z**2) < high
+    assert np.mean(z**2) < limit
 
 
 @pytest.mark.study
@@ -119,11 +119,11 @@ def test_clock_errors_are_consistent_with_their_stds():
         *_, clock = errors(name)
         std = [c.clock_offset_std for c in calibration_of(name).network.calibrated]
         z += [e / s for e, s in zip(clock, std, strict=True) if s > 0.0]
-    high = chi2.ppf(0.99, len(z)) / len(z)
+    limit = chi2.ppf(0.99, len(z)) / len(z)
     print(f'{len(z)} clocks: mean square of normalised errors {np.mean(np.square(z)):.3f}, '
-          f'limit {high:.3f}')
+          f'limit {limit:.3f}')
     assert len(z) == 16
-    assert np.mean(np.square(z)) < high
+    assert np.mean(np.square(z)) < limit
 
 
 @pytest.mark.parametrize('name', ALL_NAMES)

@@ -73,7 +73,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize('cause', FAULTS, ids=lambda cause: cause.name)
-def test_a_rejected_reading_is_identified(cause):
+def test_the_cause_of_a_rejected_reading_is_identified(cause):
     network = line_network(1)
     if cause is RejectionCause.AXIS_MISSING:
         network = dataclasses.replace(network, correction=(np.eye(3) + 0.1,))

@@ -68,8 +68,8 @@ def test_a_reason_is_given_if_the_scatter_is_unknown():
 def test_a_sensor_without_a_background_is_named():
     readings = recorded('straight_small_left').readings
     t = (readings.stamp_ns - readings.stamp_ns[0]) / 1e9
-    keep = np.array(readings.sensor_names()) == 'mag_1'
-    reason = reason_of(readings=readings.part((keep & (t < 5.0)) | (~keep & (t < 1.0))))
+    is_mag_1 = np.array(readings.sensor_names()) == 'mag_1'
+    reason = reason_of(readings=readings.part((is_mag_1 & (t < 5.0)) | (~is_mag_1 & (t < 1.0))))
     assert 'mag_2 had no background' in reason
 
 

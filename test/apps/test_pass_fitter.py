@@ -17,16 +17,16 @@ from support.track_records import NS, track_pose
 
 
 @cache
-def fit_pair(how, simulator):
+def fit_pair(scenario, simulator):
     """Fit a pair of vehicles; return (fitted passes, `World`)."""
-    world = busy(how, 2, simulator, 3, n=1)
+    world = busy(scenario, 2, simulator, 3, n=1)
     return fits_of_world(world, (2, 3)), world
 
 
 @pytest.mark.parametrize('simulator', SIMULATORS)
-@pytest.mark.parametrize('how', ['meeting', 'following'])
-def test_two_vehicles_are_fitted_together(how, simulator):
-    passes, world = fit_pair(how, simulator)
+@pytest.mark.parametrize('scenario', ['meeting', 'following'])
+def test_two_vehicles_are_fitted_together(scenario, simulator):
+    passes, world = fit_pair(scenario, simulator)
     assert [fit.label for fit in passes] == ['pass 1, vehicle 1', 'pass 1, vehicle 2']
     matches = with_vehicles(passes, [(world.t, position) for position in world.positions])
     assert sorted(match.vehicle for match in matches) == [0, 1]
@@ -119,7 +119,7 @@ def test_magnets_are_not_vehicles():
     assert len(tracks.paths(pass_of(0.0, 6.0))) == 0
 
 
-def test_the_ground_prior_follows_the_settings():
+def test_the_ground_prior_combines_the_heights_of_all_kinds():
     settings = settings_for('vehicle', {
         'track.vehicle.heights': [0.4, 0.4, 1.0], 'track.vehicle.height_stds': [0.3, 0.3, 0.3],
         'track.vehicle.climb_std': 0.2})

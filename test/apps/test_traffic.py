@@ -133,18 +133,18 @@ def test_every_column_is_described():
 
 
 def test_invalid_input_is_reported_before_the_run(tmp_path, capsys):
-    good = str(vehicle_path('straight_car_right'))
+    valid_recording = str(vehicle_path('straight_car_right'))
     other = tmp_path / 'other.mcap'
     with RecordingWriter(other) as writer:
         writer.write('/elsewhere', MAGNETIC_FIELD, field_dict(0, 'mag_9', np.ones(3)), 0)
-    assert main(['traffic', good, str(other), '--network', str(NETWORK_FILE)]) == 1
-    out, err = capsys.readouterr()
-    assert '1 vehicle' not in out and 'mag-tracking: ' in err
+    assert main(['traffic', valid_recording, str(other), '--network', str(NETWORK_FILE)]) == 1
+    out, errors = capsys.readouterr()
+    assert '1 vehicle' not in out and 'mag-tracking: ' in errors
     (tmp_path / 'file').write_text('')
-    assert main(['traffic', good, '--network', str(NETWORK_FILE), '--out',
+    assert main(['traffic', valid_recording, '--network', str(NETWORK_FILE), '--out',
                  str(tmp_path / 'file')]) == 1
-    out, err = capsys.readouterr()
-    assert '1 vehicle' not in out and 'mag-tracking: ' in err
+    out, errors = capsys.readouterr()
+    assert '1 vehicle' not in out and 'mag-tracking: ' in errors
 
 
 def test_lines_without_crossings_count_no_vehicles():
