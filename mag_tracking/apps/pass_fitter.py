@@ -83,7 +83,7 @@ class FittedPass:
         if chosen is None or not chosen.cost > energy_threshold(1e-3, chosen.degrees_of_freedom):
             return np.nan, np.nan
         similar_fits = [f for f in self.fits if f is not chosen and not f.reason
-                   and f.normalised_cost <= MAX_COST_RATIO * chosen.normalised_cost]
+                        and f.normalised_cost <= MAX_COST_RATIO * chosen.normalised_cost]
         if not similar_fits:
             return np.nan, np.nan
         return (max(float(np.linalg.norm(f.position - chosen.position)) for f in similar_fits),

@@ -70,7 +70,7 @@ def summary_lines(p: Plan) -> list[str]:
     for lane in p.lanes:
         detectable = np.flatnonzero(lane.detection >= GOOD_PD)
         first_text = (f'at {-lane.along[detectable[0]]:.3g} m before the centre' if len(detectable)
-                 else 'nowhere')
+                      else 'nowhere')
         closest = int(np.argmin(np.abs(lane.along)))
         lines.append(f'lane {lane.name}: the detection probability of a frame reaches '
                      f'{GOOD_PD:.0%} {first_text}; position bound at the centre '

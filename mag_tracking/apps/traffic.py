@@ -184,7 +184,7 @@ class _TrafficCollector:
     def _drop_old(self, now_ns: int) -> None:
         """Drop the frames of tracks that ended long ago, or before the time jumped back."""
         old_ids = self._tracks_before_jump or {track_id for track_id, frames in self._frames.items()
-                                           if now_ns - frames[-1].stamp_ns > RETENTION_S * NS}
+                                               if now_ns - frames[-1].stamp_ns > RETENTION_S * NS}
         for track_id in old_ids:
             del self._frames[track_id]
         # Passages of tracks from before the jump arrive with the frame that jumped back.
