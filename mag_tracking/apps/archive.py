@@ -25,7 +25,7 @@ from mag_tracking.recording.reader import SUFFIXES
 _Cluster = Cluster[tuple[str, Job]]
 
 METADATA = 'metadata.yaml'
-"""File that marks a folder as a recording."""
+"""Name of the file that marks a folder as a rosbag2 recording."""
 
 
 @dataclass
@@ -76,7 +76,7 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
             glob.glob(str(path), recursive=True))]
         recordings = [r for p in matches for r in _recordings_at(p, set())]
         if not recordings:
-            raise RecordingError(f'{path}: no recording found; recordings end in '
+            raise RecordingError(f'{path}: no recording found; supported file types: '
                                  f'{", ".join(SUFFIXES)}')
         selected.update(dict.fromkeys(recordings))
     # A pattern may match both a recording and the files inside it.
@@ -84,9 +84,10 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
 
 
 def _recordings_at(path: Path, visited: set[Path]) -> list[Path]:
-    """Find the recordings at or below a path; skip folders in `visited`, and add new ones to it.
+    """Return the recordings at or below a path, except in folders that are in `visited`.
 
-    An unreadable folder is returned like a recording, so that it is reported as failed.
+    Each searched folder is added to `visited`. An unreadable folder is returned like a recording,
+    so that it is reported as failed.
     """
     path = path.resolve()
     if not path.is_dir():
@@ -166,7 +167,7 @@ def archive(recordings: Iterable[str | PathLike[str]],
         If the network file is invalid.
     OutputError
         If the dataset cannot be written, is in use by another run, or was created with another
-        network, other settings or another version.
+        network, other settings or another version of the tables.
     ClusterError
         If the scheduler does not respond or has no workers.
     MissingDependencyError
@@ -200,7 +201,7 @@ def archive(recordings: Iterable[str | PathLike[str]],
 
 
 def _configuration(network: SensorNetwork, settings: Settings) -> dict[str, Any]:
-    """Configuration that all runs into a folder must share, as JSON-compatible values."""
+    """Return the JSON-compatible configuration that all runs into a folder must share."""
     def json_value(value: Any) -> Any:
         return value.tolist() if hasattr(value, 'tolist') else str(value)
     network_json = json.dumps(dataclasses.asdict(network), default=json_value, sort_keys=True)
@@ -217,13 +218,14 @@ class _Scheduler:
         self._dataset, self._cluster, self._run = dataset, cluster, run
         self._network, self._settings = network, settings
         self._progress, self._report = progress or (lambda _: None), report or (lambda _: None)
-        self._segments: Counter[Path] = Counter()
+        self._unfinished_segments: Counter[Path] = Counter()
         self._states: dict[Path, list[list[Any]]] = {}
 
     def run(self, recordings: Sequence[Path], stopped: Callable[[], bool]) -> None:
         """Track recordings until all are processed or `stopped()` returns true.
 
-        Only a few recordings are processed at a time, to limit the intermediate files.
+        At most two recordings per worker, plus one, are processed at a time. This limits the size
+        of the intermediate files.
         """
         queued = list(reversed(recordings))
         while queued or self._cluster.n_running:
@@ -236,7 +238,7 @@ class _Scheduler:
                 self._on_finished(kind, job, result)
 
     def _n_active_recordings(self) -> int:
-        """Number of recordings with unfinished tasks."""
+        """Number of recordings with running tasks."""
         return len({job.recording for _, job in self._cluster.keys()})
 
     def _start(self, path: Path) -> None:
@@ -251,7 +253,7 @@ class _Scheduler:
         self._cluster.submit(('cut', job), 0, cut, job)
 
     def _on_finished(self, kind: str, job: Job, result: Any) -> None:
-        """Record a task's result and submit dependent tasks; raises OutputError, ClusterError."""
+        """Record a result and submit the tasks that need it; raises OutputError, ClusterError."""
         path = job.recording
         if isinstance(result, OutputError | ClusterError):
             raise result
@@ -261,19 +263,19 @@ class _Scheduler:
             self._fail(path, str(result) if isinstance(result, MagTrackingError)
                        else f'{type(result).__name__}: {result}')
         elif kind == 'join':
-            self._dataset.complete(path, job.work, self._states[path], result)
+            self._dataset.complete(path, job.work_folder, self._states[path], result)
             self._run.done.append(path)
             self._run.tracks += result['tracks']
             self._run.passes += result['passes']
             self._progress(result['size'])
         else:
             if kind == 'cut':
-                self._segments[path] = result['segments']
+                self._unfinished_segments[path] = result['segments']
                 for k in range(result['segments']):
                     self._cluster.submit(('track', job), 1, track_segment, job, k)
             else:
-                self._segments[path] -= 1
-            if not self._segments[path]:
+                self._unfinished_segments[path] -= 1
+            if not self._unfinished_segments[path]:
                 self._cluster.submit(('join', job), 2, join, job)
 
     def _fail(self, path: Path, reason: str) -> None:

@@ -17,7 +17,7 @@ ROW_INTERVAL_S = 600.0
 
 
 class HealthRows:
-    """Creates rows of the table `health`: one per sensor every ten minutes, and on request.
+    """Creates the rows of the table `health`, at intervals (`due_rows`) or on request (`rows`).
 
     Parameters
     ----------
@@ -30,11 +30,11 @@ class HealthRows:
         self._previous_counts = {name: (0, 0) for name in network.names}
         self._next_ns: int | None = None
 
-    def due(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
+    def due_rows(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
         """Create one row per sensor if `ROW_INTERVAL_S` has passed since the previous rows.
 
-        The first interval begins with the first frame, or with the first frame after the time
-        jumped back.
+        The first interval begins with the first frame. If the time jumps back to before the
+        current interval, a new interval begins.
 
         Parameters
         ----------
@@ -54,7 +54,7 @@ class HealthRows:
             yield from self.rows(stamp_ns, calibrate)
 
     def rows(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
-        """Create one row per sensor, with the number of readings since the previous row.
+        """Create one row per sensor, with its accepted and rejected readings since the last row.
 
         Parameters
         ----------

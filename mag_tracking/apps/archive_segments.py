@@ -2,8 +2,8 @@
 
 The stages before the tracker process the recording once, from beginning to end, and keep their
 backgrounds across segments. The tracker is restarted for each segment, but finds the same tracks
-as in the whole recording. To this end, a segment begins with all earlier frames that a new track
-may use, and ends only after an interval without a target that is longer than the time span of these
+as in the whole recording. A segment therefore begins with all earlier frames that a new track may
+use. It ends only after an interval without a target that is longer than the time span of these
 frames.
 """
 
@@ -126,14 +126,19 @@ class SegmentWriter:
         self._last_frame: FieldFrame | None = None
 
     def add_frame(self, frame: FieldFrame, doubts: Doubts) -> None:
-        """Add the next frame; write a chunk or end the segment if due.
+        """Add the next frame.
+
+        A chunk is written when it has `CHUNK_FRAMES` frames. A segment with at least
+        `MIN_SEGMENT_FRAMES` frames ends after an interval without a target that is longer than
+        `lookback_s` and `MIN_QUIET_S`. Any segment ends if the time jumps back while no target is
+        present.
 
         Parameters
         ----------
         frame : FieldFrame
             Frame with its detection result.
         doubts : Doubts
-            Doubtful times known so far.
+            Doubtful times of each sensor, as known at this frame.
 
         Raises
         ------

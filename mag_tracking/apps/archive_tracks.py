@@ -43,7 +43,7 @@ class SegmentTables:
     Attributes
     ----------
     n_tracks, n_passes : int
-        Number of written tracks, and number of written passes, one per vehicle.
+        Numbers of written tracks and passes. A pass of several vehicles counts once per vehicle.
     """
 
     def __init__(self, recording: Path, paths: dict[str, Path], n_dipoles: int,
@@ -158,8 +158,8 @@ class SegmentTables:
 
     def _add_pass(self, number: int, data: PassData, notes: tuple[str, ...]) -> None:
         """Fit a pass as a whole and write one row per vehicle."""
-        single = (fit_pass(data, self._n_dipoles),)
-        for vehicle in fitted_vehicles(self._recording.stem, number, data, single,
+        single_fits = (fit_pass(data, self._n_dipoles),)
+        for vehicle in fitted_vehicles(self._recording.stem, number, data, single_fits,
                                        self._tracks.paths(data), self._ground,
                                        (self._n_dipoles - 1, self._n_dipoles), notes):
             rows = pass_rows(vehicle)
@@ -179,16 +179,17 @@ _STATE_COLUMNS = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_v
 def _track_columns(log: TrackLog, smoothed: SmoothedLog | None) -> dict[str, Any]:
     """Columns of a track in the table `tracks`."""
     summary = log.summary()
-    out = {name: summary[name] for name in (
+    columns = {name: summary[name] for name in (
         'end_ns', 'poses', 'arrival', 'kind', 'verdict', 'kind_weight', 'ambiguous_share',
         'nis_per_axis', 'length', 'smallest_sd', 'speed', 'heading_deg', 'moment_size')}
-    out |= dict(zip(('mx', 'my', 'mz'), summary['moment'], strict=True))
-    out |= {'doubts': ' '.join(summary['doubts']),
-            'arrival_weight': summary['arrival_weights'][summary['arrival']]}
+    columns |= dict(zip(('mx', 'my', 'mz'), summary['moment'], strict=True))
+    columns |= {'doubts': ' '.join(summary['doubts']),
+                'arrival_weight': summary['arrival_weights'][summary['arrival']]}
     if smoothed is not None:
         values = smoothed.summary()
-        out |= {'smoothed_speed': values['speed'], 'smoothed_moment_size': values['moment_size']}
-    return {name: _nullable(v) if isinstance(v, float) else v for name, v in out.items()}
+        columns |= {'smoothed_speed': values['speed'],
+                    'smoothed_moment_size': values['moment_size']}
+    return {name: _nullable(v) if isinstance(v, float) else v for name, v in columns.items()}
 
 
 def _nullable(value: float) -> float | None:

@@ -42,7 +42,7 @@ N_DIPOLES = 3
 """Number of dipoles in the row that models a vehicle."""
 
 CUT_FILE, TRACKED_FILE = 'columns.json', 'tracked.pickle'
-"""Files with the result of a task for later tasks, stored in the folder that the task writes."""
+"""Names of the files in which `cut` and `track_segment` store results for later tasks."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class Job:
 
     recording: Path
     """Path of the recording."""
-    work: Path
+    work_folder: Path
     """Folder of the intermediate results."""
-    folder: Path
+    archive_folder: Path
     """Folder of the archive."""
     network: SensorNetwork
     """Sensor network."""
@@ -61,12 +61,12 @@ class Job:
     """Settings of all stages."""
 
     @property
-    def cut(self) -> Path:
+    def cut_folder(self) -> Path:
         """Folder written by `cut`: segments, health table, and columns of the recording."""
-        return self.work / 'cut'
+        return self.work_folder / 'cut'
 
-    def segment(self, k: int) -> Path:
-        """Folder written by `track_segment`.
+    def segment_folder(self, k: int) -> Path:
+        """Return the folder that `track_segment` writes for a segment.
 
         Parameters
         ----------
@@ -77,11 +77,11 @@ class Job:
         -------
         Path
         """
-        return self.work / f'segment-{k}'
+        return self.work_folder / f'segment-{k}'
 
 
-class RecordedEvidence(ClockComparison):
-    """Clock comparison that records the passes added to it.
+class ClockComparisonHistory(ClockComparison):
+    """Clock comparison with the history of the passes added to it.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class RecordedEvidence(ClockComparison):
         self.clocks_differed = False
 
     def add(self, found: RigidPass, rows: IntArray) -> None:
-        """Add a pass and record it.
+        """Add a pass to the comparison and to the history.
 
         Parameters
         ----------
@@ -115,12 +115,12 @@ class RecordedEvidence(ClockComparison):
 
 
 @dataclass
-class _Tracked:
-    """Counts and clock evidence of a segment that was tracked."""
+class _SegmentResult:
+    """Numbers of tracks and passes in a tracked segment, and its clock comparison."""
 
     n_tracks: int
     n_passes: int
-    evidence: RecordedEvidence = field(repr=False)
+    evidence: ClockComparisonHistory = field(repr=False)
 
 
 def cut(job: Job) -> dict[str, Any]:
@@ -140,18 +140,18 @@ def cut(job: Job) -> dict[str, Any]:
     MagTrackingError
         If the recording cannot be read, or a file cannot be written.
     """
-    if not job.cut.exists():
-        with _atomic_folder(job.cut) as folder:
+    if not job.cut_folder.exists():
+        with _atomic_folder(job.cut_folder) as folder:
             with TableWriter(folder / 'health.parquet', TABLES['health']) as table:
                 columns = _Segmenter(job, folder, table).read()
             replace_text(folder / CUT_FILE, json.dumps(columns))
-    result: dict[str, Any] = json.loads((job.cut / CUT_FILE).read_text())
+    result: dict[str, Any] = json.loads((job.cut_folder / CUT_FILE).read_text())
     return result
 
 
 @contextmanager
 def _atomic_folder(final: Path) -> Iterator[Path]:
-    """Yield a folder to write to and rename it to `final` at the end; raises OutputError.
+    """Yield a temporary folder, then rename it to `final`; raises OutputError.
 
     Another process may run the same task: a worker considered lost, or a worker of a killed run.
     The first result is kept; all results are equal.
@@ -170,7 +170,7 @@ def _atomic_folder(final: Path) -> Iterator[Path]:
 
 @contextmanager
 def _output_errors(path: Path) -> Iterator[None]:
-    """Convert an OSError to an OutputError that names `path`; suppress it if `path` exists."""
+    """Convert an OSError to an OutputError that names `path`, unless `path` already exists."""
     try:
         yield
     except OSError as error:
@@ -215,7 +215,7 @@ class _Segmenter:
         self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
         self._last_ns = frame.stamp_ns
         self._writer.add_frame(frame, self._passes.calibrate.doubtful_intervals())
-        self._add_health(self._health.due(frame.stamp_ns, self._passes.calibrate))
+        self._add_health(self._health.due_rows(frame.stamp_ns, self._passes.calibrate))
 
     def _add_passes(self, passes: Iterable[tuple[PassData, tuple[str, ...]]]) -> None:
         """Assign indices to completed passes and write the passes."""
@@ -243,21 +243,21 @@ def track_segment(job: Job, k: int) -> None:
     OutputError
         If a file cannot be written.
     """
-    if not job.segment(k).exists():
-        with _atomic_folder(job.segment(k)) as folder:
-            _track_into(folder, job, k, RecordedEvidence(len(job.network)))
+    if not job.segment_folder(k).exists():
+        with _atomic_folder(job.segment_folder(k)) as folder:
+            _track_into(folder, job, k, ClockComparisonHistory(len(job.network)))
 
 
-def _track_into(folder: Path, job: Job, k: int, evidence: RecordedEvidence) -> None:
+def _track_into(folder: Path, job: Job, k: int, evidence: ClockComparisonHistory) -> None:
     """Track a segment with the clock `evidence` of earlier segments, and write its tables."""
     tracker = TrackManager(job.network, job.settings.track, evidence)
     with SegmentTables(job.recording, {name: folder / f'{name}.parquet' for name in SEGMENT_TABLES},
                        N_DIPOLES, job.settings.track) as tables:
-        for chunk in read_segment(job.cut / f'segment-{k}.pickle'):
+        for chunk in read_segment(job.cut_folder / f'segment-{k}.pickle'):
             tables.track(chunk, tracker)
         tables.finish(tracker)
     with _output_errors(folder / TRACKED_FILE), open(folder / TRACKED_FILE, 'wb') as stream:
-        pickle.dump(_Tracked(tables.n_tracks, tables.n_passes, evidence), stream)
+        pickle.dump(_SegmentResult(tables.n_tracks, tables.n_passes, evidence), stream)
 
 
 def join(job: Job) -> dict[str, Any]:
@@ -281,11 +281,11 @@ def join(job: Job) -> dict[str, Any]:
         If a file cannot be written.
     """
     columns = cut(job)
-    name, evidence = recording_key(job.recording), RecordedEvidence(len(job.network))
+    name, evidence = recording_key(job.recording), ClockComparisonHistory(len(job.network))
     folders, id_offsets, n_tracks, n_passes = [], [], 0, 0
-    with tempfile.TemporaryDirectory(dir=job.work, prefix='.again.') as repeat_folder:
+    with tempfile.TemporaryDirectory(dir=job.work_folder, prefix='.again.') as repeat_folder:
         for k in range(columns['segments']):
-            folder = job.segment(k)
+            folder = job.segment_folder(k)
             result = _read_result(folder)
             evidence.passes = []
             combined = copy.deepcopy(evidence)
@@ -305,18 +305,18 @@ def join(job: Job) -> dict[str, Any]:
         for table in SEGMENT_TABLES:
             join_tables([folder / f'{table}.parquet' for folder in folders],
                         id_offsets if table != 'passes' else [0] * len(id_offsets), table,
-                        job.folder, name)
-    join_tables([job.cut / 'health.parquet'], [0], 'health', job.folder, name)
+                        job.archive_folder, name)
+    join_tables([job.cut_folder / 'health.parquet'], [0], 'health', job.archive_folder, name)
     return {**columns, 'tracks': n_tracks, 'passes': n_passes, 'error': ''}
 
 
-def _read_result(folder: Path) -> _Tracked:
+def _read_result(folder: Path) -> _SegmentResult:
     """Read the result that `track_segment` stored in a folder."""
     with open(folder / TRACKED_FILE, 'rb') as stream:
-        result: _Tracked = pickle.load(stream)
+        result: _SegmentResult = pickle.load(stream)
     return result
 
 
 def _format_counts(counts: Mapping[str, int]) -> str:
-    """Format counts {cause: number} as a string."""
+    """Format counts {cause: number} as `number cause; number cause`."""
     return '; '.join(f'{n} {cause}' for cause, n in counts.items())

@@ -24,8 +24,8 @@ from mag_tracking.recording.pose_table import (
 )
 
 ASSUMED_NOISE = 1e-7
-"""Noise assumed for sensors without a configured noise [T]. Near a magnet, the field error is
-larger."""
+"""Noise assumed for sensors without a configured noise [T]. Near a magnet, the error of the
+field model is larger."""
 
 MIN_ROTATION_STD = 1e-7
 """Standard deviation below which an orientation is considered fixed, not estimated [rad]."""
@@ -181,7 +181,7 @@ def corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
 
 
 def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: str,
-                       by: str) -> SensorNetwork:
+                       method: str) -> SensorNetwork:
     """Return a network with the estimated positions, orientations, gains and biases.
 
     A reading is gain * field + bias. The stage Calibrate applies the correction before it removes
@@ -195,7 +195,7 @@ def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: 
     geometry : NetworkGeometry
     date : str
         Date of the calibration.
-    by : str
+    method : str
         Method of the calibration.
 
     Returns
@@ -219,7 +219,7 @@ def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: 
             columns['orientation_std'][j] = std
         record = network.calibrated[j]
         columns['calibrated'][j] = network.calibration_record(
-            j, date, by, np.nan if record is None else record.clock_offset_std)
+            j, date, method, np.nan if record is None else record.clock_offset_std)
     changes: dict[str, Any] = {name: tuple(column) for name, column in columns.items()}
     return replace(network, positions=estimated.positions, R_ws=estimated.R_ws, **changes)
 
@@ -234,7 +234,7 @@ def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
 
 
 def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwork:
-    """Return `network` with `noise_std` [T] where no noise is configured; unchanged if None."""
+    """Return `network` with `noise_std` [T] for sensors without a noise; None changes nothing."""
     if noise_std is None:
         return network
     return replace(network, noise_std=tuple(

@@ -77,11 +77,11 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
     RecordingError
         If the recording has none of the network's topics, or no samples.
     """
-    levels, survey, calibrated, interrupted = _survey_recording(
+    levels, survey, stage, interrupted = _survey_recording(
         recording, network, settings, date, progress, stopped)
-    if not calibrated.counts.total():
+    if not stage.counts.total():
         raise RecordingError(f'{recording.path}: no samples from the sensors of the network')
-    estimated = with_measured_noise(survey.network, calibrated)
+    estimated = with_measured_noise(survey.network, stage)
     evidence = None
     # A faulty sensor would bias the orientations of the other sensors.
     if passes and not interrupted and settings.track.mounting_std_deg \
@@ -95,7 +95,7 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
             estimated = _with_pass_records(with_pass_mounting(estimated, evidence), estimated, date,
                                            evidence.n_tracks)
     without_background = tuple(name for name in network.names if name not in levels)
-    return Calibration(estimated, survey, evidence, levels, rejected(calibrated.counts),
+    return Calibration(estimated, survey, evidence, levels, rejected(stage.counts),
                        without_background, interrupted)
 
 
@@ -106,8 +106,8 @@ def _survey_recording(recording: Recording, network: SensorNetwork, settings: Se
     """Survey a network from a recording; return (backgrounds, survey, stage, interrupted)."""
     reader = SampleReader(recording, network)
     # Backgrounds and noise in the network file may be outdated; they are learnt again.
-    unlearnt = replace(network, background=(), noise_std=())
-    stage, survey = Calibrate(unlearnt, settings.calibrate), Survey(network, settings.survey)
+    cleared_network = replace(network, background=(), noise_std=())
+    stage, survey = Calibrate(cleared_network, settings.calibrate), Survey(network, settings.survey)
     levels: dict[str, FloatArray] = {}
     interrupted = False
     try:
@@ -152,7 +152,7 @@ def _track_passes(recording: Recording, network: SensorNetwork, settings: Settin
 
 def _with_pass_records(network: SensorNetwork, surveyed: SensorNetwork, date: str,
                        n_tracks: int) -> SensorNetwork:
-    """Return `network` with the records of `surveyed`, each with the number of passes added."""
+    """Return `network` with the records of `surveyed`, plus the date and number of passes."""
     passes = quantity(n_tracks, 'pass', 'passes')
     return replace(network, calibrated=tuple(
         surveyed.calibration_record(j, date, f'nominal orientation; {passes}') if record is None

@@ -21,13 +21,13 @@ KNOCK_MARGIN_S = 0.25
 """Time shown before and after a knock [s]."""
 
 
-def write_report(found: Calibration, stated: SensorNetwork, name: str, path: Path) -> None:
+def write_report(calibration: Calibration, nominal: SensorNetwork, name: str, path: Path) -> None:
     """Write the report of a calibration.
 
     Parameters
     ----------
-    found : Calibration
-    stated : SensorNetwork
+    calibration : Calibration
+    nominal : SensorNetwork
         Network before the calibration.
     name : str
         Name of the recording.
@@ -39,16 +39,16 @@ def write_report(found: Calibration, stated: SensorNetwork, name: str, path: Pat
     OutputError
         If the file cannot be written.
     """
-    replace_text(path, report_html(calibration_page(found, stated, name)))
+    replace_text(path, report_html(calibration_page(calibration, nominal, name)))
 
 
-def calibration_page(found: Calibration, stated: SensorNetwork, name: str) -> Page:
+def calibration_page(calibration: Calibration, nominal: SensorNetwork, name: str) -> Page:
     """Create the page of a calibration.
 
     Parameters
     ----------
-    found : Calibration
-    stated : SensorNetwork
+    calibration : Calibration
+    nominal : SensorNetwork
         Network before the calibration.
     name : str
         Name of the recording.
@@ -57,22 +57,22 @@ def calibration_page(found: Calibration, stated: SensorNetwork, name: str) -> Pa
     -------
     Page
     """
-    survey = found.survey
-    level = ERROR if survey.disagreements else WARNING
-    notes = [Note(level, text) for text in survey.warnings()]
+    survey = calibration.survey
+    severity = ERROR if survey.disagreements else WARNING
+    notes = [Note(severity, text) for text in survey.warnings()]
     notes += [Note(WARNING, f'{sensor}: no background was learnt')
-              for sensor in found.without_background]
-    notes += [Note(WARNING, f'{cause}: {n}') for cause, n in found.rejected.items()]
-    if found.evidence is not None:
-        passes = quantity(found.evidence.n_tracks, 'pass', 'passes')
+              for sensor in calibration.without_background]
+    notes += [Note(WARNING, f'{cause}: {n}') for cause, n in calibration.rejected.items()]
+    if calibration.evidence is not None:
+        passes = quantity(calibration.evidence.n_tracks, 'pass', 'passes')
         notes.append(Note(NOTE, f'{passes} used'))
-    return Page(f'Calibration from {name}', quantity(len(stated), 'sensor'), notes, None,
-                [*_knocks(found), _headings(found, stated)], [_table(found)])
+    return Page(f'Calibration from {name}', quantity(len(nominal), 'sensor'), notes, None,
+                [*_knocks(calibration), _headings(calibration, nominal)], [_table(calibration)])
 
 
-def _knocks(found: Calibration) -> list[Chart]:
+def _knocks(calibration: Calibration) -> list[Chart]:
     """Charts of the first knock, before and after clock correction."""
-    shocks = dict(list(found.survey.shocks.items())[:MAX_KNOCKS])
+    shocks = dict(list(calibration.survey.shocks.items())[:MAX_KNOCKS])
     if not shocks:
         return []
     first, charts = first_knock(shocks), []
@@ -80,7 +80,8 @@ def _knocks(found: Calibration) -> list[Chart]:
                                 ('First knock, corrected clocks', True)):
         traces = []
         for k, (name, (t, acceleration)) in enumerate(shocks.items()):
-            offset = found.network.clock_offset[found.network.index(name)] if is_corrected else 0.0
+            offset = calibration.network.clock_offset[calibration.network.index(name)] \
+                if is_corrected else 0.0
             near = np.abs(t - offset - first) < KNOCK_MARGIN_S
             traces.append(curve(t[near] - offset - first, acceleration[near], name, k,
                                 'lines+markers'))
@@ -89,29 +90,29 @@ def _knocks(found: Calibration) -> list[Chart]:
     return charts
 
 
-def _headings(found: Calibration, stated: SensorNetwork) -> Chart:
+def _headings(calibration: Calibration, nominal: SensorNetwork) -> Chart:
     """Chart of the rotation of each sensor about the vertical, relative to the network file."""
-    steps = [('compass', found.survey.network)]
-    if found.evidence is not None:
-        steps.append(('compass and passes', found.network))
+    steps = [('compass', calibration.survey.network)]
+    if calibration.evidence is not None:
+        steps.append(('compass and passes', calibration.network))
     traces = []
     for k, (label, network) in enumerate(steps):
-        yaw = [float(np.degrees(yaw_between(stated.R_ws[j], network.R_ws[j])))
-               for j in range(len(stated))]
+        yaw = [float(np.degrees(yaw_between(nominal.R_ws[j], network.R_ws[j])))
+               for j in range(len(nominal))]
         half_width = [0.0 if s is None else SCALE_1D * float(np.degrees(s[2]))
                       for s in network.orientation_std]
         traces.append({
             'type': 'scatter', 'mode': 'markers', 'x': yaw, 'name': label, 'showlegend': True,
-            'y': [plain(name) for name in stated.names],
+            'y': [plain(name) for name in nominal.names],
             'error_x': {'type': 'data', 'array': half_width, 'color': SERIES_COLOURS[k]},
             'marker': {'color': SERIES_COLOURS[k], 'size': 8, 'symbol': ('circle', 'square')[k]}})
     return Chart('Rotation about the vertical relative to the network file, 90% intervals', traces,
                  axes('[degrees]', ''))
 
 
-def _table(found: Calibration) -> Table:
+def _table(calibration: Calibration) -> Table:
     """Table of the orientation, clock offset and noise of each sensor."""
-    network, rows = found.network, list[list[str | float | None]]()
+    network, rows = calibration.network, list[list[str | float | None]]()
     for j, name in enumerate(network.names):
         R, std, noise = network.R_ws[j], network.orientation_std[j], network.noise_std[j]
         record = network.calibrated[j]

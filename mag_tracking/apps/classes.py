@@ -46,7 +46,7 @@ class Examples:
     groups: tuple[str, ...]
     """(n,) identifiers of targets; equal for signatures of the same target."""
     axes: tuple[str, ...]
-    """Axes of all signatures."""
+    """Axes that every signature has, such as ('x', 'y')."""
     unit: str
     """Unit of all signatures; empty if unknown."""
     unusable: tuple[str, ...]

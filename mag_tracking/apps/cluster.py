@@ -89,8 +89,8 @@ class Cluster(Generic[_Key]):
         self._last_worker_time = time.monotonic()
         try:
             self._client = self._stack.enter_context(
-                _local(distributed, self._stack, workers) if scheduler is None
-                else _remote(distributed, scheduler))
+                _local_client(distributed, self._stack, workers) if scheduler is None
+                else _remote_client(distributed, scheduler))
         except BaseException:
             self._stack.close()
             raise
@@ -132,6 +132,7 @@ class Cluster(Generic[_Key]):
         priority : int
             Tasks with a higher priority are started first.
         task : function
+            Called by a worker.
         *arguments : picklable
         """
         self._run(_Task(key, priority, task, arguments, False))
@@ -238,7 +239,7 @@ def _event_loop() -> 'IOLoop':
                            f'{THREAD_START_TIMEOUT_S:.0f} s') from error
 
 
-def _local(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
+def _local_client(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
     """Start worker processes on this machine and return a client that submits tasks to them."""
     # Starting Python's resource tracker unblocks SIGINT in the calling thread, which must not be
     # the thread of the event loop.
@@ -254,19 +255,19 @@ def _local(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
     return client
 
 
-async def _reach(address: str) -> None:
+async def _check_response(address: str) -> None:
     """Check that a scheduler responds; raises OSError or ValueError."""
     from distributed.comm.core import connect
 
     await (await connect(address, timeout=CONNECT_TIMEOUT_S)).close()
 
 
-def _remote(distributed: Any, address: str) -> 'Client':
+def _remote_client(distributed: Any, address: str) -> 'Client':
     """Connect a client to a running scheduler; raises ClusterError."""
     loop = _event_loop()
     try:
         # A client that cannot connect reports errors when it is garbage-collected.
-        distributed.utils.sync(loop, _reach, address)
+        distributed.utils.sync(loop, _check_response, address)
         client: Client = distributed.Client(address, timeout=CONNECT_TIMEOUT_S, loop=loop)
     except (OSError, ValueError) as error:
         raise ClusterError(f'{address}: no response from a Dask scheduler ({error})') from error

@@ -33,7 +33,8 @@ MIN_MISSED_TARGETS = 3
 """Number of consecutive missed targets at which a sensor is reported."""
 
 LEVEL_STEP = 1e-8
-"""Step to which levels are rounded for comparison [T]: a fiftieth of the field of nearby iron."""
+"""Resolution to which levels are rounded before sensors are compared [T]; nearby iron changes the
+field by about fifty times as much."""
 
 
 def level_of(calibrate: Calibrate, name: str, health: SensorHealth) -> FloatArray:
@@ -140,10 +141,10 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
                       'keep targets away during the first seconds, or set background and '
                       'noise_std in the network file')
     if background.n_relearnt > n_reported:
-        yield Finding(False, name, f'a lasting change of the field became its background '
-                      f'{occurrences(background.n_relearnt - n_reported)}',
-                      'check for a parked vehicle or an object near it; calibrate.relearn_s: 0 '
-                      'disables relearning')
+        n_times = occurrences(background.n_relearnt - n_reported)
+        yield Finding(False, name, f'its background was relearnt {n_times} after a lasting change of '
+                      'the field', 'check for a parked vehicle or an object near it; '
+                      'calibrate.relearn_s: 0 disables relearning')
     if last is not None and frozen_since_ns is not None \
             and (last - frozen_since_ns) / NS > MAX_FROZEN_S:
         yield Finding(False, name, 'its background has been frozen for '
@@ -219,7 +220,7 @@ class Doctor:
         self.sensors = {name: SensorHealth() for name in network.names}
         self.calibrate = Calibrate(network, settings.calibrate)
         self._clock_ns = dict(zip(network.names, network.clock_offset_ns.tolist(), strict=True))
-        self._frozen_ns: dict[str, int] = {}
+        self._frozen_since_ns: dict[str, int] = {}
         self._missed = MissedTargets(network.names)
 
     def feed(self, readings: Readings, received_ns: int | None = None) -> None:
@@ -238,8 +239,8 @@ class Doctor:
         backgrounds = self.calibrate.backgrounds()
         for name, stamp in zip(names, stamps, strict=True):
             if backgrounds[name].frozen:
-                self._frozen_ns.setdefault(name, stamp)
-            elif (begin_ns := self._frozen_ns.pop(name, None)) is not None:
+                self._frozen_since_ns.setdefault(name, stamp)
+            elif (begin_ns := self._frozen_since_ns.pop(name, None)) is not None:
                 self._missed.add_target(name, begin_ns, self.sensors)
 
     def findings(self) -> list[Finding]:
@@ -254,7 +255,7 @@ class Doctor:
         for j, (name, health) in enumerate(self.sensors.items()):
             found += health.findings(name, self.network.noise_std[j],
                                      self._settings.calibrate.max_field)
-            found += background_findings(name, self.calibrate, self._frozen_ns.get(name))
+            found += background_findings(name, self.calibrate, self._frozen_since_ns.get(name))
             found += covariance_findings(name, self.network.absolute_topics[j], self.calibrate)
         found += self._missed.findings()
         found += network_findings(self.network, self._settings.survey, self.calibrate,

@@ -14,12 +14,12 @@ MAX_MISMATCH = 3.0
 _UNITS_PER_TESLA = (('millitesla', 1e3), ('gauss', 1e4), ('microtesla', 1e6), ('nanotesla', 1e9))
 
 
-def likely_cause(stated: float, measured: float) -> str:
+def likely_cause(declared: float, measured: float) -> str:
     """Guess why the noise declared in messages differs from the noise of the readings.
 
     Parameters
     ----------
-    stated : float, T
+    declared : float, T
         Standard deviation according to the messages.
     measured : float, T
         Standard deviation of quiet readings.
@@ -29,12 +29,12 @@ def likely_cause(stated: float, measured: float) -> str:
     str
         Probable meaning of the declared covariance, such as 'a placeholder'.
     """
-    if abs(np.log(stated**2 / measured)) < np.log(MAX_MISMATCH):
+    if abs(np.log(declared**2 / measured)) < np.log(MAX_MISMATCH):
         return 'the standard deviation instead of the variance'
-    exponent = 2.0 * np.log10(stated)
+    exponent = 2.0 * np.log10(declared)
     is_round = abs(exponent - round(exponent)) < 1e-6
     for unit, scale in _UNITS_PER_TESLA:
-        if not is_round and abs(np.log(stated / measured / scale)) < np.log(MAX_MISMATCH):
+        if not is_round and abs(np.log(declared / measured / scale)) < np.log(MAX_MISMATCH):
             return f'the variance in {unit}^2'
     return 'a placeholder' if is_round else 'a placeholder, or another unit'
 
@@ -57,9 +57,9 @@ def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator
     n, declared, measured = calibrate.overruled_covariances(name)
     if not n:
         return
-    advice = (f'the measured noise was used {quantity(n, "time")}; configure the driver to publish '
-              'the variance in T^2, or zeros if it is unknown (calibrate.trust_covariances: true '
-              'uses the covariances unchecked)')
+    advice = (f'the measured noise replaced {quantity(n, "covariance")}; configure the driver to '
+              'publish the variance in T^2, or zeros if it is unknown '
+              '(calibrate.trust_covariances: true uses the covariances unchecked)')
     valid = (declared > 0.0) & np.isfinite(declared) & (measured > 0.0)
     if not valid.any() or np.abs(np.log(declared[valid] / measured[valid])).max() < np.log(2.0):
         yield Finding(False, name, f'the covariances on {topic} contradict the quiet readings '

@@ -103,15 +103,16 @@ def find_events(recording: Recording, network: SensorNetwork, settings: Settings
     calibrate = Calibrate(network, settings.calibrate)
     stage = Events(network, settings.align, settings.detect)
     prescan_of(recording, network, settings.calibrate, stopped).apply(calibrate)
-    found: list[PassEvent] = []
+    pass_events: list[PassEvent] = []
     try:
         for readings in until_stopped(reader.readings, progress, stopped):
             for calibrated in calibrate.feed(readings):
-                found += stage.feed(calibrated)
+                pass_events += stage.feed(calibrated)
     except ReadingStopped:
         pass
     for calibrated in calibrate.flush():
-        found += stage.feed(calibrated)
-    found += stage.flush()
-    return EventsResult(tuple(found), dict(reader.rejected + Counter(rejected(calibrate.counts))),
+        pass_events += stage.feed(calibrated)
+    pass_events += stage.flush()
+    return EventsResult(tuple(pass_events),
+                        dict(reader.rejected + Counter(rejected(calibrate.counts))),
                         tuple(calibrate.unready()), tuple(reader.missing_topics()))

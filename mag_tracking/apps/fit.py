@@ -100,8 +100,8 @@ class RecordingFit:
         lines += [f'no background was learnt for {name}: its quiet intervals are too short; '
                   'set background and noise_std in the network file'
                   for name in collector.sensors_without_background()]
-        why = collector.no_detection_reason(self._reader.missing_topics())
-        lines += [f'nothing was detected: {why}'] if why else []
+        reason = collector.no_detection_reason(self._reader.missing_topics())
+        lines += [f'nothing was detected: {reason}'] if reason else []
         for counts in (self._reader.rejected, collector.rejected, self._recording.losses):
             lines += [f'{cause}: {n}' for cause, n in counts.items()]
         return lines
@@ -194,7 +194,7 @@ def check_orders(name: str, orders: Sequence[int]) -> None:
     Raises
     ------
     SettingsError
-        If a number is repeated or out of range, or there is no number.
+        If a number is repeated or out of range, or `orders` is empty.
     """
     if not len(orders) or min(orders) < 1 or max(orders) > 8 or len(set(orders)) < len(orders):
         raise SettingsError(f'{name}: expected different numbers from 1 to 8, got {list(orders)}')

@@ -74,17 +74,19 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
     if any(fitted.n_vehicles > 1 for fitted in passes):
         notes.append(Note(NOTE, 'for vehicles that were fitted together, the fitted field of the '
                           'other vehicles is subtracted from the measured field'))
-    peaks = [ns / NS for ns in _peaks_ns(passes)]
+    peak_times = [ns / NS for ns in _peaks_ns(passes)]
     if len({fitted.recording for fitted in passes}) > 1:
         notes.append(Note(NOTE, 'the time axis shows the recordings one after another'))
-    tracks = [_pass_entry(k + 1, fitted, fitted.chosen, peaks[k])
+    tracks = [_pass_entry(k + 1, fitted, fitted.chosen, peak_times[k])
               for k, fitted in enumerate(passes) if fitted.chosen is not None]
-    ends = [peaks[k] + float(fitted.fits[0].data.t.max()) for k, fitted in enumerate(passes)]
-    scene = scene_of(network, 0, int(max(ends) * NS), tracks) if tracks else None
+    end_times = [peak_times[k] + float(fitted.fits[0].data.t.max())
+                 for k, fitted in enumerate(passes)]
+    scene = scene_of(network, 0, int(max(end_times) * NS), tracks) if tracks else None
     n_estimates = len(tracks)
     n_passes = len({(fitted.recording, fitted.number) for fitted in passes})
-    several = f', {quantity(len(passes), "vehicle")}' if len(passes) > n_passes else ''
-    return Page(f'{quantity(n_passes, "pass", "passes")}{several}, {n_estimates} with an estimate',
+    vehicles_text = f', {quantity(len(passes), "vehicle")}' if len(passes) > n_passes else ''
+    return Page(f'{quantity(n_passes, "pass", "passes")}{vehicles_text}, '
+                f'{n_estimates} with an estimate',
                 'each fitted as a row of dipoles at constant velocity', notes, scene,
                 [_order_chart(passes)] if passes else [], [_table(passes)])
 
@@ -101,21 +103,21 @@ def _poor_fits(passes: Sequence[FittedPass]) -> list[str]:
 
 def _peaks_ns(passes: Sequence[FittedPass]) -> list[int]:
     """Return each pass's time of strongest field on the time axis of the page [ns]."""
-    out: list[int] = []
+    peaks: list[int] = []
     recording, shift, end = '', 0, 0
     for fitted in passes:
         data = fitted.fits[0].data
         if fitted.recording != recording:
             recording = fitted.recording
             first = data.stamp_ns + int(NS * data.t.min())
-            shift = end + (int(RECORDING_GAP_S * NS) if out else 0) - first
-        out.append(data.stamp_ns + shift)
-        end = out[-1] + int(NS * data.t.max())
-    return out
+            shift = end + (int(RECORDING_GAP_S * NS) if peaks else 0) - first
+        peaks.append(data.stamp_ns + shift)
+        end = peaks[-1] + int(NS * data.t.max())
+    return peaks
 
 
-def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, peak: float) -> dict[str, Any]:
-    """Create the scene entry of a chosen fit; `peak` is the time of the strongest field [s]."""
+def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, peak_time: float) -> dict[str, Any]:
+    """Create the scene entry of a chosen fit; the field is strongest at `peak_time` [s]."""
     data = fit.data
     t = np.linspace(data.t.min(), data.t.max(), N_POSES)
     F = np.tile(np.eye(6), (N_POSES, 1, 1))
@@ -125,9 +127,9 @@ def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, peak: float) -> d
     target_field = target_alone(fit)
     other_field = fit.predicted - target_field
     fields = [field_entry(int(j), (data.field - other_field)[data.sensor == j],
-                          target_field[data.sensor == j], peak + data.t[data.sensor == j])
+                          target_field[data.sensor == j], peak_time + data.t[data.sensor == j])
               for j in data.sensors]
-    entry = fitted_entry(number, peak + t, state, C, fit.ambiguous, fields)
+    entry = fitted_entry(number, peak_time + t, state, C, fit.ambiguous, fields)
     entry['facts'] = {
         'label': f'{fitted.recording}, {fitted.label}', 'kind': quantity(fit.n_dipoles, 'dipole'),
         'speed': float(fit.speed[0]), 'moment': float(np.linalg.norm(fit.moment[0])),
@@ -155,11 +157,11 @@ def _table(passes: Sequence[FittedPass]) -> Table:
         for fit in fitted.fits:
             row: list[str | float | None] = [fitted.recording, fitted.label.removeprefix('pass '),
                                              fit.n_dipoles]
-            known = bool(len(fit.x)) and not fit.reason
+            has_estimate = bool(len(fit.x)) and not fit.reason
             row += [float(fit.normalised_cost) if len(fit.x) else None]
             row += [*map(float, fit.position), float(fit.speed[0]),
                     float(np.degrees(fit.heading[0])), float(fit.length[0]),
-                    float(np.linalg.norm(fit.moment[0]))] if known else [None] * 7
+                    float(np.linalg.norm(fit.moment[0]))] if has_estimate else [None] * 7
             row += ['chosen' if fit is fitted.chosen else fit.reason]
             rows.append(row)
     return Table('All fits', ['recording', 'pass', 'dipoles', 'cost', 'x [m]', 'y [m]', 'z [m]',

@@ -119,5 +119,5 @@ class Fleet:
 
 
 def _heading(passage: VehiclePassage) -> float:
-    """Heading of a passage [rad]."""
+    """Return the heading of a passage, anticlockwise from x [rad]."""
     return float(np.arctan2(passage.velocity[1], passage.velocity[0]))

@@ -11,7 +11,7 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
 
 MAX_NOISE_RATIO = 3.0
-"""Ratio of configured noise to scatter of the readings above which noise is the likely cause."""
+"""Ratio to the scatter of readings above which a configured standard deviation is too large."""
 
 
 def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
@@ -81,9 +81,9 @@ def _likely_cause(network: SensorNetwork, settings: Settings, calibrate: Calibra
         return ('the covariances in the messages, which may be too large, are used unchecked '
                 '(calibrate.trust_covariances)')
     scatters = np.concatenate([b.scatter_std for b in calibrate.backgrounds().values()])
-    quietest = float(np.min(scatters, where=~np.isnan(scatters), initial=np.inf))
-    if settings.detect.background_std > MAX_NOISE_RATIO * quietest:
+    min_scatter = float(np.min(scatters, where=~np.isnan(scatters), initial=np.inf))
+    if settings.detect.background_std > MAX_NOISE_RATIO * min_scatter:
         return (f'detect.background_std ({settings.detect.background_std:.2g} T) is larger than '
-                f'the noise of a reading ({quietest:.2g} T)')
+                f'the noise of a reading ({min_scatter:.2g} T)')
     return ('no target came close enough, or detect.false_alarm_probability '
             f'({settings.detect.false_alarm_probability:g}) is too low')

@@ -25,7 +25,9 @@ MAX_PASS_S = 60.0
 
 
 class PassCollector:
-    """Extracts passes from readings: all measurements from `PAD_S` before an onset to the release.
+    """Extracts passes from readings.
+
+    A pass contains all measurements from `PAD_S` before the onset of a detection to its release.
 
     Parameters
     ----------
@@ -101,7 +103,7 @@ class PassCollector:
             Measurements of each pass, and notes for the user.
         """
         calibrate, align, _ = self._stages
-        out: list[tuple[PassData, tuple[str, ...]]] = []
+        passes: list[tuple[PassData, tuple[str, ...]]] = []
         batches = calibrate.feed(readings)
         if len(readings) and (batches or calibrate.n_held):
             network = self._network
@@ -112,8 +114,8 @@ class PassCollector:
         for calibrated in batches:
             self._calibrated.append(calibrated)
             for frame in align.feed(calibrated):
-                out += self._add_frame(frame)
-        return out
+                passes += self._add_frame(frame)
+        return passes
 
     def flush(self) -> list[tuple[PassData, tuple[str, ...]]]:
         """End the recording and return the pass that was still in progress.
@@ -124,15 +126,15 @@ class PassCollector:
             Measurements of the pass, and notes for the user.
         """
         calibrate, align, _ = self._stages
-        out: list[tuple[PassData, tuple[str, ...]]] = []
+        passes: list[tuple[PassData, tuple[str, ...]]] = []
         for calibrated in calibrate.flush():
             self._calibrated.append(calibrated)
-            out += [p for frame in align.feed(calibrated) for p in self._add_frame(frame)]
-        out += [p for frame in align.flush() for p in self._add_frame(frame)]
+            passes += [p for frame in align.feed(calibrated) for p in self._add_frame(frame)]
+        passes += [p for frame in align.flush() for p in self._add_frame(frame)]
         if self._onset_ns is not None and self._last_ns is not None:
-            out.append(self._cut(self._onset_ns, self._last_ns,
+            passes.append(self._cut(self._onset_ns, self._last_ns,
                                  'the recording ends before the target has passed'))
-        return out
+        return passes
 
     def _add_frame(self, frame: FieldFrame) -> list[tuple[PassData, tuple[str, ...]]]:
         """Detect targets in a frame; return the passes that end with this frame."""
@@ -199,8 +201,9 @@ class PassCollector:
 def _common_covariance(covariances: FloatArray) -> FloatArray:
     """Replace the covariances (n, 3, 3) of readings by the first one if they are similar.
 
-    While the noise is being learnt, its estimate varies slightly although the noise is constant. A
-    coarse sensor has a much larger covariance in a constant field than in a changing field.
+    While the noise is being learnt, its estimate varies slightly although the noise is constant.
+    The covariances of a coarse sensor are not similar: they are much larger in a constant field
+    than in a changing field.
     """
     traces = np.nansum(np.einsum('kii->ki', covariances), axis=1)
     if traces.max() > 2.0 * traces.min():

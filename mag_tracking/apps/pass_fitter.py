@@ -48,12 +48,12 @@ class FittedPass:
 
     @property
     def label(self) -> str:
-        """Name of the pass, and of one of several vehicles, in messages and file names."""
+        """Name for messages and file names, such as `pass 3` or `pass 3, vehicle 2`."""
         return f'pass {self.number}' + (f', vehicle {self.vehicle}' if self.n_vehicles > 1 else '')
 
     @property
     def chosen(self) -> PassFit | None:
-        """Fit with the number of dipoles that the measurements support; None if it was rejected."""
+        """Fit with the number of dipoles that the measurements support; None if it is rejected."""
         return choose_order(self.fits)
 
     @property
@@ -72,22 +72,22 @@ class FittedPass:
 
     @property
     def disagreement(self) -> tuple[float, float]:
-        """Largest differences in position [m] and velocity [m/s] from fits with a similar cost.
+        """Largest differences between the chosen fit and fits with a similar cost.
 
-        The differences from the chosen fit indicate the error of the model. They are NaN if there
-        is no chosen fit, or no other fit with a similar cost. They are also NaN if the residuals of
-        the chosen fit are consistent with the noise, because additional dipoles then fit only
-        noise.
+        The differences in position [m] and in velocity [m/s] indicate the error of the model. They
+        are NaN if there is no chosen fit, or no other fit with a similar cost. They are also NaN if
+        the residuals of the chosen fit are consistent with the noise, because additional dipoles
+        then fit only noise.
         """
         chosen = self.chosen
         if chosen is None or not chosen.cost > energy_threshold(1e-3, chosen.degrees_of_freedom):
             return np.nan, np.nan
-        similar = [f for f in self.fits if f is not chosen and not f.reason
-                   and f.normalised_cost <= MAX_COST_RATIO * chosen.normalised_cost]
-        if not similar:
+        similar_fits = [f for f in self.fits if f is not chosen and not f.reason
+                        and f.normalised_cost <= MAX_COST_RATIO * chosen.normalised_cost]
+        if not similar_fits:
             return np.nan, np.nan
-        return (max(float(np.linalg.norm(f.position - chosen.position)) for f in similar),
-                max(float(np.linalg.norm(f.velocity - chosen.velocity)) for f in similar))
+        return (max(float(np.linalg.norm(f.position - chosen.position)) for f in similar_fits),
+                max(float(np.linalg.norm(f.velocity - chosen.velocity)) for f in similar_fits))
 
 
 class PassFitter:
@@ -109,6 +109,7 @@ class PassFitter:
     Attributes
     ----------
     collector : PassCollector
+        Extracts the passes.
     """
 
     def __init__(self, recording: str, network: SensorNetwork, settings: Settings,
@@ -175,7 +176,7 @@ class PassFitter:
             yield from vehicles
 
 
-def fitted_vehicles(recording: str, number: int, data: PassData, single: Sequence[PassFit],
+def fitted_vehicles(recording: str, number: int, data: PassData, single_fits: Sequence[PassFit],
                     paths: FloatArray, ground: GroundPrior, orders: Sequence[int],
                     notes: tuple[str, ...],
                     stopped: Callable[[], bool] | None = None) -> list[FittedPass]:
@@ -188,7 +189,7 @@ def fitted_vehicles(recording: str, number: int, data: PassData, single: Sequenc
     number : int
         Index of the detection in the recording, from 1.
     data : PassData
-    single : sequence of PassFit
+    single_fits : sequence of PassFit
         Fits of the pass as a single vehicle.
     paths : (K, 6) array, m and m/s, world frame
         Position and velocity of each tracked vehicle when `data.t` is zero.
@@ -205,7 +206,7 @@ def fitted_vehicles(recording: str, number: int, data: PassData, single: Sequenc
     list of FittedPass
         One entry per vehicle.
     """
-    vehicles = fit_targets(data, single, paths, ground, orders, stopped)
+    vehicles = fit_targets(data, single_fits, paths, ground, orders, stopped)
     if len(vehicles) == 1:
         return [FittedPass(recording, number, vehicles[0], notes, correlated_motion(data))]
     chosen = [fit for fit in map(choose_order, vehicles) if fit is not None]

@@ -88,8 +88,9 @@ class PassTracks:
         return np.array(paths).reshape(-1, 6)
 
     def _poses_of_smallest_variance(self, end_ns: int) -> list[_Pose]:
-        """Return each track's pose of smallest variance up to `end_ns`; drop its other old poses.
+        """Return the pose with the smallest variance up to `end_ns` [ns] for each track.
 
+        The other poses up to `end_ns` are dropped.
         Vehicles that are still approaching are omitted: their latest pose has the smallest
         variance.
         """
@@ -111,7 +112,7 @@ class PassTracks:
 
 
 def ground_prior(settings: TrackSettings) -> GroundPrior:
-    """Compute the prior of the height and climb rate of vehicles from the settings of a tracker.
+    """Compute the prior of vehicle height and climb rate from the settings of a tracker.
 
     Parameters
     ----------

@@ -25,8 +25,8 @@ from mag_tracking.pipeline import Settings
 from mag_tracking.stages.track.settings import acceleration_density
 
 MAX_FRAMES = 1000
-"""Maximum number of frames of a pass in the calculation of the probability of a miss. The
-additional frames of slower passes hardly change this probability."""
+"""Maximum number of frames per pass in the calculation of the miss probability. Additional frames
+of slower passes hardly change this probability."""
 
 Area: TypeAlias = tuple[float, float, float, float]
 """Rectangle (x0, y0, x1, y1) [m]."""
@@ -37,7 +37,7 @@ GOOD_PD = 0.9
 
 @dataclass(frozen=True)
 class Lane:
-    """Straight lane through the network, with bounds and detection probabilities along the lane."""
+    """Straight lane, with Cramér-Rao bounds and detection probabilities along the lane."""
 
     name: str
     """Name in messages and figures."""
@@ -78,8 +78,8 @@ class Plan:
     lanes: tuple[Lane, ...]
     """Lanes through the network."""
     with_one_more: FloatArray
-    """Coarser map of the median position bound [m] on the lanes near the network if a sensor is
-    added at the point; NaN where no sensor is allowed."""
+    """(my, mx) m, coarser map of the median position bound on the lanes near the network if a
+    sensor is added at the point; NaN where no sensor is allowed."""
     without: float
     """Median position bound on the lanes near the network without an additional sensor [m]; NaN if
     no additional sensor is allowed."""
@@ -89,8 +89,8 @@ class Plan:
     """Observability at the closest point of the first lane, for one direction of the moment,
     without priors."""
     blocks: dict[str, FloatArray]
-    """{'with prior' or 'without prior': (3,) bounds of position, velocity and moment} at the
-    closest point of the first lane; medians over the directions of the moment."""
+    """{'with prior' or 'without prior': (3,) bounds of position [m], velocity [m/s] and moment
+    [A m²]} at the closest point of the first lane; medians over the directions of the moment."""
     missed: FloatArray
     """(n, 2) lateral distance [m] of a pass with the heading of the first lane, and probability
     that the pass is missed."""
@@ -107,7 +107,7 @@ def detection_range(target: PlannedTarget, noise_std: float, n_axes: int,
     ----------
     target : PlannedTarget
     noise_std : float, T
-        Noise of one axis of a frame.
+        Standard deviation of the noise of one axis in a frame.
     n_axes : int
         Number of axes of the sensor.
     false_alarm : float
@@ -153,48 +153,53 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     -------
     Plan
     """
-    step = progress or (lambda n: None)
+    report_part = progress or (lambda n: None)
     x, y = _grid(area, n_grid)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    place = network.positions, network.R_sw
+    sensor_poses = network.positions, network.R_sw
     prior = target.prior()
     bounds = []
     for heading in sorted({heading % np.pi for _, heading, _ in lanes}):
-        J = pass_information(*place, target, sampling, points, heading).sum(axis=2)
+        J = pass_information(*sensor_poses, target, sampling, points, heading).sum(axis=2)
         bounds.append(bounds_of(J, prior)[..., 0])
-        step(1)
+        report_part(1)
     detect = settings.detect
-    probability = detection_probabilities(*place, target, sampling, points,
+    probability = detection_probabilities(*sensor_poses, target, sampling, points,
                                           detect.false_alarm_probability, detect.background_std)
-    step(1)
-    planned = tuple(_lane(network, target, sampling, *lane, area, settings) for lane in lanes)
-    step(1)
+    report_part(1)
+    planned_lanes = tuple(_lane(network, target, sampling, *lane, area, settings) for lane in lanes)
+    report_part(1)
     # The effect of the additional sensor is evaluated where the lanes are near the network.
     half_length = 0.5 * max(np.ptp(network.positions[:, :2], axis=0).max(), 8.0 * target.height)
-    near = [(lane.heading, lane.points[np.abs(lane.along) <= half_length][::4]) for lane in planned]
+    near_lanes = [(lane.heading, lane.points[np.abs(lane.along) <= half_length][::4])
+                  for lane in planned_lanes]
     coarse_x, coarse_y = _grid(area, max(11, n_grid // 2))
-    places = np.stack(np.meshgrid(coarse_x, coarse_y), axis=-1).reshape(-1, 2)
-    allowed = np.all([_lane_distances(lane, places) >= clearance for lane in planned], axis=0)
-    median_bound = np.full(len(places), np.nan)
-    without, with_sensor = _added_sensor_bounds(network, target, sampling, near, places[allowed])
+    candidates = np.stack(np.meshgrid(coarse_x, coarse_y), axis=-1).reshape(-1, 2)
+    allowed = np.all([_lane_distances(lane, candidates) >= clearance for lane in planned_lanes],
+                     axis=0)
+    median_bound = np.full(len(candidates), np.nan)
+    without, with_sensor = _added_sensor_bounds(network, target, sampling, near_lanes,
+                                                candidates[allowed])
     median_bound[allowed] = with_sensor
-    step(1)
-    best = int(np.nanargmin(median_bound)) if allowed.any() else 0
-    observable, blocks = _closest_point_bounds(network, target, sampling, planned[0], half_length)
+    report_part(1)
+    best_index = int(np.nanargmin(median_bound)) if allowed.any() else 0
+    lane_observability, blocks = _closest_point_bounds(network, target, sampling,
+                                                       planned_lanes[0], half_length)
     shape = len(coarse_y), len(coarse_x)
     return Plan(
         network, target, sampling, x, y,
         np.median(np.concatenate(bounds, axis=1), axis=1).reshape(len(y), len(x)),
-        probability.mean(axis=1).reshape(len(y), len(x)), planned, median_bound.reshape(shape),
-        without, (float(coarse_x[best % shape[1]]), float(coarse_y[best // shape[1]])),
-        observable, blocks,
-        _miss_probabilities(network, target, sampling, planned[0], area, settings))
+        probability.mean(axis=1).reshape(len(y), len(x)), planned_lanes,
+        median_bound.reshape(shape), without,
+        (float(coarse_x[best_index % shape[1]]), float(coarse_y[best_index // shape[1]])),
+        lane_observability, blocks,
+        _miss_probabilities(network, target, sampling, planned_lanes[0], area, settings))
 
 
 def _closest_point_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                           lane: Lane, distance_scale: float,
                           ) -> tuple[Observability, dict[str, FloatArray]]:
-    """Compute `Plan.observability`, with positions scaled by a distance [m], and `Plan.blocks`."""
+    """Compute `Plan.observability` and `Plan.blocks`; `distance_scale` [m] scales positions."""
     closest = lane.points[np.argmin(np.abs(lane.along))][None]
     J = pass_information(network.positions, network.R_sw, target, sampling, closest,
                          lane.heading)[0].sum(axis=1)
@@ -204,10 +209,10 @@ def _closest_point_bounds(network: SensorNetwork, target: PlannedTarget, samplin
              'without prior': np.median(bounds_of(J, np.zeros((9, 9))), axis=0)})
 
 
-def _lane_distances(lane: Lane, places: FloatArray) -> FloatArray:
-    """Distances (n,) [m] of `places` (n, 2) from the centre line of a lane."""
+def _lane_distances(lane: Lane, points: FloatArray) -> FloatArray:
+    """Distances (n,) [m] of `points` (n, 2) from the centre line of a lane."""
     u = lane.points[-1] - lane.points[0]
-    r = places - lane.points[0]
+    r = points - lane.points[0]
     distance: FloatArray = np.abs(u[0] * r[:, 1] - u[1] * r[:, 0]) / np.hypot(*u)
     return distance
 
@@ -238,14 +243,14 @@ def _lane(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, nam
           heading: float, offset: float, area: Area, settings: Settings) -> Lane:
     """Compute bounds and detection probabilities along one lane."""
     u = np.array([np.cos(heading), np.sin(heading)])
-    half = 0.5 * np.hypot(area[2] - area[0], area[3] - area[1])
-    n = int(np.clip(half / (target.speed * sampling.period), 10, 60))
-    along = np.linspace(-half, half, 2 * n + 1)
+    half_length = 0.5 * np.hypot(area[2] - area[0], area[3] - area[1])
+    n = int(np.clip(half_length / (target.speed * sampling.period), 10, 60))
+    along = np.linspace(-half_length, half_length, 2 * n + 1)
     points = network.centre[:2] + offset * np.array([-u[1], u[0]]) + along[:, None] * u
-    place = network.positions, network.R_sw
-    J = pass_information(*place, target, sampling, points, heading).sum(axis=2)
+    sensor_poses = network.positions, network.R_sw
+    J = pass_information(*sensor_poses, target, sampling, points, heading).sum(axis=2)
     detect = settings.detect
-    probability = detection_probabilities(*place, target, sampling, points,
+    probability = detection_probabilities(*sensor_poses, target, sampling, points,
                                           detect.false_alarm_probability, detect.background_std)
     return Lane(name, heading, along, points,
                 np.median(bounds_of(J, target.prior()), axis=1),
@@ -292,46 +297,49 @@ def _filter_bound(network: SensorNetwork, target: PlannedTarget, sampling: Sampl
 
 
 def _added_sensor_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
-                         near: Sequence[tuple[float, FloatArray]],
-                         places: FloatArray) -> tuple[float, FloatArray]:
-    """Compute the median position bound [m] without an added sensor and with one at each place.
+                         near_lanes: Sequence[tuple[float, FloatArray]],
+                         candidates: FloatArray) -> tuple[float, FloatArray]:
+    """Compute the median position bound [m] without and with an additional sensor.
 
-    The bounds with an added sensor have the shape (n_places,). If `near` or `places` is empty, the
-    results are NaN and an empty array.
+    The second result has the shape (n_candidates,): one bound per candidate position. If
+    `near_lanes` or `candidates` is empty, the results are NaN and an empty array.
     """
     height = network.positions[:, 2].mean()
-    candidates = np.column_stack([places, np.full(len(places), height)])
-    upright = np.tile(np.eye(3), (len(places), 1, 1))
+    candidate_positions = np.column_stack([candidates, np.full(len(candidates), height)])
+    upright = np.tile(np.eye(3), (len(candidates), 1, 1))
     added_sampling = replace(sampling, noise_std=float(np.median(sampling.noise_std)))
     prior = target.prior()
-    base, extended = [], []
-    for heading, points in near:
-        if not len(places):
+    bounds_without, bounds_with = [], []
+    for heading, points in near_lanes:
+        if not len(candidates):
             continue
         J = pass_information(network.positions, network.R_sw, target, sampling, points,
                              heading).sum(axis=2)
-        base.append(bounds_of(J, prior)[..., 0].ravel())
-        added = pass_information(candidates, upright, target, added_sampling, points, heading)
-        extended.append(bounds_of(J[:, :, None] + added, prior)[..., 0].reshape(-1, len(places)))
-    if not base:
+        bounds_without.append(bounds_of(J, prior)[..., 0].ravel())
+        added = pass_information(candidate_positions, upright, target, added_sampling, points,
+                                 heading)
+        bounds_with.append(
+            bounds_of(J[:, :, None] + added, prior)[..., 0].reshape(-1, len(candidates)))
+    if not bounds_without:
         return float('nan'), np.zeros(0)
-    return float(np.median(np.concatenate(base))), np.median(np.concatenate(extended), axis=0)
+    return (float(np.median(np.concatenate(bounds_without))),
+            np.median(np.concatenate(bounds_with), axis=0))
 
 
 def _miss_probabilities(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                         lane: Lane, area: Area, settings: Settings) -> FloatArray:
-    """Compute `Plan.missed`: a pass is missed if too few consecutive frames detect the target."""
-    half = 0.5 * max(area[2] - area[0], area[3] - area[1])
-    offsets = np.linspace(0.0, 2.0 * half, 25)
+    """Compute `Plan.missed`; a detection needs `detect.onset_frames` consecutive frames."""
+    half_length = 0.5 * max(area[2] - area[0], area[3] - area[1])
+    offsets = np.linspace(0.0, 2.0 * half_length, 25)
     u = np.array([np.cos(lane.heading), np.sin(lane.heading)])
-    n = int(np.clip(4.0 * half / (target.speed * sampling.period), 1, MAX_FRAMES))
-    along = np.linspace(-2.0 * half, 2.0 * half, n)[:, None]
-    detect, out = settings.detect, []
+    n = int(np.clip(4.0 * half_length / (target.speed * sampling.period), 1, MAX_FRAMES))
+    along = np.linspace(-2.0 * half_length, 2.0 * half_length, n)[:, None]
+    detect, rows = settings.detect, []
     for offset in offsets:
         points = network.centre[:2] + offset * np.array([-u[1], u[0]]) + along * u
         probability = detection_probabilities(
             network.positions, network.R_sw, target, sampling, points,
             detect.false_alarm_probability, detect.background_std)
-        out.append((offset, float(np.mean(
+        rows.append((offset, float(np.mean(
             missed_detection_probability(probability, detect.onset_frames)))))
-    return np.array(out)
+    return np.array(rows)

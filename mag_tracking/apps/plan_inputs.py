@@ -100,16 +100,16 @@ def plan_inputs(network: SensorNetwork, settings: Settings, target: str | None =
     SettingsError
         If an input is out of range; the message begins with its name.
     """
-    planned = _target(settings.track, target, moment, height, speed)
+    planned_target = _target(settings.track, target, moment, height, speed)
     lanes = _lanes(settings.track.vehicle, _to_floats(heading), _to_floats(offset))
     _in_range('grid', grid, 5, 200)
     sampling = _sampling(network, settings, noise_std, rate, field_error)
-    reach = detection_range(planned, float(np.median(sampling.noise_std)), 3,
-                            settings.detect.false_alarm_probability)
-    sampling = replace(sampling, half_window=1.2 * reach / planned.speed)
+    range_m = detection_range(planned_target, float(np.median(sampling.noise_std)), 3,
+                              settings.detect.false_alarm_probability)
+    sampling = replace(sampling, half_window=1.2 * range_m / planned_target.speed)
     if clearance is None:
         clearance = CLEARANCE if moment is None else 0.0
-    return PlanInputs(planned, sampling, lanes, _area(network, reach, _to_floats(area)),
+    return PlanInputs(planned_target, sampling, lanes, _area(network, range_m, _to_floats(area)),
                       _in_range('clearance', clearance, 0.0, 1e6), grid)
 
 
@@ -168,12 +168,12 @@ def plan(network: SensorNetwork | str | PathLike[str], target: str | None = None
         If the network file is invalid.
     """
     network = network_of(network)
-    tree = settings_for('magnet' if target == 'magnet' else 'vehicle', settings)
+    full_settings = settings_for('magnet' if target == 'magnet' else 'vehicle', settings)
     inputs = plan_inputs(
-        network, tree, target, moment=moment, height=height, speed=speed, heading=heading,
+        network, full_settings, target, moment=moment, height=height, speed=speed, heading=heading,
         offset=offset, noise_std=noise_std, rate=rate, field_error=field_error, area=area,
         clearance=clearance, grid=grid)
-    return inputs.run(network, tree)
+    return inputs.run(network, full_settings)
 
 
 def _in_range(name: str, value: float, low: float, high: float) -> float:
@@ -255,12 +255,12 @@ def _sampling(network: SensorNetwork, settings: Settings, noise_std: float | Non
     return Sampling(period, noise / math.sqrt(max(1.0, rate * period)), error * math.sqrt(n_frames))
 
 
-def _area(network: SensorNetwork, reach: float, area: Sequence[float] | None) -> Area:
-    """Return the checked `area`; default: the box of the sensors extended by `reach` [m]."""
+def _area(network: SensorNetwork, range_m: float, area: Sequence[float] | None) -> Area:
+    """Return the checked `area`; default: the box of the sensors extended by `range_m` [m]."""
     low, high = network.positions[:, :2].min(axis=0), network.positions[:, :2].max(axis=0)
     if area is not None and len(area) != 4:
         raise SettingsError(f'area: expected X0, Y0, X1, Y1, got {area}')
-    x0, y0, x1, y1 = area or [*(low - reach), *(high + reach)]
+    x0, y0, x1, y1 = area or [*(low - range_m), *(high + range_m)]
     if not (x1 > x0 and y1 > y0):
         raise SettingsError(f'area: expected X0 < X1 and Y0 < Y1, got {area}')
     for side in (x1 - x0, y1 - y0):

@@ -68,14 +68,14 @@ def summary_lines(p: Plan) -> list[str]:
         lines.append(f'  bounds at the closest point, {name}: position {length_text(r)}, '
                      f'velocity {v:.3g} m/s, moment {m:.3g} A m^2')
     for lane in p.lanes:
-        good = np.flatnonzero(lane.detection >= GOOD_PD)
-        first = 'nowhere'
-        if len(good):
-            along = lane.along[good[0]]
-            first = f'at {abs(along):.3g} m {"past" if along > 0.0 else "before"} the centre'
+        detectable = np.flatnonzero(lane.detection >= GOOD_PD)
+        first_text = 'nowhere'
+        if len(detectable):
+            along = lane.along[detectable[0]]
+            first_text = f'at {abs(along):.3g} m {"past" if along > 0.0 else "before"} the centre'
         closest = int(np.argmin(np.abs(lane.along)))
         lines.append(f'lane {lane.name}: the detection probability of a frame reaches '
-                     f'{GOOD_PD:.0%} {first}; position bound at the centre '
+                     f'{GOOD_PD:.0%} {first_text}; position bound at the centre '
                      f'{length_text(lane.filter_std[closest])} (filter), '
                      f'{length_text(lane.pass_std[closest, 0])} (whole pass)')
     detected = p.missed[p.missed[:, 1] < 0.01, 0]
@@ -84,7 +84,7 @@ def summary_lines(p: Plan) -> list[str]:
         if len(detected) else 'the detection probability of a pass is below 99% everywhere')
     lines.append('(bounds for a point target; errors with real vehicles are several times larger)')
     if not np.isfinite(p.with_one_more).any():
-        lines.append('additional sensor: the area has no place clear of the lanes')
+        lines.append('additional sensor: no position in the area is far enough from the lanes')
     elif np.nanmin(p.with_one_more) > 0.99 * p.without:
         lines.append('additional sensor: no improvement anywhere in the area')
     else:
@@ -115,7 +115,7 @@ def plan_page(plan: Plan, lines: list[str]) -> Page:
                 [Note(NOTE, line.strip()) for line in lines], None,
                 [*_maps(plan), *_lanes(plan)],
                 [Table('Sensors', ['sensor', 'x [m]', 'y [m]', 'z [m]'],
-                       [[name, *map(float, place)] for name, place in zip(
+                       [[name, *map(float, position)] for name, position in zip(
                            network.names, network.positions, strict=True)])])
 
 
@@ -141,7 +141,7 @@ def _maps(plan: Plan) -> list[Chart]:
             heat_map(np.linspace(x[0], x[-1], nx), np.linspace(y[0], y[-1], ny), gain, 'Cividis',
                      'reduction [%]'), *_site_traces(plan, f),
             {'type': 'scatter', 'mode': 'markers', 'x': [f * plan.best_place[0]],
-             'y': [f * plan.best_place[1]], 'name': 'best place', 'hoverinfo': 'name+x+y',
+             'y': [f * plan.best_place[1]], 'name': 'best position', 'hoverinfo': 'name+x+y',
              'marker': {'symbol': 'star', 'size': 15, 'color': '#D55E00',
                         'line': {'color': '#ffffff', 'width': 1}}}], layout))
     return charts
@@ -150,9 +150,9 @@ def _maps(plan: Plan) -> list[Chart]:
 def _log_bar(low: float, high: float, title: str) -> dict[str, Any]:
     """Create a colour bar that labels logarithmic values with linear numbers."""
     steps = [10.0**k * m for k in range(-7, 8) for m in (1, 2, 5)]
-    inside = [v for v in steps if low <= np.log10(v) <= high] or [10.0 ** (0.5 * (low + high))]
-    return {'title': {'text': title, 'side': 'right'}, 'tickvals': np.log10(inside).tolist(),
-            'ticktext': [f'{v:.3g}' for v in inside]}
+    ticks = [v for v in steps if low <= np.log10(v) <= high] or [10.0 ** (0.5 * (low + high))]
+    return {'title': {'text': title, 'side': 'right'}, 'tickvals': np.log10(ticks).tolist(),
+            'ticktext': [f'{v:.3g}' for v in ticks]}
 
 
 def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:

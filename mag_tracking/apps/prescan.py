@@ -54,7 +54,7 @@ class Prescan:
         return None if level is None else [level.begin, level.end]
 
     def apply(self, calibrate: Calibrate) -> None:
-        """Initialise a calibration with the backgrounds and resolutions.
+        """Initialise the calibration stage with the backgrounds and resolutions.
 
         Parameters
         ----------
@@ -139,8 +139,8 @@ def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
         learner.feed(part)
         for name, background in learner.backgrounds().items():
             if background.ready and name not in learnt and name in first_ns:
-                since = (int(part.stamp_ns[-1]) - first_ns[name]) / NS
-                learnt[name] = since, learner.background(name)
+                elapsed_s = (int(part.stamp_ns[-1]) - first_ns[name]) / NS
+                learnt[name] = elapsed_s, learner.background(name)
 
 
 def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: QuietLevel,

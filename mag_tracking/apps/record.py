@@ -13,14 +13,14 @@ from mag_tracking.messages.types import (
 )
 from mag_tracking.quantities import quantity
 
-RESULTS_OF = ('calibration_node/', 'detection_node/', 'tracker_node/')
+RESULT_PREFIXES = ('calibration_node/', 'detection_node/', 'tracker_node/')
 """Prefixes of result topics, relative to the namespace of the recorder."""
-RESULTS = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
-"""Result topics that do not begin with a prefix in `RESULTS_OF`."""
+OTHER_RESULT_TOPICS = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
+"""Result topics that do not begin with a prefix in `RESULT_PREFIXES`."""
 
 
 class RecorderState(Protocol):
-    """State of a recorder, as described by `progress_line` and `summary`."""
+    """State of a recorder, as needed by `progress_line` and `summary`."""
 
     counts: Counter[str]
     """Number of messages written per topic."""
@@ -37,7 +37,7 @@ class RecorderState(Protocol):
 
 
 class Selection(NamedTuple):
-    """Topics to record, with names as given by the user or, after `resolved`, absolute names."""
+    """Topics to record; names may be relative, but are absolute in the result of `resolved`."""
 
     fields: tuple[str, ...] = ()
     """Magnetic-field topics of the network."""
@@ -51,10 +51,10 @@ class Selection(NamedTuple):
     """Whether to record all topics."""
     readings: str = RAW_READINGS
     """Topic with the readings of many sensors."""
-    results_of: tuple[str, ...] = RESULTS_OF
+    result_prefixes: tuple[str, ...] = RESULT_PREFIXES
     """Prefixes of result topics."""
-    result_topics: tuple[str, ...] = RESULTS
-    """Result topics that do not begin with a prefix in `results_of`."""
+    result_topics: tuple[str, ...] = OTHER_RESULT_TOPICS
+    """Result topics that do not begin with a prefix in `result_prefixes`."""
 
     def resolved(self, resolve: Callable[[str], str]) -> 'Selection':
         """Return the selection with absolute names.
@@ -71,11 +71,11 @@ class Selection(NamedTuple):
         return self._replace(
             fields=tuple(map(resolve, self.fields)), imus=tuple(map(resolve, self.imus)),
             topics=tuple(map(resolve, self.topics)), readings=resolve(self.readings),
-            results_of=tuple(f'{resolve(name.rstrip("/"))}/' for name in self.results_of),
+            result_prefixes=tuple(f'{resolve(name.rstrip("/"))}/' for name in self.result_prefixes),
             result_topics=tuple(map(resolve, self.result_topics)))
 
     def includes(self, topic: str) -> bool:
-        """Whether to record a topic.
+        """Return whether to record a topic.
 
         Parameters
         ----------
@@ -91,7 +91,7 @@ class Selection(NamedTuple):
         # Topics with a name component that begins with an underscore are hidden, as in rosbag2.
         if self.all_topics and '/_' not in topic:
             return True
-        return self.results and (topic.startswith(self.results_of) or topic == '/diagnostics'
+        return self.results and (topic.startswith(self.result_prefixes) or topic == '/diagnostics'
                                  or topic in self.result_topics
                                  or topic.removesuffix('_calibrated') in self.fields)
 

@@ -112,8 +112,8 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     table = read_truth_table(truth) if truth is not None and is_table else None
     reader = SampleReader(recording, network, truth if table is None else None)
     pipeline = Pipeline(network, settings)
-    found = prescan_of(recording, network, settings.calibrate, stopped)
-    found.apply(pipeline.calibrate)
+    prescan = prescan_of(recording, network, settings.calibrate, stopped)
+    prescan.apply(pipeline.calibrate)
     interrupted = False
 
     with ResultFolder(out, network) as results:
@@ -127,7 +127,7 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
             interrupted = True
         collector.add(pipeline.flush())
         arrays = reader.truth_arrays() if table is None else table
-        summary = summarise(recording, reader, pipeline, collector, arrays, found)
+        summary = summarise(recording, reader, pipeline, collector, arrays, prescan)
         summary['interrupted'] = interrupted
         results.write_summary(summary)
     return Run(summary, collector.logs, collector.smoothed, arrays)
@@ -230,7 +230,7 @@ class RunCollector:
 
 def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
               collector: RunCollector, truth: Mapping[str, Truth],
-              found: Prescan) -> dict[str, Any]:
+              prescan: Prescan) -> dict[str, Any]:
     """Summarise a replay.
 
     Parameters
@@ -242,7 +242,7 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
         Pipeline after the whole recording has been processed.
     collector : RunCollector
     truth : {target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}
-    found : Prescan
+    prescan : Prescan
         Result of the first pass over the recording.
 
     Returns
@@ -258,7 +258,7 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
                          'ready': background.ready, 'stuck': background.stuck,
                          'times_relearnt': background.n_relearnt,
                          'doubtful_ns': [list(segment) for segment in background.doubtful_times],
-                         'quiet_stretch_s': found.segment_of(name)}
+                         'quiet_stretch_s': prescan.segment_of(name)}
         covariance = background.covariance
         if background.ready and covariance is not None and counts['accepted']:
             std = np.sqrt(np.diagonal(covariance))
@@ -284,7 +284,7 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
 
 def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline,
                  truth: Mapping[str, Truth]) -> dict[str, Any]:
-    """Entry of a track in the summary."""
+    """Create the entry of a track in the summary."""
     entry: dict[str, Any] = log.summary()
     entry['nis_by_sensor'] = log.nis_of(pipeline.network.names)
     entry['mounting'] = _mounting(log, pipeline)
@@ -303,7 +303,7 @@ def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline
 
 
 def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
-    """Speed and heading from the delays between the sensors, or the reason why they are missing."""
+    """Create the entry `delay` of a track: speed and heading, or why both are missing."""
     motion = correlated_motion(PassData.of_frames(network, log.stamp_ns, log.measured, log.noise))
     if motion.reason:
         return {'reason': motion.reason}
@@ -340,12 +340,12 @@ def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Configured,
     dict or None
         Entry `truth` of a track in `summary.json`; None if no ground truth covers the track.
     """
-    best: tuple[float, dict[str, Any]] | None = None
+    best_match: tuple[float, dict[str, Any]] | None = None
     for name, arrays in truth.items():
         errors = _errors_of(log, pipeline, arrays)
-        if errors is not None and (best is None or errors[0] < best[0]):
-            best = errors[0], {'name': name, **errors[1]}
-    return None if best is None else best[1]
+        if errors is not None and (best_match is None or errors[0] < best_match[0]):
+            best_match = errors[0], {'name': name, **errors[1]}
+    return None if best_match is None else best_match[1]
 
 
 def _errors_of(log: TrackLog | SmoothedLog, pipeline: Configured,

@@ -92,9 +92,9 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(WARNING, quantity(n_lost, 'track lost its target', 'tracks lost their target')
                    + ': check the orientations in the network file; other possible causes are '
                    'simultaneous targets, or a kind of target that the settings do not include')
-    uncertain = counts.get('sensors whose orientation is hardly known', 0)
-    if uncertain:
-        yield Note(WARNING, quantity(uncertain, 'sensor has', 'sensors have')
+    n_uncertain = counts.get('sensors whose orientation is hardly known', 0)
+    if n_uncertain:
+        yield Note(WARNING, quantity(n_uncertain, 'sensor has', 'sensors have')
                    + ' an orientation uncertainty of more than 15 degrees in the network file: '
                    'calibrate the network')
     n_too_long = counts.get('tracks too long to smooth', 0)
@@ -116,7 +116,7 @@ def _truth_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
 
 
 def _describe_disturbance(d: Mapping[str, Any]) -> str:
-    """Describe a disturbance in one sentence."""
+    """Describe the duration, amplitude and extent of a disturbance in one sentence."""
     duration = (d['stamp_ns'] - d['begin_ns']) / NS
     extent = 'uniform over the network' if d['uniform'] > 0.5 else 'different at each sensor'
     return (f'disturbance {d["id"]}: {duration:.1f} s, up to {1e9 * d["largest"]:.3g} nT at '

@@ -116,7 +116,7 @@ def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) 
         noise = [v for v in s.get('noise_std', []) if v is not None]
         state = ('stuck' if s['stuck'] else 'no background' if not s['ready'] else
                  'doubtful at times' if s['doubtful_ns'] else 'ready')
-        nis = [found[name] for found in innovations if found[name] is not None]
+        nis = [sensor_nis[name] for sensor_nis in innovations if sensor_nis[name] is not None]
         rows.append([
             name, state, s['accepted'], s['rejected'],
             1e9 * float(np.mean(noise)) if noise else None, s['times_relearnt'],

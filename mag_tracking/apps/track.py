@@ -55,12 +55,12 @@ class TrackingResult:
     settings: Settings
     """Settings of all stages."""
     poses: StructArray
-    """(n,) published pose of every frame and track: the fields of `Track`."""
+    """(n,) published poses, one per frame and track, with the fields of `Track`."""
     smoothed: StructArray
-    """(k,) smoothed poses: the fields of `SmoothedPose`. If `complete` is false, the pose is
+    """(k,) smoothed poses with the fields of `SmoothedPose`. If `complete` is false, the pose is
     smoothed with the fixed lag `track.smoothing_lag_s`, otherwise over the whole track."""
     detections: StructArray
-    """(m,) onsets and releases: the fields of `Detection`."""
+    """(m,) onsets and releases with the fields of `Detection`."""
     tracks: dict[int, TrackLog]
     """{track id: history with hypotheses, measured and predicted fields}."""
     truth: dict[str, Truth]
@@ -80,7 +80,7 @@ class TrackingResult:
     """Sensors that were not used because their background was not learnt. To use them, record a
     quiet interval, or set `background` and `noise_std` in the network file."""
     disturbances: tuple[Disturbance, ...]
-    """Field changes that a disturbance explains better than a target does."""
+    """Field changes that are explained better by a disturbance than by a target."""
 
     def __repr__(self) -> str:
         unused = {**self.rejections, **self.lost}
@@ -286,16 +286,16 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
                 pipeline.settings.calibrate).apply(pipeline.calibrate)
         for readings in _batches(source.readings):
             collector.add(pipeline.feed(readings))
-        info = source
+        recorded = source
     else:
         recording = Recording(source)
         reader = SampleReader(recording, network)
         prescan_of(recording, network, pipeline.settings.calibrate).apply(pipeline.calibrate)
         for readings in reader.readings():
             collector.add(pipeline.feed(readings))
-        info = recorded_readings(recording, reader, Readings.joined([]))
+        recorded = recorded_readings(recording, reader, Readings.joined([]))
     collector.add(pipeline.flush())
-    return _tracking_result(pipeline, results, collector.logs, info)
+    return _tracking_result(pipeline, results, collector.logs, recorded)
 
 
 def _batches(readings: Readings) -> Iterator[Readings]:

@@ -61,7 +61,7 @@ class TrafficResult:
     summaries: tuple[TrafficSummary, ...]
     """One summary per line and interval."""
     counts: dict[str, int]
-    """Events such as passages, and tracks that crossed no line: {event: number}."""
+    """{event: number}, for events such as passages, or tracks that crossed no line."""
     rejections: dict[str, int]
     """Readings that were not used: {cause: number}."""
     missing_topics: tuple[str, ...]
@@ -71,7 +71,7 @@ class TrafficResult:
     no_detection_reason: str | None
     """Explanation, in one sentence, of why nothing was detected; None if a target was detected."""
     no_track_reason: str | None
-    """Explanation if nothing was tracked because only one sensor measured; otherwise None."""
+    """Explanation if nothing was tracked because only one sensor measured the target, else None."""
 
     def __repr__(self) -> str:
         lines = dict(Counter(v.passage.line for v in self.vehicles))
@@ -140,23 +140,23 @@ def count_traffic(recording: Recording, network: SensorNetwork, settings: Settin
     pipeline = Pipeline(network, settings)
     reader = SampleReader(recording, network)
     prescan_of(recording, network, settings.calibrate, stopped).apply(pipeline.calibrate)
-    counter = _Counter(network)
+    collector = _TrafficCollector(network)
     try:
         for readings in until_stopped(reader.readings, progress, stopped):
-            counter.add(pipeline.feed(readings))
+            collector.add(pipeline.feed(readings))
     except ReadingStopped:
         pass
-    counter.add(pipeline.flush())
+    collector.add(pipeline.flush())
     rejections = dict(reader.rejected + Counter(pipeline.rejections()))
     reason = no_detection_reason(network, settings, pipeline.calibrate, pipeline.detect,
                                  reader.missing_topics(), rejections)
-    return TrafficResult(settings.traffic.class_names, tuple(counter.vehicles),
-                         tuple(counter.summaries), dict(pipeline.traffic.counts), rejections,
+    return TrafficResult(settings.traffic.class_names, tuple(collector.vehicles),
+                         tuple(collector.summaries), dict(pipeline.traffic.counts), rejections,
                          tuple(reader.missing_topics()), tuple(pipeline.calibrate.unready()),
                          reason, no_track_reason(pipeline.counts()['track']))
 
 
-class _Counter:
+class _TrafficCollector:
     """Collects passages and summaries; stores the frames of tracks to compute the delays."""
 
     def __init__(self, network: SensorNetwork) -> None:
@@ -183,16 +183,16 @@ class _Counter:
 
     def _drop_old(self, now_ns: int) -> None:
         """Drop the frames of tracks that ended long ago, or before the time jumped back."""
-        old = self._tracks_before_jump or {track_id for track_id, frames in self._frames.items()
-                                           if now_ns - frames[-1].stamp_ns > RETENTION_S * NS}
-        for track_id in old:
+        old_ids = self._tracks_before_jump or {track_id for track_id, frames in self._frames.items()
+                                               if now_ns - frames[-1].stamp_ns > RETENTION_S * NS}
+        for track_id in old_ids:
             del self._frames[track_id]
         # Passages of tracks from before the jump arrive with the frame that jumped back.
-        jumped = self._frame is not None and now_ns < self._frame.stamp_ns
-        self._tracks_before_jump = set(self._frames) if jumped else set()
+        jumped_back = self._frame is not None and now_ns < self._frame.stamp_ns
+        self._tracks_before_jump = set(self._frames) if jumped_back else set()
 
     def _delay_motion(self, track_id: int) -> CorrelatedMotion:
-        """Compute the velocity of a track from sensor delays, or the reason why it is missing."""
+        """Compute the velocity of a track from sensor delays; `reason` explains a missing value."""
         frames = self._frames.get(track_id)
         if not frames:
             return CorrelatedMotion('the fields of the track are no longer stored')

@@ -81,8 +81,8 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
         columns['background'][j] = columns['noise_std'][j] = None
         record = network.calibrated[j]
         columns['calibrated'][j] = network.calibration_record(
-            j, date, f'{"nominal orientation" if record is None else record.by}; tumbled to '
-            f'{100 * fit.residual:.1f} % of the field', float('nan') if record is None
+            j, date, f'{"nominal orientation" if record is None else record.by}; tumbled with '
+            f'a residual of {100 * fit.residual:.1f} % of the field', float('nan') if record is None
             else record.clock_offset_std)
     changes: dict[str, Any] = {key: tuple(v) for key, v in columns.items()}
     return replace(network, **changes), fits, readings, interrupted

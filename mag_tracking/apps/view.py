@@ -21,7 +21,7 @@ BATCH_S = 0.05
 MAX_WAIT_S = 5.0
 """Maximum wait during a gap in a recording [s]."""
 HEALTH_INTERVAL_S = 1.0
-"""Interval between updates of the health [s]."""
+"""Interval between updates of the sensor health [s]."""
 
 
 def view(recording: Recording, network: SensorNetwork, settings: Settings, scene: LiveScene,

@@ -211,7 +211,7 @@ def test_plan_accepts_unusual_options(tmp_path, capsys, options):
     assert len(content['lanes']) == (2 if '--rate' in options else 1)
     assert len(list(out.glob('*.png'))) == 4
     if '1e6' in options:
-        assert 'the area has no place clear of the lanes' in capsys.readouterr().out
+        assert 'no position in the area is far enough from the lanes' in capsys.readouterr().out
 
 
 def test_the_additional_sensor_has_the_clearance_from_each_lane():

@@ -104,7 +104,7 @@ def test_clock_differences_carry_over_between_segments(
 
 
 def test_an_archive_contains_all_valid_recordings(tmp_path, recordings, capsys):
-    """Two workers report and skip the invalid recording. A second run changes nothing."""
+    """The invalid recording is reported and skipped. A second run changes nothing."""
     out, lines = tmp_path / 'out', []
     settings = settings_for('vehicle', QUICK)
     run = archive([recordings], NETWORK_FILE, settings, out, workers=2, report=lines.append)
@@ -194,7 +194,8 @@ def frames(*segments):
 
 
 @pytest.mark.parametrize('quiet_s, n', [(0.5, 1), (2.5, 1), (3.5, 2), (30.0, 2)])
-def test_segments_are_cut_where_no_track_looks_back(tmp_path, monkeypatch, quiet_s, n):
+def test_quiet_intervals_longer_than_the_lookback_separate_segments(
+        tmp_path, monkeypatch, quiet_s, n):
     monkeypatch.setattr(archive_segments, 'MIN_SEGMENT_FRAMES', 10)
     monkeypatch.setattr(archive_segments, 'CHUNK_FRAMES', 7)
     all_frames = frames((20.0, False), (2.0, True), (quiet_s, False), (2.0, True), (9.0, False))

@@ -56,15 +56,15 @@ def test_an_incompatible_folder_is_refused(tmp_path, recordings, complete_archiv
     other.write_text(NETWORK_FILE.read_text().replace('4.5', '4.6'))
     with pytest.raises(OutputError, match='other values of network'):
         archive(paths, other, settings, complete_archive)
-    old = tmp_path / 'old'
-    shutil.copytree(complete_archive, old)
-    head = json.loads((old / 'archive.json').read_text())
-    (old / 'archive.json').write_text(json.dumps({**head, 'schema': 0}))
+    old_archive = tmp_path / 'old'
+    shutil.copytree(complete_archive, old_archive)
+    metadata = json.loads((old_archive / 'archive.json').read_text())
+    (old_archive / 'archive.json').write_text(json.dumps({**metadata, 'schema': 0}))
     with pytest.raises(OutputError, match='tables of version 0; this program writes version 2'):
-        archive(paths, NETWORK_FILE, settings, old)
-    (old / 'archive.json').write_text('{"schema"')
+        archive(paths, NETWORK_FILE, settings, old_archive)
+    (old_archive / 'archive.json').write_text('{"schema"')
     with pytest.raises(OutputError, match='cannot read'):
-        archive(paths, NETWORK_FILE, settings, old)
+        archive(paths, NETWORK_FILE, settings, old_archive)
 
 
 def test_a_second_run_into_the_same_folder_is_refused(tmp_path, recordings):
@@ -81,7 +81,7 @@ def test_a_second_run_into_the_same_folder_is_refused(tmp_path, recordings):
     assert lines == ['refused']
 
 
-def test_a_scheduler_that_does_not_respond_is_an_error(tmp_path, recordings, monkeypatch):
+def test_a_scheduler_that_does_not_respond_is_reported(tmp_path, recordings, monkeypatch):
     monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT_S', 1.0)
     settings = settings_for('vehicle', QUICK)
     for address, error in ((f'tcp://127.0.0.1:{free_port()}', 'no response from a Dask scheduler'),

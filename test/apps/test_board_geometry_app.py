@@ -26,7 +26,7 @@ def with_earlier_calibration(network):
 
 
 def raw_readings(network, field):
-    """Raw readings (K, n, 3) that the network calibrates to `field`."""
+    """Raw readings (K, n, 3) [T] whose calibration by the network gives `field`."""
     return np.stack([np.linalg.solve(C, field[:, j].T).T + o for j, (C, o) in enumerate(
         zip(network.correction, network.offset, strict=True))], axis=1)
 

@@ -26,7 +26,7 @@ def truth_of(name):
     return json.loads((FILES[name].parent / f'{name}.truth.json').read_text())
 
 
-def as_installed(truth):
+def nominal_network(truth):
     """Nominal network: true positions and Earth's field; sensors upright, with x to the east."""
     n = len(truth['sensors_m'])
     names = tuple(f'mag_{i + 1}' for i in range(n))
@@ -42,7 +42,7 @@ ALL_NAMES = studied(FILES, QUICK_NAMES)
 
 @cache
 def calibration_of(name):
-    return calibrate(Recording(FILES[name]), as_installed(truth_of(name)),
+    return calibrate(Recording(FILES[name]), nominal_network(truth_of(name)),
                      settings_for('vehicle'), DATE, passes=True)
 
 
@@ -105,11 +105,11 @@ def test_heading_errors_are_within_three_stds(name):
 def test_heading_errors_are_consistent_with_their_stds():
     z = np.concatenate([errors(name)[1] / orientation_stds(name)[:, 2]
                         for name in FILES])
-    high = chi2.ppf(0.99, len(z)) / len(z)
+    limit = chi2.ppf(0.99, len(z)) / len(z)
     print(f'{len(z)} headings: mean square of normalised errors {np.mean(z**2):.3f}, '
-          f'limit {high:.3f}')
+          f'limit {limit:.3f}')
     assert len(z) == 26
-    assert np.mean(z**2) < high
+    assert np.mean(z**2) < limit
 
 
 @pytest.mark.study
@@ -119,11 +119,11 @@ def test_clock_errors_are_consistent_with_their_stds():
         *_, clock = errors(name)
         std = [c.clock_offset_std for c in calibration_of(name).network.calibrated]
         z += [e / s for e, s in zip(clock, std, strict=True) if s > 0.0]
-    high = chi2.ppf(0.99, len(z)) / len(z)
+    limit = chi2.ppf(0.99, len(z)) / len(z)
     print(f'{len(z)} clocks: mean square of normalised errors {np.mean(np.square(z)):.3f}, '
-          f'limit {high:.3f}')
+          f'limit {limit:.3f}')
     assert len(z) == 16
-    assert np.mean(np.square(z)) < high
+    assert np.mean(np.square(z)) < limit
 
 
 @pytest.mark.parametrize('name', ALL_NAMES)
@@ -160,7 +160,7 @@ def test_the_noise_is_estimated(name):
 
 def test_a_recording_without_topics_of_the_network_is_refused():
     truth = truth_of('straight_car_right')
-    network = as_installed({**truth, 'sensors_m': [[0.0, 0.0, 0.0]]})
+    network = nominal_network({**truth, 'sensors_m': [[0.0, 0.0, 0.0]]})
     object.__setattr__(network, 'topics', ('/nowhere/mag',))
     with pytest.raises(RecordingError, match='has none of the network'):
         calibrate(Recording(FILES['straight_car_right']), network, settings_for('vehicle'), DATE)
@@ -173,11 +173,11 @@ def test_a_calibration_reports_progress_and_can_be_stopped():
         polls.append(True)
         return len(polls) > 500
 
-    found = calibrate(Recording(FILES[name]), as_installed(truth_of(name)),
+    found = calibrate(Recording(FILES[name]), nominal_network(truth_of(name)),
                       settings_for('vehicle'), DATE, True, progress.append, stopped)
     assert found.interrupted and found.evidence is None
     assert 0 < sum(progress) < FILES[name].stat().st_size
     complete = []
-    calibrate(Recording(FILES[name]), as_installed(truth_of(name)), settings_for('vehicle'), DATE,
-              False, complete.append)
+    calibrate(Recording(FILES[name]), nominal_network(truth_of(name)), settings_for('vehicle'),
+              DATE, False, complete.append)
     assert sum(complete) > 1000

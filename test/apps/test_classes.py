@@ -19,7 +19,7 @@ ROAD = DATA / 'two_way_road'
 
 @pytest.fixture(scope='module')
 def tables(tmp_path_factory):
-    """Folder with the same signatures as a table by sample and as a table by signature."""
+    """Folder with two tables of the same signatures: a row per sample, and a row per signature."""
     folder, found = tmp_path_factory.mktemp('classes'), signatures(COUNTS, 'boxes')
     write_by_sample(folder / 'by_sample.csv', found)
     write_by_row(folder / 'by_row.csv', found)
@@ -31,9 +31,9 @@ def test_commands_train_evaluate_and_predict(tables, tmp_path, capsys, name):
     table, model = str(tables / f'{name}.csv'), str(tmp_path / 'classes.json')
     assert main(['classes', 'evaluate', table, '--splits', '3']) == 0
     printed = capsys.readouterr().out
-    for what in ('largest class: 7', 'balanced accuracy: ', 'recall of truck: ',
+    for text in ('largest class: 7', 'balanced accuracy: ', 'recall of truck: ',
                  'calibration error'):
-        assert what in printed
+        assert text in printed
     assert main(['classes', 'train', table, '--out', model]) == 0
     assert '25 of car, 10 of truck' in capsys.readouterr().out
     assert main(['classes', 'evaluate', table, '--model', model]) == 0
@@ -55,7 +55,7 @@ def write_intervals(path, rows, header=('label', 'begin_s', 'end_s')):
     return path
 
 
-def test_labelled_intervals_give_a_signature_of_each_sensor(tmp_path):
+def test_a_labelled_interval_gives_one_signature_per_sensor(tmp_path):
     truth = json.loads((ROAD / 'two_way_road.truth.json').read_text())
     vehicles = [v for k, v in enumerate(truth['vehicles'])
                 if all(abs(v['cpa_time_s'] - w['cpa_time_s']) > 5.0
@@ -68,12 +68,12 @@ def test_labelled_intervals_give_a_signature_of_each_sensor(tmp_path):
     # The network has two sensors, each with two axes.
     assert len(found) == 2 * len(rows) and all(s.field.shape[1] == 2 for s in found)
     epoch = truth['epoch_s']
-    absolute = [(label, round((epoch + a) * 1e9), round((epoch + b) * 1e9), 'mag_2')
-                for label, a, b in rows]
-    of_one = labelled_signatures(ROAD / 'two_way_road.mcap', write_intervals(
-        tmp_path / 'b.csv', absolute, ('label', 'begin_ns', 'end_ns', 'sensor')), network)
-    assert len(of_one) == len(rows) and all('mag_2' in s.source for s in of_one)
-    assert {s.label for s in of_one} == {'car', 'truck'}
+    absolute_rows = [(label, round((epoch + a) * 1e9), round((epoch + b) * 1e9), 'mag_2')
+                     for label, a, b in rows]
+    of_mag_2 = labelled_signatures(ROAD / 'two_way_road.mcap', write_intervals(
+        tmp_path / 'b.csv', absolute_rows, ('label', 'begin_ns', 'end_ns', 'sensor')), network)
+    assert len(of_mag_2) == len(rows) and all('mag_2' in s.source for s in of_mag_2)
+    assert {s.label for s in of_mag_2} == {'car', 'truck'}
 
 
 @pytest.mark.parametrize(('rows', 'error'), [
@@ -166,18 +166,19 @@ def test_signatures_of_events_can_be_classified(tmp_path, capsys):
 def test_an_inconsistent_model_is_refused(tables, tmp_path, capsys):
     model = tmp_path / 'classes.json'
     assert main(['classes', 'train', str(tables / 'by_row.csv'), '--out', str(model)]) == 0
-    good = json.loads(model.read_text())
+    valid_model = json.loads(model.read_text())
     changes = [({name: value}, f'{name}: expected ') for name, value in (
         ('weights', [[1.0]]), ('weights', [[1.0], [1.0, 2.0]]), ('temperature', 0),
         ('temperature', 10**400), ('limit', True), ('limit', None), ('scale', 0),
         ('classes', ['car']), ('classes', ['car', 'car']),
         ('classes', 'car'), ('offsets', [1.0]), ('mean', None), ('mean', []), ('unit', 7),
         ('examples', 3))]
-    contents = [({**good, **change}, message) for change, message in changes]
-    contents += [({k: v for k, v in good.items() if k != name}, f'the entry {name!r} is missing')
-                 for name in good]
-    contents += [({**good, 'more': 1}, "unknown entry 'more'"), ([good], 'expected a mapping'),
-                 (good['mean'], 'expected a mapping')]
+    contents = [({**valid_model, **change}, message) for change, message in changes]
+    contents += [({k: v for k, v in valid_model.items() if k != name},
+                  f'the entry {name!r} is missing') for name in valid_model]
+    contents += [({**valid_model, 'more': 1}, "unknown entry 'more'"),
+                 ([valid_model], 'expected a mapping'),
+                 (valid_model['mean'], 'expected a mapping')]
     for content, message in contents:
         model.write_text(json.dumps(content))
         assert main(['classes', 'predict', str(tables / 'by_row.csv'), '--model', str(model)]) == 1
@@ -185,10 +186,10 @@ def test_an_inconsistent_model_is_refused(tables, tmp_path, capsys):
     model.write_text('{')
     assert main(['classes', 'predict', str(tables / 'by_row.csv'), '--model', str(model)]) == 1
     assert 'is not a valid file of trained classes: it is not valid JSON' in capsys.readouterr().err
-    model.write_text(json.dumps({**good, 'mag_tracking.classes': 99}))
+    model.write_text(json.dumps({**valid_model, 'mag_tracking.classes': 99}))
     assert main(['classes', 'predict', str(tables / 'by_row.csv'), '--model', str(model)]) == 1
     assert 'class version 99 is not supported' in capsys.readouterr().err
-    model.write_text(json.dumps(good))
+    model.write_text(json.dumps(valid_model))
     table = tmp_path / 'table.csv'
     table.write_text((tables / 'by_row.csv').read_text())
     assert main(['classes', 'train', str(table), '--out', str(table)]) == 1

@@ -38,7 +38,7 @@ def test_a_description_identifies_its_cause(reason):
 
 
 def quiet(n, network):
-    """Samples of sensor `mag_1` at 100 Hz without a target."""
+    """Return `n` samples of sensor `mag_1` at 100 Hz without a target."""
     rng = np.random.default_rng(0)
     field = network.R_sw[0] @ network.earth_field
     return [MagSample(10**18 + k * STEP_NS, 'mag_1', field + 1.2e-8 * rng.standard_normal(3))
@@ -73,7 +73,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize('cause', FAULTS, ids=lambda cause: cause.name)
-def test_a_rejected_reading_is_identified(cause):
+def test_the_cause_of_a_rejected_reading_is_identified(cause):
     network = line_network(1)
     if cause is RejectionCause.AXIS_MISSING:
         network = dataclasses.replace(network, correction=(np.eye(3) + 0.1,))

@@ -12,7 +12,7 @@ from support.bundled import DATA, NETWORK_FILE, vehicle_path
 from support.iron_passes import HARD, recorded
 
 OTHER_HARD = [-x for x in HARD[:2]] + [HARD[2]]
-"""Hard iron of another vehicle, with equal magnitude."""
+"""Hard iron [A m²] of another vehicle, with the magnitude of `HARD`."""
 
 
 @pytest.fixture(scope='module')

@@ -13,8 +13,10 @@ STEP = 2e-7
 
 
 def findings_of(last_amplitude, stuck_from, n_targets=4):
-    """Findings for three sensors of coarse resolution. The third sensor measures targets of
-    `last_amplitude` [T] and repeats its reading from `stuck_from` [s].
+    """Findings, as texts, for three sensors with coarse resolution.
+
+    The third sensor measures targets with an amplitude of `last_amplitude` [T]. From `stuck_from`
+    [s] on, it repeats one reading.
     """
     network, samples = line_network(3), []
     rng = np.random.default_rng(0)

@@ -45,31 +45,31 @@ def test_the_reason_names_the_cause(expected, arguments):
     assert re.search(expected, reason_of(**arguments)), reason_of(**arguments)
 
 
-def test_trusted_covariances_are_named():
+def test_trusted_covariances_are_named_as_the_cause():
     reason = reason_of(spoiler.covariance(1e-2), calibrate__trust_covariances=True)
     assert 'calibrate.trust_covariances' in reason
     assert reason_of(spoiler.covariance(1e-2)) is None
 
 
-def test_a_wrong_unit_is_named():
+def test_readings_in_a_wrong_unit_are_reported_as_too_large():
     readings = recorded('straight_small_left').readings
     reason = reason_of(readings=dataclasses.replace(readings, field=1e6 * readings.field))
     assert 'no reading was usable: 2800 were rejected (above 0.001 T' in reason
 
 
-def test_given_backgrounds_need_no_comparison_with_readings():
-    """There are too few readings to estimate the scatter of a sensor."""
-    given = dataclasses.replace(NETWORK, noise_std=(np.full(3, 1e-8),) * 2, background=tuple(
+def test_a_reason_is_given_if_the_scatter_is_unknown():
+    """With configured backgrounds, a few readings suffice, but do not determine the scatter."""
+    configured = dataclasses.replace(NETWORK, noise_std=(np.full(3, 1e-8),) * 2, background=tuple(
         np.median(QUIET.field[np.array(QUIET.sensor_names()) == name], axis=0)
         for name in NETWORK.names))
-    assert 'times the threshold' in reason_of(network=given, readings=QUIET.part(slice(0, 40)))
+    assert 'times the threshold' in reason_of(network=configured, readings=QUIET.part(slice(0, 40)))
 
 
 def test_a_sensor_without_a_background_is_named():
     readings = recorded('straight_small_left').readings
     t = (readings.stamp_ns - readings.stamp_ns[0]) / 1e9
-    keep = np.array(readings.sensor_names()) == 'mag_1'
-    reason = reason_of(readings=readings.part((keep & (t < 5.0)) | (~keep & (t < 1.0))))
+    is_mag_1 = np.array(readings.sensor_names()) == 'mag_1'
+    reason = reason_of(readings=readings.part((is_mag_1 & (t < 5.0)) | (~is_mag_1 & (t < 1.0))))
     assert 'mag_2 had no background' in reason
 
 

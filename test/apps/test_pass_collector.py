@@ -8,7 +8,7 @@ from support.passes import EARTH, ROAD
 from support.samples import MagSample, batch
 
 
-def test_an_empty_batch_may_arrive_while_a_reading_is_delayed():
+def test_an_empty_batch_is_accepted_while_a_reading_is_held():
     """A message may contain only readings of sensors outside the network."""
     rng, passes = np.random.default_rng(0), []
     collector = PassCollector(ROAD, settings_for('vehicle'))

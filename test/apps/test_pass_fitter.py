@@ -17,20 +17,20 @@ from support.track_records import NS, track_pose
 
 
 @cache
-def fit_pair(how, simulator):
+def fit_pair(scenario, simulator):
     """Fit a pair of vehicles; return (fitted passes, `World`)."""
-    a_world = busy(how, 2, simulator, 3, n=1)
-    return fits_of_world(a_world, (2, 3)), a_world
+    world = busy(scenario, 2, simulator, 3, n=1)
+    return fits_of_world(world, (2, 3)), world
 
 
 @pytest.mark.parametrize('simulator', SIMULATORS)
-@pytest.mark.parametrize('how', ['meeting', 'following'])
-def test_two_vehicles_are_fitted_together(how, simulator):
-    passes, a_world = fit_pair(how, simulator)
+@pytest.mark.parametrize('scenario', ['meeting', 'following'])
+def test_two_vehicles_are_fitted_together(scenario, simulator):
+    passes, world = fit_pair(scenario, simulator)
     assert [fit.label for fit in passes] == ['pass 1, vehicle 1', 'pass 1, vehicle 2']
-    right = with_vehicles(passes, [(a_world.t, position) for position in a_world.positions])
-    assert sorted(match.vehicle for match in right) == [0, 1]
-    for match in right:
+    matches = with_vehicles(passes, [(world.t, position) for position in world.positions])
+    assert sorted(match.vehicle for match in matches) == [0, 1]
+    for match in matches:
         assert '2 vehicles were fitted together' in match.one.notes[-1]
         # Three standard deviations are allowed, because a driver may brake.
         found, std = match.one.chosen.speed
@@ -38,19 +38,19 @@ def test_two_vehicles_are_fitted_together(how, simulator):
 
 
 def test_a_stopped_run_returns_no_fits():
-    a_world = busy('meeting', 2, 'clouds', 3, n=1)
-    fitter = PassFitter('x', a_world.network, settings_for('vehicle'), (1, 2))
-    assert [*fitter.feed(a_world.readings, lambda: True), *fitter.flush(lambda: True)] == []
+    world = busy('meeting', 2, 'clouds', 3, n=1)
+    fitter = PassFitter('x', world.network, settings_for('vehicle'), (1, 2))
+    assert [*fitter.feed(world.readings, lambda: True), *fitter.flush(lambda: True)] == []
 
 
 @pytest.mark.study
 @pytest.mark.parametrize('name', ['meeting_2_sensors', 'following_2_sensors'])
 def test_every_vehicle_of_a_recording_is_fitted(name):
     """All sixteen directions are correct; 90 % of the speeds are within 10 %."""
-    passes, right = fits_of_recording(name)
-    off = np.array([match.one.chosen.speed[0] / match.speed - 1.0 for match in right])
-    assert len(right) == len(passes) == 16
-    assert (np.abs(off) < 0.1).mean() >= 0.9, np.round(off, 2)
+    passes, matches = fits_of_recording(name)
+    speed_errors = np.array([match.one.chosen.speed[0] / match.speed - 1.0 for match in matches])
+    assert len(matches) == len(passes) == 16
+    assert (np.abs(speed_errors) < 0.1).mean() >= 0.9, np.round(speed_errors, 2)
 
 
 def pass_of(begin, end):
@@ -62,7 +62,7 @@ def pass_of(begin, end):
 
 
 def crossing(number, at, y, v, n=5, std=0.1):
-    """Poses of a track that crosses x = 0 at time `at` [s], where its covariance is smallest."""
+    """Poses of a track that crosses x = 0 at time `at` [s], when its covariance is smallest."""
     return [track_pose(at + 0.2 * k, 0.2 * k * v, y, v, id=number,
                        covariance=(std + 0.1 * abs(k))**2 * np.eye(6))
             for k in range(-n, n + 1)]
@@ -73,7 +73,7 @@ def in_order(*tracks):
     return sorted((record for track in tracks for record in track), key=lambda r: r.stamp_ns)
 
 
-def test_vehicles_of_a_pass_have_their_smallest_covariance_in_it():
+def test_a_vehicle_belongs_to_the_pass_with_its_smallest_covariance():
     tracks = PassTracks(settings_for('vehicle').track)
     # The third vehicle belongs to the next pass, which begins before the first pass ends.
     tracks.add([object(), *in_order(crossing(1, 3.0, -1.7, 10.0), crossing(2, 4.0, 1.7, -12.0),
@@ -119,7 +119,7 @@ def test_magnets_are_not_vehicles():
     assert len(tracks.paths(pass_of(0.0, 6.0))) == 0
 
 
-def test_the_ground_prior_follows_the_settings():
+def test_the_ground_prior_combines_the_heights_of_all_kinds():
     settings = settings_for('vehicle', {
         'track.vehicle.heights': [0.4, 0.4, 1.0], 'track.vehicle.height_stds': [0.3, 0.3, 0.3],
         'track.vehicle.climb_std': 0.2})

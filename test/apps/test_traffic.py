@@ -32,12 +32,12 @@ def road():
 
 def test_thirty_vehicles_are_counted_with_direction_class_and_speed():
     passages = [v.passage for v in road().vehicles]
-    right = rightly_counted('two_way_road', passages, ROAD)
-    assert len(passages) == len(right) == 30
-    kinds = [(p.vehicle_class == 'truck') == (v['length_m'] > 6.0) for p, v in right]
-    cars = [p.vehicle_class == 'car' for p, v in right if v['length_m'] < 6.0]
+    matches = rightly_counted('two_way_road', passages, ROAD)
+    assert len(passages) == len(matches) == 30
+    kinds = [(p.vehicle_class == 'truck') == (v['length_m'] > 6.0) for p, v in matches]
+    cars = [p.vehicle_class == 'car' for p, v in matches if v['length_m'] < 6.0]
     assert np.count_nonzero(kinds) == 30 and np.count_nonzero(cars) >= 22
-    speeds = np.array([[p.speed, p.speed_std, v['speed_mps']] for p, v in right])
+    speeds = np.array([[p.speed, p.speed_std, v['speed_mps']] for p, v in matches])
     errors = np.abs(speeds[:, 0] - speeds[:, 2])
     # The goal is 30. The speeds of three small cars, tracked as point targets, are 12 to 24 % too
     # low: two of them within two standard deviations, the third ambiguous.
@@ -50,7 +50,7 @@ def test_fields_and_tracks_agree_on_directions():
     assert np.count_nonzero(np.isfinite(errors)) >= 28 and np.nanmax(errors) < 0.1
 
 
-def test_summaries_add_up():
+def test_summaries_cover_all_vehicles_and_the_whole_recording():
     result = road()
     assert sum(c.count for s in result.summaries for c in s.counts) == 30
     assert sum(s.observed_s for s in result.summaries) == pytest.approx(360.0, abs=5.0)
@@ -85,12 +85,13 @@ def test_tables_contain_every_vehicle_and_interval(tmp_path, capsys):
         ('straight_car_right', 'car'), ('straight_truck_right', 'truck')]
     assert float(rows[0]['p_car']) > 0.5 and rows[0]['headway'] == ''
     for name in ('passages', 'intervals'):
-        ours = pd.read_parquet(tmp_path / f'{name}.parquet')
-        theirs = pd.read_csv(tmp_path / f'{name}.csv')
-        assert list(ours.columns) == list(theirs.columns) and len(ours) == len(theirs)
-        numbers = ours.select_dtypes('number').columns
-        np.testing.assert_allclose(ours[numbers].astype(float), theirs[numbers].astype(float),
-                                   rtol=1e-8)
+        from_parquet = pd.read_parquet(tmp_path / f'{name}.parquet')
+        from_csv = pd.read_csv(tmp_path / f'{name}.csv')
+        assert list(from_parquet.columns) == list(from_csv.columns) \
+            and len(from_parquet) == len(from_csv)
+        numbers = from_parquet.select_dtypes('number').columns
+        np.testing.assert_allclose(from_parquet[numbers].astype(float),
+                                   from_csv[numbers].astype(float), rtol=1e-8)
     counts = pd.read_parquet(tmp_path / 'intervals.parquet')
     assert counts['count'].sum() == 2
     truth = json.loads(vehicle_path('straight_car_right').with_suffix('.truth.json').read_text())
@@ -132,18 +133,18 @@ def test_every_column_is_described():
 
 
 def test_invalid_input_is_reported_before_the_run(tmp_path, capsys):
-    good = str(vehicle_path('straight_car_right'))
+    valid_recording = str(vehicle_path('straight_car_right'))
     other = tmp_path / 'other.mcap'
     with RecordingWriter(other) as writer:
         writer.write('/elsewhere', MAGNETIC_FIELD, field_dict(0, 'mag_9', np.ones(3)), 0)
-    assert main(['traffic', good, str(other), '--network', str(NETWORK_FILE)]) == 1
-    out, err = capsys.readouterr()
-    assert '1 vehicle' not in out and 'mag-tracking: ' in err
+    assert main(['traffic', valid_recording, str(other), '--network', str(NETWORK_FILE)]) == 1
+    out, errors = capsys.readouterr()
+    assert '1 vehicle' not in out and 'mag-tracking: ' in errors
     (tmp_path / 'file').write_text('')
-    assert main(['traffic', good, '--network', str(NETWORK_FILE), '--out',
+    assert main(['traffic', valid_recording, '--network', str(NETWORK_FILE), '--out',
                  str(tmp_path / 'file')]) == 1
-    out, err = capsys.readouterr()
-    assert '1 vehicle' not in out and 'mag-tracking: ' in err
+    out, errors = capsys.readouterr()
+    assert '1 vehicle' not in out and 'mag-tracking: ' in errors
 
 
 def test_lines_without_crossings_count_no_vehicles():

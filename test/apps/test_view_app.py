@@ -44,9 +44,9 @@ class StoringScene(LiveScene):
 def view_recording(path, network, rate):
     """View a recording at `rate` times real time; return (scene, duration [s])."""
     scene = StoringScene(network)
-    began = time.monotonic()
+    start_s = time.monotonic()
     view(Recording(path), network, settings_for('vehicle', QUICK), scene, rate, lambda: False)
-    return scene, time.monotonic() - began
+    return scene, time.monotonic() - start_s
 
 
 def test_tracks_equal_a_replay(road_network):

@@ -179,7 +179,8 @@ def test_tumbling_calibrates_a_real_sensor(tmp_path, capsys):
     magnitude = np.linalg.norm((readings - network.offset[0]) @ network.correction[0].T, axis=1)
     assert magnitude.std() / magnitude.mean() <= 0.015
     assert network.offset[1] is None and network.correction[1] is None
-    assert 'nominal orientation; tumbled to 1.3 % of the field' == network.calibrated[0].by
+    assert 'nominal orientation; tumbled with a residual of 1.3 % of the field' \
+        == network.calibrated[0].by
 
 
 def test_tumbling_removes_background_and_noise_of_raw_readings(tmp_path, capsys):

@@ -103,7 +103,7 @@ def test_a_relearnt_background_is_reported(publish_until, statuses):
 
     try:
         assert publish_until(lambda: background('mag_1') == background('mag_2') == 'ready')
-        assert publish_until(lambda: 'became its background' in message('mag_1'), step=1e-6)
+        assert publish_until(lambda: 'background was relearnt' in message('mag_1'), step=1e-6)
         assert 'background' not in message('mag_2')
         state = {v.key: v.value for v in statuses['calibration_node: mag_1'].values}
         assert state['backgrounds relearnt'] == '1' and state['background'] == 'ready'
@@ -275,7 +275,7 @@ def test_past_faults_expire_after_two_windows(monkeypatch):
             stage.feed(one(sample))
         if k % 100 == 99:
             reports.append((now[0], [s.message for s in health.statuses('node', stage)]))
-    times = [t for t, messages in reports if 'became its background once' in messages[0]]
+    times = [t for t, messages in reports if 'background was relearnt once' in messages[0]]
     assert 20.0 < min(times) < 35.0
     assert sensor_health.WINDOW_S < max(times) - min(times) <= 2.0 * sensor_health.WINDOW_S + 5.0
     assert reports[-1][1] == ['running', 'running']

@@ -285,7 +285,7 @@ def test_the_doctor_reports_frozen_relearnt_and_missing_backgrounds():
     assert len(steps) == 2 and 'its background has been frozen for 5' in steps[1]
     assert 'its background is doubtful' in steps[0]
     parked = doctor_findings(lambda k, field: field + 1e-6 * (k > 1000), seconds=155.0)
-    assert len(parked) == 1 and 'became its background once;' in parked[0]
+    assert len(parked) == 1 and 'was relearnt once after a lasting change' in parked[0]
     early = doctor_findings(seconds=2.0)
     assert len(early) == 3 and all('no background was learnt' in text for text in early)
 
