@@ -91,6 +91,7 @@ def coverage(u: FloatArray, w: FloatArray) -> float:
     Returns
     -------
     float
+        0 to 1; 1 for even coverage.
     """
     x, y, z = u.T
     s = np.sqrt(15.0)

@@ -139,7 +139,7 @@ class _Counts(TypedDict):
 
 
 class _Parameters(TypedDict):
-    """Parameters and standard deviations in the readings' units; see `EllipsoidFit`."""
+    """Parameters and standard deviations in the units of `EllipsoidFit`."""
 
     offset: FloatArray
     correction: FloatArray
@@ -232,12 +232,12 @@ def _validated(readings: FloatArray, field_magnitude: float | None) -> FloatArra
 
 
 def _relative_spread(magnitudes: FloatArray) -> float:
-    """Coefficient of variation of magnitudes; NaN without readings or if all readings are zero."""
+    """Coefficient of variation of magnitudes; NaN if `magnitudes` is empty or all zero."""
     return float(magnitudes.std() / magnitudes.mean()) if magnitudes.any() else float('nan')
 
 
 def _notes_on_input(counts: _Counts, is_saturated: BoolArray) -> tuple[str, ...]:
-    """Warnings about excluded readings."""
+    """Warnings about missing and saturated readings."""
     notes: tuple[str, ...] = ()
     if counts['n_missing']:
         notes += (f'readings excluded because of a missing axis: {counts["n_missing"]}',)
@@ -274,7 +274,7 @@ def _insufficient_data(y: FloatArray) -> str:
 
 def _in_units(o: FloatArray, C: FloatArray, P: FloatArray, centre: FloatArray, scale: float,
               field_magnitude: float | None) -> _Parameters:
-    """Parameters and standard deviations in the readings' units."""
+    """Convert normalised parameters and their covariance `P` to the units of the result."""
     volume = np.linalg.det(C)**(-1.0 / 3.0)
     t = np.einsum('ij,kji->k', np.linalg.inv(C), BASIS)
     if field_magnitude is None:

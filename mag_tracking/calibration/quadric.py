@@ -9,7 +9,7 @@ OUTLIER = 4.0
 """[std] Distance from the ellipsoid beyond which a reading is an outlier."""
 
 MIN_SCALE = 1e-9
-"""Standard deviation of residuals, relative to the radius, below which rounding causes them."""
+"""Minimum standard deviation of residuals, relative to the radius; less is due to rounding."""
 
 POSSIBLE_CAUSES = ('possible causes are too few directions, a sensor at rest, or a field that is '
                    'not uniform')
@@ -69,7 +69,7 @@ def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
 
 
 def robust_std(d: FloatArray, w: FloatArray) -> float:
-    """Robust standard deviation of residuals, from the weighted median of their magnitudes.
+    """Robust standard deviation of residuals, from the weighted median of the magnitudes.
 
     Parameters
     ----------
@@ -81,6 +81,7 @@ def robust_std(d: FloatArray, w: FloatArray) -> float:
     Returns
     -------
     float
+        At least `MIN_SCALE`.
     """
     order = np.argsort(np.abs(d))
     total = np.cumsum(w[order])

@@ -23,7 +23,7 @@ differences between and next to these neighbours."""
 
 
 def isolated_readings(values: FloatArray) -> IntArray:
-    """Find single readings of one axis that differ from both neighbours while these two agree.
+    """Find single readings of one axis that differ from both neighbours, which agree.
 
     Parameters
     ----------
@@ -39,12 +39,12 @@ def isolated_readings(values: FloatArray) -> IntArray:
         return np.zeros(0, dtype=np.int64)
     change = np.diff(values)
     change_before, change_after = change[1:-2], change[2:-1]
-    around = np.maximum(np.abs(change[:-3]), np.abs(change[3:]))
-    around = np.maximum(around, np.abs(change_before + change_after))
+    adjacent = np.maximum(np.abs(change[:-3]), np.abs(change[3:]))
+    adjacent = np.maximum(adjacent, np.abs(change_before + change_after))
     height = np.minimum(np.abs(change_before), np.abs(change_after))
     smallest_change = np.min(np.abs(change[change != 0.0]), initial=np.inf)
     indices: IntArray = 2 + np.flatnonzero((change_before * change_after < 0.0) & (
-        height > MIN_ISOLATION * np.maximum(around, smallest_change)))
+        height > MIN_ISOLATION * np.maximum(adjacent, smallest_change)))
     return indices
 
 
@@ -86,8 +86,8 @@ def saturated_readings(values: FloatArray) -> BoolArray:
             continue
         edges = np.flatnonzero(np.diff(np.concatenate([[False], is_extreme, [False]])))
         for first, end in edges.reshape(-1, 2):
-            sides = [jumps[i] for i in (first - 1, end - 1) if 0 <= i < len(jumps)]
-            if end - first >= MIN_RUN and max(sides) >= MIN_JUMP * step:
+            edge_jumps = [jumps[i] for i in (first - 1, end - 1) if 0 <= i < len(jumps)]
+            if end - first >= MIN_RUN and max(edge_jumps) >= MIN_JUMP * step:
                 nearby = np.flatnonzero(is_extreme)[:, None] + np.arange(-MARGIN, MARGIN + 1)
                 out[present[np.clip(nearby, 0, len(v) - 1)]] = True
                 break

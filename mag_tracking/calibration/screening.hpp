@@ -1,7 +1,7 @@
 // Rejection of faulty readings of one sensor: spikes and stuck sensors.
 //
-// Only a suspect reading is held until the next readings permit a decision; other readings pass at
-// once.
+// Only a suspect reading is held until the next readings permit a decision; other readings pass
+// immediately.
 
 #pragma once
 

@@ -139,6 +139,6 @@ def test_a_target_that_stays_for_hours_needs_bounded_memory(chromium, scene, ser
         ...Object.values(track.arrivals).flatMap(Object.values)].map(v => v.length))
         (magTracking.scene.tracks[0])""")
     assert len(set(lengths)) == 1
-    assert sum(len(message) for message in scene.whole()) < 10_000_000
+    assert sum(len(message) for message in scene.snapshot()) < 10_000_000
     assert page.complaints == []
     page.page.close()

@@ -158,10 +158,10 @@ def test_the_number_of_viewers_is_limited(scene, monkeypatch):
 
 def test_an_error_of_the_scene_is_reported_and_does_not_stop_the_server(caplog):
     class Broken:
-        def whole(self):
+        def snapshot(self):
             return ['{"type": "health", "notes": [], "tables": []}']
 
-        def news(self):
+        def updates(self):
             raise ValueError('broken')
 
     with PageServer(Broken(), port=0) as server:
