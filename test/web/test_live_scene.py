@@ -13,7 +13,7 @@ from support.live_records import NS, feed, later, poses
 
 
 class Viewer:
-    """State of a page, built from messages; `tracks` is {key: times of the poses}."""
+    """State of a page that receives messages; `tracks` is {key: times of the poses [s]}."""
 
     def __init__(self):
         self.tracks, self.ended, self.scenes = {}, set(), 0
@@ -61,7 +61,7 @@ def test_track_1_of_a_restarted_tracker_is_a_new_track(scene, records, seconds):
 
 
 def test_a_track_after_a_killed_tracker_is_a_new_track(scene, records):
-    """The first track has no closing record; the next track begins minutes later."""
+    """Track 1 has no closing record; another track 1 begins minutes later."""
     viewer = follow(scene, records[:-1])
     feed(scene, later(records, 300.0))
     viewer.receive(scene.updates())
@@ -82,12 +82,12 @@ def test_a_late_record_of_a_track_does_not_clear_the_page(scene, records):
 def test_a_looped_bag_clears_the_page(scene, records):
     viewer = follow(scene, records)
     scenes = viewer.scenes
-    viewer.receive(feed_and_get_news(scene, records[:60]))
+    viewer.receive(updates_after(scene, records[:60]))
     assert viewer.scenes == scenes + 1
     assert sum(map(len, viewer.tracks.values())) == len(poses(records[:60]))
 
 
-def feed_and_get_news(scene, records):
+def updates_after(scene, records):
     feed(scene, records)
     return [*scene.updates(), *scene.updates()]
 
@@ -106,8 +106,8 @@ def test_old_tracks_and_excess_poses_are_removed(scene, records):
     scene.updates()
     rows = scene.updates()
     late.receive([*scene.snapshot()])
-    kept = sum(map(len, late.tracks.values()))
-    assert kept <= MAX_POSES
+    n_kept = sum(map(len, late.tracks.values()))
+    assert n_kept <= MAX_POSES
     first = min(times[-1] for times in late.tracks.values())
     last = max(times[-1] for times in late.tracks.values())
     assert last - first <= HISTORY_S
@@ -129,7 +129,7 @@ def test_nan_values_give_valid_json(scene, records):
 
 
 def test_fields_are_those_of_the_sensors_near_the_target(records, road_network):
-    """A target moves along a road from the first sensors to the last."""
+    """Fields of eight sensors are sent while a target moves from the first sensor to the last."""
     n = 20
 
     class Road:
