@@ -212,7 +212,7 @@ def _headings(std: FloatArray, B0: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _axis_changes() -> list[list[_AxisChange]]:
-    """Groups of equally complex signed permutations, simplest first."""
+    """Groups of equally complex signed permutations of the axes, simplest group first."""
     groups: dict[tuple[int, int], list[_AxisChange]] = {}
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):

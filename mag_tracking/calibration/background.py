@@ -44,7 +44,7 @@ class RunningBackground:
     block : float, s
         Length of a block.
     freeze_std : float
-        A block departs from the background if its mean differs by this number of standard
+        A block departs from the background if its mean differs by more than this number of standard
         deviations of the noise.
     relearn : float, s
         Duration of another steady level after which that level becomes the background. The

@@ -41,7 +41,7 @@ class Lag:
     correlation: float
     """Correlation at the offset, 0 to 1, even if the offset was rejected; NaN if not computed."""
     reason: str
-    """Why the offset is unknown; empty if it is known."""
+    """Reason for an unknown offset; empty if the offset is known."""
 
 
 def _no_lag(reason: str, correlation: float = float('nan')) -> Lag:

@@ -102,7 +102,7 @@ def coverage(u: FloatArray, w: FloatArray) -> float:
 
 
 def empty_octants(u: FloatArray, w: FloatArray) -> tuple[str, ...]:
-    """Find the octants that contain hardly any reading.
+    """Find the octants with a weight below `EMPTY_OCTANT`, i.e. with few or no readings.
 
     Parameters
     ----------

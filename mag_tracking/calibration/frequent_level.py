@@ -6,7 +6,7 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.blocks import Blocks, line_through, pooled_covariance
-from mag_tracking.calibration.resolution import TOGGLE
+from mag_tracking.calibration.resolution import TOGGLE_TOLERANCE
 
 MAX_CALM_RATIO = 3.0
 """Maximum standard deviation within a block, relative to the 20 % quantile of all blocks. Blocks
@@ -102,7 +102,7 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int) -> Q
     is_calm = (variance[:, is_used] <= MAX_CALM_RATIO**2 * quietest).all(axis=1)
     width = np.full(3, np.nan)
     width[is_used] = np.maximum(LEVEL_WIDTH * np.sqrt(quietest / np.median(n[:, is_used], axis=0)),
-                                np.maximum(TOGGLE * steps[is_used], MIN_WIDTH))
+                                np.maximum(TOGGLE_TOLERANCE * steps[is_used], MIN_WIDTH))
     rows = np.flatnonzero(is_calm)
     if len(rows) < MIN_BLOCKS:
         return None

@@ -30,8 +30,8 @@ SEARCH_GROWTH = 1.1
 """Factor by which the number of blocks must grow before the level is determined again."""
 
 MIN_OBSERVED_S = 10.0
-"""[s] Minimum total duration of a certain level, which must also last far longer than any other
-level."""
+"""[s] Minimum total duration of a certain level. The duration must also be at least
+`MIN_DURATION_RATIO` times the duration of any other level."""
 
 MAD_TO_STD = 1.4826
 """Standard deviation of a normal distribution relative to its median absolute deviation."""
@@ -47,7 +47,8 @@ class FrequentLevel:
     standard deviation. It is large for a level observed for less than half of the time. NaN for an
     unreported axis."""
     is_certain: bool
-    """Whether the level was observed for long enough, and far longer than any other level."""
+    """Whether the level was observed for at least `MIN_OBSERVED_S`, and at least
+    `MIN_DURATION_RATIO` times as long as any other level."""
 
     @property
     def observed_s(self) -> float:

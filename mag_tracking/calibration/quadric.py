@@ -5,7 +5,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.directions import even_weights
 
-OUTLIER = 4.0
+OUTLIER_STDS = 4.0
 """[std] Distance from the ellipsoid beyond which a reading is an outlier."""
 
 MIN_SCALE = 1e-9
@@ -29,7 +29,7 @@ def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
     offset : (3,) array
     correction : (3, 3) array
     reason : str
-        Why no ellipsoid was found; empty if one was found.
+        Reason for the failure; empty if an ellipsoid was found.
 
     References
     ----------
@@ -64,7 +64,7 @@ def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
         q = (z - o) @ C
         w = even_weights(q)
         d = np.abs(np.linalg.norm(q, axis=1) - 1.0)
-        w = w * (d <= OUTLIER * robust_std(d, w))
+        w = w * (d <= OUTLIER_STDS * robust_std(d, w))
     return o, C, ''
 
 

@@ -11,13 +11,13 @@ from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration import core
 from mag_tracking.records import plain
 
-SAME = core.SAME
+MAX_ROUNDING = core.SAME
 """Maximum relative difference of two values that is due to rounding (single precision)."""
 
 MIN_STD = core.MIN_STD
 """[T] Maximum standard deviation of the readings of an axis that has not changed."""
 
-TOGGLE = core.TOGGLE
+TOGGLE_TOLERANCE = core.TOGGLE
 """[steps] Tolerance of an axis at rest, which may toggle between two adjacent values."""
 
 
@@ -91,6 +91,6 @@ def smallest_steps(fields: FloatArray) -> FloatArray:
     for axis, values in enumerate(fields.T):
         values = values[~np.isnan(values)]
         change = np.abs(np.diff(values))
-        change = change[change > SAME * np.abs(values[1:])]
+        change = change[change > MAX_ROUNDING * np.abs(values[1:])]
         out[axis] = change.min(initial=np.inf)
     return out

@@ -12,7 +12,7 @@ MIN_JUMP = 3.0
 """Minimum jump to the limit of an axis, in multiples of the smallest step; a smooth curve in coarse
 steps reaches its extreme by single steps."""
 
-MARGIN = 6
+N_MARGIN = 6
 """Number of readings excluded before and after each saturated reading. Noise pushes some of these
 readings beyond the limit, which biases the remaining readings."""
 
@@ -88,7 +88,7 @@ def saturated_readings(values: FloatArray) -> BoolArray:
         for first, end in edges.reshape(-1, 2):
             edge_jumps = [jumps[i] for i in (first - 1, end - 1) if 0 <= i < len(jumps)]
             if end - first >= MIN_RUN and max(edge_jumps) >= MIN_JUMP * step:
-                nearby = np.flatnonzero(is_extreme)[:, None] + np.arange(-MARGIN, MARGIN + 1)
+                nearby = np.flatnonzero(is_extreme)[:, None] + np.arange(-N_MARGIN, N_MARGIN + 1)
                 out[present[np.clip(nearby, 0, len(v) - 1)]] = True
                 break
     return out

@@ -38,8 +38,7 @@ class TargetBayesFactor:
         stamp_ns : int, ns
             Timestamp of the frame.
         ratio : float
-            Bayes factor at or above which a target is favoured, and at or below the reciprocal of
-            which the alternative is favoured.
+            Required Bayes factor. The alternative is favoured at or below the reciprocal.
 
         Notes
         -----

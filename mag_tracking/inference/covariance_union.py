@@ -30,7 +30,8 @@ def inflated_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
 
     Notes
     -----
-    Only the horizontal position determines the inflation, and the other estimate has no covariance.
+    Only the horizontal position determines the inflation. The covariance of the other estimate is
+    not used.
 
     References
     ----------

@@ -14,7 +14,7 @@ from scipy.special import log_ndtr, ndtr
 
 from mag_tracking.arrays import FloatArray
 
-LAG = 0.35
+LAG_FRACTION = 0.35
 """Default lag as a fraction of the full width at half maximum of the signal energy; near the
 optimum for passes at constant speed (PHD15 Paper B eq. (19))."""
 
@@ -154,7 +154,7 @@ def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
     width = np.count_nonzero(energy > 0.5 * energy.max())
     if not width:
         return 0
-    return int(np.clip(round(LAG * width), 1, max(1, min(max_lag, len(field) // 4))))
+    return int(np.clip(round(LAG_FRACTION * width), 1, max(1, min(max_lag, len(field) // 4))))
 
 
 def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int]) -> int:

@@ -15,8 +15,8 @@ from mag_tracking.records import plain
 STRENGTHS = np.logspace(-1.5, 4.5, 13)
 """[1/s^1.5] Root spectral densities of the bank, relative to the scale of a component."""
 
-SWITCH_S = 0.75
-"""Mean time between switches of the strength [s]."""
+SWITCH_INTERVAL_S = 0.75
+"""[s] Mean time between switches of the strength."""
 
 
 class GaussMarkovVectors:
@@ -57,7 +57,7 @@ class GaussMarkovVectors:
 
     def log_density(self, vector: IntArray, H: FloatArray, y: FloatArray, variance: FloatArray,
                     dt: float) -> float:
-        """Update the filters with scalar measurements, and return the log-density of these.
+        """Update with scalar measurements, and return the log-density of these measurements.
 
         Parameters
         ----------
@@ -79,4 +79,4 @@ class GaussMarkovVectors:
         """
         return core.step_vectors(self._x, self._P, self._log_w, self._densities,
                                  plain(vector, np.int64), plain(H), plain(y), plain(variance), dt,
-                                 SWITCH_S)
+                                 SWITCH_INTERVAL_S)

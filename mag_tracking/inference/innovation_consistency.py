@@ -15,7 +15,7 @@ from mag_tracking.inference.sliding_sum import SlidingSum
 WINDOW_S = 0.5
 """[s] Length of the window of latest frames that are tested together."""
 
-FALSE_ALARM = 1e-3
+FALSE_ALARM_PROBABILITY = 1e-3
 """False-alarm probability of a test of the network, and of the tests of all sensors together."""
 
 
@@ -74,8 +74,8 @@ class InnovationConsistency:
 
     def _fails(self, values: FloatArray) -> FloatArray:
         """Flag the sums of NIS (n_sensors + 1,) that exceed the chi-square threshold."""
-        probability = np.append(np.full(self._n_sensors, FALSE_ALARM / self._n_sensors),
-                                FALSE_ALARM)
+        probability = np.append(np.full(self._n_sensors, FALSE_ALARM_PROBABILITY / self._n_sensors),
+                                FALSE_ALARM_PROBABILITY)
         nis, dof = values
         with np.errstate(invalid='ignore'):
             exceeds: FloatArray = nis > np.where(

@@ -142,7 +142,7 @@ def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
 
 
 def _axis_value(field: Any, axis: str) -> float:
-    """Field of one axis [T]; NaN for null. Raise ValueError if it is missing or not a number."""
+    """Field of one axis [T]; NaN for null. Raise ValueError for a missing or non-numeric axis."""
     if not hasattr(field, axis):
         raise ValueError(f'magnetic_field.{axis} is missing')
     value = getattr(field, axis)

@@ -115,7 +115,7 @@ UNRESOLVED = pytest.mark.xfail(strict=True, reason=(
     pytest.param(shape, rates, marks=[UNRESOLVED] * (shape == 'ringing' and rates[0] == 100.0))
     for shape in SHAPES for rates in [(100.0, 100.0), (200.0, 100.0), (400.0, 400.0)]])
 def test_error_agrees_with_its_std(shape, rates, n=60):
-    """The mean normalised squared error is within chi-square limits, of which the lower is wide."""
+    """The mean normalised squared error is below its chi-square limit, and not far below one."""
     squares, missed = [], 0
     for seed in range(n):
         rng = np.random.default_rng(1000 + seed)

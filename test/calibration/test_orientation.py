@@ -1,4 +1,4 @@
-"""Tilt and heading: properties, consistent standard deviations, and unobservable headings."""
+"""Tilt and heading: invariances, consistent standard deviations, and unobservable headings."""
 
 import numpy as np
 import pytest

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from mag_tracking.apps.pass_collector import PassCollector
-from mag_tracking.calibration.saturation import MARGIN, saturated_readings
+from mag_tracking.calibration.saturation import N_MARGIN, saturated_readings
 from mag_tracking.pipeline import settings_for
 from support.passes import ROAD, measured, random_path, unknowns_at
 from support.samples import MagSample, one
@@ -18,7 +18,7 @@ def curve(n=200):
 def test_saturation_is_detected_in_noise():
     noisy = curve() + np.random.default_rng(1).standard_normal(200)
     clipped = np.minimum(noisy, 300.0)
-    expected = np.convolve(noisy >= 300.0, np.ones(2 * MARGIN + 1), 'same') > 0.0
+    expected = np.convolve(noisy >= 300.0, np.ones(2 * N_MARGIN + 1), 'same') > 0.0
     assert expected.sum() < 60
     assert np.array_equal(saturated_readings(clipped), expected)
     assert np.array_equal(saturated_readings(-clipped), expected)

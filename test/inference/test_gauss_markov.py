@@ -6,7 +6,7 @@ from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import KalmanFilter
 from scipy.special import logsumexp
 
-from mag_tracking.inference.gauss_markov import STRENGTHS, SWITCH_S, GaussMarkovVectors
+from mag_tracking.inference.gauss_markov import STRENGTHS, SWITCH_INTERVAL_S, GaussMarkovVectors
 
 
 def plain_filter(density, std):
@@ -22,7 +22,7 @@ def by_plain_filters(series, variance, dt, scale, std):
     log_w = np.full(len(STRENGTHS), -np.log(len(STRENGTHS)))
     out = []
     for y in series:
-        p_stay = np.exp(-dt / SWITCH_S)
+        p_stay = np.exp(-dt / SWITCH_INTERVAL_S)
         log_w = np.log(p_stay * np.exp(log_w) + (1.0 - p_stay) / len(STRENGTHS))
         for k, bank in enumerate(banks):
             for kf, value in zip(bank, y, strict=True):
@@ -85,7 +85,7 @@ def test_density_of_data_from_the_model_is_near_that_of_the_true_filter(strength
         true_filter.update(value, R=1.0)
         true_log_density += true_filter.log_likelihood
     # The unknown strength costs its initial weight and at most log(1/p_stay) per frame.
-    assert true_log_density - n * dt / SWITCH_S - np.log(len(STRENGTHS)) \
+    assert true_log_density - n * dt / SWITCH_INTERVAL_S - np.log(len(STRENGTHS)) \
         < log_density < true_log_density + 10.0
 
 
@@ -118,7 +118,7 @@ def test_components_of_zero_strength_are_constant():
         kf.P = np.diag([4.0, (0.5 * strength)**2, 4.0])
         filters.append(kf)
     for y in np.cumsum(rng.standard_normal((25, 2)), axis=0):
-        p_stay = np.exp(-0.1 / SWITCH_S)
+        p_stay = np.exp(-0.1 / SWITCH_INTERVAL_S)
         log_w = np.log(p_stay * np.exp(log_w) + (1.0 - p_stay) / len(STRENGTHS))
         for k, kf in enumerate(filters):
             Q = np.zeros((3, 3))
