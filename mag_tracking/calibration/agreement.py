@@ -22,7 +22,7 @@ MAX_HEADING_STDS = 5.0
 """Maximum tested heading error, in standard deviations."""
 
 YAW_STEP = np.deg2rad(0.25)
-"""[rad] Step of the tested headings; a step changes a horizontal field of 20 uT by 0.1 uT."""
+"""[rad] Step of the tested headings; one step rotates a horizontal field of 20 uT by 0.1 uT."""
 
 MAX_REMAINING_FRACTION = 0.3
 """Maximum difference that remains after a partial explanation, as a fraction of the original
@@ -45,7 +45,7 @@ class FieldInconsistency:
 
     sensor: str
     magnitude: float
-    """[T] Magnitude of the difference between the measured and the expected field."""
+    """[T] Magnitude of the measured field minus the Earth's field, over the reported axes."""
     explanations: tuple[str, ...]
     """The simplest possible explanations; empty if no known fault explains the difference."""
 
@@ -58,7 +58,7 @@ class FieldInconsistency:
 
 
 def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
-    """Median field of the sensors of a network.
+    """Median of the measured fields of a network, for each world axis.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def _cache_key(a: FloatArray) -> tuple[float, ...]:
 def _is_consistent_cached(field: tuple[float, ...], orientation: tuple[float, ...],
                           orientation_std: tuple[float, ...], B0: tuple[float, ...],
                           bias_std: float) -> bool:
-    """Cached version of `_is_consistent`, with tuples as arguments."""
+    """Compute `_is_consistent` from tuples, which are hashable, and cache the result."""
     y, R_ws, std = (np.array(field), np.array(orientation).reshape(3, 3),
                     np.array(orientation_std))
     reported = ~np.isnan(y)
@@ -177,7 +177,7 @@ def _explanations(j: int, suspects: Sequence[int], names: Sequence[str], fields:
 
 def _partial_explanation(y: FloatArray, R_ws: FloatArray, std: FloatArray,
                          B0: FloatArray) -> tuple[str, ...]:
-    """Simplest change of axes that explains most of the difference of a field, if any."""
+    """Describe the simplest change of axes that explains most of a difference; () if none does."""
     original = _remaining_difference(y, R_ws, std, B0)
     for changes in _axis_changes():
         remainders = sorted(
@@ -193,14 +193,17 @@ def _partial_explanation(y: FloatArray, R_ws: FloatArray, std: FloatArray,
 
 def _remaining_difference(y: FloatArray, R_ws: FloatArray, std: FloatArray,
                           B0: FloatArray) -> float:
-    """Difference [T] of a measured field from the Earth's field at the best heading."""
+    """Magnitude [T] of a measured field minus the Earth's field, at the best heading."""
     reported = ~np.isnan(y)
     _, B = _headings(std, B0)
     return float(np.linalg.norm((y - B @ R_ws)[:, reported], axis=1).min())
 
 
 def _headings(std: FloatArray, B0: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Tested heading errors (n,) [rad] of a sensor, and the Earth's field (n, 3) [T] for each."""
+    """Tested heading errors (n,) [rad] of a sensor, and the Earth's field rotated by each.
+
+    The field (n, 3) is in [T].
+    """
     max_error = min(np.pi, MAX_HEADING_STDS * std[2])
     yaw = np.linspace(-max_error, max_error, 1 + 2 * max(1, round(max_error / YAW_STEP)))
     return yaw, np.stack([B0[0] * np.cos(yaw) + B0[1] * np.sin(yaw),
@@ -209,7 +212,7 @@ def _headings(std: FloatArray, B0: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _axis_changes() -> list[list[_AxisChange]]:
-    """Groups of equally complex signed permutations, simplest first."""
+    """Groups of equally complex signed permutations of the axes, simplest group first."""
     groups: dict[tuple[int, int], list[_AxisChange]] = {}
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):

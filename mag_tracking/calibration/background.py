@@ -23,7 +23,7 @@ from mag_tracking.calibration.frequent_level import MIN_DURATION_RATIO
 from mag_tracking.calibration.learning_window import LearningWindow
 from mag_tracking.calibration.level_change import ChangeEvaluator, SharedChanges
 from mag_tracking.calibration.level_departure import SHORTENED_FRACTION, LevelDeparture
-from mag_tracking.calibration.provisional import MIN_SEEN_S, FrequentLevel, ProvisionalLevel
+from mag_tracking.calibration.provisional import MIN_OBSERVED_S, FrequentLevel, ProvisionalLevel
 from mag_tracking.calibration.quiet_interval import QuietInterval, line_of
 from mag_tracking.calibration.resolution import MIN_STD, corrected_steps
 from mag_tracking.units import NS
@@ -44,7 +44,7 @@ class RunningBackground:
     block : float, s
         Length of a block.
     freeze_std : float
-        A block departs from the background if its mean differs by this number of standard
+        A block departs from the background if its mean differs by more than this number of standard
         deviations of the noise.
     relearn : float, s
         Duration of another steady level after which that level becomes the background. The
@@ -54,12 +54,12 @@ class RunningBackground:
         Background, if it is known in advance.
     noise_std : (3,) array, T, optional
         Standard deviation of the noise, if it is known in advance. If `background` is also given,
-        the background is ready at once.
+        the background is ready immediately.
     phase : float, optional
-        Extra length of the first block, as a fraction of `block`, which staggers the blocks of
-        sensors that started together. A complete block is then evaluated by a later call of
-        `evaluate_block`, at the latest before the next reading. Default: blocks are evaluated at
-        once.
+        Extra length of the first block, as a fraction of `block`. The extra length staggers the
+        blocks of sensors that started together. If `phase` is given, each complete block is
+        evaluated by a later call of `evaluate_block`, at the latest before the next reading.
+        Default: each block is evaluated when it is complete.
     sensors : (1,) SENSOR array
         State of the sensor: the current block, and the line and noise for compiled code.
     evaluate_change : ChangeEvaluator, optional
@@ -106,13 +106,13 @@ class RunningBackground:
         self._learning_window.clear()
         self._departure.forget()
         self.frozen = self.stuck = False
-        self._is_resumed = self._relearns_soon = self._is_contested = self._is_steep = False
+        self._is_resumed = self._relearns_soon = self._is_ambiguous = self._is_steep = False
         self._provisional.clear()
         # Frames still in the pipeline remain doubtful.
         self.doubtful_times = updated(self.doubtful_times, int(self._state['last_ns']), False)
         # Duration for which the level was observed, its end, and the start of the background.
-        self._seen_s = 0.0 if self._known_background is None else inf
-        self._seen_until = self._start_time = np.nan
+        self._observed_s = 0.0 if self._known_background is None else inf
+        self._observed_until = self._start_time = np.nan
         self._level.set_uncertainty()
         self._level.set(None if self._known_background is None
                         else (0.0, self._known_background, np.zeros(3), 0.0), self._known_noise)
@@ -133,7 +133,7 @@ class RunningBackground:
         self._level.set((0.0, np.asarray(background, dtype=float), np.zeros(3), 0.0),
                         noise if self._known_noise is None else self._known_noise)
         self._is_resumed = self._relearns_soon = True
-        self._seen_s, self._is_steep = inf, False
+        self._observed_s, self._is_steep = inf, False
         self._level.set_uncertainty()
 
     def start_from(self, level: FloatArray, covariance: FloatArray) -> None:
@@ -162,7 +162,7 @@ class RunningBackground:
     @property
     def doubtful(self) -> bool:
         """Whether the background is provisional or may contain the field of a target."""
-        return self._level.is_provisional or self._is_contested or self._is_steep
+        return self._level.is_provisional or self._is_ambiguous or self._is_steep
 
     @property
     def departed_at(self) -> float | None:
@@ -178,7 +178,7 @@ class RunningBackground:
     def covariance(self) -> FloatArray | None:
         """Noise covariance of one sample, (3, 3) T²; None if unknown, NaN for an unreported axis.
 
-        The variance due to the sensor's steps is included.
+        Includes the quantisation variance of the sensor.
         """
         return self._level.covariance
 
@@ -207,7 +207,7 @@ class RunningBackground:
 
     @property
     def scatter_std(self) -> FloatArray:
-        """Standard deviation of the quiet readings including steps, (3,) T; NaN if unknown."""
+        """Standard deviation of the quiet readings, (3,) T, with quantisation; NaN if unknown."""
         variance = self._quiet.scatter() + self._state['step_variance']
         return np.where(variance > 0.0, np.sqrt(variance), np.nan)
 
@@ -237,14 +237,14 @@ class RunningBackground:
         self.doubtful_times = updated(self.doubtful_times, last_ns, self.doubtful)
 
     def _collect_until_quiet(self, block: Block) -> None:
-        """Add a block, and adopt a quiet interval as the background once it is long enough."""
+        """Add a block; adopt the latest quiet interval as the background if it is long enough."""
         self._start_time = block.time if np.isnan(self._start_time) else self._start_time
         segments = self._learning_window.segments(block, self.stuck)
         if not any(self._adopt_if_steady(s) for s in segments) and not self.stuck:
             self._start_provisionally(block)
 
     def _start_provisionally(self, block: Block) -> None:
-        """Add a block, and adopt a frequent level or the given background when possible."""
+        """Add a block; if a frequent level exists, adopt it or the given background."""
         self._provisional.collect(block)
         frequent = self._provisional.frequent_level(corrected_steps(self._sensors))
         if frequent is not None and self._known_background is not None:
@@ -262,7 +262,7 @@ class RunningBackground:
     def _start_with_frequent(self, frequent: FrequentLevel) -> None:
         """Adopt a frequent level as the background; another level may still replace it."""
         self.start_from(frequent.level.level, frequent.level.covariance)
-        self._seen_s, self.frozen, self._is_contested = frequent.observed_s, False, False
+        self._observed_s, self.frozen, self._is_ambiguous = frequent.observed_s, False, False
         self._learning_window.clear()
         self._departure.end()
 
@@ -277,23 +277,23 @@ class RunningBackground:
             self._quiet.pending.clear()
             self._change_if_steady(block)
             return
-        self._is_contested = False
+        self._is_ambiguous = False
         if self._departure.was_steady:
             self._provisional.clear()  # The level of the vehicle, which has left, is obsolete.
-        if not np.isnan(self._seen_until):
-            self._seen_s += block.time - self._seen_until
-        self._seen_until = block.time
+        if not np.isnan(self._observed_until):
+            self._observed_s += block.time - self._observed_until
+        self._observed_until = block.time
         self._departure.end()
         for blocks in self._quiet.extend(block):
             self._fit(blocks)
 
     def _change_if_steady(self, block: Block) -> None:
         """While frozen, adopt another level that persists or that was the background earlier."""
-        self._seen_until = np.nan
+        self._observed_until = np.nan
         departure = self._departure
         duration = block.time - departure.blocks[0].time
         relearn_time = departure.relearn_time(
-            self._seen_s, self._is_resumed and self._relearns_soon)
+            self._observed_s, self._is_resumed and self._relearns_soon)
         if not relearn_time:
             return departure.end()
         other_level = self._provisional.frequent_level(corrected_steps(self._sensors))
@@ -304,15 +304,17 @@ class RunningBackground:
             return
         # Either of two levels of equal duration may be the background, unless a vehicle was
         # observed to arrive at one of the levels.
-        self._is_contested = not departure.has_arrived and (
-            self._is_contested
-            or duration >= min(self._seen_s, self._relearn) and departure.steady_end() is not None
-            or other_level is not None and other_level.observed_s >= min(self._seen_s, MIN_SEEN_S))
+        self._is_ambiguous = not departure.has_arrived and (
+            self._is_ambiguous
+            or duration >= min(self._observed_s, self._relearn)
+            and departure.steady_end() is not None
+            or other_level is not None
+            and other_level.observed_s >= min(self._observed_s, MIN_OBSERVED_S))
         if duration < relearn_time:
             return
         if self._adopt_if_steady(departure.blocks):
             self.n_relearnt += 1
-            self.frozen = self._is_contested = False
+            self.frozen = self._is_ambiguous = False
         elif other_level is not None and other_level.is_certain:
             self.n_relearnt += 1
             self._start_with_frequent(other_level)
@@ -320,10 +322,13 @@ class RunningBackground:
             departure.shorten()
 
     def _adopt_if_background(self, new_blocks: deque[Block]) -> bool:
-        """Adopt the level of the `new_blocks` if it is the background; return whether it is."""
-        former_seen_s = self._departure.former_seen_s()
-        if former_seen_s:
-            self._change_to(new_blocks, former_seen_s)
+        """Adopt the level of `new_blocks` if it is a former level or a vehicle has departed.
+
+        Returns whether the level was adopted.
+        """
+        former_observed_s = self._departure.former_observed_s()
+        if former_observed_s:
+            self._change_to(new_blocks, former_observed_s)
             return True
         is_known = self._known_background is not None and self._departure.former is None
         if not self._departure.has_departed(new_blocks) or is_known:
@@ -340,19 +345,22 @@ class RunningBackground:
         second_half = list(new_blocks)[len(new_blocks) // 2:]
         self._store_former_level(second_half[0].time)
         self._level.set_constant(stacked(second_half))
-        self._is_resumed, self._relearns_soon, self._seen_s = True, False, observed_s
+        self._is_resumed, self._relearns_soon, self._observed_s = True, False, observed_s
         self._quiet.begin(second_half)
         self.n_relearnt += 1
-        self.frozen = self._is_contested = self._is_steep = False
+        self.frozen = self._is_ambiguous = self._is_steep = False
 
     def _store_former_level(self, begin: float) -> None:
         """Store the present level as the former level, which ended at `begin` [s]."""
         self._start_time = begin
-        self._departure.former = FormerLevel(begin, self._level.at(begin), self._seen_s)
+        self._departure.former = FormerLevel(begin, self._level.at(begin), self._observed_s)
         self._departure.end()
 
     def _adopt_if_steady(self, collected: deque[Block]) -> bool:
-        """Adopt the collected blocks if they lie on one line; return whether they were adopted."""
+        """Adopt blocks as the background if all blocks lie on one line.
+
+        Returns whether the blocks were adopted.
+        """
         blocks = stacked(collected)
         noise = pooled_covariance(blocks) if self._known_noise is None else self._known_noise
         noise = None if noise is None else self._level.without_dead_axes(noise)
@@ -372,8 +380,8 @@ class RunningBackground:
             self._store_former_level(float(blocks.time[0]))
         # The required length was checked by the caller; the initial length does not apply.
         self._is_resumed = False
-        self._seen_s = float(blocks.time[-1] - blocks.time[0]) + self._block_length
-        self._seen_until = float(blocks.time[-1])
+        self._observed_s = float(blocks.time[-1] - blocks.time[0]) + self._block_length
+        self._observed_until = float(blocks.time[-1])
         self._level.set_uncertainty()
         self._quiet.begin(collected)
         self._learning_window.clear()
@@ -391,7 +399,7 @@ class RunningBackground:
         self._is_resumed = False
         line = line_of(blocks)
         assert self._level.noise is not None
-        is_young = MIN_DURATION_RATIO * self._seen_s < self._relearn
+        is_young = MIN_DURATION_RATIO * self._observed_s < self._relearn
         self._is_steep = is_young and is_steep(
             blocks, line[2], self._level.noise.diagonal() + self._state['step_variance'])
         self._level.set_uncertainty(np.abs(line[2]) * self._learn if self._is_steep else 0.0)

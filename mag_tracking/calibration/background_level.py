@@ -32,7 +32,7 @@ class BackgroundLevel:
     line : (float, (3,), (3,), float) or None
         Centre [s], mean [T], slope [T/s] and horizon [s].
     noise : (3, 3) array or None, T²
-        Noise covariance of one reading, without the variance due to steps.
+        Noise covariance of one reading, without the quantisation variance.
     limits : (3,) array, T
         Maximum difference between the mean of a block and the background.
     is_provisional : bool
@@ -59,7 +59,7 @@ class BackgroundLevel:
         line : (float, (3,), (3,), float) or None
             Centre [s], mean [T], slope [T/s] and horizon [s].
         noise : (3, 3) array or None, T²
-            Noise covariance of one reading, without the variance due to steps.
+            Noise covariance of one reading, without the quantisation variance.
         """
         s = self._state
         self.line, self.noise = line, noise
@@ -70,7 +70,7 @@ class BackgroundLevel:
         self.apply_steps()
 
     def apply_steps(self) -> None:
-        """Update noise and `limits` with the variance due to the sensor's latest steps."""
+        """Update the noise and `limits` with the current quantisation variance of the sensor."""
         core.apply_steps(self._sensors, self._freeze_std, self.limits)
 
     def without_dead_axes(self, noise: FloatArray) -> FloatArray:
@@ -83,14 +83,14 @@ class BackgroundLevel:
         Returns
         -------
         (3, 3) array, T²
-            NaN for a dead axis, which is constant although its steps are not coarse.
+            NaN for a dead axis: an axis that is constant although its steps are not coarse.
         """
         steps, variance = corrected_steps(self._sensors), noise.diagonal()
         if np.isfinite(steps).all() and (variance > MIN_STD**2).all():
             return noise
         steps = completed_steps(variance, steps)
-        dead = ~np.isfinite(steps) | (steps == 0.0) & (variance <= MIN_STD**2)
-        return np.where(dead[:, None] | dead, np.nan, noise)
+        is_dead = ~np.isfinite(steps) | (steps == 0.0) & (variance <= MIN_STD**2)
+        return np.where(is_dead[:, None] | is_dead, np.nan, noise)
 
     def without_unknown_noise(self, covariance: FloatArray) -> FloatArray:
         """Return a covariance with NaN for axes whose noise is unknown.
@@ -105,8 +105,8 @@ class BackgroundLevel:
             NaN for a constant axis whose steps are unknown or too fine to be observed.
         """
         steps = corrected_steps(self._sensors)
-        dead = (covariance.diagonal() <= MIN_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
-        return np.where(dead[:, None] | dead, np.nan, covariance)
+        is_dead = (covariance.diagonal() <= MIN_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
+        return np.where(is_dead[:, None] | is_dead, np.nan, covariance)
 
     def set_uncertainty(self, std: FloatArray | float = 0.0, is_provisional: bool = False) -> None:
         """Set the uncertainty of the line.
@@ -221,19 +221,19 @@ class BackgroundLevel:
         Returns
         -------
         deque of Block or None
-            None if the blocks are not steady or too few.
+            None if the blocks are not steady, fewer than three, or shorter than `length`.
         """
-        since = blocks[-1].time - length
+        start = blocks[-1].time - length
         latest_blocks: deque[Block] = deque()
         for block in reversed(blocks):
-            if block.time <= since and len(latest_blocks) >= 3:
+            if block.time <= start and len(latest_blocks) >= 3:
                 break
             latest_blocks.appendleft(block)
-        is_long = len(blocks) >= 3 and blocks[0].time <= since
+        is_long = len(blocks) >= 3 and blocks[0].time <= start
         return latest_blocks if is_long and self.are_steady(stacked(latest_blocks)) else None
 
     def are_steady(self, blocks: Blocks) -> bool:
-        """Whether blocks lie on one line within `limits`, and none is far noisier than another.
+        """Whether blocks lie on one line within `limits`, and have similar noise.
 
         Parameters
         ----------

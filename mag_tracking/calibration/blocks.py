@@ -45,7 +45,7 @@ def block_of(sensors: StructArray) -> Block:
 
 
 class Blocks(NamedTuple):
-    """Several blocks as arrays: time (k,), mean (k, 3), scatter (k, 3, 3), n (k, 3)."""
+    """`Block` as arrays: time (k,) [s], mean (k, 3) [T], scatter (k, 3, 3) [T²], n (k, 3)."""
 
     time: FloatArray
     mean: FloatArray
@@ -54,7 +54,7 @@ class Blocks(NamedTuple):
 
 
 class BlockWindow:
-    """Ring buffer of the latest blocks, stored as arrays for the frequent line fits.
+    """Ring buffer of the latest blocks, stored as arrays to speed up line fits.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def has_noisy_block(blocks: Blocks, step_variance: FloatArray) -> bool:
     ----------
     blocks : Blocks
     step_variance : (3,) array, T²
-        Variance due to the sensor's steps.
+        Quantisation variance of the sensor.
 
     Returns
     -------

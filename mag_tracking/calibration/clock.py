@@ -41,11 +41,11 @@ class Lag:
     correlation: float
     """Correlation at the offset, 0 to 1, even if the offset was rejected; NaN if not computed."""
     reason: str
-    """Why the offset is unknown; empty if it is known."""
+    """Reason for an unknown offset; empty if the offset is known."""
 
 
 def _no_lag(reason: str, correlation: float = float('nan')) -> Lag:
-    """Create a `Lag` without an offset."""
+    """Create a `Lag` with an unknown offset, and with the reason."""
     return Lag(float('nan'), float('nan'), correlation, reason)
 
 
@@ -125,7 +125,7 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
 
 
 def _validated_series(t: FloatArray, s: FloatArray, name: str) -> _Series:
-    """Validate the times and values of a series, and remove NaN."""
+    """Remove NaN values from a series; raise ValueError for invalid shapes or times."""
     t, s = np.asarray(t, dtype=float), np.asarray(s, dtype=float)
     if t.shape != s.shape or t.ndim != 1:
         raise ValueError(f'the {name} has times of shape {t.shape} for values of shape {s.shape}')
@@ -145,8 +145,8 @@ def _without_cut_knocks(t: FloatArray, s: FloatArray) -> _Series:
         if is_loud[t <= t[0] + MARGIN_S].any():
             # The knock ends where the signal has been quiet for MARGIN_S.
             ends = np.flatnonzero(np.diff(np.append(t[is_loud], np.inf)) > MARGIN_S)
-            keep = t > t[is_loud][ends[0]]
-            t, s, is_loud = t[keep], s[keep], is_loud[keep]
+            is_kept = t > t[is_loud][ends[0]]
+            t, s, is_loud = t[is_kept], s[is_kept], is_loud[is_kept]
         t, s, is_loud = -t[::-1], s[::-1], is_loud[::-1]
         if not len(t):
             break
@@ -154,7 +154,10 @@ def _without_cut_knocks(t: FloatArray, s: FloatArray) -> _Series:
 
 
 def _knock_separation(a: _Series, b: _Series, max_lag: float) -> float | None:
-    """Smallest interval [s] between knocks of two series if it exceeds `max_lag`, else None."""
+    """Smallest interval [s] between knocks of two series.
+
+    None if the interval is at most `max_lag` + `MARGIN_S`, or if a series contains no knock.
+    """
     if not (len(a[1]) > 7 and len(b[1]) > 7 and _is_knock(a[1]).any() and _is_knock(b[1]).any()):
         return None
     s, t = a[0][_is_knock(a[1])], b[0][_is_knock(b[1])]
@@ -187,14 +190,14 @@ def _knock_times(t: FloatArray, s: FloatArray) -> tuple[float, float]:
 
 
 def _sampling_interval(t: FloatArray, s: FloatArray) -> float:
-    """Sampling interval [s] around the knocks."""
+    """Median sampling interval [s] around the knocks; infinite for fewer than three readings."""
     first, last = _knock_times(t, s)
     is_near = (t >= first - MARGIN_S) & (t <= last + MARGIN_S)
     return float(np.median(np.diff(t[is_near]))) if np.count_nonzero(is_near) > 2 else float('inf')
 
 
 def _coarse_lag(a: _Series, b: _Series, max_lag: float) -> tuple[float, float, str]:
-    """Lag [s] of the largest correlation, that correlation, and why the lag is rejected or ''."""
+    """Lag [s] with the largest correlation, the correlation, and the reason for rejection or ''."""
     step = 0.5 * min(_sampling_interval(*a), _sampling_interval(*b))
     if not np.isfinite(step):
         return float('nan'), float('nan'), 'the knock is shorter than the sampling interval'
@@ -204,8 +207,8 @@ def _coarse_lag(a: _Series, b: _Series, max_lag: float) -> tuple[float, float, s
     c = correlate(v, u, method='auto') / np.sqrt((u @ u) * (v @ v))
     lags = step * np.arange(1 - len(u), len(v))
     # The margin excludes maxima on the border.
-    within = np.abs(lags) <= max_lag + 4.0 * step
-    c, lags = c[within], lags[within]
+    is_allowed = np.abs(lags) <= max_lag + 4.0 * step
+    c, lags = c[is_allowed], lags[is_allowed]
     best = int(c.argmax())
     if c[best] < MIN_CORRELATION:
         return lags[best], float(c[best]), (
@@ -220,7 +223,7 @@ def _coarse_lag(a: _Series, b: _Series, max_lag: float) -> tuple[float, float, s
 
 
 def _refined_lag(a: _Series, b: _Series, lag: float) -> tuple[float, float]:
-    """Least-squares lag [s] of `b` relative to an interpolation of `a`, and its std [s]."""
+    """Least-squares lag [s] of `b` relative to an interpolation of `a`, and the lag's std [s]."""
     offset, std = _fitted_lag(a, b, lag, PchipInterpolator(*a, extrapolate=False))
     # The signal between two readings is unknown; a second interpolation estimates its effect.
     other_offset, _ = _fitted_lag(a, b, lag, CubicSpline(*a, extrapolate=False))

@@ -12,7 +12,7 @@ using Structured = py::array;
 // Python may have changed the values that are used as indices.
 Sensor& checked(Sensor& s) {
     if (s.now < 0 || s.now > 1 || s.n_held < 0 || s.n_held > MAX_HELD + 1 || s.n_steps < 0)
-        throw py::value_error("now, n_held or n_steps of a sensor: out of range");
+        throw py::value_error("now, n_held or n_steps of a sensor is out of range");
     return s;
 }
 
@@ -37,7 +37,7 @@ int calibrate_readings(Structured sensors, Structured limits, Integers rows, Int
     if (batch.next < 0) throw py::index_error("next: must not be negative");
     for (Size i = batch.next; i < n; ++i) {
         if (in.rows[i] >= all.size())
-            throw py::index_error("rows: out of range, there is no such sensor");
+            throw py::index_error("rows: a sensor index is out of range");
         if (in.rows[i] >= 0) checked(all.data()[in.rows[i]]);
         if (in.own[i]) input_of(covariances, "covariances", {n, 3, 3});
     }
@@ -50,7 +50,7 @@ bool use_reading(Structured sensors, Structured limits, Structured batches, int6
                  Integers out_stamps, Array out_fields, Array out_covariances) {
     Structs<Sensor> all(sensors);
     if (row < 0 || row >= all.size())
-        throw py::index_error("row: out of range, there is no such sensor");
+        throw py::index_error("row: the sensor index is out of range");
     const Reading reading{stamp, input_of(field, "field", {3}), own,
                           input_of(covariance, "covariance", {3, 3})};
     return use(checked(all.data()[row]), Structs<Limits>(limits).only(), Structs<Batch>(batches).only(), row,

@@ -1,7 +1,7 @@
 """Calibration of readings one by one, compiled; the rules are in `readings.hpp`.
 
-`sensors` is an array of `SENSOR`. Functions without an argument
-`row` or `rows` require an array of a single element.
+`sensors` is an array of `SENSOR`. Functions without an argument `row` or `rows` require an array
+with a single element.
 """
 
 from typing import Any
@@ -55,7 +55,7 @@ def calibrate_readings(
         fields: FloatArray, own: IntArray, covariances: FloatArray, batches: StructArray,
         out_rows: IntArray, out_stamps: IntArray, out_fields: FloatArray,
         out_covariances: FloatArray) -> int:
-    """Calibrate the readings of a batch from its `next` on, until Python has to act.
+    """Calibrate the readings of a batch from index `next` on, until Python must handle a case.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def complete_steps(variance: FloatArray, steps: FloatArray) -> None:
     """
 
 def apply_steps(sensors: StructArray, freeze_std: float, limits: FloatArray) -> None:
-    """Add the variance due to the steps of a sensor to its noise.
+    """Add the quantisation variance of a sensor to its noise.
 
     Reads `noise`; writes `step_variance` and `noise_std`.
 
@@ -178,7 +178,7 @@ def apply_steps(sensors: StructArray, freeze_std: float, limits: FloatArray) -> 
     sensors : (1,) SENSOR array
         Updated.
     freeze_std : float
-        Limits in standard deviations of the noise.
+        Number of standard deviations of the noise in `limits`.
     limits : (3,) array, T
         Overwritten: maximum difference between the mean of a block and the background.
     """
@@ -235,7 +235,7 @@ def pooled_covariance(scatter: FloatArray, n: FloatArray) -> FloatArray | None:
     """
 
 def note_step(sensors: StructArray, stamp: int, raw: FloatArray) -> None:
-    """Update the steps of a sensor and the time of the latest change of each axis.
+    """Update the quantisation steps and the time of the latest change of each axis.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ def note_step(sensors: StructArray, stamp: int, raw: FloatArray) -> None:
     """
 
 def is_stuck(sensors: StructArray, field: FloatArray) -> bool:
-    """Record a reading, and return whether it has been repeated for too long to be chance.
+    """Record a reading, and return whether its repetitions are too many to be due to chance.
 
     Parameters
     ----------
@@ -281,7 +281,7 @@ def screen_spike(sensors: StructArray, threshold: float, stamp: int, field: Floa
     """
 
 def collect(sensors: StructArray, time: float, field: FloatArray) -> None:
-    """Add a reading to the current block, after starting a new block if one is due.
+    """Add a reading to the current block; if that block has ended, start the next block first.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ alias. A wider pass band would increase the delay, which is about four output in
 GAP_TOLERANCE = 0.5
 """Relative difference from the median interval beyond which an interval is a gap."""
 RATE_SAMPLES = 32
-"""Number of samples from which the rate is measured; they are decimated afterwards."""
+"""Number of samples from which the rate is measured. These samples are decimated afterwards."""
 
 
 def lowpass(factor: int) -> FloatArray:
@@ -126,7 +126,7 @@ class Decimator:
             interval - self._interval) > GAP_TOLERANCE * self._interval)
 
     def _measure_rate(self) -> list[tuple[int, FloatArray]]:
-        """Determine the factor once enough samples are stored, and return their outputs."""
+        """Determine the factor if enough samples are stored; return the resulting outputs."""
         if len(self._window) < RATE_SAMPLES:
             return []
         stamps = np.array([s for s, _ in self._window], dtype=np.int64)
@@ -138,7 +138,7 @@ class Decimator:
         return [out for stamp, field in stored for out in self.feed(stamp, field)]
 
     def _filter(self, factor: int, taps: FloatArray) -> list[tuple[int, FloatArray]]:
-        """Return the output of the filter if one is due."""
+        """Return the output of the filter as a list; empty if no output is due."""
         if len(self._window) < len(taps):
             return []
         if self._n_until_output:

@@ -91,6 +91,7 @@ def coverage(u: FloatArray, w: FloatArray) -> float:
     Returns
     -------
     float
+        0 to 1; 1 for even coverage.
     """
     x, y, z = u.T
     s = np.sqrt(15.0)
@@ -101,7 +102,7 @@ def coverage(u: FloatArray, w: FloatArray) -> float:
 
 
 def empty_octants(u: FloatArray, w: FloatArray) -> tuple[str, ...]:
-    """Find the octants that contain hardly any reading.
+    """Find the octants with a weight below `EMPTY_OCTANT`, i.e. with few or no readings.
 
     Parameters
     ----------

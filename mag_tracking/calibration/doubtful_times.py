@@ -36,13 +36,13 @@ def updated(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool,
 
 
 def doubtful_since(times: DoubtfulTimes, since_ns: int) -> DoubtfulTimes:
-    """Return the intervals with the background doubtful from a time on.
+    """Add an open interval that begins at a given time, and return the intervals.
 
     Parameters
     ----------
     times : DoubtfulTimes
     since_ns : int, ns
-        Start of the open interval that replaces all later intervals.
+        Start of the open interval, which replaces all later intervals.
 
     Returns
     -------

@@ -49,11 +49,11 @@ class FormerLevel:
         -------
         bool
         """
-        since = block.time - self.until
-        tolerance = limits + np.minimum(TYPICAL_DRIFT * since, MAX_DRIFT * limits)
+        age = block.time - self.until
+        tolerance = limits + np.minimum(TYPICAL_DRIFT * age, MAX_DRIFT * limits)
         # A comparison with NaN is false: an axis that is not reported does not differ.
-        is_off = bool((np.abs(block.mean - self.level) > tolerance).any())
-        return since <= MAX_AGE_S and not is_off
+        differs = bool((np.abs(block.mean - self.level) > tolerance).any())
+        return age <= MAX_AGE_S and not differs
 
 
 def is_steep(blocks: Blocks, slope: FloatArray, variance: FloatArray) -> bool:
@@ -71,8 +71,8 @@ def is_steep(blocks: Blocks, slope: FloatArray, variance: FloatArray) -> bool:
     -------
     bool
     """
-    since = blocks.time - blocks.time.mean()
-    spread = (blocks.n * np.square(since)[:, None]).sum(axis=0)
+    relative_time = blocks.time - blocks.time.mean()
+    spread = (blocks.n * np.square(relative_time)[:, None]).sum(axis=0)
     std = np.sqrt(variance / np.where(spread > 0.0, spread, np.nan))
     # A comparison with NaN is false: an axis that is not reported has no slope.
     return bool((np.abs(slope) > STEEP_DRIFT + MIN_SLOPE_STDS * std).any())

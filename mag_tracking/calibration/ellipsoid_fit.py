@@ -96,7 +96,7 @@ class EllipsoidFit:
     shared by adjacent directions are amplified by up to 1/sqrt(coverage) relative to even
     coverage."""
     empty_octants: tuple[str, ...]
-    """Octants of the sensor frame that contain hardly any corrected reading, e.g. '+x-y+z'."""
+    """Octants of the sensor frame with few or no corrected readings, e.g. '+x-y+z'."""
     n_readings: int
     """Number of readings used by the fit."""
     n_missing: int
@@ -104,12 +104,12 @@ class EllipsoidFit:
     n_saturated: int
     """Number of readings excluded because of saturation."""
     n_outliers: int
-    """Number of excluded glitches, plus the number of readings further than OUTLIER robust standard
-    deviations from the ellipsoid. The robust loss limits the influence of the latter."""
+    """Number of excluded glitches, plus the number of readings further than OUTLIER_STDS robust
+    standard deviations from the ellipsoid. The robust loss limits the influence of the latter."""
     converged: bool
     """Whether the calibration is valid."""
     reason: str
-    """Why the fit is rejected; empty if it is accepted."""
+    """Reason for the rejection of the fit; empty if the fit is accepted."""
     warnings: tuple[str, ...]
     """Warnings about readings and accuracy."""
 
@@ -139,7 +139,7 @@ class _Counts(TypedDict):
 
 
 class _Parameters(TypedDict):
-    """Parameters and standard deviations in the readings' units; see `EllipsoidFit`."""
+    """Parameters and standard deviations in the units of `EllipsoidFit`."""
 
     offset: FloatArray
     correction: FloatArray
@@ -232,12 +232,12 @@ def _validated(readings: FloatArray, field_magnitude: float | None) -> FloatArra
 
 
 def _relative_spread(magnitudes: FloatArray) -> float:
-    """Coefficient of variation of magnitudes; NaN without readings or if all readings are zero."""
+    """Coefficient of variation of magnitudes; NaN if `magnitudes` is empty or all zero."""
     return float(magnitudes.std() / magnitudes.mean()) if magnitudes.any() else float('nan')
 
 
 def _notes_on_input(counts: _Counts, is_saturated: BoolArray) -> tuple[str, ...]:
-    """Warnings about excluded readings."""
+    """Warnings about missing and saturated readings."""
     notes: tuple[str, ...] = ()
     if counts['n_missing']:
         notes += (f'readings excluded because of a missing axis: {counts["n_missing"]}',)
@@ -258,7 +258,7 @@ def _glitches(y: FloatArray) -> BoolArray:
 
 
 def _insufficient_data(y: FloatArray) -> str:
-    """Why a quadric cannot be fitted; empty if it can."""
+    """Reason for which no quadric can be fitted to the readings; empty if a fit is possible."""
     if len(y) < MIN_READINGS:
         return f'{len(y)} valid readings, minimum {MIN_READINGS}'
     largest = np.abs(y - y[0]).max()
@@ -274,7 +274,7 @@ def _insufficient_data(y: FloatArray) -> str:
 
 def _in_units(o: FloatArray, C: FloatArray, P: FloatArray, centre: FloatArray, scale: float,
               field_magnitude: float | None) -> _Parameters:
-    """Parameters and standard deviations in the readings' units."""
+    """Convert normalised parameters and their covariance `P` to the units of the result."""
     volume = np.linalg.det(C)**(-1.0 / 3.0)
     t = np.einsum('ij,kji->k', np.linalg.inv(C), BASIS)
     if field_magnitude is None:
@@ -292,7 +292,7 @@ def _in_units(o: FloatArray, C: FloatArray, P: FloatArray, centre: FloatArray, s
 
 def _rejection_reason(C: FloatArray, P: FloatArray, quality: Quality,
                       outlier_fraction: float) -> str:
-    """Why a fit is rejected; empty if it is accepted."""
+    """Reason for the rejection of a fit; empty if the fit is accepted."""
     if quality['scatter'] > MAX_SCATTER:
         return (f'the scatter about the ellipsoid is {quality["scatter"]:.2g} of the radius, '
                 f'maximum {MAX_SCATTER}; {POSSIBLE_CAUSES}')

@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.directions import binned, coverage, empty_octants, even_weights
-from mag_tracking.calibration.quadric import OUTLIER, robust_std
+from mag_tracking.calibration.quadric import OUTLIER_STDS, robust_std
 
 LOSS_SCALE = 2.0
 """[std] Residual at which the loss changes from quadratic to linear; the loss of efficiency for
@@ -34,12 +34,12 @@ class Quality(TypedDict):
     directions: int
     """Number of cells with readings."""
     coverage: float
-    """See `EllipsoidFit`."""
+    """Coverage of the sphere by the corrected readings, as in `EllipsoidFit`."""
     scatter: float
     """Scatter about the ellipsoid relative to its radius, without outliers."""
     n_outliers: int
     empty: tuple[str, ...]
-    """Octants that contain hardly any reading."""
+    """Names of the octants with few or no readings, e.g. '+x-y+z'."""
 
 
 def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
@@ -78,7 +78,7 @@ def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
             loss=lambda square, w=w: _loss(square, w), max_nfev=100)
         theta = fit.x
     q, d, J = _model(theta, z)
-    is_inlier = np.abs(d) <= OUTLIER * robust_std(d, w)
+    is_inlier = np.abs(d) <= OUTLIER_STDS * robust_std(d, w)
     u, _, n = binned(q[is_inlier])
     quality: Quality = {
         'solved': fit.status > 0, 'directions': int((n > 0).sum()),

@@ -6,7 +6,7 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.blocks import Blocks, line_through, pooled_covariance
-from mag_tracking.calibration.resolution import TOGGLE
+from mag_tracking.calibration.resolution import TOGGLE_TOLERANCE
 
 MAX_CALM_RATIO = 3.0
 """Maximum standard deviation within a block, relative to the 20 % quantile of all blocks. Blocks
@@ -26,15 +26,14 @@ MIN_BLOCKS = 4
 """Minimum number of blocks of a level."""
 
 MIN_LEVEL_DISTANCE = 3.0
-"""Minimum distance of another level, in widths. A smaller difference may be due to a
-distant target at the same level."""
+"""Minimum distance of another level, in widths. A distant target may change a level by less."""
 
 MIN_DURATION_RATIO = 4.0
 """Minimum duration of a level that replaces the initial level, relative to the duration of the
 initial level. Such a level indicates that a target present at the start has left."""
 
 BATCH_SIZE = 64
-"""Number of blocks that are compared with all other blocks at once, to limit memory."""
+"""Number of blocks that are compared with all other blocks in one operation, to limit memory."""
 
 
 @dataclass(frozen=True)
@@ -81,14 +80,14 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int) -> Q
     blocks : Blocks
         Blocks in chronological order.
     steps : (3,) array, T
-        Smallest change of each axis; 0 if unknown.
+        Quantisation step of each axis; 0 if unknown.
     max_blocks : int
         Maximum number of blocks that determine the level; the earliest blocks are used.
 
     Returns
     -------
     QuietLevel or None
-        None if no level has at least `MIN_BLOCKS` blocks.
+        None if no level has at least `MIN_BLOCKS` blocks, or the noise is unknown on all axes.
     """
     n = np.maximum(blocks.n, 1.0)
     variance = np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1.0, 1.0)
@@ -103,7 +102,7 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int) -> Q
     is_calm = (variance[:, is_used] <= MAX_CALM_RATIO**2 * quietest).all(axis=1)
     width = np.full(3, np.nan)
     width[is_used] = np.maximum(LEVEL_WIDTH * np.sqrt(quietest / np.median(n[:, is_used], axis=0)),
-                                np.maximum(TOGGLE * steps[is_used], MIN_WIDTH))
+                                np.maximum(TOGGLE_TOLERANCE * steps[is_used], MIN_WIDTH))
     rows = np.flatnonzero(is_calm)
     if len(rows) < MIN_BLOCKS:
         return None
@@ -131,8 +130,8 @@ def _densest(means: FloatArray, width: FloatArray) -> IntArray:
     best: BoolArray = np.zeros(len(means), dtype=bool)
     for first in range(0, len(means), BATCH_SIZE):
         is_near: BoolArray = np.ones((len(means[first:first + BATCH_SIZE]), len(means)), dtype=bool)
-        for axis, widest in zip(means.T, width, strict=True):
-            is_near &= np.abs(axis[first:first + BATCH_SIZE, None] - axis) <= widest
+        for axis, half_width in zip(means.T, width, strict=True):
+            is_near &= np.abs(axis[first:first + BATCH_SIZE, None] - axis) <= half_width
         densest = is_near[np.argmax(np.count_nonzero(is_near, axis=1))]
         best = densest if np.count_nonzero(densest) > np.count_nonzero(best) else best
     centre = np.median(means[best], axis=0)

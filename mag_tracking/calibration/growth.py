@@ -41,7 +41,7 @@ class Growth:
         return self.quarters[2] + self.quarters[3]
 
     @property
-    def whole(self) -> float:
+    def duration(self) -> float:
         """Total duration [s]."""
         return self.early + self.late
 

@@ -18,8 +18,7 @@ from mag_tracking.calibration.blocks import Blocks
 from mag_tracking.calibration.growth import growth_of
 
 MAX_SMALL_FRACTION = 0.3
-"""Maximum magnitude of the evaluated ends of a change, as a fraction of the magnitude of the whole
-change."""
+"""Maximum magnitude of the evaluated ends of a change, as a fraction of the total magnitude."""
 
 DETECTION_STDS = 3.0
 """Detection limit of a change in standard deviations of the mean of a block, per axis."""
@@ -90,45 +89,45 @@ def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: F
     LevelChange
     """
     after = np.average(blocks.mean[-n_steady:], axis=0)
-    off_before, off_after = (
+    distance_before, distance_after = (
         _magnitude((blocks.mean - level) / noise_std) for level in (before, after))
     size = float(_magnitude((after - before[-1]) / noise_std))
     n_axes, n_readings = np.count_nonzero(~np.isnan(after)), np.median(blocks.n[blocks.n > 0.0])
     detectable = DETECTION_STDS * float(np.sqrt(n_axes / n_readings))
-    end = int(np.flatnonzero(off_after > detectable).max(initial=-1)) + 1
+    end = int(np.flatnonzero(distance_after > detectable).max(initial=-1)) + 1
     since = origin + float(blocks.time[min(end, len(blocks.time) - 1)])
     # If the latest blocks still approach the level, the change is not complete.
-    is_complete = not (off_after[-n_steady:] > detectable).any()
-    asymmetry = _asymmetry(blocks.time, off_before, off_after, detectable,
+    is_complete = not (distance_after[-n_steady:] > detectable).any()
+    asymmetry = _asymmetry(blocks.time, distance_before, distance_after, detectable,
                            MAX_SMALL_FRACTION * size) if is_complete else 0.0
     return LevelChange(since, size, None if abs(asymmetry) < MIN_ASYMMETRY else asymmetry > 0.0)
 
 
-def _magnitude(off: FloatArray) -> FloatArray:
+def _magnitude(difference: FloatArray) -> FloatArray:
     """Euclidean norms (...) of differences (..., 3) over the reported axes."""
-    size: FloatArray = np.sqrt(np.nansum(np.square(off), axis=-1))
+    size: FloatArray = np.sqrt(np.nansum(np.square(difference), axis=-1))
     return size
 
 
-def _asymmetry(time: FloatArray, off_before: FloatArray, off_after: FloatArray, detectable: float,
-               small: float) -> float:
+def _asymmetry(time: FloatArray, distance_before: FloatArray, distance_after: FloatArray,
+               detectable: float, largest: float) -> float:
     """Binary logarithm of the asymmetry of a change; positive for a departure.
 
     Zero if the growth stalls at one end, for example because a second vehicle stops behind the
-    first one. Zero also if neither end matches a starting or stopping vehicle. `off_before` and
-    `off_after` (k,) are the distances from both levels in standard deviations of a reading. The
-    ends are evaluated from `detectable` to `small`.
+    first one. Zero also if neither end matches a starting or stopping vehicle. The arguments
+    `distance_before` and `distance_after` (k,) are the distances from the two levels in standard
+    deviations of a reading. The ends are evaluated from `detectable` to `largest`.
     """
     length = float(np.median(np.diff(time)))
-    first = growth_of(time, off_before, detectable, small)
-    last = growth_of(-time[::-1], off_after[::-1], detectable, small)
-    if small < MIN_GROWTH * detectable or first is None or last is None \
-            or max(first.whole, last.whole) < MIN_BLOCKS * length \
-            or any(max(end.quarters) > MAX_QUARTER_FRACTION * end.whole + length
+    first = growth_of(time, distance_before, detectable, largest)
+    last = growth_of(-time[::-1], distance_after[::-1], detectable, largest)
+    if largest < MIN_GROWTH * detectable or first is None or last is None \
+            or max(first.duration, last.duration) < MIN_BLOCKS * length \
+            or any(max(end.quarters) > MAX_QUARTER_FRACTION * end.duration + length
                    for end in (first, last)):
         return 0.0
     # The position of an end within a block is unknown.
-    longer = (last.whole + 0.5 * length) / (first.whole + 0.5 * length)
+    longer = (last.duration + 0.5 * length) / (first.duration + 0.5 * length)
     rise, fall = ((end.early + 0.25 * length) / (end.late + 0.25 * length)
                   for end in (first, last))
     starts_slowly = (rise if longer > 1.0 else fall) < MAX_START_RATIO
@@ -136,11 +135,11 @@ def _asymmetry(time: FloatArray, off_before: FloatArray, off_after: FloatArray, 
 
 
 NO_CHANGE = LevelChange(np.nan, 0.0, None)
-"""Placeholder for a sensor whose level does not change."""
+"""`LevelChange` of a sensor whose level does not change."""
 
 
 class SharedChanges:
-    """The latest `LevelChange` of each sensor of a network."""
+    """Latest `LevelChange` of each sensor of a network, for a joint classification."""
 
     def __init__(self) -> None:
         self._latest_changes: dict[int, LevelChange] = {}

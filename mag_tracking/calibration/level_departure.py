@@ -133,7 +133,7 @@ class LevelDeparture:
         return self._relearn and min(
             self._relearn, max(self._learn, MIN_RELEARN_S, MIN_DURATION_RATIO * observed_s))
 
-    def former_seen_s(self) -> float:
+    def former_observed_s(self) -> float:
         """Duration for which the former level was observed, if the latest block is at that level.
 
         Returns

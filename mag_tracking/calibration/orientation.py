@@ -83,8 +83,8 @@ def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
     distance = finite - np.median(finite, axis=0)
     scale = 1.4826 * np.median(np.abs(distance), axis=0)
     # The scatter of a coarse accelerometer at rest can be zero.
-    quiet = (np.abs(distance) <= OUTLIER_STDS * np.maximum(scale, 1e-3)).all(axis=1)
-    at_rest = finite[quiet]
+    is_at_rest = (np.abs(distance) <= OUTLIER_STDS * np.maximum(scale, 1e-3)).all(axis=1)
+    at_rest = finite[is_at_rest]
     if len(at_rest) < 8:
         raise ValueError(f'only {len(at_rest)} of {len(finite)} accelerations are at rest, 8 are '
                          'required')
@@ -149,7 +149,7 @@ def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatAr
     across = np.cross([0.0, 0.0, 1.0], B0)
 
     def fit(yaw: float) -> tuple[FloatArray, FloatArray]:
-        """Residual on the reported axes, and derivative of the field with respect to the yaw."""
+        """Residual of the reported axes [T], and derivative of the field by the yaw [T/rad]."""
         R_sw = (rotation_about_z(yaw) @ R_level).T
         return (y - R_sw @ B0)[reported], -(R_sw @ across)[reported]
 
@@ -175,7 +175,7 @@ def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatAr
 
 
 def _refined_yaw(fit: _Fit, yaw: float) -> float:
-    """Refine a yaw by Gauss-Newton steps of at most half a radian."""
+    """Refine a yaw [rad] by Gauss-Newton steps of at most 0.5 rad."""
     for _ in range(30):
         residual, slope = fit(yaw)
         square = slope @ slope
@@ -190,7 +190,7 @@ def _refined_yaw(fit: _Fit, yaw: float) -> float:
 
 def levelled(up: UpDirection | None, stated: FloatArray,
              stated_std: FloatArray) -> Orientation | None:
-    """Correct the tilt of a nominal orientation with a measured up direction.
+    """Correct the tilt of a nominal orientation by means of a measured up direction.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def levelled(up: UpDirection | None, stated: FloatArray,
     Returns
     -------
     Orientation or None
-        Its bias is NaN. None if `up` is None.
+        The heading is unchanged, and the bias is NaN. None if `up` is None.
     """
     if up is None:
         return None
@@ -226,7 +226,7 @@ def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
     bias_std : float, T
         Prior standard deviation.
     weight : float
-        Number of values that the prior counts as.
+        Weight of the prior, as an equivalent number of observed components.
 
     Returns
     -------

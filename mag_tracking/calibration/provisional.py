@@ -1,4 +1,4 @@
-"""Most frequent level so far: a provisional background until a quiet interval is long enough.
+"""Provisional background: the most frequent level until a quiet interval is long enough.
 
 In dense traffic no interval is quiet for several seconds, and a sensor without a background cannot
 contribute to tracking.
@@ -21,7 +21,7 @@ WAIT_RATIO = 2.0
 """Waiting time for a quiet interval, relative to its required length."""
 
 MIN_BLOCKS = 12
-"""Minimum number of blocks, independent of the rate of the sensor."""
+"""Minimum number of blocks for the first search, independent of the rate of the sensor."""
 
 MAX_BLOCKS = 240
 """Maximum number of stored blocks: a minute of blocks of the usual length."""
@@ -29,9 +29,9 @@ MAX_BLOCKS = 240
 SEARCH_GROWTH = 1.1
 """Factor by which the number of blocks must grow before the level is determined again."""
 
-MIN_SEEN_S = 10.0
-"""[s] Minimum total duration of a certain level, which must also last far longer than any other
-level."""
+MIN_OBSERVED_S = 10.0
+"""[s] Minimum total duration of a certain level. The duration must also be at least
+`MIN_DURATION_RATIO` times the duration of any other level."""
 
 MAD_TO_STD = 1.4826
 """Standard deviation of a normal distribution relative to its median absolute deviation."""
@@ -47,7 +47,8 @@ class FrequentLevel:
     standard deviation. It is large for a level observed for less than half of the time. NaN for an
     unreported axis."""
     is_certain: bool
-    """Whether the level was observed for long enough, and far longer than any other level."""
+    """Whether the level was observed for at least `MIN_OBSERVED_S`, and at least
+    `MIN_DURATION_RATIO` times as long as any other level."""
 
     @property
     def observed_s(self) -> float:
@@ -89,7 +90,7 @@ class ProvisionalLevel:
         Parameters
         ----------
         steps : (3,) array, T
-            Steps of the axes of the sensor; inf if unknown.
+            Quantisation steps of the sensor; inf if unknown.
 
         Returns
         -------
@@ -109,6 +110,6 @@ class ProvisionalLevel:
         distance, is_known = np.full(3, np.nan), ~np.isnan(level.level)
         distance[is_known] = np.nanmedian(
             np.abs(stored.mean[:, is_known] - level.level[is_known]), axis=0)
-        is_certain = level.n_blocks * level.block_s >= MIN_SEEN_S \
+        is_certain = level.n_blocks * level.block_s >= MIN_OBSERVED_S \
             and level.n_blocks >= MIN_DURATION_RATIO * level.n_rival
         return FrequentLevel(level, MAD_TO_STD * distance, is_certain)

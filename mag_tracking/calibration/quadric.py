@@ -5,11 +5,11 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.directions import even_weights
 
-OUTLIER = 4.0
+OUTLIER_STDS = 4.0
 """[std] Distance from the ellipsoid beyond which a reading is an outlier."""
 
 MIN_SCALE = 1e-9
-"""Standard deviation of residuals, relative to the radius, below which rounding causes them."""
+"""Minimum standard deviation of residuals, relative to the radius; less is due to rounding."""
 
 POSSIBLE_CAUSES = ('possible causes are too few directions, a sensor at rest, or a field that is '
                    'not uniform')
@@ -29,7 +29,7 @@ def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
     offset : (3,) array
     correction : (3, 3) array
     reason : str
-        Why no ellipsoid was found; empty if one was found.
+        Reason for the failure; empty if an ellipsoid was found.
 
     References
     ----------
@@ -64,12 +64,12 @@ def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
         q = (z - o) @ C
         w = even_weights(q)
         d = np.abs(np.linalg.norm(q, axis=1) - 1.0)
-        w = w * (d <= OUTLIER * robust_std(d, w))
+        w = w * (d <= OUTLIER_STDS * robust_std(d, w))
     return o, C, ''
 
 
 def robust_std(d: FloatArray, w: FloatArray) -> float:
-    """Robust standard deviation of residuals, from the weighted median of their magnitudes.
+    """Robust standard deviation of residuals, from the weighted median of the magnitudes.
 
     Parameters
     ----------
@@ -81,6 +81,7 @@ def robust_std(d: FloatArray, w: FloatArray) -> float:
     Returns
     -------
     float
+        At least `MIN_SCALE`.
     """
     order = np.argsort(np.abs(d))
     total = np.cumsum(w[order])

@@ -29,7 +29,7 @@ MAX_BLOCKS = 4000
 
 
 class BlockRecorder(RunningBackground):
-    """Background estimator that only collects blocks, for a first pass over a recording."""
+    """Estimator that collects blocks but estimates no background, for a prescan of a recording."""
 
     def evaluate_block(self) -> None:
         """Store the latest complete block, unless it has been stored already."""
@@ -80,14 +80,14 @@ class BlockRecorder(RunningBackground):
         -------
         bool
         """
-        level, since, n = initial, 0.0, 0
+        level, previous_time, n = initial, 0.0, 0
         for block in self._blocks:
-            width = found.width + TYPICAL_DRIFT * (block.time - since)
+            width = found.width + TYPICAL_DRIFT * (block.time - previous_time)
             # A comparison with NaN is false: an axis that is not reported does not differ.
             if (np.abs(block.mean - level) > width).any():
                 continue
             level = level + LEVEL_WEIGHT * np.where(np.isnan(level), 0.0, block.mean - level)
-            since, n = block.time, n + 1
+            previous_time, n = block.time, n + 1
             if found.begin <= block.time <= found.end \
                     and not (np.abs(level - found.level) > found.width).any():
                 return True
@@ -118,6 +118,6 @@ class BlockRecorder(RunningBackground):
 
     @property
     def steps(self) -> FloatArray:
-        """Steps of each raw axis, (3,) T; inf if unknown."""
+        """Quantisation steps of the raw axes, (3,) T; inf if unknown."""
         steps = raw_steps(self._sensors)
         return np.where(steps > 0.0, steps, np.inf)

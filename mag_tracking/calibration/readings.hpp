@@ -68,7 +68,7 @@ struct Calibrated {
     double *fields, *covariances;
 };
 
-// Why a raw reading is rejected, or DONE.
+// Reason for the rejection of a raw reading, or DONE.
 inline Reason field_fault(const Limits& limits, const double* raw, int64_t own) {
     double largest = 0.0;
     bool is_known = false;
@@ -101,7 +101,7 @@ inline bool remove_iron(const Sensor& s, const double* raw, double* field) {
     return is_known;
 }
 
-// Why a timestamp is rejected, or DONE.
+// Reason for the rejection of a timestamp, or DONE.
 inline Reason timestamp_fault(Sensor& s, const Limits& limits, int64_t stamp) {
     if (s.last_ns != NEVER) {
         if (double(stamp - s.last_ns) > limits.longest_jump_ns) {
@@ -125,7 +125,8 @@ inline Reason timestamp_fault(Sensor& s, const Limits& limits, int64_t stamp) {
     return DONE;
 }
 
-// Why a reading is rejected or delayed, or DONE; writes the reading corrected for iron to `field`.
+// Reason for the rejection or delay of a reading, or DONE. Writes the reading, corrected for iron,
+// to `field`.
 inline Reason check(Sensor& s, const Limits& limits, int64_t stamp, const double* raw, int64_t own,
                     double* field) {
     if (s.is_full) return BLOCK_COMPLETE;

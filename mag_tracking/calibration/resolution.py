@@ -11,13 +11,13 @@ from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration import core
 from mag_tracking.records import plain
 
-SAME = core.SAME
+MAX_ROUNDING = core.SAME
 """Maximum relative difference of two values that is due to rounding (single precision)."""
 
 MIN_STD = core.MIN_STD
-"""[T] Maximum scatter of an axis that has not changed."""
+"""[T] Maximum standard deviation of the readings of an axis that has not changed."""
 
-TOGGLE = core.TOGGLE
+TOGGLE_TOLERANCE = core.TOGGLE
 """[steps] Tolerance of an axis at rest, which may toggle between two adjacent values."""
 
 
@@ -52,7 +52,7 @@ def raw_steps(sensors: StructArray) -> FloatArray:
 
 
 def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
-    """Return the steps of all axes, with unknown steps copied from other axes at rest.
+    """Replace unknown steps by the steps of other axes at rest.
 
     An axis that has never changed is dead if another axis of the same sensor changes with every
     reading. If no axis has changed, all axes may be at rest.
@@ -60,7 +60,7 @@ def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
     Parameters
     ----------
     variance : (3,) array, T²
-        Scatter of quiet readings; NaN for a missing axis.
+        Variance of quiet readings; NaN for a missing axis.
     steps : (3,) array, T
         From `corrected_steps`.
 
@@ -91,6 +91,6 @@ def smallest_steps(fields: FloatArray) -> FloatArray:
     for axis, values in enumerate(fields.T):
         values = values[~np.isnan(values)]
         change = np.abs(np.diff(values))
-        change = change[change > SAME * np.abs(values[1:])]
+        change = change[change > MAX_ROUNDING * np.abs(values[1:])]
         out[axis] = change.min(initial=np.inf)
     return out

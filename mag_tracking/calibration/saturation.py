@@ -12,7 +12,7 @@ MIN_JUMP = 3.0
 """Minimum jump to the limit of an axis, in multiples of the smallest step; a smooth curve in coarse
 steps reaches its extreme by single steps."""
 
-MARGIN = 6
+N_MARGIN = 6
 """Number of readings excluded before and after each saturated reading. Noise pushes some of these
 readings beyond the limit, which biases the remaining readings."""
 
@@ -23,7 +23,7 @@ differences between and next to these neighbours."""
 
 
 def isolated_readings(values: FloatArray) -> IntArray:
-    """Find single readings of one axis that differ from both neighbours while these two agree.
+    """Find single readings of one axis that differ from both neighbours, which agree.
 
     Parameters
     ----------
@@ -39,12 +39,12 @@ def isolated_readings(values: FloatArray) -> IntArray:
         return np.zeros(0, dtype=np.int64)
     change = np.diff(values)
     change_before, change_after = change[1:-2], change[2:-1]
-    around = np.maximum(np.abs(change[:-3]), np.abs(change[3:]))
-    around = np.maximum(around, np.abs(change_before + change_after))
+    adjacent = np.maximum(np.abs(change[:-3]), np.abs(change[3:]))
+    adjacent = np.maximum(adjacent, np.abs(change_before + change_after))
     height = np.minimum(np.abs(change_before), np.abs(change_after))
     smallest_change = np.min(np.abs(change[change != 0.0]), initial=np.inf)
     indices: IntArray = 2 + np.flatnonzero((change_before * change_after < 0.0) & (
-        height > MIN_ISOLATION * np.maximum(around, smallest_change)))
+        height > MIN_ISOLATION * np.maximum(adjacent, smallest_change)))
     return indices
 
 
@@ -86,9 +86,9 @@ def saturated_readings(values: FloatArray) -> BoolArray:
             continue
         edges = np.flatnonzero(np.diff(np.concatenate([[False], is_extreme, [False]])))
         for first, end in edges.reshape(-1, 2):
-            sides = [jumps[i] for i in (first - 1, end - 1) if 0 <= i < len(jumps)]
-            if end - first >= MIN_RUN and max(sides) >= MIN_JUMP * step:
-                nearby = np.flatnonzero(is_extreme)[:, None] + np.arange(-MARGIN, MARGIN + 1)
+            edge_jumps = [jumps[i] for i in (first - 1, end - 1) if 0 <= i < len(jumps)]
+            if end - first >= MIN_RUN and max(edge_jumps) >= MIN_JUMP * step:
+                nearby = np.flatnonzero(is_extreme)[:, None] + np.arange(-N_MARGIN, N_MARGIN + 1)
                 out[present[np.clip(nearby, 0, len(v) - 1)]] = True
                 break
     return out

@@ -1,7 +1,7 @@
 // Rejection of faulty readings of one sensor: spikes and stuck sensors.
 //
-// Only a suspect reading is held until the next readings permit a decision; other readings pass at
-// once.
+// Only a suspect reading is held until the next readings permit a decision; other readings pass
+// immediately.
 
 #pragma once
 
@@ -144,10 +144,10 @@ inline void hold(Sensor& s, const Reading& reading, const double* steps) {
 
 // Record a reading that passes, for comparison with the next reading. `steps` may be nullptr.
 inline void pass(Sensor& s, const Reading& reading, const double* steps) {
-    double* place = s.steps[s.n_steps % RECENT];
+    double* slot = s.steps[s.n_steps % RECENT];
     for (int a = 0; a < 3; ++a) {
         s.before[a] = reading.field[a];
-        if (steps != nullptr) place[a] = steps[a];
+        if (steps != nullptr) slot[a] = steps[a];
     }
     s.before_ns = reading.stamp;
     s.n_steps += steps != nullptr;

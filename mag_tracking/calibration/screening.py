@@ -1,7 +1,7 @@
 """Rejection of faulty readings of one sensor: spikes and stuck sensors.
 
-A suspect reading is held until the next readings permit a decision. Other readings pass at once.
-The rules are compiled: `screening.hpp`.
+A suspect reading is held until the next readings permit a decision. Other readings pass
+immediately. The rules are compiled: `screening.hpp`.
 """
 
 from mag_tracking.arrays import Record

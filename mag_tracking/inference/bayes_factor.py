@@ -38,11 +38,11 @@ class TargetBayesFactor:
         stamp_ns : int, ns
             Timestamp of the frame.
         ratio : float
-            Bayes factor at which an explanation is favoured.
+            Required Bayes factor. The alternative is favoured at or below the reciprocal.
 
         Notes
         -----
-        After a value that is not finite, the Bayes factor remains unknown, and no target is
+        After a value that is not finite, the Bayes factor remains unknown, and a target is never
         favoured.
         """
         if not np.isfinite(log_ratio):
@@ -57,12 +57,12 @@ class TargetBayesFactor:
         self._recent_sum.add(stamp_ns, log_ratio)
 
     def would_be_favoured(self, log_ratio: float, ratio: float) -> bool:
-        """Whether a target would be favoured if its fit improved.
+        """Whether a target would be favoured if its log-likelihood increased.
 
         Parameters
         ----------
         log_ratio : float, nats
-            Improvement of the log-likelihood of the whole track.
+            Assumed increase of the log-likelihood of the whole track.
         ratio : float
             Required Bayes factor.
 
@@ -113,8 +113,8 @@ class TargetBayesFactor:
         Returns
         -------
         float, s
-            0 if a target has been favoured before, because the field of a vehicle that has stopped
-            is as smooth as the alternative.
+            0 if the Bayes factor is unknown. 0 also if a target was favoured earlier, because the
+            field of a stopped vehicle is as smooth as the alternative.
         """
         if self._was_favoured or self._disfavoured_since_ns is None or not self._is_known:
             return 0.0

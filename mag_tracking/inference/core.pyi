@@ -23,8 +23,8 @@ def step_vectors(x: FloatArray, P: FloatArray, log_w: FloatArray, densities: Flo
 def inverses(A: FloatArray, least: float, out: FloatArray) -> bool:
     """Write the inverses of symmetric matrices `A` (n, k, k) to `out`.
 
-    Return False if a matrix is not finite. Return False also if the root of a pivot, at unit
-    diagonal, does not exceed `least`.
+    Return False if a matrix is not finite, or if the root of a pivot of a matrix scaled to unit
+    diagonal does not exceed `least`.
     """
 
 def best(x: FloatArray, P: FloatArray, log_w: FloatArray, label: IntArray, kind: IntArray,

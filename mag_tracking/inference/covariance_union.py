@@ -12,8 +12,9 @@ from mag_tracking.arrays import FloatArray
 def inflated_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
     """Inflate the covariance of a state until its horizontal position covers another estimate.
 
-    The standard deviation along the horizontal difference becomes at least the difference.
-    Other components are inflated in proportion to their own difference, fully correlated with it.
+    The standard deviation along the horizontal difference becomes at least the length of that
+    difference. Each other component is inflated in proportion to its own difference; the added
+    errors of all components are fully correlated.
 
     Parameters
     ----------
@@ -29,7 +30,8 @@ def inflated_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
 
     Notes
     -----
-    Only the horizontal position determines the inflation, and the other estimate has no covariance.
+    Only the horizontal position determines the inflation. The covariance of the other estimate is
+    not used.
 
     References
     ----------

@@ -23,13 +23,13 @@ from mag_tracking.inference.matrices import (
 )
 
 RANK_TOLERANCE = 1e-12
-"""Eigenvalues below this fraction of the largest one count as zero."""
+"""Eigenvalues at or below this fraction of the largest eigenvalue count as zero."""
 
 _KERNEL_TOLERANCE = 1e-6
-"""Minimum component of a kernel along the axis of a state at which the state is unobservable."""
+"""Component of a kernel along the axis of a state above which the state is unobservable."""
 
 _K_DIPOLE = 1e-7
-"""mu0 / (4 pi) [T m/A]; the constant in `physics` must not be imported here."""
+"""mu0 / (4 pi) [T m/A]; not imported, because `inference` does not depend on `physics`."""
 
 
 def information(H: ArrayLike, C: ArrayLike | None = None) -> FloatArray:
@@ -60,7 +60,7 @@ def information(H: ArrayLike, C: ArrayLike | None = None) -> FloatArray:
 
 @dataclass(frozen=True)
 class Observability:
-    """Observability of the states near one point."""
+    """Observability of the states near the point at which a model is linearised."""
 
     eigenvalues: FloatArray
     """Eigenvalues of the scaled information, (n_x,), ascending; zeros are subject to rounding of
@@ -81,7 +81,7 @@ class Observability:
 
 def observability(information: ArrayLike, names: Sequence[str],
                   scale: ArrayLike | None = None) -> Observability:
-    """Local observability, from the eigenvalues of an information matrix.
+    """Local observability of states, from the eigenvalues of their information matrix.
 
     Parameters
     ----------
@@ -91,8 +91,8 @@ def observability(information: ArrayLike, names: Sequence[str],
         Names of the n_x states.
     scale : (n_x,) array, optional
         Typical magnitude of each state, in its unit. Eigenvalues, condition number and rank
-        refer to diag(scale) information diag(scale), the information about x / scale. Default: 1,
-        which is of little use if units differ by decades (metres and tesla).
+        refer to diag(scale) information diag(scale), the information about x / scale. Default: 1;
+        a scale is required if the units differ by decades (metres and tesla).
 
     Returns
     -------
@@ -396,7 +396,8 @@ def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
 def _inverse_root(J: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Scale J to unit diagonal, and decompose the scaled matrix.
 
-    Returns the scale, a root G of the pseudo-inverse G G' and an orthonormal kernel basis.
+    Returns the scale (n,), a root G (n, rank) of the pseudo-inverse G G' of the scaled matrix, and
+    an orthonormal basis of its kernel (n, n - rank).
     """
     scale, w, V = unit_diagonal('information', J)
     zero = w <= RANK_TOLERANCE * w.max(initial=0.0)
@@ -404,6 +405,6 @@ def _inverse_root(J: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _is_in_kernel(kernel: FloatArray) -> BoolArray:
-    """Whether each state has a component in the kernel with orthonormal basis (n, k); (n,)."""
+    """Flag the states (n,) with a component in a kernel, given its orthonormal basis (n, k)."""
     in_kernel: BoolArray = np.linalg.norm(kernel, axis=1) > _KERNEL_TOLERANCE
     return in_kernel

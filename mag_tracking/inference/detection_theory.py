@@ -11,7 +11,7 @@ from mag_tracking.arrays import FloatArray, IntArray
 
 def energy_threshold(false_alarm_probability: float | FloatArray,
                      degrees_of_freedom: float | IntArray) -> FloatArray:
-    """Threshold of the energy test for a false-alarm probability.
+    """Threshold of the energy test for a given false-alarm probability.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def detection_probability(snr: float | FloatArray, threshold: float | FloatArray
 
 
 def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray:
-    """Probability that a pass contains no run of `run` consecutive detections.
+    """Probability that a pass contains fewer than `run` consecutive detections.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray
     Returns
     -------
     (...) array
-        Computed exactly from the distribution of the current number of consecutive detections.
+        Exact: computed from the distribution of the current number of consecutive detections.
     """
     p = np.asarray(probability, dtype=float)
     run_probability = np.zeros((run, *p.shape[1:]))

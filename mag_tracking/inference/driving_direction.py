@@ -14,7 +14,7 @@ from scipy.special import log_ndtr, ndtr
 
 from mag_tracking.arrays import FloatArray
 
-LAG = 0.35
+LAG_FRACTION = 0.35
 """Default lag as a fraction of the full width at half maximum of the signal energy; near the
 optimum for passes at constant speed (PHD15 Paper B eq. (19))."""
 
@@ -33,7 +33,7 @@ is treated as vertical."""
 
 
 class FieldRotation(NamedTuple):
-    """Statistic of the sense of rotation, treated as normally distributed."""
+    """Statistic of the sense of rotation of a field; it is treated as normally distributed."""
 
     correlation: float
     """Correlation of the horizontal axes, T²; negative for a target that moves from left to
@@ -53,13 +53,13 @@ class FieldRotation(NamedTuple):
 
     @property
     def log_odds(self) -> float:
-        """Log-odds of left to right against right to left, for equal priors."""
+        """Log-odds [nats] of left to right against right to left, for equal priors."""
         z = self.correlation / np.sqrt(self.variance)
         return float(log_ndtr(-z) - log_ndtr(z))
 
 
 def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotation:
-    """Correlation of the two horizontal axes at a lag, with its estimated variance.
+    """Correlation of the two horizontal axes at a lag, with the estimated variance.
 
     Parameters
     ----------
@@ -120,18 +120,18 @@ def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRo
 
 
 def _correlation(field: FloatArray, lag: int) -> float:
-    """Lagged correlation of the horizontal axes, PHD15 Paper B eq. (5a), on the inner samples."""
+    """Correlation [T²] of the horizontal axes at a lag, without both ends; PHD15 B eq. (5a)."""
     current, delayed = field[lag:-lag], field[2 * lag:]
     return float(np.sum(current[:, 0] * delayed[:, 1] - current[:, 1] * delayed[:, 0])) / lag
 
 
 def _squared_lag_differences(field: FloatArray, lag: int) -> float:
-    """Sum of the squared differences of samples two lags apart."""
+    """Sum over both axes of the squared differences of samples two lags apart [T²]."""
     return float(np.sum(np.square(field[2 * lag:] - field[:-2 * lag])))
 
 
 def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
-    """Lag, in samples, that matches the width of a pass.
+    """Lag that matches the width of a pass.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
     Returns
     -------
     int
-        From 1 to a quarter of the window; 0 if the field does not exceed the noise.
+        Samples, from 1 to a quarter of the window; 0 if the field does not exceed the noise.
     """
     window = 1 + len(field) // 20
     energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(window), 'same')
@@ -154,7 +154,7 @@ def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
     width = np.count_nonzero(energy > 0.5 * energy.max())
     if not width:
         return 0
-    return int(np.clip(round(LAG * width), 1, max(1, min(max_lag, len(field) // 4))))
+    return int(np.clip(round(LAG_FRACTION * width), 1, max(1, min(max_lag, len(field) // 4))))
 
 
 def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int]) -> int:
@@ -172,6 +172,7 @@ def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int
     Returns
     -------
     int
+        Samples; one of `lags`.
 
     References
     ----------

@@ -13,10 +13,11 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference import core
 
 _NEGLIGIBLE_LOG_RATIO = np.log(100.0)
-"""Hypotheses lighter than the heaviest one by more than this [nats] do not affect the choice of the
-published hypothesis."""
+"""[nats] Maximum log-weight difference from the heaviest hypothesis. Lighter hypotheses do not
+affect the choice of the published hypothesis."""
 _SINGULAR_TOLERANCE = 1e-15
-"""A variance below this fraction of the largest counts as zero, as in `numpy.linalg.pinv`."""
+"""Fraction of the largest variance at or below which a variance counts as zero, as in
+`numpy.linalg.pinv`."""
 
 
 def log_sum_exp(a: ArrayLike, axis: int | None = None) -> FloatArray:
@@ -201,7 +202,7 @@ class FilterBank:
         return FilterBank(**{**selected, 'log_w': np.full(len(rows), -np.log(len(rows)))})
 
     def alone(self, i: int) -> 'FilterBank':
-        """Create a bank with a single hypothesis.
+        """Create a bank that contains a single hypothesis of this bank.
 
         Parameters
         ----------
@@ -246,7 +247,7 @@ class FilterBank:
         return bool(np.exp(np.sort(self.log_w)[-n:]).sum() >= fraction)
 
     def is_separated(self, i: int, distance: float = 3.0) -> BoolArray:
-        """Whether hypotheses differ significantly in position from a reference hypothesis.
+        """Flag the hypotheses whose position differs significantly from a reference hypothesis.
 
         Parameters
         ----------
@@ -322,14 +323,14 @@ class FilterBank:
                 setattr(self, name, getattr(self, name)[mask])
         return n_removed
 
-    def prune(self, log_ratio: float, most: int) -> int:
+    def prune(self, log_ratio: float, max_hypotheses: int) -> int:
         """Remove hypotheses of low weight.
 
         Parameters
         ----------
         log_ratio : float, nats
             Maximum difference from the log-weight of the heaviest hypothesis.
-        most : int
+        max_hypotheses : int
             Maximum number of hypotheses; the lightest are removed.
 
         Returns
@@ -338,10 +339,10 @@ class FilterBank:
             Number of hypotheses removed.
         """
         mask = self.log_w >= self.log_w.max() - log_ratio
-        if np.count_nonzero(mask) > most:
+        if np.count_nonzero(mask) > max_hypotheses:
             order = np.argsort(-self.log_w, kind='stable')
             mask = np.zeros(len(self), dtype=bool)
-            mask[order[:most]] = True
+            mask[order[:max_hypotheses]] = True
         return self.keep(mask)
 
 
@@ -353,7 +354,7 @@ def _selected_states(x: FloatArray, P: FloatArray, columns: IntArray
 
 
 def _class_indices(labels: IntArray) -> IntArray:
-    """Class index (n,) of each row of labels, (n,) or (n, n_targets)."""
+    """Class index (n,) of each hypothesis; hypotheses with equal `labels` have equal indices."""
     if labels.ndim == 1:
         return labels
     classes: IntArray = np.unique(labels, axis=0, return_inverse=True)[1].reshape(-1)
@@ -361,10 +362,10 @@ def _class_indices(labels: IntArray) -> IntArray:
 
 
 def _compacted(a: FloatArray, rows: IntArray) -> FloatArray:
-    """Select the ascending `rows` (n,) of an array by moving them to its beginning.
+    """Select the ascending `rows` (n,) of an array by moving the rows to the beginning.
 
-    This is faster than a new array. A new array is returned if the old array would occupy more
-    than twice the memory.
+    Moving rows in place is faster than a copy. A copy is returned if the selected rows occupy less
+    than half of the buffer.
     """
     buffer = a if a.base is None else a.base
     if len(rows) * a[:1].nbytes < buffer.nbytes // 2:

@@ -1,4 +1,4 @@
-"""Filters for vectors that change smoothly, without a model of the cause.
+"""Kalman filters for vectors that change smoothly due to an unknown cause.
 
 Each component is an integrated random walk: its rate of change is a Wiener process. The strength of
 the process is unknown and may change: a bank of strengths is weighted by the data, and each
@@ -13,14 +13,14 @@ from mag_tracking.inference import core
 from mag_tracking.records import plain
 
 STRENGTHS = np.logspace(-1.5, 4.5, 13)
-"""Root spectral densities of the bank, in units of the scale of a vector [1/s^1.5]."""
+"""[1/s^1.5] Root spectral densities of the bank, relative to the scale of a component."""
 
-SWITCH_S = 0.75
-"""Mean time between switches of the strength [s]."""
+SWITCH_INTERVAL_S = 0.75
+"""[s] Mean time between switches of the strength."""
 
 
 class GaussMarkovVectors:
-    """Filters for vectors that change independently of each other and start at zero.
+    """Kalman filters for vectors that start at zero and change independently of each other.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class GaussMarkovVectors:
 
     def log_density(self, vector: IntArray, H: FloatArray, y: FloatArray, variance: FloatArray,
                     dt: float) -> float:
-        """Update with scalar measurements, and return their log-density given earlier measurements.
+        """Update with scalar measurements, and return the log-density of these measurements.
 
         Parameters
         ----------
@@ -74,8 +74,9 @@ class GaussMarkovVectors:
 
         Returns
         -------
-        float
+        float, nats
+            Given the earlier measurements.
         """
         return core.step_vectors(self._x, self._P, self._log_w, self._densities,
                                  plain(vector, np.int64), plain(H), plain(y), plain(variance), dt,
-                                 SWITCH_S)
+                                 SWITCH_INTERVAL_S)

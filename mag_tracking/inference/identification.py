@@ -18,11 +18,11 @@ MIN_HEADING_SEPARATION = np.deg2rad(45.0)
 """Minimum difference of headings that separates hard from soft iron [rad]."""
 
 HEADING_TOLERANCE = np.deg2rad(10.0)
-"""Maximum difference of headings at which a vehicle enrolled at a single heading is compared [rad].
-"""
+"""[rad] Maximum difference of headings at which a pass is compared with a vehicle that is enrolled
+at a single heading."""
 
 SIGNIFICANCE_LEVEL = 0.01
-"""A moment that is less probable than this for every vehicle belongs to an unknown vehicle."""
+"""Significance level of the chi-square test; a moment rejected for every vehicle is unknown."""
 
 
 @dataclass(frozen=True)
@@ -62,17 +62,18 @@ class EnrolledVehicle:
         ----------
         [T10]_ eq. (6.16); [TSP14]_ eq. (15), (16).
         """
-        between = PASS_TO_PASS_STD**2 * np.eye(3)
+        pass_to_pass = PASS_TO_PASS_STD**2 * np.eye(3)
         if self.iron is None:
             if abs(_wrapped(heading - self.heading)) > HEADING_TOLERANCE:
                 return None
-            return self.moment, self.covariance + between
+            return self.moment, self.covariance + pass_to_pass
         c, s = np.cos(heading), np.sin(heading)
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         slope = np.array([[-s, -c, 0.0], [c, -s, 0.0], [0.0, 0.0, 0.0]]) @ self.iron.hard
         A = np.hstack([R, induction[:, None]])
         return (R @ self.iron.hard + self.iron.soft * induction,
-                A @ self.iron.covariance @ A.T + heading_std**2 * np.outer(slope, slope) + between)
+                A @ self.iron.covariance @ A.T + heading_std**2 * np.outer(slope, slope)
+                + pass_to_pass)
 
 
 @dataclass(frozen=True)
@@ -84,14 +85,15 @@ class Identification:
     probabilities: dict[str, float]
     """{vehicle: probability} of the compared vehicles, for equal priors."""
     distances: dict[str, float]
-    """{vehicle: squared Mahalanobis distance}, chi-square with three degrees of freedom."""
+    """{vehicle: squared Mahalanobis distance}; chi-square distributed with three degrees of freedom
+    for the true vehicle."""
     not_compared: tuple[str, ...]
     """Vehicles that are enrolled at another heading only."""
 
 
 def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: FloatArray,
           induction: FloatArray) -> EnrolledVehicle:
-    """Enrol a vehicle by its passes.
+    """Enrol a vehicle from its passes at known headings.
 
     Parameters
     ----------
@@ -100,7 +102,7 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
     moments : (n, 3) array, A m², world frame
         Fitted moments of the passes.
     covariances : (n, 3, 3) array, A² m⁴
-        Covariances of the fits; the spread between passes is added.
+        Covariances of the fits; the variance between passes is added.
     headings : (n,) array, rad, world frame
     induction : (3,) array, A/m, world frame
         B0/mu0.
@@ -118,20 +120,20 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
     moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
     if not len(moments):
         raise ValueError(f'{name}: enrolment requires at least one pass')
-    spread = np.asarray(covariances, dtype=float) + PASS_TO_PASS_STD**2 * np.eye(3)
+    total_covariances = np.asarray(covariances, dtype=float) + PASS_TO_PASS_STD**2 * np.eye(3)
     separation = np.abs(_wrapped(headings[:, None] - headings)).max()
     if separation >= MIN_HEADING_SEPARATION:
-        iron = hard_and_soft_iron(moments, headings, induction, spread)
+        iron = hard_and_soft_iron(moments, headings, induction, total_covariances)
         return EnrolledVehicle(name, iron, np.nan, np.full(3, np.nan), np.full((3, 3), np.nan))
     if not np.isfinite(moments).all() or separation > HEADING_TOLERANCE:
         raise ValueError(f'{name}: expected finite moments at one heading, or at headings at least '
                          f'{np.rad2deg(MIN_HEADING_SEPARATION):.0f} degrees apart; got headings '
                          f'{np.rad2deg(separation):.0f} degrees apart')
-    information = np.linalg.inv(spread)
+    information = np.linalg.inv(total_covariances)
     covariance = np.linalg.inv(information.sum(axis=0))
     mean = covariance @ np.einsum('nij,nj->i', information, moments)
-    middle = float(np.angle(np.exp(1j * headings).sum()))
-    return EnrolledVehicle(name, None, middle, mean, covariance)
+    mean_heading = float(np.angle(np.exp(1j * headings).sum()))
+    return EnrolledVehicle(name, None, mean_heading, mean, covariance)
 
 
 def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance: FloatArray,

@@ -13,10 +13,10 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.sliding_sum import SlidingSum
 
 WINDOW_S = 0.5
-"""Length of the window of latest frames that are tested together [s]."""
+"""[s] Length of the window of latest frames that are tested together."""
 
-FALSE_ALARM = 1e-3
-"""Probability that the innovations of a consistent filter fail one test."""
+FALSE_ALARM_PROBABILITY = 1e-3
+"""False-alarm probability of a test of the network, and of the tests of all sensors together."""
 
 
 class InnovationConsistency:
@@ -69,15 +69,15 @@ class InnovationConsistency:
 
     @property
     def fails(self) -> bool:
-        """Whether the innovations of the whole track are too large, in total or at a sensor."""
+        """Whether the innovations of the whole track fail the test, for the network or a sensor."""
         return bool(self._fails(self._total).any())
 
     def _fails(self, values: FloatArray) -> FloatArray:
-        """Whether each sum of NIS exceeds its chi-square threshold, (n_sensors + 1,)."""
-        probability = np.append(np.full(self._n_sensors, FALSE_ALARM / self._n_sensors),
-                                FALSE_ALARM)
-        nis, freedom = values
+        """Flag the sums of NIS (n_sensors + 1,) that exceed the chi-square threshold."""
+        probability = np.append(np.full(self._n_sensors, FALSE_ALARM_PROBABILITY / self._n_sensors),
+                                FALSE_ALARM_PROBABILITY)
+        nis, dof = values
         with np.errstate(invalid='ignore'):
             exceeds: FloatArray = nis > np.where(
-                freedom > 0, chdtri(np.maximum(freedom, 1.0), probability), np.inf)
+                dof > 0, chdtri(np.maximum(dof, 1.0), probability), np.inf)
         return exceeds

@@ -17,7 +17,7 @@ class Iron:
     soft: float
     """Soft iron D, m³."""
     covariance: FloatArray
-    """Covariance of [m0, D], (4, 4)."""
+    """Covariance of [m0, D], (4, 4), in the squared units of m0 [A m²] and D [m³]."""
     residuals: FloatArray
     """Measured minus predicted moments, (n, 3) A m², world frame."""
     normalised_cost: float
@@ -90,7 +90,10 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: Array
 
 
 def _whitening_matrices(covariances: ArrayLike | None, n: int) -> FloatArray:
-    """Inverse Cholesky factors (n, 3, 3) of covariances; identity matrices if None is given."""
+    """Inverse Cholesky factors (n, 3, 3) of covariances; identity matrices if None.
+
+    Raises ValueError for a wrong shape or a covariance that is not positive definite.
+    """
     if covariances is None:
         return np.tile(np.eye(3), (n, 1, 1))
     covariances = np.asarray(covariances, dtype=float)

@@ -1,4 +1,4 @@
-"""Non-linear least squares from many starting points at once.
+"""Non-linear least squares from many starting points in parallel.
 
 A model is a function that returns residuals and Jacobians.
 """
@@ -21,7 +21,7 @@ CORRELATION_TIME_S = 0.2
 
 def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iterations: int = 40,
            tolerance: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Minimise sums of squares by Levenberg-Marquardt from many starting points at once.
+    """Minimise a sum of squares by Levenberg-Marquardt from many starting points in parallel.
 
     Each starting point has its own damping.
 
@@ -46,8 +46,8 @@ def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iteration
     covariance : (n, n_x, n_x) array
         Pseudo-inverse of the information at `x`.
     converged : (n,) bool array
-        Whether the steps or the decrease of the cost became negligible within the iterations. False
-        if no damping lowers the cost.
+        Whether the step or the decrease of the cost became negligible within `n_iterations`. False
+        if no damping below `MAX_DAMPING` decreases the cost.
 
     References
     ----------
@@ -65,9 +65,9 @@ def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iteration
         trial = x[active] + step
         trial_residual, trial_J, trial_cost = _evaluate(residual_and_jacobian, trial)
         is_better = trial_cost < cost[active]
-        gain = cost[active] - trial_cost
+        decrease = cost[active] - trial_cost
         is_done = (np.abs(step) <= 1e-10 * np.abs(x[active])).all(axis=1)
-        is_done |= is_better & (gain <= tolerance * cost[active])
+        is_done |= is_better & (decrease <= tolerance * cost[active])
         improved = active[is_better]
         x[improved], cost[improved] = trial[is_better], trial_cost[is_better]
         residual[improved], J[improved] = trial_residual[is_better], trial_J[is_better]
@@ -78,11 +78,11 @@ def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iteration
 
 
 MAX_DAMPING = 1e12
-"""Damping at which a search is abandoned, because even tiny steps do not lower the cost."""
+"""Damping at which a search stops, because even tiny steps do not decrease the cost."""
 
 
 def _damped_step(J: FloatArray, residual: FloatArray, damping: FloatArray) -> FloatArray:
-    """Levenberg-Marquardt steps (n, n_x)."""
+    """Levenberg-Marquardt steps (n, n_x) for the damping (n,) of each point."""
     Jt = np.swapaxes(J, 1, 2)
     information = Jt @ J
     # Marquardt's scaling: damping is relative to the information of each parameter.
@@ -95,7 +95,7 @@ def _damped_step(J: FloatArray, residual: FloatArray, damping: FloatArray) -> Fl
 
 def _evaluate(residual_and_jacobian: ResidualAndJacobian, x: FloatArray
               ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Evaluate residuals, Jacobians and costs; an unusable point has infinite cost."""
+    """Evaluate residuals, Jacobians and costs; the cost is infinite if any result is not finite."""
     with ignoring_overflow():
         residual, J = residual_and_jacobian(x)
         cost = np.einsum('ni,ni->n', residual, residual)
@@ -106,7 +106,7 @@ def _evaluate(residual_and_jacobian: ResidualAndJacobian, x: FloatArray
 
 def project_out_linear(A: FloatArray, y: FloatArray
                        ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Estimate the linear parameters p of many models y = A p + e, e ~ N(0, I).
+    """Estimate the linear parameters p of several models y = A p + e, e ~ N(0, I).
 
     Parameters
     ----------

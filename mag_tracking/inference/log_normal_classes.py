@@ -11,7 +11,7 @@ from mag_tracking.arrays import FloatArray
 UNKNOWN = 'unknown'
 """Name that is returned for an object that matches no class."""
 SIGNIFICANCE_LEVEL = 0.01
-"""An object that is less probable than this under every class is classified as `UNKNOWN`."""
+"""Significance level of the chi-square test; an object rejected for every class is `UNKNOWN`."""
 
 
 class Feature(NamedTuple):
@@ -22,9 +22,9 @@ class Feature(NamedTuple):
     std: float
     """Standard deviation of the measurement."""
     medians: Sequence[float]
-    """Median in each class."""
+    """Median of the feature in each class."""
     spreads: Sequence[float]
-    """Standard deviation of the natural logarithm in each class."""
+    """Standard deviation of the natural logarithm of the feature in each class."""
 
 
 class ClassPosterior(NamedTuple):

@@ -24,7 +24,7 @@ class MarginalWhitener:
         self._attenuation: FloatArray = 1.0 - 1.0 / np.sqrt(1.0 + singular_values**2)
 
     def __call__(self, A: FloatArray) -> FloatArray:
-        """Whiten `A` (..., n_y, k), or (n_y,)."""
+        """Return `A`, (..., n_y, k) or (n_y,), multiplied by the inverse root of I + C C'."""
         whitened: FloatArray = A - (self._U * self._attenuation) @ (self._U.T @ A)
         return whitened
 
@@ -34,7 +34,7 @@ class MarginalWhitener:
         Parameters
         ----------
         A : (n_y, k) array
-            Matrix A of the product; the same function is applied to B.
+            Matrix A of the product; apply the same method to B.
 
         Returns
         -------

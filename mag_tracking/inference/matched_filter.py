@@ -16,7 +16,7 @@ from scipy.special import ndtr, ndtri
 from mag_tracking.arrays import BoolArray, FloatArray
 
 _BAND_EDGE_TOLERANCE = 1e-9
-"""Relative tolerance by which a band is extended, so that it includes its edges."""
+"""Relative tolerance by which a band is extended, so that the band includes its edges."""
 
 
 def noise_spectrum(frequency: ArrayLike, background: float, resolution: float,
@@ -63,7 +63,7 @@ def noise_spectrum(frequency: ArrayLike, background: float, resolution: float,
 
 def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArray], ArrayLike],
                band: Sequence[float]) -> FloatArray:
-    """Deflection of the matched filter: separation of its two means in standard deviations.
+    """Deflection of the matched filter: difference of its mean outputs with and without the signal.
 
     Parameters
     ----------
@@ -79,7 +79,8 @@ def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArra
     Returns
     -------
     (...) array
-        Root of the sum of the squared deflections of the axes; NaN if no axis is measured.
+        In standard deviations of the output: root of the sum of the squared deflections of the
+        axes. NaN if no axis is measured.
 
     Raises
     ------
@@ -129,7 +130,7 @@ def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArra
 
 def detection_probability(deflection: ArrayLike, false_alarm_probability: ArrayLike
                           ) -> FloatArray:
-    """Probability that the matched filter detects its signal.
+    """Detection probability of the matched filter.
 
     Parameters
     ----------
@@ -207,6 +208,6 @@ def _raise_for_invalid(name: str, requirement: str, value: ArrayLike,
     """Raise ValueError for the first entry of `value` that is flagged in `is_invalid`, if any."""
     if np.any(is_invalid):
         index = np.argwhere(is_invalid)[0].tolist() if np.ndim(is_invalid) else []
-        where = index if index else ''
+        position = index if index else ''
         actual = np.asarray(value)[tuple(index)].tolist()
-        raise ValueError(f'{name}{where} must be {requirement}, got {actual}')
+        raise ValueError(f'{name}{position} must be {requirement}, got {actual}')

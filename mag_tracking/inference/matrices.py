@@ -23,7 +23,7 @@ def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
     Returns
     -------
     (..., n_y, n_x) array
-        Rows of unit noise; zero for missing rows.
+        Rows with uncorrelated noise of variance 1; zero for missing rows.
 
     Raises
     ------
@@ -171,13 +171,14 @@ def ignoring_overflow() -> AbstractContextManager[None]:
 
 
 PSEUDO_INVERSE_TOLERANCE = 1e-15
-"""Relative eigenvalue below which a direction consists of rounding errors."""
+"""Eigenvalue, relative to the largest, below which a direction is due to rounding errors."""
 
 
 def pseudo_inverse(A: FloatArray, rank: float = PSEUDO_INVERSE_TOLERANCE) -> FloatArray:
-    """Pseudo-inverses of symmetric matrices, scaled to unit diagonal.
+    """Pseudo-inverses of symmetric matrices.
 
-    The matrices are scaled because the units of the parameters differ by decades.
+    The matrices are scaled to unit diagonal first, because the units of the parameters differ by
+    decades.
 
     Parameters
     ----------
@@ -212,4 +213,4 @@ def pseudo_inverse(A: FloatArray, rank: float = PSEUDO_INVERSE_TOLERANCE) -> Flo
 
 
 MIN_PIVOT_ROOT = 1e-3
-"""Root of a pivot, at unit diagonal, above which a matrix is inverted by its Cholesky factor."""
+"""Minimum root of the pivots, at unit diagonal, for an inversion by the Cholesky factor."""

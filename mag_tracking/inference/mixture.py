@@ -7,7 +7,7 @@ from mag_tracking.arrays import FloatArray
 
 def second_moment(weights: FloatArray, differences: FloatArray,
                   covariances: FloatArray) -> FloatArray:
-    """Mean square error of an estimate if the truth follows a Gaussian mixture.
+    """Mean squared error matrix of an estimate if the truth follows a Gaussian mixture.
 
     Parameters
     ----------

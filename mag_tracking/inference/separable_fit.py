@@ -47,7 +47,7 @@ class SeparableModel(Protocol):
 
 
 class SeparableProblem:
-    """Least-squares problem of a separable model; p is eliminated for every theta.
+    """Least-squares problem of a separable model, with p eliminated by variable projection.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class SeparableProblem:
 
     Notes
     -----
-    Variable projection with the Jacobian of Kaufman (1975).
+    The Jacobian is the approximation of Kaufman (1975).
 
     References
     ----------
@@ -87,7 +87,7 @@ class SeparableProblem:
         return A - self._Q @ (self._Q.T @ A)
 
     def cost(self, theta: FloatArray) -> FloatArray:
-        """Minimum of the sum of squares over the linear parameters.
+        """Minimum of the cost over the linear parameters.
 
         Parameters
         ----------
@@ -97,7 +97,8 @@ class SeparableProblem:
         Returns
         -------
         (n,) array
-            Infinite where the model is not finite.
+            Sum of squared whitened residuals, including the prior; infinite where the model is not
+            finite.
         """
         with ignoring_overflow():
             A = self._without_nuisance(self._model.basis(theta))
@@ -162,7 +163,7 @@ class _Prior:
         """Derivative of the whitened measurements, (n_known, n_theta)."""
 
     def residual(self, theta: FloatArray) -> FloatArray:
-        """Whitened residuals (n, n_known) for theta (n, n_theta)."""
+        """Whitened residuals (n, n_known) of the prior at theta (n, n_theta)."""
         residual_of_prior: FloatArray = (self._mean - theta[:, self._prior_indices]) / self._std
         return residual_of_prior
 
@@ -178,7 +179,7 @@ class Minimum:
     converged: bool
     """Whether the final search converged."""
     rivals: tuple[tuple[FloatArray, float], ...] = ()
-    """Other minima as (theta, cost), best first."""
+    """Other distinct minima as (theta, cost), lowest cost first."""
 
 
 def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparableProblem,
@@ -290,7 +291,7 @@ def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray,
 
 def distinct(theta: FloatArray, cost: FloatArray, min_difference: FloatArray,
              max_points: int) -> IntArray:
-    """Select the best distinct points.
+    """Select the distinct points of lowest cost.
 
     Parameters
     ----------
@@ -306,7 +307,7 @@ def distinct(theta: FloatArray, cost: FloatArray, min_difference: FloatArray,
     Returns
     -------
     (k,) int array
-        Indices of the selected points, best first.
+        Indices of the selected points, lowest cost first.
     """
     selected: list[int] = []
     for i in np.argsort(cost, kind='stable').tolist():

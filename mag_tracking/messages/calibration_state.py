@@ -80,7 +80,7 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
 
 
 def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
-    """Latest interval in which each sensor's background was doubtful, from a CalibrationState.
+    """Read the latest doubtful interval of each sensor's background from a CalibrationState.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
     Returns
     -------
     dict of str to DoubtfulTimes
-        Empty for a sensor whose background was never doubtful.
+        At most one interval per sensor; empty for a sensor whose background was never doubtful.
     """
     times: dict[str, DoubtfulTimes] = {}
     for s in message.sensors:
@@ -99,7 +99,7 @@ def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
 
 
 def with_orientations(network: SensorNetwork, message: CalibrationState) -> SensorNetwork:
-    """Return a copy of a network that has the sensor orientations of a CalibrationState.
+    """Copy a network, with the sensor orientations of a CalibrationState.
 
     Parameters
     ----------

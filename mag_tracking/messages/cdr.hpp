@@ -155,15 +155,16 @@ struct Field {
         if (length == ONE) return value->add(content, out);
         // Strings and dicts would also pass as sequences.
         if (PyUnicode_Check(content.ptr()) || PyDict_Check(content.ptr()))
-            throw py::type_error(std::string(name) + ": not a list");
+            throw py::type_error(std::string(name) + ": expected a list");
         const auto items = py::reinterpret_steal<py::object>(
-            content.is_none() ? PyTuple_New(0) : PySequence_Fast(content.ptr(), "not a list"));
+            content.is_none() ? PyTuple_New(0) : PySequence_Fast(content.ptr(), "expected a list"));
         check_python();
         const Size n = PySequence_Fast_GET_SIZE(items.ptr());
         if (length == SEQUENCE)
             out.add_length(n);
         else if (n && n != length)
-            throw py::value_error(std::to_string(n) + " elements, not " + std::to_string(length));
+            throw py::value_error("expected " + std::to_string(length) + " elements, got "
+                                  + std::to_string(n));
         for (Size i = 0; i < (length == SEQUENCE ? n : length); ++i)
             value->add(n ? py::handle(PySequence_Fast_GET_ITEM(items.ptr(), i)) : Py_None, out);
     }

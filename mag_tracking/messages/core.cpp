@@ -28,7 +28,7 @@ std::shared_ptr<const Value> built_in(const std::string& type, const py::object&
     if (type == "uint64") return value_of<Integer<std::uint64_t>>(default_value, zero);
     if (type == "bool") return value_of<Boolean>(default_value, zero);
     if (type == "string") return value_of<String>(default_value, py::str(""));
-    throw py::value_error("this type cannot be encoded: " + type);
+    throw py::value_error("type cannot be encoded: " + type);
 }
 
 // Encodes the messages of one type.

@@ -1,7 +1,7 @@
 """Message definitions without comments, for recordings that are written without ROS.
 
-The standard types are from ROS 2 Jazzy, the types of this package from `msg_defs/`. A test compares
-the definitions with these sources.
+The standard types are from ROS 2 Jazzy, the types of this package from `msg_defs/`. A test checks
+that the definitions agree with these sources.
 """
 
 DEFINITIONS: dict[str, str] = {

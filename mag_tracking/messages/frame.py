@@ -1,4 +1,4 @@
-"""Conversion of network frames to and from messages, as nested dicts, without ROS."""
+"""Conversion of network frames to messages as nested dicts, and from messages, without ROS."""
 
 from typing import Protocol
 
@@ -12,7 +12,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 
 MAX_OFFSET_S = 60.0
-"""[s] Maximum time offset of a sensor within a frame: the largest `align.period_s`."""
+"""[s] Maximum time offset of a sensor within a frame; equals the maximum of `align.period_s`."""
 
 
 class NamedSensors(Protocol):

@@ -34,7 +34,7 @@ _GREY = {'r': 0.35, 'g': 0.35, 'b': 0.35, 'a': 1.0}
 
 
 def track_markers(track: Track, frame: str) -> dict[str, Any]:
-    """Markers of a `Track`: ellipsoid, moment and label.
+    """Markers of a `Track`: ellipsoid, moment arrow and label.
 
     The ellipsoid shows the covariance of the pose topics. If the track is ambiguous, this
     covariance covers all hypotheses.
@@ -53,7 +53,7 @@ def track_markers(track: Track, frame: str) -> dict[str, Any]:
 
 
 def delete_markers(track: Track, frame: str) -> dict[str, Any]:
-    """Markers that delete the markers of an ended `Track`.
+    """Markers that delete the displayed markers of a `Track` that has ended.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
 
 
 def _smallest_distance(positions: FloatArray) -> float:
-    """Smallest distance between two sensors [m]; infinite for a single sensor."""
+    """Smallest distance [m] between two sensors; infinite for a single sensor."""
     distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
     np.fill_diagonal(distances, np.inf)
     return float(distances.min())
@@ -116,7 +116,7 @@ def _quaternion(R: FloatArray) -> dict[str, float]:
 
 
 def _ellipsoid(track: Track, frame: str) -> dict[str, Any]:
-    """Marker of the 90 % region of the position."""
+    """Ellipsoid marker of the 90 % region of the position."""
     uncertainty: Track | PoseUncertainty = track.topic_uncertainty or track
     variances, R = np.linalg.eigh(uncertainty.covariance[:3, :3])
     if np.linalg.det(R) < 0.0:
@@ -142,7 +142,7 @@ def _arrow(track: Track, frame: str) -> dict[str, Any]:
 
 
 def _label(track: Track, frame: str) -> dict[str, Any]:
-    """Text marker with track id, kind and speed; a question mark means an ambiguous track."""
+    """Text marker with track id, kind and speed, and a question mark if the track is ambiguous."""
     size = float(np.clip(np.sqrt(np.trace(track.covariance[:3, :3])), 0.005, 0.5))
     words = [word for word in (f'{track.id}', track.kind,
                                f'{np.hypot(*track.velocity[:2]):.1f} m/s') if word]

@@ -1,4 +1,4 @@
-"""Decoding of many messages of one type at once, from their CDR bytes.
+"""Vectorised decoding of the CDR bytes of many messages of one type.
 
 A message that consists of a header and numbers has a fixed size, except for the frame name. Many
 messages can therefore be decoded as arrays, twenty times faster than individually.
@@ -14,7 +14,7 @@ from mag_tracking.messages.schema import known_covariances
 
 _HEADER_TYPE = np.dtype([('encapsulation', 'u1', 4), ('sec', '<i4'), ('nanosec', '<u4'),
                          ('length', '<u4')])
-"""Layout up to the frame name, whose `length` includes the terminating zero."""
+"""Layout of a message before its frame name; `length` includes the terminating zero of the name."""
 _FIELD_DOUBLES = 12
 """Number of float64 values in a MagneticField: x, y, z and the covariance."""
 _POSE_DOUBLES = 7
@@ -25,26 +25,25 @@ class FieldArrays(NamedTuple):
     """Contents of sensor_msgs/MagneticField messages as arrays."""
 
     is_decoded: BoolArray
-    """(n,) False for a message that is damaged, not little-endian CDR or in a frame with a
-    non-ASCII name, and which must be decoded individually. The corresponding elements of the other
-    arrays are meaningless."""
+    """(n,) False for a message that must be decoded individually: it is damaged, not little-endian
+    CDR, or in a frame with a non-ASCII name. The corresponding elements of the other arrays are
+    invalid."""
     stamp_ns: IntArray
-    """(n,) Timestamps."""
+    """(n,) [ns] Timestamps."""
     field: FloatArray
     """(n, 3) [T] Field, sensor frame."""
     covariance: FloatArray | None
-    """(n, 3, 3) [T^2] Covariance, as in `Readings`."""
+    """(n, 3, 3) [T^2] Covariance; NaN where unknown, None if all are unknown, as in `Readings`."""
 
 
 class PoseArrays(NamedTuple):
     """Contents of geometry_msgs/PoseStamped messages as arrays."""
 
     is_decoded: BoolArray
-    """(n,) False for a message that is in another frame, damaged or not little-endian CDR, and
-    which must be decoded individually. The corresponding elements of the other arrays are
-    meaningless."""
+    """(n,) False for a message that must be decoded individually: it is damaged, not little-endian
+    CDR, or in another frame. The corresponding elements of the other arrays are invalid."""
     stamp_ns: IntArray
-    """(n,) Timestamps."""
+    """(n,) [ns] Timestamps."""
     pose: FloatArray
     """(n, 7) Position [m] and quaternion xyzw."""
 
@@ -100,7 +99,7 @@ class _StampedMessages:
     ----------
     is_decoded : (n,) bool array
         False for a message that is truncated or not little-endian CDR.
-    stamp_ns : (n,) int array
+    stamp_ns : (n,) int array, ns
         Timestamps.
     """
 
@@ -120,11 +119,11 @@ class _StampedMessages:
         self.stamp_ns: IntArray = header['sec'].astype(np.int64) * 1_000_000_000 + header['nanosec']
 
     def _frames(self, rows: IntArray, length: int) -> NDArray[np.uint8]:
-        """Frame names of `rows` (k,), all of which have `length` bytes: (k, length) array."""
+        """Bytes (k, length) of the frame names of `rows` (k,), each of `length` bytes."""
         return self._data[(self._begins[rows] + _HEADER_TYPE.itemsize)[:, None] + np.arange(length)]
 
     def have_ascii_frames(self, rows: IntArray) -> BoolArray:
-        """Whether the frame names of `rows` are zero-terminated ASCII: (k,) array."""
+        """Flag the `rows` (k,) whose frame name is zero-terminated ASCII."""
         out = np.zeros(len(rows), dtype=bool)
         for length in np.unique(self._name_length[rows]):
             same_length = np.flatnonzero(self._name_length[rows] == length)
@@ -133,7 +132,7 @@ class _StampedMessages:
         return out
 
     def have_frame(self, rows: IntArray, frame: str) -> BoolArray:
-        """Whether the messages of `rows` are in `frame`: (k,) array."""
+        """Flag the `rows` (k,) whose message is in `frame`."""
         name = np.frombuffer(frame.encode() + b'\0', np.uint8)
         out: BoolArray = self._name_length[rows] == len(name)
         out[out] = (self._frames(rows[out], len(name)) == name).all(axis=1)
@@ -144,6 +143,7 @@ class _StampedMessages:
         out = np.zeros((len(self._begins), self._n_doubles))
         rows = np.flatnonzero(self.is_decoded)
         if len(rows):
-            at = (self._begins + self._values_begin)[rows, None] + np.arange(8 * self._n_doubles)
-            out[rows] = self._data[at].view('<f8')
+            indices = (self._begins + self._values_begin)[rows, None] \
+                + np.arange(8 * self._n_doubles)
+            out[rows] = self._data[indices].view('<f8')
         return out

@@ -1,4 +1,4 @@
-"""Conversion of records to and from messages, as nested dicts, without ROS."""
+"""Conversion of records to messages as nested dicts, and from messages, without ROS."""
 
 from array import array
 from collections.abc import Sequence
@@ -81,7 +81,7 @@ def reading_of(message: MagneticField, sensor: str) -> Readings:
 def known_covariances(C: FloatArray) -> FloatArray | None:
     """Convert covariances of messages to the convention of `Readings`.
 
-    A NaN covariance means "unknown" in `Readings` only. In a message, NaN is a fault: it is
+    In `Readings`, a NaN covariance is unknown. In a message, a NaN covariance is invalid: it is
     replaced by zero, which the calibration stage rejects.
 
     Parameters
@@ -123,9 +123,9 @@ def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
 
 
 def float64_array(values: ArrayLike) -> 'array[float]':
-    """Convert numbers to the array type that a float64[] field accepts without conversion.
+    """Convert numbers to the array type of a float64[] field.
 
-    The elements of a list would be checked individually.
+    ROS accepts this type without conversion; it would check the elements of a list individually.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def xyz(v: Sequence[float] | FloatArray) -> dict[str, float]:
     Parameters
     ----------
     v : (3,) array
-        Only the first three elements are used.
+        Further elements are ignored.
 
     Returns
     -------
@@ -173,7 +173,7 @@ def header_dict(ns: int, frame: str) -> MessageDict:
 
 
 def magnetic_field_dicts(readings: Readings, frame: str = '') -> list[tuple[str, MessageDict]]:
-    """Convert `Readings` to sensor_msgs/MagneticField, one message per reading.
+    """Convert `Readings` to sensor_msgs/MagneticField messages, one per reading.
 
     Parameters
     ----------
@@ -313,7 +313,7 @@ def _pose(position: FloatArray, quaternion: FloatArray) -> MessageDict:
 
 
 def pose_covariance(uncertainty: Track | SmoothedPose | PoseUncertainty) -> FloatArray:
-    """Covariance of position and small rotations about the fixed axes, in the element order of ROS.
+    """Covariance of a pose in the order of ROS: position, then small rotations about fixed axes.
 
     Parameters
     ----------

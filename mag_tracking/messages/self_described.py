@@ -1,4 +1,4 @@
-"""Magnetic fields in JSON or protobuf messages, decoded by means of their schema.
+"""Decoding of magnetic fields from JSON or protobuf messages by means of the message schema.
 
 Such messages are written by Foxglove's tools and by programs without ROS. A message is treated as
 a magnetic field if it has `magnetic_field` with x, y and z [T], and a time in `header.stamp`,
@@ -65,7 +65,7 @@ def cdr_of(schema: Schema, data: bytes) -> bytes:
 
 @functools.cache
 def decode_errors() -> tuple[type[Exception], ...]:
-    """Exceptions raised for invalid message bytes.
+    """Exceptions that a decoder of `field_decoder` raises for invalid message bytes.
 
     Returns
     -------
@@ -131,7 +131,7 @@ def _field(message: Any) -> MessageDict:
 
 
 def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
-    """First integer field of `names`; raise ValueError if it is missing or not in [0, limit)."""
+    """First integer field among `names`; raise ValueError if missing or not in [0, limit)."""
     for name in names:
         value = getattr(stamp, name, None)
         if isinstance(value, int) and not isinstance(value, bool):
@@ -142,7 +142,7 @@ def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
 
 
 def _axis_value(field: Any, axis: str) -> float:
-    """Field of one axis [T], NaN for null; raise ValueError if it is missing or not a number."""
+    """Field of one axis [T]; NaN for null. Raise ValueError for a missing or non-numeric axis."""
     if not hasattr(field, axis):
         raise ValueError(f'magnetic_field.{axis} is missing')
     value = getattr(field, axis)

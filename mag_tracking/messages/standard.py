@@ -59,9 +59,9 @@ def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[Messag
 def detections_3d_dict(track: Track, frame: str) -> MessageDict:
     """Convert a `Track` to vision_msgs/Detection3DArray.
 
-    The results are the kinds of target with their probabilities; each result has the pose of the
-    track. The box has the length of the line of dipoles; its width and height are not observable
-    and are set to 0.
+    Each result is a kind of target with its probability and the pose of the track. The bounding box
+    has the length of the line of dipoles. The width and height of the box are not observable and
+    are 0.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def detections_3d_dict(track: Track, frame: str) -> MessageDict:
     Returns
     -------
     dict (vision_msgs/Detection3DArray)
-        Empty if the track has ended or its pose is withheld.
+        Without detections if the track has ended or its pose is withheld.
     """
     header = header_dict(track.stamp_ns, frame)
     if track.ended or track.topic_uncertainty is None:

@@ -49,13 +49,13 @@ _FIELD = re.compile(r'\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?P<array>(?:<=)
 
 
 def _full_name(kind: str, package: str) -> str:
-    """Full name of a type that is referenced by a definition of `package`."""
+    """Full name of a type that a definition in `package` references as `kind`."""
     owner, _, leaf = kind.rpartition('/')
     return f'{(owner or package).partition("/")[0]}/msg/{leaf}'
 
 
 def referenced_types(message_definition: str, package: str) -> list[str]:
-    """Message types that are referenced by a definition.
+    """Message types that a definition references directly.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def referenced_types(message_definition: str, package: str) -> list[str]:
 
 
 def _dependencies(type_name: str) -> list[str]:
-    """Types that `type_name` contains, without duplicates, breadth first."""
+    """Types contained in `type_name` at any depth, without duplicates, in breadth-first order."""
     visited: list[str] = []
     queue = [type_name]
     while queue:
@@ -196,7 +196,7 @@ def decode(message: _RawMessage) -> SimpleNamespace:
     Returns
     -------
     SimpleNamespace
-        Has the fields of the message type as attributes.
+        The attributes are the fields of the message type.
 
     Raises
     ------

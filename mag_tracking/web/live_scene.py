@@ -24,8 +24,8 @@ MAX_POSES = 30_000
 MAX_FRAMES = 64
 """Number of recent frames that are stored for matching with tracks."""
 JUMP_BACK_S = 1.0
-"""[s] Maximum backward jump of the timestamps of frames. A larger jump starts a new scene, for
-example when a bag is looped."""
+"""[s] Maximum backward jump of the timestamps of frames. A larger jump starts a new scene; a
+looped bag causes such a jump."""
 
 
 class LiveScene:
@@ -66,7 +66,7 @@ class LiveScene:
             self._clear()
 
     def _clear(self) -> None:
-        """Start a new scene."""
+        """Discard all frames and tracks, and start a new scene."""
         self._begin_ns: int | None = None
         self._end_ns = self._frame_ns = 0
         self._frames: OrderedDict[int, FieldFrame] = OrderedDict()
@@ -114,7 +114,7 @@ class LiveScene:
             self._remove_old_tracks()
 
     def _empty_frame(self, track: Track) -> FieldFrame:
-        """Empty frame that replaces a missing frame of a track."""
+        """Frame without data, at the time of a track pose whose frame is missing."""
         n = len(self._network)
         return FieldFrame(track.stamp_ns, np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan),
                           np.zeros(n, dtype=int), np.zeros(n))
@@ -147,8 +147,8 @@ class LiveScene:
             if (notes, tables) != (self._notes, self._tables):
                 self._notes, self._tables, self._is_health_new = notes, tables, True
 
-    def whole(self) -> list[str]:
-        """Messages that give a new viewer the state that all other viewers have received.
+    def snapshot(self) -> list[str]:
+        """Messages that bring a new viewer to the state of all other viewers.
 
         Returns
         -------
@@ -157,11 +157,11 @@ class LiveScene:
         """
         with self._lock:
             begin_ns = self._begin_ns or 0
-            tracks = [live.sent(begin_ns) for live in self._tracks.values()]
+            tracks = [live.sent_entry(begin_ns) for live in self._tracks.values()]
             return [*self._scene_messages([t for t in tracks if t is not None]),
                     self._health_message()]
 
-    def news(self) -> list[str]:
+    def updates(self) -> list[str]:
         """Return messages with all changes since the last call.
 
         Returns
@@ -176,7 +176,8 @@ class LiveScene:
             out = [self._health_message()] if self._is_health_new else []
             self._is_health_new = False
             begin_ns, frame = self._begin_ns or 0, None
-            tracks = [live.news(begin_ns) for live in self._tracks.values() if live.has_unsent]
+            tracks = [live.unsent_entry(begin_ns) for live in self._tracks.values()
+                      if live.has_unsent]
             smoothed = [live.smoothed for live in self._tracks.values() if live.is_smoothed_new]
             for live in self._tracks.values():
                 live.is_smoothed_new = False
@@ -192,7 +193,7 @@ class LiveScene:
             return out
 
     def _scene_messages(self, tracks: list[dict[str, Any]]) -> list[str]:
-        """List with the message that replaces the scene; empty while the sensors are unknown."""
+        """List with the message that replaces the scene; empty if the network has no sensors."""
         if not len(self._network):
             return []
         begin_ns = self._begin_ns or 0
@@ -201,7 +202,7 @@ class LiveScene:
                            'scene': scene})]
 
     def _health_message(self) -> str:
-        """Health message: notes and tables."""
+        """JSON message with the notes and tables of the page."""
         return json_text({'type': 'health', 'notes': [asdict(note) for note in self._notes],
                           'tables': [asdict(table) for table in self._tables]})
 
@@ -214,7 +215,7 @@ class LiveScene:
         self._end_ns = max(self._end_ns, stamp_ns)
 
     def _remove_old_tracks(self) -> None:
-        """Remove tracks that ended long ago, and the oldest tracks if there are too many poses."""
+        """Remove tracks that ended more than `HISTORY_S` ago, and the oldest beyond `MAX_POSES`."""
         n = sum(len(live.log.stamp_ns) for live in self._tracks.values())
         for key, live in list(self._tracks.items())[:-1]:
             is_old = (self._end_ns - live.end_ns) / NS > HISTORY_S

@@ -17,7 +17,7 @@ N_RECENT = 100
 
 
 class LiveTrack:
-    """Track of a live page.
+    """Track of a live page, which stores the poses and counts the poses that have been sent.
 
     Parameters
     ----------
@@ -79,8 +79,8 @@ class LiveTrack:
             self.log.forget(N_REMOVED)
             self._n_sent = max(0, self._n_sent - N_REMOVED)
 
-    def news(self, begin_ns: int) -> dict[str, Any]:
-        """Return an entry with all unsent poses, and mark the poses as sent.
+    def unsent_entry(self, begin_ns: int) -> dict[str, Any]:
+        """Return an entry with all unsent poses, and mark these poses as sent.
 
         Parameters
         ----------
@@ -96,8 +96,8 @@ class LiveTrack:
         self._is_end_sent = self.log.ended
         return self._entry(begin_ns, range(first, self._n_sent))
 
-    def sent(self, begin_ns: int) -> dict[str, Any] | None:
-        """Entry with all poses that have been sent.
+    def sent_entry(self, begin_ns: int) -> dict[str, Any] | None:
+        """Entry with all poses that have already been sent.
 
         Parameters
         ----------
@@ -112,7 +112,7 @@ class LiveTrack:
         return self._entry(begin_ns, range(self._n_sent)) if self._n_sent else None
 
     def _entry(self, begin_ns: int, rows: range) -> dict[str, Any]:
-        """JSON object of selected poses, with the fields of the recently strongest sensors."""
+        """JSON object with the poses of `rows` and the fields of the recently strongest sensors."""
         recent = range(max(0, rows.stop - max(N_RECENT, len(rows))), rows.stop)
         entry = track_entry(self.log, begin_ns, strongest_sensors(self.log, recent), rows)
         entry['key'], entry['smoothed'] = self.key, self.smoothed

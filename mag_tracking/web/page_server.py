@@ -41,7 +41,7 @@ LOG = getLogger('mag_tracking.web')
 class Source(Protocol):
     """Source of the messages, such as a `LiveScene`."""
 
-    def whole(self) -> list[str]:
+    def snapshot(self) -> list[str]:
         """Messages that give a new viewer the current state.
 
         Returns
@@ -49,8 +49,8 @@ class Source(Protocol):
         list of str
         """
 
-    def news(self) -> list[str]:
-        """New messages for all viewers.
+    def updates(self) -> list[str]:
+        """Messages with all changes since the last call, for all viewers.
 
         Returns
         -------
@@ -68,7 +68,7 @@ class PageServer:
         Local address to listen on. Unless it is a loopback address, browsers need the token in
         `url`.
     port : int, optional
-        0 selects a free port.
+        TCP port; 0 selects a free port.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class PageServer:
         self.close()
 
     def _run(self) -> None:
-        """Run the event loop of the server thread."""
+        """Run the event loop in the server thread until `close` is called."""
         asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_until_complete(self._serve())
@@ -135,7 +135,7 @@ class PageServer:
             self._loop.close()
 
     async def _serve(self) -> None:
-        """Serve until `close` is called."""
+        """Accept viewers and send updates until `close` is called."""
         # Malformed requests must not fill the log.
         LOG.addFilter(lambda record: record.msg != 'opening handshake failed')
         # Compression would be repeated for every viewer.
@@ -165,7 +165,8 @@ class PageServer:
     def _send_updates(self) -> None:
         """Send new messages to all viewers.
 
-        Viewers that have caught up receive the complete scene; stalled viewers are disconnected.
+        A lagging viewer receives the complete scene when its buffer is empty. A viewer whose buffer
+        has not shrunk for `LAG_TIMEOUT_S` is disconnected.
         """
         if not self._viewers and not self._lagging:
             return
@@ -179,7 +180,7 @@ class PageServer:
             else:
                 # A complete scene may exceed MAX_BUFFERED; the excess is allowed until it is sent.
                 self._viewers[viewer] = max(MAX_BUFFERED, min(allowed, n_buffered + MAX_BUFFERED))
-        for message in self._messages(self._source.news):
+        for message in self._messages(self._source.updates):
             broadcast(self._viewers, message)
         for viewer, (progress_time, buffered_before) in list(self._lagging.items()):
             n_buffered = _buffered_bytes(viewer)
@@ -193,12 +194,12 @@ class PageServer:
                 viewer.transport.abort()
 
     def _send_snapshot(self, viewer: ServerConnection) -> None:
-        """Send the complete scene to a viewer; new messages follow."""
+        """Send the complete scene to a viewer, and include the viewer in later updates."""
         # Pending messages are sent first: the scene contains them, so they must not follow the
         # scene.
-        for message in self._messages(self._source.news):
+        for message in self._messages(self._source.updates):
             broadcast(self._viewers, message)
-        for message in self._messages(self._source.whole):
+        for message in self._messages(self._source.snapshot):
             broadcast([viewer], message)
         self._viewers[viewer] = _buffered_bytes(viewer) + MAX_BUFFERED
 
@@ -246,7 +247,7 @@ class PageServer:
 
 
 def _reachable_name(host: str) -> str:
-    """Host part of the address that viewers open."""
+    """Host part of the URL of the page; the host name of this machine for a wildcard address."""
     if host in ('0.0.0.0', '::'):
         return socket.gethostname()
     return f'[{host}]' if ':' in host else host
@@ -258,6 +259,7 @@ def check_port(host: str, port: int) -> None:
     Parameters
     ----------
     host : str
+        Local address to listen on.
     port : int
 
     Raises
@@ -288,7 +290,7 @@ def is_loopback(host: str) -> bool:
 
 
 def _host_name(host: str) -> str:
-    """Host name or address of a Host header, without the port."""
+    """Host name or address of a Host header, without the port; empty if the header is invalid."""
     try:
         return urlsplit(f'//{host}').hostname or ''
     except ValueError:

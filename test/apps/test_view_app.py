@@ -59,7 +59,7 @@ def test_tracks_equal_a_replay(road_network):
     assert scene.notes == ['end of the recording']
     recording = Recording(vehicle_path(NAME))
     assert seconds > 0.9 * (recording.end_ns - recording.start_ns) / 1e9 / 4.0
-    assert json.loads(scene.whole()[-1])['tables'][0]['rows'][0][1] == 'ready'
+    assert json.loads(scene.snapshot()[-1])['tables'][0]['rows'][0][1] == 'ready'
 
 
 def test_an_hour_without_messages_is_skipped(road_network, tmp_path):

@@ -1,4 +1,4 @@
-"""Comparison of sensors with the Earth's field: identification of faults, and false-alarm rate."""
+"""Comparison of sensors with the Earth's field: identification of faults, false-alarm rate."""
 
 from itertools import combinations
 
@@ -65,7 +65,7 @@ def test_a_swapped_pair_is_identified(pair, seed):
 
 @pytest.mark.parametrize('order, text', [([2, 0, 1], 'z, x, y'), ([1, 2, 0], 'y, z, x')])
 def test_axes_in_another_order_are_identified(order, text):
-    """In the first case, the sensor reports its z as x, its x as y and its y as z."""
+    """The order z, x, y means that the reported x is the true z, y is x, and z is y."""
     fields = correct_fields()
     fields[0] = fields[0][order]
     assert explanations_of(fields) == {'a': (f'its axes are in the order {text}',)}
@@ -93,16 +93,16 @@ def test_exchanged_sensors_are_identified(i, j):
 
 
 def test_a_match_in_one_direction_is_not_an_exchange():
-    """The other sensor is also faulty, but an exchange does not explain its readings."""
+    """Sensor a reports the field of b, but an exchange does not explain the readings of b."""
     fields = correct_fields()
     fields[0], fields[1] = fields[1], fields[1] + [9e-6, -7e-6, 8e-6]
     assert explanations_of(fields) == {'a': (), 'b': ()}
 
 
-@pytest.mark.parametrize('turn', [90.0, 180.0])
-def test_exchanged_sensors_at_right_angles_are_identified(turn):
+@pytest.mark.parametrize('degrees', [90.0, 180.0])
+def test_exchanged_sensors_at_right_angles_are_identified(degrees):
     """An exchange is more probable than two flipped axes on both sensors."""
-    R_ws = np.array([np.eye(3), rotation_about_z(np.deg2rad(turn)), *R_WS[2:]])
+    R_ws = np.array([np.eye(3), rotation_about_z(np.deg2rad(degrees)), *R_WS[2:]])
     fields = correct_fields(None, R_ws)
     fields[[0, 1]] = fields[[1, 0]]
     found = explanations_of(fields, R_ws)
@@ -152,7 +152,7 @@ def test_an_unknown_heading_is_no_fault(yaw):
 @pytest.mark.parametrize('std', [np.deg2rad([0.3, 0.3, 5.0]), np.deg2rad([2.0, 2.0, 2.0])])
 @pytest.mark.parametrize('missing', [None, 2])
 def test_false_alarm_rate_does_not_exceed_the_nominal_rate(std, missing, n=300):
-    """The number of alarms is within the 99.9 % quantile of the nominal probability per sensor."""
+    """The number of alarms does not exceed the 99.9 % quantile for the nominal probability."""
     rng = np.random.default_rng(11)
     alarms = 0
     for k in range(n):
@@ -165,7 +165,7 @@ def test_false_alarm_rate_does_not_exceed_the_nominal_rate(std, missing, n=300):
 
 
 def test_the_statistic_is_chi_square(monkeypatch, n=200):
-    """With a false-alarm probability of 0.1, the rate of alarms agrees with the probability."""
+    """The observed alarm rate agrees with a nominal false-alarm probability of 0.1."""
     monkeypatch.setattr('mag_tracking.calibration.agreement.FALSE_ALARM_PROBABILITY', 0.1)
     std, rng = np.deg2rad([0.3, 0.5, 2.0]), np.random.default_rng(12)
     for missing in ([], [2]):
@@ -179,15 +179,15 @@ def test_the_statistic_is_chi_square(monkeypatch, n=200):
         assert low <= alarms <= high
 
 
-def test_consensus_does_not_need_the_earth_field():
+def test_consensus_is_the_median_of_complete_sensors():
     fields = correct_fields(np.random.default_rng(2))
     fields[1] *= -1.0
     fields[3, 1] = np.nan
     with pytest.raises(ValueError, match='three sensors must report all axes, but only 2 do'):
         consensus(fields[[0, 1, 3]], R_WS[[0, 1, 3]])
-    five, R = np.vstack([fields, correct_fields(R_ws=R_WS[:1])]), np.vstack([R_WS, R_WS[:1]])
+    five_fields, R = np.vstack([fields, correct_fields(R_ws=R_WS[:1])]), np.vstack([R_WS, R_WS[:1]])
     # The faulty sensor and the sensor with two axes do not contribute.
-    assert np.abs(consensus(five, R) - EARTH).max() < 3e-6
+    assert np.abs(consensus(five_fields, R) - EARTH).max() < 3e-6
     np.testing.assert_allclose(consensus(correct_fields(), R_WS), EARTH, rtol=1e-9)
 
 
@@ -218,7 +218,7 @@ def test_two_faults_are_identified_separately():
 @pytest.mark.parametrize('sensor, axis', [
     (j, a) for j, a in np.argwhere(np.abs(correct_fields()) > 2e-5)])
 def test_a_flipped_axis_is_identified_with_iron_nearby(sensor, axis):
-    """Axes that measure little of the field are not tested: flipping them changes little."""
+    """Axes with a small component of the field are not tested: a flip changes them little."""
     first_explanations = []
     for seed in range(20):
         rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""Clock offsets from knocks: properties, statistics, and recordings that yield no offset."""
+"""Clock offsets from knocks: invariances, standard deviations, and cases without an offset."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ NOISE = 0.02
 
 
 def double_sided(t):
-    """Double-sided exponential of 30 ms, as in the recordings."""
+    """Double-sided exponential pulse of 30 ms, as in the recordings."""
     return np.exp(-np.abs(t) / 0.03)
 
 
@@ -70,10 +70,10 @@ def test_a_sensor_has_no_lag_to_itself():
 @pytest.mark.parametrize('seed', range(5))
 def test_exchanged_sensors_have_the_opposite_lag(seed):
     p = pair(0.0237, seed, rates=(100.0, 100.0))
-    there, back = knock_lag(*p, 0.5), knock_lag(*p[2:], *p[:2], 0.5)
-    assert there.reason == back.reason == ''
+    forward, backward = knock_lag(*p, 0.5), knock_lag(*p[2:], *p[:2], 0.5)
+    assert forward.reason == backward.reason == ''
     # The other sensor is interpolated, so a difference of a fraction of a sample remains.
-    assert abs(there.offset + back.offset) < 1.5e-3 and there.offset > 0.02
+    assert abs(forward.offset + backward.offset) < 1.5e-3 and forward.offset > 0.02
 
 
 def test_a_common_shift_of_the_times_has_no_effect():
@@ -115,7 +115,7 @@ UNRESOLVED = pytest.mark.xfail(strict=True, reason=(
     pytest.param(shape, rates, marks=[UNRESOLVED] * (shape == 'ringing' and rates[0] == 100.0))
     for shape in SHAPES for rates in [(100.0, 100.0), (200.0, 100.0), (400.0, 400.0)]])
 def test_error_agrees_with_its_std(shape, rates, n=60):
-    """The normalised squared errors are within chi-square limits; the lower limit is generous."""
+    """The mean normalised squared error is below its chi-square limit, and not far below one."""
     squares, missed = [], 0
     for seed in range(n):
         rng = np.random.default_rng(1000 + seed)
@@ -144,22 +144,22 @@ def test_error_is_a_fraction_of_a_sample(shape, rates):
 
 
 def test_lag_is_exact_with_10_hz_at_rest_and_100_hz_near_knocks():
-    """The recordings have these sampling rates."""
+    """The sensors of the recordings use these sampling rates."""
     for seed in range(10):
         t, s, u, v = pair(-0.0213, seed)
-        keep = []
+        is_kept = []
         for clock, ahead in ((t, 0.0), (u, -0.0213)):
             near = (clock - ahead > KNOCKS[0] - 0.2) & (clock - ahead < KNOCKS[1] + 0.2)
-            keep.append(near | (np.arange(len(clock)) % 10 == 0))
-        lag = knock_lag(t[keep[0]], s[keep[0]], u[keep[1]], v[keep[1]], 0.5)
+            is_kept.append(near | (np.arange(len(clock)) % 10 == 0))
+        lag = knock_lag(t[is_kept[0]], s[is_kept[0]], u[is_kept[1]], v[is_kept[1]], 0.5)
         assert lag.reason == '' and abs(lag.offset + 0.0213) < 1e-3
 
 
 def test_a_sensor_without_a_knock_is_reported():
     t, s, u, v = pair(0.01)
-    still = 0.02 * np.random.default_rng(0).random(len(t))
-    for args, text in (((t, still, u, v), 'the reference measured no knock'),
-                       ((t, s, t, still), 'the sensor measured no knock'),
+    at_rest = 0.02 * np.random.default_rng(0).random(len(t))
+    for args, text in (((t, at_rest, u, v), 'the reference measured no knock'),
+                       ((t, s, t, at_rest), 'the sensor measured no knock'),
                        ((t, s, t, 0.0 * s), 'the sensor measured no knock'),
                        ((t, s, t[:5], s[:5]), 'the sensor measured no knock')):
         lag = knock_lag(*args, 0.5)
@@ -177,14 +177,14 @@ def test_knocks_measured_by_one_sensor_each_yield_no_lag():
     assert np.isnan(lag.offset)
 
 
-def test_clocks_decades_apart_yield_no_lag():
+def test_clocks_that_differ_by_decades_yield_no_lag():
     t, s, u, v = pair(0.01)
     lag = knock_lag(t, s, u + 1e9, v, 0.5)
     assert lag.reason == 'the knocks are 1e+09 s apart, maximum 0.5 s'
 
 
 @pytest.mark.parametrize('offset', [0.51, 0.52, 0.53, 0.56, 0.6, 0.8, 2.0, -0.52, -0.53, -0.8])
-def test_a_lag_beyond_the_maximum_is_never_wrong(offset):
+def test_an_offset_beyond_the_maximum_yields_no_wrong_lag(offset):
     lag = knock_lag(*pair(offset, knocks=(2.0, 2.8)), 0.5)
     assert lag.reason or abs(lag.offset - offset) < max(5.0 * lag.std, 1e-3)
     # A lag up to two samples beyond the maximum may be correct; larger lags are not searched.
@@ -192,8 +192,8 @@ def test_a_lag_beyond_the_maximum_is_never_wrong(offset):
 
 
 def test_evenly_spaced_knocks_are_ambiguous():
-    row = tuple(1.0 + 0.25 * k for k in range(13))
-    assert 'unevenly' in knock_lag(*pair(0.02, knocks=row), 0.5).reason
+    even = tuple(1.0 + 0.25 * k for k in range(13))
+    assert 'unevenly' in knock_lag(*pair(0.02, knocks=even), 0.5).reason
     # Uneven spacing resolves the ambiguity.
     uneven = tuple(np.cumsum([1.0, 0.25, 0.4, 0.17, 0.33, 0.21, 0.46]))
     assert knock_lag(*pair(0.02, knocks=uneven), 0.5).offset == pytest.approx(0.02, abs=5e-4)
@@ -201,11 +201,11 @@ def test_evenly_spaced_knocks_are_ambiguous():
 
 def test_a_gap_in_the_readings_does_not_affect_the_lag():
     t, s, u, v = pair(0.02)
-    keep = (u < 2.4) | (u > 2.9)
-    assert knock_lag(t, s, u[keep], v[keep], 0.5).offset == pytest.approx(0.02, abs=5e-4)
+    is_kept = (u < 2.4) | (u > 2.9)
+    assert knock_lag(t, s, u[is_kept], v[is_kept], 0.5).offset == pytest.approx(0.02, abs=5e-4)
     # With a gap over a knock of one sensor, there is no lag or the correct lag.
-    keep = (u < 1.8) | (u > 2.3)
-    lag = knock_lag(t, s, u[keep], v[keep], 0.5)
+    is_kept = (u < 1.8) | (u > 2.3)
+    lag = knock_lag(t, s, u[is_kept], v[is_kept], 0.5)
     assert lag.reason or lag.offset == pytest.approx(0.02, abs=1e-3)
 
 
@@ -224,8 +224,8 @@ def test_nan_readings_are_ignored():
     s[5:400:9], v[3:400:11] = np.nan, np.nan
     lag = knock_lag(t, s, u, v, 0.5)
     assert lag.offset == pytest.approx(before.offset, abs=1e-3)
-    none = knock_lag(t, np.full(len(t), np.nan), u, v, 0.5)
-    assert none.reason == 'the reference measured no knock'
+    lag_of_nan = knock_lag(t, np.full(len(t), np.nan), u, v, 0.5)
+    assert lag_of_nan.reason == 'the reference measured no knock'
 
 
 def test_times_that_do_not_increase_are_rejected():

@@ -22,7 +22,7 @@ def run(decimator, t, field):
 
 
 @pytest.mark.parametrize('factor', [2, 4, 8, 10])
-def test_lowpass_passes_the_band_and_suppresses_aliases(factor):
+def test_lowpass_preserves_the_pass_band_and_suppresses_aliases(factor):
     taps = lowpass(factor)
     assert len(taps) % 2 and taps.sum() == pytest.approx(1.0)
     np.testing.assert_allclose(taps, taps[::-1])
@@ -108,7 +108,7 @@ def test_stage_decimates_and_propagates_the_covariance():
     assert stage.counts_of('mag_1')['accepted'] == 2000
     # There is no output until the background is known, after 200 samples.
     assert len(out) == stage.counts['calibrated'] > 120
-    gain = Decimator(20.0)
-    run(gain, np.arange(0.0, 1.0, 0.005), np.zeros((200, 3)))
-    np.testing.assert_allclose(out[-1].covariance, C * gain.noise_gain())
-    assert np.std([s.field for s in out]) < 1e-8 * np.sqrt(1.5 * gain.noise_gain())
+    reference = Decimator(20.0)
+    run(reference, np.arange(0.0, 1.0, 0.005), np.zeros((200, 3)))
+    np.testing.assert_allclose(out[-1].covariance, C * reference.noise_gain())
+    assert np.std([s.field for s in out]) < 1e-8 * np.sqrt(1.5 * reference.noise_gain())

@@ -81,11 +81,11 @@ def test_fits_of_recordings_agree_with_another_program(recordings, name, limit, 
 
 
 @pytest.mark.parametrize('name, limit', [(r[0], r[1]) for r in RECORDINGS])
-def test_half_of_a_recording_predicts_the_other(recordings, name, limit):
+def test_a_fit_of_half_a_recording_corrects_the_other_half(recordings, name, limit):
     y = recordings[name]
     fits = [fit_ellipsoid(y[k::2], field_magnitude=1.0) for k in (0, 1)]
-    for fit, rest in zip(fits, (y[1::2], y[::2]), strict=True):
-        assert spread(fit.correct(rest)) <= limit
+    for fit, other_half in zip(fits, (y[1::2], y[::2]), strict=True):
+        assert spread(fit.correct(other_half)) <= limit
     # Adjacent readings share errors, so the two fits differ by less than their errors.
     assert (np.abs(fits[0].offset - fits[1].offset) < 3.0 * fits[0].offset_std).all()
 
@@ -126,7 +126,7 @@ def test_units_only_scale_the_result(unit, size):
         np.testing.assert_allclose(b, a, rtol=1e-5)
 
 
-def test_corrected_field_has_the_given_size():
+def test_corrected_field_has_the_given_magnitude():
     y = readings(tumbling(1000))
     free, fit = fit_ellipsoid(y), fit_ellipsoid(y, 5e-5)
     assert fit.field_magnitude == 5e-5 and fit.field_magnitude_std == 0.0
@@ -152,21 +152,21 @@ def test_rotated_and_shifted_readings_rotate_and_shift_the_fit():
         assert other.coverage == pytest.approx(one.coverage, abs=0.05)
 
 
-def test_optimum_is_that_of_a_general_solver():
+def test_fit_equals_the_optimum_of_a_general_solver():
     """The oracle minimises the soft L1 loss with a numerical Jacobian and unit weights."""
     y = readings(scattered(2000), 0.03)
     y[::30] = OFFSET + 1.3 * (y[::30] - OFFSET)
     rows, columns = np.triu_indices(3)
 
-    def off(theta):
+    def residual(theta):
         C = np.zeros((3, 3))
         C[rows, columns] = C[columns, rows] = theta[3:]
         return np.linalg.norm((y - theta[:3]) @ C, axis=1) - 1.0
 
     theta = np.concatenate([OFFSET, CORRECTION[rows, columns]])
     for _ in range(3):
-        scale = 2.0 * 1.4826 * np.median(np.abs(off(theta)))
-        theta = least_squares(off, theta, loss='soft_l1', f_scale=scale, xtol=1e-12).x
+        scale = 2.0 * 1.4826 * np.median(np.abs(residual(theta)))
+        theta = least_squares(residual, theta, loss='soft_l1', f_scale=scale, xtol=1e-12).x
     fit = fit_ellipsoid(y, 1.0)
     assert (np.abs(fit.offset - theta[:3]) < 0.02 * fit.offset_std).all()
     assert (np.abs(fit.correction[rows, columns] - theta[3:])
@@ -175,7 +175,7 @@ def test_optimum_is_that_of_a_general_solver():
 
 @pytest.mark.parametrize('correlation', studied([0.0, 0.8], [0.0]))
 def test_stated_stds_cover_the_truth(correlation):
-    """The noise may be correlated in time, as in real sensors.
+    """80 % intervals have their nominal coverage, also for noise that is correlated in time.
 
     The noise is small, because the square of the noise biases the radius.
     """
@@ -197,7 +197,7 @@ def test_stated_stds_cover_the_truth(correlation):
     assert (low <= inside.sum(axis=0)).all() and (inside.sum(axis=0) <= high).all()
 
 
-def test_a_varying_field_size_does_not_affect_the_std_of_the_shape():
+def test_a_varying_field_magnitude_does_not_affect_the_std_of_the_shape():
     """Each time block covers the sphere with its own field magnitude; det(correction) is one."""
     size = 1.0 + 0.02 * np.random.default_rng(6).standard_normal(N_BLOCKS)
     fit = fit_ellipsoid(readings(tumbling(20000) * np.repeat(size, 20000 // N_BLOCKS)[:, None]))
@@ -209,12 +209,13 @@ def test_readings_at_rest_weigh_no_more_than_one_direction():
     """The field is distorted by 3 % in a pattern that no ellipsoid describes."""
     u = tumbling(2000)
     x, y, z = u.T
-    bent = readings(u * (1.0 + 0.03 * (5.0 * z**3 - 3.0 * z) / 2.0)[:, None], 0.002)
-    still = readings(np.tile([0.0, 0.0, 1.03], (6000, 1)), 0.002, seed=5)
-    even, piled = fit_ellipsoid(bent), fit_ellipsoid(np.concatenate([still, bent]))
-    assert piled.converged
+    distorted = readings(u * (1.0 + 0.03 * (5.0 * z**3 - 3.0 * z) / 2.0)[:, None], 0.002)
+    at_rest = readings(np.tile([0.0, 0.0, 1.03], (6000, 1)), 0.002, seed=5)
+    expected, fit = (fit_ellipsoid(distorted),
+                     fit_ellipsoid(np.concatenate([at_rest, distorted])))
+    assert fit.converged
     # The readings at rest, three quarters of all readings, have the weight of 3 of 500 cells.
-    assert np.abs(piled.offset - even.offset).max() < 0.001
+    assert np.abs(fit.offset - expected.offset).max() < 0.001
 
 
 @pytest.mark.parametrize('factor', [1.3, 0.5, 2.2])
@@ -244,21 +245,21 @@ def test_glitches_are_excluded_and_counted():
 def test_missing_readings_are_excluded_and_counted():
     y = readings(tumbling(1000))
     gaps = np.insert(y, range(0, 1000, 10), [np.nan, 1.0, 1.0], axis=0)
-    fit, whole = fit_ellipsoid(gaps), fit_ellipsoid(y)
+    fit, expected = fit_ellipsoid(gaps), fit_ellipsoid(y)
     assert fit.n_missing == 100 and fit.n_readings == 1000 and fit.converged
     assert fit.warnings == ('readings excluded because of a missing axis: 100',)
-    np.testing.assert_array_equal(fit.offset, whole.offset)
-    assert fit.residual == whole.residual and fit.residual_before == whole.residual_before
+    np.testing.assert_array_equal(fit.offset, expected.offset)
+    assert fit.residual == expected.residual and fit.residual_before == expected.residual_before
 
 
 def test_saturated_readings_are_excluded_and_reported():
     y = readings(tumbling(20000))
-    top = 0.5 * (OFFSET[1] + y[:, 1].max())
-    y[:, 1] = np.minimum(y[:, 1], top)
+    limit = 0.5 * (OFFSET[1] + y[:, 1].max())
+    y[:, 1] = np.minimum(y[:, 1], limit)
     y[::50, 0] = np.nan
     fit = fit_ellipsoid(y)
     assert fit.n_readings + fit.n_missing + fit.n_saturated == 20000 and fit.n_missing == 400
-    assert fit.converged and fit.n_saturated > (y[:, 1] == top).sum() > 1000
+    assert fit.converged and fit.n_saturated > (y[:, 1] == limit).sum() > 1000
     assert fit.warnings[1] == f'readings excluded because of saturation of y: {fit.n_saturated}'
     assert (np.abs(fit.offset - OFFSET) < 4.0 * fit.offset_std).all()
     assert fit.residual == pytest.approx(spread(fit.correct(y[~np.isnan(y[:, 0])])), rel=1e-12)

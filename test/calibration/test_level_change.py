@@ -33,7 +33,7 @@ def test_growth_of_an_approach_and_of_a_start_agrees_with_theory(ratio):
         growth = growth_of(t, size, 1.0, ratio)
         assert [a / b for a, b in pairwise(growth.quarters)] == pytest.approx([each] * 3, rel=5e-3)
         assert growth.early / growth.late == pytest.approx(each**2, rel=5e-3)
-        assert growth.early + growth.late == growth.whole
+        assert growth.early + growth.late == growth.duration
 
 
 def test_growth_without_start_or_end_is_not_evaluated():
@@ -44,29 +44,32 @@ def test_growth_without_start_or_end_is_not_evaluated():
 
 def test_growth_across_a_gap_is_not_evaluated():
     t, size = np.arange(12.0), 0.3 * 1.5**np.arange(12.0)
-    whole, parted = np.arange(12), np.r_[0:4, 7:12]
+    no_gap, with_gap = np.arange(12), np.r_[0:4, 7:12]
     quarter = np.log(10.0) / np.log(1.5) / 4.0
-    assert growth_of(t[whole], size[whole], 1.0, 10.0).quarters == pytest.approx([quarter] * 4)
-    assert growth_of(t[parted], size[parted], 1.0, 10.0) is None
+    assert growth_of(t[no_gap], size[no_gap], 1.0, 10.0).quarters == pytest.approx([quarter] * 4)
+    assert growth_of(t[with_gap], size[with_gap], 1.0, 10.0) is None
 
 
 def ride(t, at, acceleration, top, stops):
-    """Position (n,) [m] along the road of a vehicle that stops or starts at time `at` [s]."""
-    since = np.maximum(at - t if stops else t - at, 0.0)
-    straight = np.minimum(since, top / acceleration)
-    distance = 0.5 * acceleration * straight**2 + top * (since - straight)
+    """Position (n,) [m] along the road of a vehicle that stops or starts at time `at` [s].
+
+    The vehicle accelerates or brakes at a constant rate to or from the speed `top` [m/s].
+    """
+    elapsed = np.maximum(at - t if stops else t - at, 0.0)
+    accelerating = np.minimum(elapsed, top / acceleration)
+    distance = 0.5 * acceleration * accelerating**2 + top * (elapsed - accelerating)
     return -distance if stops else distance
 
 
 def vehicle(seed, stops, at=12.0):
-    """Signal of a vehicle that stops or starts at a sensor: function of t [s], (3,) [T]."""
+    """Field (3,) [T], as a function of t [s], of a vehicle that stops or starts near a sensor."""
     rng = np.random.default_rng(seed)
     moment = rng.uniform(200.0, 600.0) * _direction(rng)
-    place = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
+    stop_position = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
     acceleration, top = rng.uniform(1.0, 4.0), rng.uniform(6.0, 14.0)
 
     def signal(t):
-        r = np.array([ride(t, at, acceleration, top, stops), 0.0, 0.0]) + place
+        r = np.array([ride(t, at, acceleration, top, stops), 0.0, 0.0]) + stop_position
         return dipole_field(r, moment)
     return signal
 
@@ -95,68 +98,68 @@ def time_reversed(blocks):
 
 @pytest.mark.parametrize('stops', [True, False])
 def test_a_stopping_vehicle_has_arrived_and_a_starting_one_has_departed(stops):
-    """Eighty vehicles of each kind are simulated; reversed changes never have the same result."""
-    verdicts = []
+    """A change and its time reversal never have the same result, for 80 vehicles of each kind."""
+    results = []
     for seed in range(80):
         begin, end = (0.0, 16.0) if stops else (8.0, 30.0)
         signal = vehicle(seed, stops)
         blocks = blocks_of(lambda t, s=signal, b=begin: s(t + b), end - begin, seed)
         found, reverse = evaluated(blocks), evaluated(time_reversed(blocks))
         if found.size >= CLEAR_SIZE:
-            verdicts.append(found.has_departed)
+            results.append(found.has_departed)
             assert found.has_departed is None \
                 or reverse.has_departed in (None, not found.has_departed)
-    assert len(verdicts) > 20
+    assert len(results) > 20
     # A wrong decision is worse than no decision.
-    assert verdicts.count(stops) == 0
-    assert verdicts.count(not stops) >= 0.9 * len(verdicts)
+    assert results.count(stops) == 0
+    assert results.count(not stops) >= 0.9 * len(results)
 
 
 def queue(seed):
-    """Signal of a vehicle that stops and of another one that stops behind it; its end [s]."""
+    """Signal of two vehicles that stop one behind the other, and time of the second stop [s]."""
     rng = np.random.default_rng(seed)
     gap, delay = rng.uniform(6.0, 8.0), rng.uniform(1.5, 5.0)
-    place = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
+    stop_position = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
     cars = [(rng.uniform(200.0, 600.0) * _direction(rng), rng.uniform(1.0, 4.0),
-             rng.uniform(6.0, 14.0), 12.0 + k * delay, place - [k * gap, 0.0, 0.0])
+             rng.uniform(6.0, 14.0), 12.0 + k * delay, stop_position - [k * gap, 0.0, 0.0])
             for k in range(2)]
 
     def signal(t):
-        return sum(dipole_field(np.array([ride(t, at, a, top, True), 0.0, 0.0]) + there, moment)
-                   for moment, a, top, at, there in cars)
+        return sum(dipole_field(np.array([ride(t, at, a, top, True), 0.0, 0.0]) + final, moment)
+                   for moment, a, top, at, final in cars)
     return signal, 12.0 + delay
 
 
 @pytest.mark.parametrize('case', ['queue', 'reverse'])
 def test_a_queue_or_a_reversing_vehicle_has_not_departed(case):
-    """The change is evaluated whenever the latest two seconds are steady.
+    """At most one of 50 runs yields a departure.
 
-    One departure in fifty runs is tolerated; the aim is zero.
+    The change is evaluated whenever the latest two seconds are steady.
     """
     n_departed, n_arrived = 0, 0
     for seed in range(50):
         signal, end = queue(seed) if case == 'queue' else reverse(seed)
         blocks = blocks_of(signal, end + 8.0, seed)
-        verdicts = set()
+        results = set()
         for k in range(round(14.0 / BLOCK_S), len(blocks.time)):
-            so_far = Blocks(*(values[:k] for values in blocks))
-            latest = so_far.mean[-8:]
+            past_blocks = Blocks(*(values[:k] for values in blocks))
+            latest = past_blocks.mean[-8:]
             if (np.abs(latest - latest.mean(axis=0)) < 2.0 * SIGMA).all():
-                verdicts.add(evaluated(so_far, 8).has_departed)
-        n_departed, n_arrived = n_departed + (True in verdicts), n_arrived + (False in verdicts)
+                results.add(evaluated(past_blocks, 8).has_departed)
+        n_departed, n_arrived = n_departed + (True in results), n_arrived + (False in results)
     assert n_departed <= 1 and n_arrived > 20
 
 
 def reverse(seed):
-    """Signal of a vehicle that overshoots by 6 m, stands for a second and reverses; its end [s]."""
+    """Signal of a vehicle that overshoots by 6 m, waits 1 s and reverses, and end time [s]."""
     rng = np.random.default_rng(seed)
     moment = rng.uniform(200.0, 600.0) * _direction(rng)
-    place = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
+    stop_position = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
 
     def signal(t):
         x = 6.0 + ride(t, 12.0, 2.0, 8.0, True) if t < 12.0 \
             else 6.0 - min(max(t - 13.0, 0.0), 6.0)
-        return dipole_field(np.array([x, 0.0, 0.0]) + place, moment)
+        return dipole_field(np.array([x, 0.0, 0.0]) + stop_position, moment)
     return signal, 19.0
 
 
@@ -192,7 +195,7 @@ CLEAR = [seed for seed in range(20) if is_clear(seed)][:4]
 @pytest.mark.parametrize('seed', CLEAR)
 @pytest.mark.parametrize('rate', [100.0, 20.0])
 def test_a_departed_vehicle_is_removed_from_the_background_in_seconds(seed, rate):
-    """When it is removed, the vehicle is at least 30 m away, with a field below the noise.
+    """The background is replaced while the vehicle is at least 30 m away, below the noise.
 
     At 20 Hz, with blocks of 0.4 s, the replacement takes a second longer.
     """
@@ -218,15 +221,15 @@ def test_a_vehicle_at_a_red_light_does_not_become_the_background(seed):
 
 def test_one_axis_is_sufficient_and_a_missing_axis_causes_no_delay():
     signal = vehicle(CLEAR[0], stops=False, at=15.0)
-    one, two = running(), running()
+    one_axis, two_axes = running(), running()
     rng = np.random.default_rng(0)
     for t in np.arange(0.0, 24.0, 0.01):
         field = EARTH + signal(t) + SIGMA * rng.standard_normal(3)
-        one.add(t, np.where(np.arange(3) == 1, field, np.nan))
-        two.add(t, np.where((np.arange(3) == 2) & (t > 14.0), np.nan, field))
-    assert one.n_relearnt == two.n_relearnt == 1
-    assert np.abs(one.level(24.0) - EARTH)[1] < SIGMA[1]
-    assert (np.abs(two.level(24.0) - EARTH) < SIGMA)[:2].all()
+        one_axis.add(t, np.where(np.arange(3) == 1, field, np.nan))
+        two_axes.add(t, np.where((np.arange(3) == 2) & (t > 14.0), np.nan, field))
+    assert one_axis.n_relearnt == two_axes.n_relearnt == 1
+    assert np.abs(one_axis.level(24.0) - EARTH)[1] < SIGMA[1]
+    assert (np.abs(two_axes.level(24.0) - EARTH) < SIGMA)[:2].all()
 
 
 def test_a_change_before_a_backward_time_jump_is_not_used():

@@ -1,4 +1,4 @@
-"""Tilt and heading: properties, consistent standard deviations, and unobservable headings."""
+"""Tilt and heading: invariances, consistent standard deviations, and unobservable headings."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def up_of(R_ws, std=0.0):
 
 
 def angles_between(R, S):
-    """Rotation vector (3,) [rad] from R to S, world frame."""
+    """Rotation vector (3,) [rad], world frame, of the rotation from R to S."""
     return Rotation.from_matrix(S @ R.T).as_rotvec()
 
 
@@ -64,12 +64,12 @@ def test_up_direction_rotates_with_the_sensor(R):
 
 def test_knocks_and_readings_that_are_not_finite_are_excluded():
     a = at_rest(np.eye(3))
-    still = up_direction(a, 0.0)
+    expected = up_direction(a, 0.0)
     a[50:60] += [30.0, -20.0, 10.0]
     a[70], a[71, 1] = np.nan, np.inf
     up = up_direction(a, 0.0)
     assert up.n_excluded >= 12 and up.n + up.n_excluded == 200
-    assert np.arccos(up.direction @ still.direction) < 1e-3
+    assert np.arccos(up.direction @ expected.direction) < 1e-3
     # An accelerometer with coarse steps has no scatter at rest.
     coarse = np.tile([0.0, 0.0, GRAVITY], (50, 1))
     coarse[20] += [0.0, 5.0, 0.0]
@@ -94,8 +94,8 @@ def test_tilt_error_agrees_with_its_std(n=400):
     for k in range(n):
         R = Rotation.random(random_state=k).as_matrix()
         up = up_direction(at_rest(R, 20, 0.1, k, 0.05 * rng.standard_normal(3)), 0.05)
-        off = np.cross(R @ up.direction, UP)[:2]
-        squares.append(off @ off / up.std**2)
+        error = np.cross(R @ up.direction, UP)[:2]
+        squares.append(error @ error / up.std**2)
     low, high = chi2.ppf([0.001, 0.999], 2 * n)
     # With 20 readings, the scatter is known to one sixth; it is one seventh of the variance.
     assert 0.9 * low < np.sum(squares) < 1.1 * high
@@ -140,9 +140,12 @@ def test_orientation_rotates_with_the_world():
 
 @pytest.mark.parametrize('lean, missing', [(0.3, None), (3.0, None), (0.3, 2), (3.0, 2)])
 def test_heading_error_agrees_with_its_std(lean, missing, n=300):
-    """Many mountings are simulated, each with a bias per axis and an accelerometer error."""
+    """The normalised errors of heading and tilt are chi-square distributed.
+
+    Each simulated mounting has a random bias per axis and a random accelerometer error.
+    """
     rng = np.random.default_rng(5)
-    heading, tilt, gross = [], [], 0
+    heading, tilt, n_gross = [], [], 0
     for k in range(n):
         R = rotation_about_z(rng.uniform(-np.pi, np.pi)) @ Rotation.from_rotvec(
             lean * rng.standard_normal(3)).as_matrix()
@@ -157,13 +160,13 @@ def test_heading_error_agrees_with_its_std(lean, missing, n=300):
         # With a missing horizontal axis, there are two headings or one uncertain heading.
         if not np.isnan(found.rival) or found.std[2] > np.deg2rad(5.0):
             continue
-        off = angles_between(found.R_ws, R)
-        if abs(off[2]) > 0.5:
-            gross += 1
+        error = angles_between(found.R_ws, R)
+        if abs(error[2]) > 0.5:
+            n_gross += 1
             continue
         # The tilts are a third of a degree, so the rotation vector has independent components.
-        heading.append((off[2] / found.std[2])**2)
-        tilt.append(np.sum((off[:2] / found.std[:2])**2))
+        heading.append((error[2] / found.std[2])**2)
+        tilt.append(np.sum((error[:2] / found.std[:2])**2))
     print(f'missing {missing}: heading {np.mean(heading):.3f}, tilt {np.mean(tilt) / 2:.3f}, '
           f'{len(heading)} of {n}')
     for squares, each in ((heading, 1), (tilt, 2)):
@@ -171,12 +174,12 @@ def test_heading_error_agrees_with_its_std(lean, missing, n=300):
         assert low < np.sum(squares) < high
     assert len(heading) > (0.95 if missing is None or lean < 1.0 else 0.4) * n
     # The true heading is not reported if the cost of its bias exceeds MAX_RIVAL_COST.
-    assert gross <= binom.ppf(0.999, n, chi2.sf(MAX_RIVAL_COST, 1)) * (missing is not None)
+    assert n_gross <= binom.ppf(0.999, n, chi2.sf(MAX_RIVAL_COST, 1)) * (missing is not None)
 
 
 @pytest.mark.parametrize('posture', POSTURES)
-def test_heading_error_without_bias_is_that_of_the_tilt(posture, n=200):
-    """At a dip of 72 degrees, a tilt changes the heading by three times the tilt."""
+def test_heading_error_without_bias_is_due_to_the_tilt_error(posture, n=200):
+    """At a dip of 72 degrees, a tilt error causes a heading error three times as large."""
     rng, squares = np.random.default_rng(8), []
     for k in range(n):
         R = rotation_about_z(rng.uniform(-np.pi, np.pi)) @ POSTURES[posture]
@@ -203,7 +206,7 @@ def test_heading_is_not_observable_with_a_vertical_axis_alone():
         compass_orientation(up_of(np.eye(3)), np.full(3, np.nan), EARTH, BIAS)
 
 
-def test_a_vertical_axis_adds_nothing_to_two_horizontal_ones():
+def test_a_vertical_axis_adds_no_information_to_two_horizontal_axes():
     R = rotation_about_z(0.4)
     y = R.T @ EARTH + [2e-7, 1e-7, 0.0]
     three = compass_orientation(up_of(R, 5e-3), y, EARTH, BIAS)
@@ -263,23 +266,23 @@ def heading_of(yaw_deg, std_deg, R=POSTURES['upright']):
     (2.0, 180.0, 6.0 * 4.0 / 32404.0, 2.0)])
 def test_headings_are_weighted_by_their_variances(compass, stated, expected, std):
     R = POSTURES['askew']
-    both = with_stated_heading(heading_of(0.0, compass, R), heading_of(6.0, 0.0, R).R_ws,
+    fused = with_stated_heading(heading_of(0.0, compass, R), heading_of(6.0, 0.0, R).R_ws,
                                np.deg2rad(stated))
-    assert np.degrees(yaw_between(R, both.R_ws)) == pytest.approx(expected, rel=1e-3)
-    np.testing.assert_allclose(np.degrees(both.std), [0.3, 0.4, std], rtol=1e-3)
+    assert np.degrees(yaw_between(R, fused.R_ws)) == pytest.approx(expected, rel=1e-3)
+    np.testing.assert_allclose(np.degrees(fused.std), [0.3, 0.4, std], rtol=1e-3)
     # The tilt is measured by the accelerometer.
-    np.testing.assert_allclose(both.R_ws.T @ UP, R.T @ UP, atol=1e-12)
-    assert both.bias[0] == 1e-7
+    np.testing.assert_allclose(fused.R_ws.T @ UP, R.T @ UP, atol=1e-12)
+    assert fused.bias[0] == 1e-7
 
 
 def test_an_inconsistent_stated_heading_is_not_fused():
-    def both(apart):
-        return with_stated_heading(heading_of(0.0, 3.0), heading_of(apart, 0.0).R_ws,
+    def fused(difference):
+        return with_stated_heading(heading_of(0.0, 3.0), heading_of(difference, 0.0).R_ws,
                                    np.deg2rad(4.0))
     for sign in (1.0, -1.0):
-        assert both(14.9 * sign) is not None
-        assert both(15.1 * sign) is None
-    assert both(180.0) is None
+        assert fused(14.9 * sign) is not None
+        assert fused(15.1 * sign) is None
+    assert fused(180.0) is None
 
 
 def test_levelling_is_the_smallest_rotation_to_the_vertical():
@@ -288,10 +291,10 @@ def test_levelling_is_the_smallest_rotation_to_the_vertical():
         truth = lean @ posture
         found = levelled(up_of(truth, 5e-3), posture, np.deg2rad([5.0, 5.0, 4.0]))
         np.testing.assert_allclose(found.R_ws @ (truth.T @ UP), UP, atol=1e-12)
-        turn = angles_between(posture, found.R_ws)
+        rotation = angles_between(posture, found.R_ws)
         # The rotation is about a horizontal axis, by the tilt of the sensor.
-        assert abs(turn[2]) < 1e-12
-        assert np.linalg.norm(turn) == pytest.approx(np.hypot(0.05, 0.08), rel=1e-6)
+        assert abs(rotation[2]) < 1e-12
+        assert np.linalg.norm(rotation) == pytest.approx(np.hypot(0.05, 0.08), rel=1e-6)
         np.testing.assert_allclose(found.std, [5e-3, 5e-3, np.deg2rad(4.0)])
         assert np.isnan(found.bias).all() and np.isnan(found.rival)
     assert levelled(None, np.eye(3), np.ones(3)) is None
@@ -309,7 +312,7 @@ def test_pooled_bias_counts_only_observed_components():
     assert two == pytest.approx(np.sqrt((4.0 * BIAS**2 + 25e-14) / 5.0))
 
 
-def test_pooled_bias_of_many_sensors_is_the_true_one():
+def test_pooled_bias_std_of_many_sensors_is_the_true_std():
     rng, found = np.random.default_rng(2), []
     for k in range(200):
         R = Rotation.random(random_state=k).as_matrix()

@@ -39,7 +39,7 @@ def level_error(b):
 
 @pytest.mark.parametrize('seed', range(5))
 def test_a_provisional_background_is_found_between_vehicles(seed):
-    """No interval of three seconds is quiet; the level is correct within its std."""
+    """The level is correct within its std, although no interval of three seconds is quiet."""
     signal = traffic(2.0, seed=seed)
     assert not run_on(signal, 5.5).ready
     b = run_on(signal, 14.0)
@@ -66,7 +66,7 @@ def test_a_quiet_interval_makes_the_background_certain():
 @pytest.mark.parametrize('relearn', [0.0, 60.0])
 @pytest.mark.parametrize('signal', [
     0.0, lambda t: np.array([2e-6, 0.0, 0.0]) / (1 + ((t - 12.0) / 0.8)**2)**2.5])
-def test_after_a_quiet_beginning_nothing_is_doubtful(signal, relearn):
+def test_a_background_from_a_quiet_beginning_is_never_doubtful(signal, relearn):
     b = run_on(signal, 30.0, relearn=relearn)
     assert b.certain and not b.doubtful_times
 
@@ -76,7 +76,7 @@ def standing_vehicle(until):
 
 
 def test_a_background_with_a_vehicle_at_the_start_is_doubtful_and_replaced():
-    """The vehicle leaves after 4 s; after another 4 s, either level may be the background."""
+    """The vehicle leaves after 4 s. After another 4 s, either level may be the background."""
     for seconds, is_doubtful, has_departed in ((4.0, False, False), (9.5, True, False),
                                                (24.0, False, True)):
         b = run_on(standing_vehicle(4.0), seconds)
@@ -87,7 +87,7 @@ def test_a_background_with_a_vehicle_at_the_start_is_doubtful_and_replaced():
 
 @pytest.mark.parametrize('stood_s', [4.0, 20.0])
 def test_a_background_with_a_vehicle_before_dense_traffic_is_doubtful_and_replaced(stood_s):
-    """No quiet interval follows, but the most frequent level changes."""
+    """The most frequent level replaces the background, because no quiet interval follows."""
     vehicles = traffic(2.0, begin=stood_s)
 
     def signal(t):
@@ -115,15 +115,15 @@ def test_a_vehicle_that_stood_in_dense_traffic_is_replaced():
 def test_another_stopping_car_is_not_a_former_background(later):
     """A car parks for 100 s; later, another car with 60 % of its field stops for 5 s."""
     def signal(t):
-        halts = 120.0 + later
+        stop_time = 120.0 + later
         return np.array([2e-6, 0.0, 1e-6]) * ((20.0 < t < 120.0)
-                                              + 0.6 * (halts < t < halts + 5.0))
+                                              + 0.6 * (stop_time < t < stop_time + 5.0))
     b = running()
     feed(b, np.arange(0.0, 127.0 + later, 0.04), signal=signal)
     assert b.n_relearnt == 2 and (np.abs(b.level(127.0 + later) - EARTH) < SIGMA).all()
 
 
-def test_an_axis_that_stops_early_does_not_delay_the_others():
+def test_an_axis_that_stops_reporting_does_not_delay_the_others():
     vehicles = traffic(2.0)
     b, rng = running(), np.random.default_rng(0)
     for t in np.arange(0.0, 14.0, 1.0 / RATE):
@@ -132,8 +132,8 @@ def test_an_axis_that_stops_early_does_not_delay_the_others():
     assert b.ready and (np.abs(b.level(14.0) - EARTH)[:2] < 3.0 * level_error(b)[:2]).all()
 
 
-def test_a_former_background_is_restored_at_once():
-    """A car parks for two minutes and departs."""
+def test_a_former_background_is_restored_within_seconds():
+    """A car parks for two minutes; the former level is restored 6 s after its departure."""
     def parked(t):
         return np.array([2e-6, 0.0, 1e-6]) * (20.0 < t < 140.0)
     assert (np.abs(run_on(parked, 130.0).level(130.0) - EARTH - parked(130.0)) < SIGMA).all()
@@ -175,12 +175,12 @@ def test_covariance_includes_the_error_of_a_provisional_background():
 
 
 def test_doubtful_intervals_do_not_depend_on_the_batches():
-    whole = readings(traffic(2.0), 40.0)
-    stage, covariance, _ = calibrated([whole])
-    parts = [whole.part(slice(i, i + 7)) for i in range(0, len(whole), 7)]
-    other, again, _ = calibrated(parts)
-    assert stage.doubtful_intervals() == other.doubtful_intervals() != {}
-    np.testing.assert_array_equal(covariance, again)
+    batch_of_all = readings(traffic(2.0), 40.0)
+    stage, covariance, _ = calibrated([batch_of_all])
+    parts = [batch_of_all.part(slice(i, i + 7)) for i in range(0, len(batch_of_all), 7)]
+    other_stage, other_covariance, _ = calibrated(parts)
+    assert stage.doubtful_intervals() == other_stage.doubtful_intervals() != {}
+    np.testing.assert_array_equal(covariance, other_covariance)
 
 
 def test_doubtful_intervals_follow_the_clock():
@@ -224,7 +224,7 @@ def test_doubtful_intervals_are_recorded_and_merged():
         == {'a': ((1, 2), (4, 6)), 'b': ((3, None),)}
     # An interval without an end is closed at the start of the next interval.
     assert merged({'a': ((1, None),)}, {'a': ((4, 6),)}) == {'a': ((1, 4), (4, 6))}
-    # An interval that begins and ends with the same reading, and the next interval.
+    # An interval of zero length replaces, and is replaced by, an interval with the same start.
     assert merged({'a': ((4, None),)}, {'a': ((4, 4),)}) == {'a': ((4, 4),)}
     assert merged({'a': ((4, 4),)}, {'a': ((4, None),)}) == {'a': ((4, None),)}
     # The doubtful background was replaced by a background that was never doubtful.

@@ -18,7 +18,7 @@ NETWORK, SETTINGS = line_network(1), CalibrateSettings()
 
 
 def readings(signal, seconds=60.0, rate=50.0, seed=0, step=0.0):
-    """Readings of one sensor: noise, the Earth's field, and `signal(t)` [T], (3,) or a scalar."""
+    """Readings of one sensor: the sum of noise, the Earth's field and `signal(t)` [T]."""
     rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 1.0 / rate)
     fields = [EARTH + signal(s) + SIGMA * rng.standard_normal(3) for s in t]
     if step:
@@ -42,7 +42,7 @@ def departing(until):
 @pytest.mark.parametrize('signal', [
     lambda t: 0.0, passing(20.0), passing(7.0, 12.0, 17.0, 30.0), lambda t: 3e-9 * t,
     lambda t: 1e-8 * t, lambda t: 2e-6 * (25.0 < t < 40.0)])
-def test_no_level_is_needed_after_a_quiet_beginning(signal):
+def test_a_recording_with_a_quiet_beginning_has_no_level(signal):
     assert prescan_of(signal).levels == {}
 
 
@@ -74,30 +74,30 @@ def test_a_target_that_arrives_later_and_stays_is_not_the_background(arrives, un
         return 2e-6 - departing(arrives)(t)
     assert prescan_of(signal, seconds=until).levels == {}
     # Without relearning, a level stays the background even if another level lasts longer.
-    never = replace(SETTINGS, {'relearn_s': 0.0})
-    assert prescan_of(signal, never, seconds=10.0 * until).levels == {}
+    no_relearning = replace(SETTINGS, {'relearn_s': 0.0})
+    assert prescan_of(signal, no_relearning, seconds=10.0 * until).levels == {}
 
 
 def test_a_level_that_lasts_most_of_the_recording_is_not_the_background():
-    """The vehicle departs, so the short level after the departure is the background."""
-    def shutdown(t):
-        way = 0.5 * 2.0 * max(t - 30.0, 0.0)**2
-        return 4e-6 / (1.0 + (way / 5.0)**2)**1.5
-    level, = prescan_of(shutdown, seconds=44.0).levels.values()
+    """The vehicle departs, so the background is the short level after the departure."""
+    def departing_slowly(t):
+        distance = 0.5 * 2.0 * max(t - 30.0, 0.0)**2
+        return 4e-6 / (1.0 + (distance / 5.0)**2)**1.5
+    level, = prescan_of(departing_slowly, seconds=44.0).levels.values()
     assert (np.abs(level.level - EARTH) < SIGMA).all() and level.begin > 33.0
 
 
 def test_a_first_level_that_returns_is_the_background():
     """Two vehicles arrive; one vehicle departs, and half of the field remains until 60 s."""
     def queue(t):
-        way = 0.5 * 2.0 * max(t - 30.0, 0.0)**2
-        return (2e-6 + 2e-6 / (1.0 + (way / 5.0)**2)**1.5) * (20.0 < t < 60.0)
+        distance = 0.5 * 2.0 * max(t - 30.0, 0.0)**2
+        return (2e-6 + 2e-6 / (1.0 + (distance / 5.0)**2)**1.5) * (20.0 < t < 60.0)
     assert prescan_of(queue, seconds=80.0).levels == {}
 
 
 @pytest.mark.parametrize('rates', [(50.0, 1.0), (2.0, 2.0), (100.0, 5.0)])
 @pytest.mark.parametrize('starts', [0.0, 7.0, 40.0])
-def test_slow_and_late_sensors_have_a_quiet_beginning(rates, starts):
+def test_slow_and_late_sensors_without_a_target_have_no_level(rates, starts):
     network, parts = line_network(2), []
     for j, (rate, start) in enumerate(zip(rates, (0.0, starts), strict=True)):
         part = readings(lambda t: 0.0, 120.0, rate, seed=j)
@@ -111,13 +111,13 @@ def test_slow_and_late_sensors_have_a_quiet_beginning(rates, starts):
 @pytest.mark.parametrize('value', [EARTH, np.zeros(3), np.array([2e-5, 0.0, 0.0]),
                                    EARTH + np.array([1.234e-8, -5.6e-9, 7.7e-9])])
 def test_a_sensor_that_never_changes_has_no_background(value):
-    hung = batch([MagSample(int(k * 1e7), 'mag_1', value) for k in range(2000)])
-    stage, found_levels = Calibrate(NETWORK, SETTINGS), prescan([hung], NETWORK, SETTINGS)
+    constant = batch([MagSample(int(k * 1e7), 'mag_1', value) for k in range(2000)])
+    stage, found_levels = Calibrate(NETWORK, SETTINGS), prescan([constant], NETWORK, SETTINGS)
     found_levels.apply(stage)
-    assert stage.feed(hung) == [] and stage.unready() == ['mag_1']
+    assert stage.feed(constant) == [] and stage.unready() == ['mag_1']
 
 
-def test_no_level_is_searched_if_the_background_is_given_or_disabled():
+def test_no_level_is_searched_for_a_given_background_or_without_look_ahead():
     given = dataclasses.replace(NETWORK, background=(EARTH,))
     assert prescan_of(passing(1.0), network=given).levels == {}
     assert prescan_of(passing(1.0), replace(SETTINGS, {'look_ahead_s': 0.0})).levels == {}
@@ -129,8 +129,9 @@ def test_a_recording_of_only_a_target_has_no_level():
 
 
 def test_level_does_not_depend_on_the_batches():
-    whole = readings(passing(1.0))
-    expected = prescan([whole], NETWORK, SETTINGS).levels['mag_1']
-    parts = (whole.part(slice(i, i + 7)) for i in range(0, len(whole), 7))
+    batch_of_all = readings(passing(1.0))
+    expected = prescan([batch_of_all], NETWORK, SETTINGS).levels['mag_1']
+    parts = (batch_of_all.part(slice(i, i + 7))
+             for i in range(0, len(batch_of_all), 7))
     level = prescan(parts, NETWORK, SETTINGS).levels['mag_1']
     np.testing.assert_array_equal(level.level, expected.level)

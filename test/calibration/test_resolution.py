@@ -48,7 +48,7 @@ def test_missing_axes_and_spikes_do_not_change_the_step():
         np.testing.assert_allclose(step, [1e-7, 1e-7, np.inf])
 
 
-def test_a_field_that_changes_with_every_reading_shows_no_steps():
+def test_a_field_that_changes_with_every_reading_has_no_observable_steps():
     y = np.cumsum(np.random.default_rng(0).uniform(1e-6, 3e-6, (60, 3)), axis=0)
     state = sensor_after(y)
     assert (state[0]['step'] > 1e-6).all() and (raw_steps(state) == 0.0).all()
@@ -73,14 +73,14 @@ def test_a_rest_counts_as_one_measurement_for_a_limited_time():
     n = MAX_REST_NS // (10 * MS)
     assert sensor_after(np.ones((3, 3)))[0]['n_rest'].tolist() == [3, 3, 3]
     assert sensor_after(np.ones((10 * n, 3)))[0]['n_rest'].tolist() == [n + 1] * 3
-    one_moves = sensor_after([*np.ones((10 * n, 3)), [1.0, 1.0, 2.0]])
-    assert one_moves[0]['n_rest'].tolist() == [n + 1, n + 1, 1]
+    after_change = sensor_after([*np.ones((10 * n, 3)), [1.0, 1.0, 2.0]])
+    assert after_change[0]['n_rest'].tolist() == [n + 1, n + 1, 1]
 
 
 @pytest.mark.parametrize('sigma', [0.01, 0.1, 0.2, 0.4, 0.5, 1.0, 3.0])
 def test_mean_of_readings_has_the_predicted_error(sigma):
     """Over many levels, the mean of `n` readings has the error predicted from noise and steps."""
-    rng, n, errors, stated = np.random.default_rng(0), 8, [], []
+    rng, n, errors, predicted = np.random.default_rng(0), 8, [], []
     for level in rng.uniform(-0.5, 0.5, 4000):
         y = np.round(level + sigma * rng.standard_normal((n, 1)))
         variance = np.array([np.var(np.round(level + sigma * rng.standard_normal(200)))])
@@ -90,8 +90,8 @@ def test_mean_of_readings_has_the_predicted_error(sigma):
             run = run + 1 if k and y[k] == y[k - 1] else 1
             runs.append(run)
         errors.append(y.mean() - level)
-        stated.append(np.sum(variance[0] + at_rest * np.array(runs) / 12.0) / n**2)
-    ratio = np.mean(np.square(errors)) / np.mean(stated)
+        predicted.append(np.sum(variance[0] + at_rest * np.array(runs) / 12.0) / n**2)
+    ratio = np.mean(np.square(errors)) / np.mean(predicted)
     # The predicted error is too large if noise crosses the edge of a step, and rarely too small.
     assert 0.2 < ratio < 1.8, ratio
 
@@ -102,14 +102,14 @@ def test_an_axis_that_never_changed_is_at_rest_or_dead():
     fine = np.array([0.0, 4.0, 0.0])
     np.testing.assert_array_equal(completed_steps(fine, np.array([inf, 1.0, inf])),
                                   [np.nan, 1.0, np.nan])
-    never = np.full(3, inf)
-    np.testing.assert_array_equal(completed_steps(np.zeros(3), never), never)
+    unknown = np.full(3, inf)
+    np.testing.assert_array_equal(completed_steps(np.zeros(3), unknown), unknown)
     one = np.array([np.nan, 0.0, np.nan])
     np.testing.assert_array_equal(completed_steps(one, np.array([inf, 2.0, inf])), [inf, 2.0, inf])
 
 
-def test_an_axis_at_rest_keeps_its_steps_if_another_gets_noisy():
-    """Without steps, the readings of the axis would have zero noise."""
+def test_an_axis_at_rest_keeps_its_steps_if_another_becomes_noisy():
+    """The axis retains its quantisation variance; without it, its noise would be zero."""
     sensors = new_sensors(1)
     sensors['noise'], sensors['step'] = np.zeros((3, 3)), [np.inf, 1e-6, np.inf]
     limits = np.empty(3)

@@ -24,7 +24,7 @@ def quantised(fields, step):
 
 
 class SpikeScreen:
-    """Records which readings `core.screen_spike` holds and releases."""
+    """Spike detection by `core.screen_spike`, with a record of the readings held and released."""
 
     def __init__(self, threshold, std=SIGMA, step=np.inf):
         self.sensors, self._threshold, self._held = new_sensors(1), threshold, []
@@ -32,7 +32,7 @@ class SpikeScreen:
         self.sensors['is_ready'], self.sensors['noise_std'] = std is not None, std or np.nan
 
     def feed(self, row, stamp, field):
-        """Screen a reading; return the readings that it decides, as [(index, is spike)]."""
+        """Screen a reading; return the readings with a decision, as [(index, is spike)]."""
         verdict, out = core.screen_spike(self.sensors, self._threshold, stamp, field), []
         if verdict == SPIKE:
             assert self.sensors['n_held'][0] == len(self._held)
@@ -52,7 +52,7 @@ class SpikeScreen:
 
 
 def screened(fields, rate=100.0, std=SIGMA, threshold=30.0, step=np.inf):
-    """Indices of spikes, maximum number of held readings, and indices of readings released late."""
+    """Indices of spikes, maximum number of held readings, and indices of readings decided late."""
     spikes, max_held, late, out, f = [], 0, [], 0, SpikeScreen(threshold, std, step)
     for k, field in enumerate(fields):
         decided = f.feed(k, round(k * NS / rate), field)
@@ -73,15 +73,15 @@ def stuck(fields):
     return [k for k, field in enumerate(fields) if core.is_stuck(sensors, field)]
 
 
-# No false alarms.
+# False alarms.
 
 @pytest.mark.parametrize('step', [0.0, 0.3, 1.0, 3.0, 10.0])
 @pytest.mark.parametrize('slope', [0.0, 2e-11])
 @pytest.mark.parametrize('rate', [10.0, 100.0])
-def test_noise_and_coarse_steps_at_rest_pass_at_once(step, slope, rate):
-    """Ten thousand readings pass; the background may drift from one step of the sensor to the next.
+def test_noise_and_coarse_steps_at_rest_pass_immediately(step, slope, rate):
+    """None of 10 000 readings is held or stuck.
 
-    During such a drift, a sensor with coarse steps must not be classified as stuck.
+    The background may drift across a quantisation step of the sensor.
     """
     y = noise(10_000) + slope * np.arange(10_000)[:, None] * [1.0, 0.8, -0.6]
     y = quantised(y, step)
@@ -96,11 +96,11 @@ def passes(rate, speed, n=4):
     network = line_network(1)
     for k in range(n):
         if k % 2:
-            body, aside = random_vehicle(rng), 1.0 + 1.7 / 2
+            body, lateral = random_vehicle(rng), 1.0 + 1.7 / 2
         else:
-            body, aside = point_body(rng.normal(0.0, 250.0, 3), 5.0, 0.5), 1.0
+            body, lateral = point_body(rng.normal(0.0, 250.0, 3), 5.0, 0.5), 1.0
         begin = -40.0 - rng.uniform(0.0, speed / rate)
-        samples, *_ = simulate(network, body, Path(np.array([begin, -4.5 + aside]), 0.0, speed),
+        samples, *_ = simulate(network, body, Path(np.array([begin, -4.5 + lateral]), 0.0, speed),
                                rate, 80.0 / speed + 3.0, rng)
         fields += [s.field for s in samples]
     return np.array(fields)
@@ -109,9 +109,9 @@ def passes(rate, speed, n=4):
 @pytest.mark.parametrize('step', [0.0, 1.0, 3.0, 10.0])
 @pytest.mark.parametrize('rate', [10.0, 50.0, 100.0])
 def test_vehicles_at_a_metre_are_no_spikes(rate, step):
-    """At 10 Hz, a whole pass must not be rejected as a spike.
+    """No reading of a pass is a spike, even at 10 Hz.
 
-    After the pass, a sensor with coarse steps at rest must not be classified as stuck.
+    After the pass, a sensor with coarse steps at rest is not classified as stuck.
     """
     for speed in (6.0, 13.0, 25.0):
         y = quantised(passes(rate, speed), step)
@@ -194,7 +194,7 @@ def test_a_step_is_no_spike(size):
     assert (spikes, max_held, late) == ([], MAX_HELD, [30, 31, 32])
 
 
-def test_usual_changes_are_learnt_again_after_a_step():
+def test_the_differences_after_a_step_replace_the_earlier_ones():
     y = np.tile(EARTH, (60, 1))
     y[30:] += 3e-6
     y[34:] += 40.0 * SIGMA * np.arange(26)[:, None]
@@ -208,7 +208,7 @@ def test_a_spike_requires_eight_preceding_changes():
         assert screened(y)[0] == found
 
 
-def test_steepness_and_size_are_compared_on_the_same_axis():
+def test_both_spike_criteria_must_hold_on_the_same_axis():
     y = np.tile(EARTH, (40, 1))
     y[22:, 0] += 5.0 * SIGMA
     y[25] += np.array([36.0, 9.0, 0.0]) * SIGMA
@@ -230,16 +230,16 @@ def test_a_spike_returns_close_to_the_previous_level():
         assert bool(screened(y)[0]) == found
 
 
-def test_a_missing_axis_is_no_spike_and_masks_none():
+def test_a_missing_axis_is_no_spike_and_hides_no_spike():
     y = noise(80)
     y[20:50, 2] = np.nan
     y[30] += 4e-6
     y[55:58, 0] = np.nan
     assert screened(y)[0] == [30]
-    once = noise(60)
-    once[21, 0] = np.nan
-    once[30, 0] += 4e-6
-    assert screened(once)[0] == [30]
+    one_missing = noise(60)
+    one_missing[21, 0] = np.nan
+    one_missing[30, 0] += 4e-6
+    assert screened(one_missing)[0] == [30]
     y[:, 0] = np.nan
     y[31, 1] = np.nan
     spikes, max_held, _ = screened(y)
@@ -285,7 +285,7 @@ def test_readings_are_released_once_in_order_and_at_most_three_are_held(seed):
 
 @pytest.mark.parametrize('step, delay', [(0.0, 6), (0.3, 6), (1.0, 7)])
 @pytest.mark.parametrize('n', [15, 150])
-def test_a_frozen_sensor_is_detected_soon_and_recovers_at_once(step, delay, n):
+def test_a_frozen_sensor_is_detected_and_recovers_immediately(step, delay, n):
     y = quantised(noise(2000), step)
     y[1500:1500 + n] = y[1499]
     found = stuck(y)
@@ -304,7 +304,7 @@ def test_repeated_freezes_are_detected():
     assert max(Counter(r // 100 for r in frozen - set(rows)).values()) <= 7
 
 
-def test_repetitions_need_enough_changes_and_a_minimum_number():
+def test_a_stuck_sensor_requires_enough_changes_and_repetitions():
     few, many = noise(49), noise(51)
     assert stuck(np.concatenate([few, np.tile(few[-1], (100, 1))])) == []
     assert stuck(np.concatenate([many, np.tile(many[-1], (100, 1))])) != []
@@ -314,7 +314,7 @@ def test_repetitions_need_enough_changes_and_a_minimum_number():
 
 
 def test_limit_depends_on_the_usual_rate_of_repetitions():
-    """If one in 30 readings is a repetition, a run of seven is a fault, a run of six is not."""
+    """If one in 30 readings is a repetition, a run of seven is a fault, and a run of six is not."""
     y = noise(9000)
     y[29::30] = y[28::30]
     assert stuck(y) == []
@@ -324,7 +324,7 @@ def test_limit_depends_on_the_usual_rate_of_repetitions():
 
 
 def test_old_repetitions_are_forgotten():
-    """A sensor with many repetitions at the start is later evaluated like any other sensor."""
+    """A freeze is detected although the sensor repeated many readings at the start."""
     y = noise(70_000)
     y[60:2000] = y[59]
     begin, end = stuck(y), 30_000

@@ -66,7 +66,7 @@ def test_another_arrival_makes_a_track_ambiguous_at_equal_positions(
     assert [h.weight for h in track.hypotheses[1:]] == [other_hypothesis.weight]
 
 
-def test_log_sum_exp_equals_scipy_and_survives_extremes():
+def test_log_sum_exp_equals_scipy_also_for_extreme_values():
     a = np.array([[-4500.0, 0.0, 3.0], [-1e5, -1e5, -1e5 + 1]])
     np.testing.assert_allclose(log_sum_exp(a, axis=1), logsumexp(a, axis=1), rtol=1e-14)
     assert log_sum_exp([-np.inf, -np.inf]) == -np.inf
@@ -234,10 +234,11 @@ def test_keep_leaves_the_remaining_hypotheses_unchanged(removed):
 
 
 def test_an_initial_bank_returns_the_rows_of_its_source_bank():
-    """Later changes of the source bank and of a copy with the same arrays have no effect."""
+    """Later changes of the source bank and of a returned bank have no effect."""
     from_targets = random_bank(5, 4)
-    own = np.array([np.diag([1.0, 2.0]), np.diag([3.0, 4.0])])
-    bank = FilterBank.from_targets(from_targets.x, from_targets.P, from_targets.label, 2, 1e-8, own,
+    own_covariance = np.array([np.diag([1.0, 2.0]), np.diag([3.0, 4.0])])
+    bank = FilterBank.from_targets(from_targets.x, from_targets.P, from_targets.label, 2, 1e-8,
+                                   own_covariance,
                                    from_targets.kind)
     before, start = bank.copy(), InitialBank.of(bank, 4)
     other = copy(start)

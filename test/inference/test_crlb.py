@@ -74,14 +74,14 @@ def test_observability_of_the_published_example(m, sensors, kernel, smallest, co
 
 
 def test_scaled_observability_does_not_depend_on_units():
-    """If scales are given, the eigenvalues do not depend on the units of the states."""
+    """With given scales, the eigenvalues do not depend on the units of the states."""
     J = information(car(ROAD), NOISE * np.eye(3))
     unit = np.repeat([1e3, 1e3, 1.0, 1e9], [3, 3, 3, 6])
     names = NAMES + list('abcdef')
-    ours = observability(J, names, CAR_SCALE)
-    theirs = observability(J / np.outer(unit, unit), names, CAR_SCALE * unit)
-    assert ours.kernel_dimension == 0
-    np.testing.assert_allclose(ours.eigenvalues, theirs.eigenvalues, rtol=1e-6)
+    found = observability(J, names, CAR_SCALE)
+    in_other_units = observability(J / np.outer(unit, unit), names, CAR_SCALE * unit)
+    assert found.kernel_dimension == 0
+    np.testing.assert_allclose(found.eigenvalues, in_other_units.eigenvalues, rtol=1e-6)
     # Without scales, the background in tesla dominates all other states.
     assert observability(J, names).kernel_dimension > 0
     # The kernel is returned in the units of the states: [r0, v0, 3 m, 0].
@@ -103,7 +103,7 @@ def test_known_cpa_range_makes_one_sensor_observable():
 
 
 def test_cpa_information_is_that_of_the_gradient_of_the_range():
-    """The oracle uses central differences; TSP14 omits the minus sign."""
+    """The gradient of the oracle is computed by central differences; TSP14 lacks a minus sign."""
     def cpa_range(x):
         return np.linalg.norm(np.cross(x[:3], x[3:6])) / np.linalg.norm(x[3:6])
 
@@ -150,7 +150,7 @@ def test_unobservable_states_have_infinite_variance(m):
 
 
 def test_a_state_with_a_small_part_in_the_kernel_is_unobservable():
-    """The part in the kernel is so small that the other states alone appear unobservable."""
+    """The component of the state in the kernel is far smaller than those of the other states."""
     A = np.random.default_rng(4).standard_normal((20, 6))
     n = np.array([1e-5, 1.0, -2.0, 1.0, 0.0, 3.0])
     A -= np.outer(A @ n, n) / (n @ n)
@@ -172,7 +172,7 @@ def test_bound_of_an_observable_case_is_the_inverse_in_any_units():
 
 
 def test_bound_never_exceeds_the_prior():
-    """MITRE12 figure 5: far away, the bounds approach the prior."""
+    """MITRE12 figure 5: at a large distance, the bounds approach the prior."""
     std = np.array([30.0, 5.0, 1.0, 4.5, 1.0, 0.1, 100.0, 100.0, 100.0])
     near, far = (np.sqrt(np.diag(bound(information(
         jacobian(CAR[6:], ONE, [-20.0, y, 0.0], [11.0, 0.0, 0.0]), NOISE * np.eye(3)),
@@ -181,8 +181,8 @@ def test_bound_never_exceeds_the_prior():
     np.testing.assert_allclose(far, std, rtol=1e-3)
 
 
-def test_states_known_exactly_are_treated_as_not_estimated():
-    """MITRE12 section 4.3: the variance of such states is zero."""
+def test_exactly_known_states_have_zero_variance():
+    """MITRE12 section 4.3; the other states have the bound of a problem without these states."""
     J, free = unitless(ONES, ONE), np.ix_([1, 2, 3, 5, 6, 7, 8], [1, 2, 3, 5, 6, 7, 8])
     expected = np.zeros((9, 9))
     expected[free] = np.linalg.inv(J[free])
@@ -192,12 +192,12 @@ def test_states_known_exactly_are_treated_as_not_estimated():
 
 def test_marginal_information_is_the_schur_complement():
     J, keep = information(car(ROAD), CORRELATED) * np.outer(CAR_SCALE, CAR_SCALE), [5, 0, 1]
-    ours, rest = marginal(J, keep), np.setdiff1d(np.arange(15), keep)
+    found, rest = marginal(J, keep), np.setdiff1d(np.arange(15), keep)
     block = np.linalg.inv(J)[np.ix_(keep, keep)]
-    np.testing.assert_allclose(ours @ block, np.eye(3), atol=1e-8)
+    np.testing.assert_allclose(found @ block, np.eye(3), atol=1e-8)
     mixed = J[np.ix_(keep, rest)]
     schur = J[np.ix_(keep, keep)] - mixed @ np.linalg.inv(J[np.ix_(rest, rest)]) @ mixed.T
-    np.testing.assert_allclose(ours, schur, rtol=1e-6)
+    np.testing.assert_allclose(found, schur, rtol=1e-6)
     np.testing.assert_array_equal(marginal(J, np.arange(15) < 6), marginal(J, range(6)))
 
 
@@ -206,13 +206,13 @@ def test_marginal_information_is_the_schur_complement():
 def test_unobservable_states_stay_unobservable_in_marginal_information(m, keep):
     """Rounding errors must not turn an infinite bound into a large finite bound."""
     J, keep = unitless(m, ONE), np.array(keep)
-    whole, part = bound(J)[np.ix_(keep, keep)], bound(marginal(J, keep))
-    assert np.array_equal(np.isinf(np.diag(part)), np.isinf(np.diag(whole)))
-    np.testing.assert_allclose(part, whole, rtol=1e-6, atol=1e-9)
+    expected, found = bound(J)[np.ix_(keep, keep)], bound(marginal(J, keep))
+    assert np.array_equal(np.isinf(np.diag(found)), np.isinf(np.diag(expected)))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
 
 
 def plain_kalman(F, Q, H, C, P):
-    """Oracle: the textbook recursion with the rows of all sensors stacked."""
+    """Covariances after each update by the textbook recursion with all sensors stacked (oracle)."""
     out = []
     for F_k, Q_k, H_k in zip(F, Q, H, strict=True):
         P = F_k @ P @ F_k.T + Q_k
@@ -287,12 +287,13 @@ def test_missing_axes_and_sensors_add_no_information():
     for t, j in np.ndindex(5, 2):
         p = np.flatnonzero(~np.isnan(H[t, j, :, 0]))
         J += H[t, j, p].T @ np.linalg.inv(C[j][np.ix_(p, p)]) @ H[t, j, p]
-    ours, size = information(H, C), np.outer(CAR_SCALE, CAR_SCALE)
-    np.testing.assert_allclose(ours * size, J * size, rtol=1e-12, atol=1e-12 * (J * size).max())
+    found, scale = information(H, C), np.outer(CAR_SCALE, CAR_SCALE)
+    np.testing.assert_allclose(found * scale, J * scale, rtol=1e-12,
+                               atol=1e-12 * (J * scale).max())
     # The covariance of missing axes is ignored.
     C = np.broadcast_to(C, (5, 2, 3, 3)).copy()
     C[1, 0], C[2, 1, 1], C[2, 1, :, 1] = np.nan, np.nan, np.nan
-    np.testing.assert_array_equal(information(H, C), ours)
+    np.testing.assert_array_equal(information(H, C), found)
     assert np.all(information(np.full((4, 3, 9), np.nan), np.eye(3)) == 0.0)
 
 

@@ -17,7 +17,7 @@ N = 100
 
 
 def signal(distance=1.0, direction=1.0, n=N):
-    """Field (n, 2) of a dipole (1, 1, 1) that moves from -5 to 5, without mu0 / 4 pi."""
+    """Field (n, 2), without mu0 / 4 pi, of a dipole (1, 1, 1) that moves from x = -5 to 5 m."""
     r = np.stack([direction * np.linspace(-5.0, 5.0, n), np.full(n, distance), np.zeros(n)], axis=1)
     size = np.linalg.norm(r, axis=1)[:, None]
     return (3.0 * r * r.sum(axis=1)[:, None] / size**5 - 1.0 / size**3)[:, :2]
@@ -43,7 +43,7 @@ def test_expected_rotation_equals_the_published_simulation():
 
 
 def normalised_errors(snr_db, lag, runs=4000):
-    """Errors of mean, variance, error rate and variance estimate, in standard errors."""
+    """Errors of mean, variance, error rate and estimated variance, in standard errors."""
     rng, h = np.random.default_rng([snr_db + 50, lag]), signal()
     std = noise_for(h, snr_db)
     padded = np.pad(h, ((lag, lag), (0, 0)))
@@ -52,13 +52,13 @@ def normalised_errors(snr_db, lag, runs=4000):
     f, estimates = (np.array(v) for v in zip(*found, strict=True))
     expected = expected_rotation(h, std, lag)
     assert estimates.min() >= 2.0 * N / lag**2 * std**4
-    root, error = np.sqrt(runs), max(expected.error_probability, 1.0 / runs)
-    out = [(f.mean() - expected.correlation) / f.std() * root,
-           (f.var() - expected.variance) / np.std((f - f.mean())**2) * root,
+    root_n, error = np.sqrt(runs), max(expected.error_probability, 1.0 / runs)
+    out = [(f.mean() - expected.correlation) / f.std() * root_n,
+           (f.var() - expected.variance) / np.std((f - f.mean())**2) * root_n,
            # The statistic is not exactly normal; the tolerance is one percentage point.
-           max(0.0, abs(np.mean(f > 0.0) - error) - 0.01) / np.sqrt(error * (1 - error)) * root]
+           max(0.0, abs(np.mean(f > 0.0) - error) - 0.01) / np.sqrt(error * (1 - error)) * root_n]
     # If noise dominates, the lower limit increases the estimate of the variance.
-    return [*out, (estimates.mean() - expected.variance) / estimates.std() * root
+    return [*out, (estimates.mean() - expected.variance) / estimates.std() * root_n
             if snr_db >= 0 else 0.0]
 
 
@@ -72,15 +72,15 @@ def test_mean_variance_and_error_rate_agree_with_theory():
 
 def test_sign_is_that_of_the_direction_for_any_yaw_of_the_sensor():
     h, c, s = signal(), np.cos(0.7), np.sin(0.7)
-    left = expected_rotation(h, 0.1, 7)
-    assert left.left_to_right > 0.999 and left.log_odds > 6.0
+    unrotated = expected_rotation(h, 0.1, 7)
+    assert unrotated.left_to_right > 0.999 and unrotated.log_odds > 6.0
     assert expected_rotation(signal(direction=-1.0), 0.1, 7).log_odds < -6.0
     rotated = expected_rotation(h @ np.array([[c, -s], [s, c]]), 0.1, 7)
-    assert rotated == pytest.approx(left)
+    assert rotated == pytest.approx(unrotated)
 
 
 def test_the_published_best_lag_requires_a_distance_of_two_metres():
-    """The best lag is 7 samples at the published distance of 1 m; the published 15 fits 2 m."""
+    """The best lag is 7 samples at the published distance of 1 m; the published lag 15 fits 2 m."""
     def best(distance):
         h = signal(distance)
         std, lags = noise_for(h, -5.0), list(range(1, 26))
@@ -114,9 +114,9 @@ def test_noise_alone_yields_no_direction():
 
 def test_sensors_on_both_sides_are_fused():
     """PHD15 Paper B eq. (20)-(23): product of the odds, inverted on the other side of the road."""
-    near, far = FieldRotation(-2.0, 1.0), FieldRotation(1.0, 1.0)
-    p, q = near.left_to_right, 1.0 - far.left_to_right
-    fused = fused_log_odds([near.log_odds, far.log_odds], [True, False])
+    this_side, other_side = FieldRotation(-2.0, 1.0), FieldRotation(1.0, 1.0)
+    p, q = this_side.left_to_right, 1.0 - other_side.left_to_right
+    fused = fused_log_odds([this_side.log_odds, other_side.log_odds], [True, False])
     assert fused == pytest.approx(np.log(p * q / ((1.0 - p) * (1.0 - q))))
     # The probability of this log-odds rounds to one.
     assert FieldRotation(-40.0, 1.0).log_odds > 800.0

@@ -6,24 +6,24 @@ from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import KalmanFilter
 from scipy.special import logsumexp
 
-from mag_tracking.inference.gauss_markov import STRENGTHS, SWITCH_S, GaussMarkovVectors
+from mag_tracking.inference.gauss_markov import STRENGTHS, SWITCH_INTERVAL_S, GaussMarkovVectors
 
 
 def plain_filter(density, std):
-    """Kalman filter of one component, from filterpy."""
+    """Kalman filter of one component, implemented by filterpy."""
     kf = KalmanFilter(dim_x=2, dim_z=1)
     kf.H, kf.P = np.array([[1.0, 0.0]]), np.diag([std**2, density])
     return kf
 
 
 def by_plain_filters(series, variance, dt, scale, std):
-    """Log-densities of the vectors `series` (n, m) from one plain filter for each component."""
+    """Log-densities of the vectors `series` (n, m) by banks with one plain filter per component."""
     banks = [[plain_filter((s * scale)**2, std) for _ in series[0]] for s in STRENGTHS]
     log_w = np.full(len(STRENGTHS), -np.log(len(STRENGTHS)))
     out = []
     for y in series:
-        stay = np.exp(-dt / SWITCH_S)
-        log_w = np.log(stay * np.exp(log_w) + (1.0 - stay) / len(STRENGTHS))
+        p_stay = np.exp(-dt / SWITCH_INTERVAL_S)
+        log_w = np.log(p_stay * np.exp(log_w) + (1.0 - p_stay) / len(STRENGTHS))
         for k, bank in enumerate(banks):
             for kf, value in zip(bank, y, strict=True):
                 q = Q_continuous_white_noise(2, dt, (STRENGTHS[k] * scale)**2)
@@ -40,15 +40,15 @@ def test_densities_equal_those_of_plain_filters():
     rng = np.random.default_rng(0)
     series = np.cumsum(rng.standard_normal((25, 3)), axis=0)
     series[7, 1] = series[11] = np.nan
-    ours = GaussMarkovVectors(1, np.full(3, 0.5), 2.0)
+    vectors = GaussMarkovVectors(1, np.full(3, 0.5), 2.0)
     densities = []
     for y in series:
         is_present = np.isfinite(y)
-        densities.append(ours.log_density(
+        densities.append(vectors.log_density(
             np.zeros(is_present.sum(), dtype=np.int64), np.eye(3)[is_present], y[is_present],
             np.full(is_present.sum(), 0.04), 0.1))
-    theirs = by_plain_filters(series, 0.04, 0.1, 0.5, 2.0)
-    assert densities == pytest.approx(theirs, rel=1e-9)
+    expected = by_plain_filters(series, 0.04, 0.1, 0.5, 2.0)
+    assert densities == pytest.approx(expected, rel=1e-9)
 
 
 def test_vectors_are_independent_and_measured_in_any_orientation():
@@ -70,22 +70,23 @@ def test_vectors_are_independent_and_measured_in_any_orientation():
 
 
 @pytest.mark.parametrize('strength', [0.1, 10.0, 1000.0])
-def test_density_of_its_own_model_is_near_that_of_the_true_filter(strength):
+def test_density_of_data_from_the_model_is_near_that_of_the_true_filter(strength):
     rng = np.random.default_rng(2)
     dt, n = 0.08, 400
     rate = np.cumsum(strength * np.sqrt(dt) * rng.standard_normal(n))
     y = np.cumsum(rate) * dt + rng.standard_normal(n)
     bank, true_filter = GaussMarkovVectors(1, np.ones(1), 1.0), plain_filter(strength**2, 1.0)
-    ours = theirs = 0.0
+    log_density = true_log_density = 0.0
     for value in y:
-        ours += bank.log_density(np.zeros(1, dtype=np.int64), np.ones((1, 1)), np.array([value]),
-                                 np.ones(1), dt)
+        log_density += bank.log_density(np.zeros(1, dtype=np.int64), np.ones((1, 1)),
+                                        np.array([value]), np.ones(1), dt)
         true_filter.predict(F=np.array([[1.0, dt], [0.0, 1.0]]),
                             Q=Q_continuous_white_noise(2, dt, strength**2))
         true_filter.update(value, R=1.0)
-        theirs += true_filter.log_likelihood
-    # The unknown strength costs its initial weight and at most log(1/stay) per frame.
-    assert theirs - n * dt / SWITCH_S - np.log(len(STRENGTHS)) < ours < theirs + 10.0
+        true_log_density += true_filter.log_likelihood
+    # The unknown strength costs its initial weight and at most log(1/p_stay) per frame.
+    assert true_log_density - n * dt / SWITCH_INTERVAL_S - np.log(len(STRENGTHS)) \
+        < log_density < true_log_density + 10.0
 
 
 @pytest.mark.parametrize('gap, noise', [(3600.0, 4e-9), (86400.0, 1e-10), (10.0, 1e-12)])
@@ -99,10 +100,10 @@ def test_densities_stay_finite_over_long_gaps_and_with_little_noise(gap, noise):
         assert np.isfinite(density)
     # The bank still follows the signal: a repeated value has a high density.
     y = np.full(3, 1e-6)
-    known = [bank.log_density(np.zeros(3, dtype=np.int64), np.eye(3), value, np.full(3, noise**2),
-                              0.08) for value in (y, y, y + 1e3 * noise)]
+    densities = [bank.log_density(np.zeros(3, dtype=np.int64), np.eye(3), value,
+                                  np.full(3, noise**2), 0.08) for value in (y, y, y + 1e3 * noise)]
     # A strength larger by a factor of 1000 costs log(1000) per axis.
-    assert known[2] < known[1] - 15.0
+    assert densities[2] < densities[1] - 15.0
 
 
 def test_components_of_zero_strength_are_constant():
@@ -117,8 +118,8 @@ def test_components_of_zero_strength_are_constant():
         kf.P = np.diag([4.0, (0.5 * strength)**2, 4.0])
         filters.append(kf)
     for y in np.cumsum(rng.standard_normal((25, 2)), axis=0):
-        stay = np.exp(-0.1 / SWITCH_S)
-        log_w = np.log(stay * np.exp(log_w) + (1.0 - stay) / len(STRENGTHS))
+        p_stay = np.exp(-0.1 / SWITCH_INTERVAL_S)
+        log_w = np.log(p_stay * np.exp(log_w) + (1.0 - p_stay) / len(STRENGTHS))
         for k, kf in enumerate(filters):
             Q = np.zeros((3, 3))
             Q[:2, :2] = Q_continuous_white_noise(2, 0.1, (0.5 * STRENGTHS[k])**2)

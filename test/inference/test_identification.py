@@ -19,7 +19,7 @@ HARD, SOFT = SCALE * np.array([-0.47, 0.29, -0.56]), 1.22
 
 
 def distances(between_std, monkeypatch):
-    """Squared Mahalanobis distance of each published pass from a prediction by the others."""
+    """Squared Mahalanobis distances of the published passes, each predicted from all others."""
     monkeypatch.setattr('mag_tracking.inference.identification.PASS_TO_PASS_STD', between_std)
     out = []
     for k in range(len(TABLE)):
@@ -31,13 +31,13 @@ def distances(between_std, monkeypatch):
 
 
 def test_published_passes_are_consistent_with_the_spread_between_passes(monkeypatch):
-    """Leave-one-out test of T10 Table 6.9; the published standard deviations are too small."""
+    """T10 Table 6.9, leave-one-out: without the spread, the published covariances are too small."""
     low, high = chi2.ppf([0.005, 0.995], 3 * len(TABLE)) / len(TABLE)
     assert low < distances(PASS_TO_PASS_STD, monkeypatch).mean() < high
     assert distances(1e-6, monkeypatch).mean() > high
 
 
-def test_a_pass_at_a_heading_not_enrolled_is_identified():
+def test_a_pass_at_another_heading_than_enrolled_is_identified():
     """T10 Table 6.9; the vehicle is enrolled without the passes at the tested heading."""
     for heading in np.unique(HEADINGS):
         rest = heading != HEADINGS
@@ -59,7 +59,7 @@ def rotated_hard_iron(degrees):
 
 
 @pytest.mark.parametrize('degrees', [60, 90, 120, 180])
-def test_two_cars_of_equal_size_are_distinguished(degrees):
+def test_two_cars_with_moments_of_equal_magnitude_are_distinguished(degrees):
     """As in T10 Fig. 7.1, cars enrolled at two headings are identified at any heading."""
     rng, C = np.random.default_rng(degrees), np.diag([8.0, 8.0, 15.0])**2
     spread = np.linalg.cholesky(C + PASS_TO_PASS_STD**2 * np.eye(3))
@@ -73,33 +73,34 @@ def test_two_cars_of_equal_size_are_distinguished(degrees):
              for name, hard in cars.items()]
     # The 90 % ellipses of the horizontal moment do not touch at the headings of the figure.
     for heading in enrolled_at:
-        (one, P), (other, Q) = (v.moment_at(heading, 0.0, INDUCTION) for v in fleet)
-        e = (one - other)[:2]
-        reach = [np.sqrt(chi2.ppf(0.9, 2) * e @ S[:2, :2] @ e) / np.linalg.norm(e) for S in (P, Q)]
-        assert sum(reach) < np.linalg.norm(e)
-    right = [identify(fleet, m, C, heading, 0.02, INDUCTION).name == name
+        (mean, P), (other_mean, Q) = (v.moment_at(heading, 0.0, INDUCTION) for v in fleet)
+        e = (mean - other_mean)[:2]
+        radii = [np.sqrt(chi2.ppf(0.9, 2) * e @ S[:2, :2] @ e) / np.linalg.norm(e) for S in (P, Q)]
+        assert sum(radii) < np.linalg.norm(e)
+    is_correct = [identify(fleet, m, C, heading, 0.02, INDUCTION).name == name
              for name, hard in cars.items() for heading in np.deg2rad([90.0, 270.0, 20.0, 200.0])
              for m in passes(hard, [heading] * 10)]
     # One pass in a hundred exceeds the threshold of `unknown`.
-    assert np.mean(right) > 0.99 - 3.0 * np.sqrt(0.01 * 0.99 / len(right))
+    assert np.mean(is_correct) > 0.99 - 3.0 * np.sqrt(0.01 * 0.99 / len(is_correct))
 
 
-def test_a_vehicle_enrolled_at_one_heading_is_compared_there_only():
+def test_a_vehicle_enrolled_at_one_heading_is_compared_only_at_this_heading():
     C = np.tile(np.diag([10.0] * 3)**2, (2, 1, 1))
     headings = np.deg2rad([88.0, 92.0])
-    one = enrol('van', np.array([moment_at(HARD, h) for h in headings]), C, headings, INDUCTION)
-    assert one.iron is None
-    found = identify([one], moment_at(HARD, np.pi / 2), C[0], np.pi / 2, 0.02, INDUCTION)
+    vehicle = enrol('van', np.array([moment_at(HARD, h) for h in headings]), C, headings, INDUCTION)
+    assert vehicle.iron is None
+    found = identify([vehicle], moment_at(HARD, np.pi / 2), C[0], np.pi / 2, 0.02, INDUCTION)
     assert found.name == 'van' and found.probabilities == {'van': 1.0}
-    found = identify([one], moment_at(HARD, 0.0), C[0], 0.0, 0.02, INDUCTION)
+    found = identify([vehicle], moment_at(HARD, 0.0), C[0], 0.0, 0.02, INDUCTION)
     assert found.name == UNKNOWN and found.not_compared == ('van',)
 
 
 def test_a_vehicle_not_enrolled_is_unknown():
     C = np.tile(np.diag([10.0] * 3)**2, (4, 1, 1))
     headings = np.deg2rad([0.0, 90.0, 180.0, 270.0])
-    one = enrol('van', np.array([moment_at(HARD, h) for h in headings]), C, headings, INDUCTION)
-    found = identify([one], moment_at(2.0 * rotated_hard_iron(90), 0.3), C[0], 0.3, 0.02, INDUCTION)
+    vehicle = enrol('van', np.array([moment_at(HARD, h) for h in headings]), C, headings, INDUCTION)
+    found = identify([vehicle], moment_at(2.0 * rotated_hard_iron(90), 0.3), C[0], 0.3, 0.02,
+                     INDUCTION)
     assert found.name == UNKNOWN and found.distances['van'] > 11.3
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from mag_tracking.inference.innovation_consistency import (
-    FALSE_ALARM,
+    FALSE_ALARM_PROBABILITY,
     WINDOW_S,
     InnovationConsistency,
 )
@@ -28,8 +28,8 @@ def test_consistent_filters_fail_at_the_nominal_rate():
     # The network and, at half the probability each, the two sensors are tested: the total rate is
     # 1e-3 to 2e-3, within four standard deviations of the binomial distribution.
     for failed in (sum(r.fails for r in runs), sum(r.excess > 1.0 for r in runs)):
-        assert FALSE_ALARM * n - 4 * np.sqrt(n * FALSE_ALARM) < failed \
-            < 2 * FALSE_ALARM * n + 4 * np.sqrt(2 * n * FALSE_ALARM)
+        assert FALSE_ALARM_PROBABILITY * n - 4 * np.sqrt(n * FALSE_ALARM_PROBABILITY) < failed \
+            < 2 * FALSE_ALARM_PROBABILITY * n + 4 * np.sqrt(2 * n * FALSE_ALARM_PROBABILITY)
 
 
 def test_innovations_twice_as_large_as_expected_are_detected_and_quantified():

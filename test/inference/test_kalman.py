@@ -17,14 +17,18 @@ from support.samples import one, simulate
 
 
 def dense_update(x, P, y, h, H, C, inflation, x_lin, n_own=0):
-    """Oracle: the stacked textbook update of one hypothesis."""
+    """Textbook update of one hypothesis with all sensors stacked (oracle).
+
+    Returns the mean, the covariance, the log-likelihood, the NIS, and the whitened Jacobian,
+    innovation and innovation covariance.
+    """
     n_sensors, n_t = len(H), H.shape[2] - n_own
     full = np.zeros((3 * n_sensors, len(x)))
     full[:, -3 * n_sensors:] = np.eye(3 * n_sensors)
     for j in range(n_sensors):
-        own = n_t + n_own * j
+        first_own = n_t + n_own * j
         full[3 * j:3 * j + 3, :n_t] = H[j, :, :n_t]
-        full[3 * j:3 * j + 3, own:own + n_own] = H[j, :, n_t:]
+        full[3 * j:3 * j + 3, first_own:first_own + n_own] = H[j, :, n_t:]
     R = np.zeros((3 * n_sensors, 3 * n_sensors))
     for j in range(n_sensors):
         R[3 * j:3 * j + 3, 3 * j:3 * j + 3] = C[j] + inflation[j] * np.eye(3)
@@ -83,21 +87,21 @@ def compare(n_sensors, missing=False, shift=0.0):
     x_lin = x + shift * np.sqrt(np.einsum('nii->ni', P))
     new_x, new_P = x.copy(), P.copy()
     log_likelihood, nis, _ = plain_kalman.update(new_x, new_P, y, h, H, C, inflation, x_lin)
-    worst = np.zeros(4)
+    largest = np.zeros(4)
     for p in range(len(x)):
-        ox, oP, oll, onis, (A, z, _) = dense_update(x[p], P[p], y, h[p], H[p], C, inflation[p],
-                                                    x_lin[p])
-        sd = np.sqrt(np.diagonal(oP))
-        worst[0] = max(worst[0], np.abs((new_x[p] - ox) / sd).max())
-        worst[1] = max(worst[1], np.abs((new_P[p] - oP) / np.outer(sd, sd)).max())
-        assert abs(log_likelihood[p] - oll) <= 1e-8 * max(1.0, abs(oll))
-        assert abs(nis[p].sum() - onis) <= 1e-8 * max(1.0, onis)
+        expected_x, expected_P, expected_ll, expected_nis, (A, z, _) = dense_update(
+            x[p], P[p], y, h[p], H[p], C, inflation[p], x_lin[p])
+        sd = np.sqrt(np.diagonal(expected_P))
+        largest[0] = max(largest[0], np.abs((new_x[p] - expected_x) / sd).max())
+        largest[1] = max(largest[1], np.abs((new_P[p] - expected_P) / np.outer(sd, sd)).max())
+        assert abs(log_likelihood[p] - expected_ll) <= 1e-8 * max(1.0, abs(expected_ll))
+        assert abs(nis[p].sum() - expected_nis) <= 1e-8 * max(1.0, expected_nis)
         ekf = ExtendedKalmanFilter(len(x[p]), len(z))
         ekf.x, ekf.P, ekf.R = x[p].copy(), P[p].copy(), np.eye(len(z))
         ekf.update(z, lambda _, A=A: A, lambda _, z=z: np.zeros_like(z))
-        worst[2] = max(worst[2], np.abs((new_x[p] - ekf.x) / sd).max())
-        worst[3] = max(worst[3], np.abs((new_P[p] - ekf.P) / np.outer(sd, sd)).max())
-    return worst
+        largest[2] = max(largest[2], np.abs((new_x[p] - ekf.x) / sd).max())
+        largest[3] = max(largest[3], np.abs((new_P[p] - ekf.P) / np.outer(sd, sd)).max())
+    return largest
 
 
 @pytest.mark.parametrize('n_sensors', studied([2, 8, 32], [2, 8]))
@@ -116,7 +120,7 @@ def test_update_with_missing_axes_and_sensors():
 @pytest.mark.parametrize('n_own', [0, 2, 3])
 @pytest.mark.parametrize('n_t', [0, 3, 5, 7, 12])
 def test_update_of_values_near_one_with_any_axes_missing(n_t, n_own):
-    """In tesla, an axis with large noise could not be distinguished from an excluded axis."""
+    """Values near one reveal a missing axis that is not excluded; values in tesla would not."""
     rng = np.random.default_rng(n_t)
     n_sensors = 8
     n_x = n_t + (n_own + 3) * n_sensors
@@ -135,11 +139,12 @@ def test_update_of_values_near_one_with_any_axes_missing(n_t, n_own):
     new_x, new_P = x.copy(), P.copy()
     log_likelihood, nis, _ = plain_kalman.update(new_x, new_P, y, h, H, C, inflation, x_lin, n_own)
     filled = np.where(np.isnan(C), np.eye(3), C)
-    ox, oP, oll, onis, _ = dense_update(x[0], P[0], y, h[0], H[0], filled, inflation[0], x_lin[0],
-                                        n_own)
-    np.testing.assert_allclose(new_x[0], ox, atol=1e-9)
-    np.testing.assert_allclose(new_P[0], oP, atol=1e-9)
-    np.testing.assert_allclose([log_likelihood[0], nis[0].sum()], [oll, onis], rtol=1e-9)
+    expected_x, expected_P, expected_ll, expected_nis, _ = dense_update(
+        x[0], P[0], y, h[0], H[0], filled, inflation[0], x_lin[0], n_own)
+    np.testing.assert_allclose(new_x[0], expected_x, atol=1e-9)
+    np.testing.assert_allclose(new_P[0], expected_P, atol=1e-9)
+    np.testing.assert_allclose([log_likelihood[0], nis[0].sum()], [expected_ll, expected_nis],
+                               rtol=1e-9)
 
 
 def test_update_linearised_away_from_the_mean():
@@ -147,7 +152,7 @@ def test_update_linearised_away_from_the_mean():
 
 
 def test_nees_of_a_linear_gaussian_case_is_chi_square():
-    """With a linear model, true prior and true noise, the mean NEES lies in its 95 % band."""
+    """With a linear model, true prior and true noise, the mean NEES is within its 95 % interval."""
     rng = np.random.default_rng(11)
     runs, steps, n_t, n_sensors, dt = 400, 12, 6, 2, 0.1
     n_x = n_t + 3 * n_sensors

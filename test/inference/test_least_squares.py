@@ -52,8 +52,8 @@ class SineModel:
 
     def derivative(self, theta, p):
         a = theta[:, :1] * self.t
-        by_f = self.t * (np.cos(a) * p[:, :1] - np.sin(a) * p[:, 1:])
-        return np.stack([by_f, np.zeros_like(by_f)], axis=2)
+        derivative = self.t * (np.cos(a) * p[:, :1] - np.sin(a) * p[:, 1:])
+        return np.stack([derivative, np.zeros_like(derivative)], axis=2)
 
 
 def sinusoid(prior):
@@ -61,8 +61,8 @@ def sinusoid(prior):
     return SeparableProblem(SineModel(), y, prior=prior)
 
 
-def test_a_prior_counts_like_a_measurement():
-    """Oracle: maximum a posteriori estimate by scipy, with all unknowns at once."""
+def test_a_prior_has_the_weight_of_a_measurement():
+    """The estimate equals the maximum a posteriori estimate by scipy for all unknowns jointly."""
     mean, std = np.array([2.4, 0.7]), np.array([0.05, 0.2])
     problem, y = sinusoid((mean, std)), np.sin(2.0 * SineModel.t) + 0.3 * np.random.default_rng(
         1).standard_normal(40)
@@ -73,20 +73,20 @@ def test_a_prior_counts_like_a_measurement():
         return np.concatenate([y - a * np.sin(f * SineModel.t) - b * np.cos(f * SineModel.t),
                                (mean - [f, phase]) / std])
 
-    peer = least_squares(residual, [2.4, 0.7, 1.0, 0.0], xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    np.testing.assert_allclose(x[0], peer.x[:2], rtol=1e-5)
-    assert converged[0] and np.isclose(cost[0], 2.0 * peer.cost)
+    expected = least_squares(residual, [2.4, 0.7, 1.0, 0.0], xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    np.testing.assert_allclose(x[0], expected.x[:2], rtol=1e-5)
+    assert converged[0] and np.isclose(cost[0], 2.0 * expected.cost)
     np.testing.assert_allclose(problem.cost(x), cost)
     # A parameter that is not measured retains its prior.
     assert np.isclose(x[0, 1], 0.7) and np.isclose(P[0, 1, 1], 0.2**2)
-    covariance = np.linalg.inv(peer.jac.T @ peer.jac)
+    covariance = np.linalg.inv(expected.jac.T @ expected.jac)
     np.testing.assert_allclose(P[0, 0, 0], covariance[0, 0], rtol=1e-4)
 
 
 def test_a_prior_of_infinite_std_has_no_effect():
-    alone, known = sinusoid(None), sinusoid((np.array([9.0, 9.0]), np.full(2, np.inf)))
+    without_prior, with_prior = sinusoid(None), sinusoid((np.array([9.0, 9.0]), np.full(2, np.inf)))
     theta = np.array([[2.1, 0.0], [1.7, 3.0]])
-    np.testing.assert_array_equal(alone.cost(theta), known.cost(theta))
-    for a, b in zip(alone.residual_and_jacobian(theta), known.residual_and_jacobian(theta),
-                    strict=True):
+    np.testing.assert_array_equal(without_prior.cost(theta), with_prior.cost(theta))
+    for a, b in zip(without_prior.residual_and_jacobian(theta),
+                    with_prior.residual_and_jacobian(theta), strict=True):
         np.testing.assert_array_equal(a, b)

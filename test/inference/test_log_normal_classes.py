@@ -48,18 +48,18 @@ def test_a_vehicle_that_fits_no_class_is_unknown():
 
 
 def test_posteriors_are_calibrated():
-    """For vehicles from the assumed distributions, probabilities equal the success rates."""
+    """Probabilities agree with success rates for vehicles from the assumed distributions."""
     rng, s = np.random.default_rng(0), SETTINGS
-    stated, right = [], []
+    stated, is_correct = [], []
     for _ in range(4000):
         k = rng.choice(3, p=np.array(s.class_shares) / sum(s.class_shares))
         size = s.class_moments[k] * np.exp(s.class_moment_spreads[k] * rng.standard_normal())
         length = s.class_lengths[k] * np.exp(s.class_length_spreads[k] * rng.standard_normal())
         found = posterior(size, length if rng.random() < 0.5 else 0.0)
         stated.append(found.probabilities.max())
-        right.append(int(np.argmax(found.probabilities)) == k)
-    stated, right = np.array(stated), np.array(right)
+        is_correct.append(int(np.argmax(found.probabilities)) == k)
+    stated, is_correct = np.array(stated), np.array(is_correct)
     for low, high in ((0.33, 0.7), (0.7, 0.9), (0.9, 0.99), (0.99, 1.01)):
         in_range = (low <= stated) & (stated < high)
-        allowed = 3.0 * np.sqrt(0.25 / max(in_range.sum(), 1))
-        assert abs(stated[in_range].mean() - right[in_range].mean()) < allowed
+        tolerance = 3.0 * np.sqrt(0.25 / max(in_range.sum(), 1))
+        assert abs(stated[in_range].mean() - is_correct[in_range].mean()) < tolerance

@@ -34,7 +34,7 @@ def within_binomial(hits, n, p):
 
 
 def pulse(n, rate, rng=None):
-    """Two axes of a smooth signal [T], or of a random signal if `rng` is given."""
+    """Signal (n, 2) [T]: smooth, or random if `rng` is given."""
     t = np.arange(n) / rate
     if rng is not None:
         return 1e-9 * rng.standard_normal((n, 2))
@@ -96,7 +96,7 @@ def test_a_long_smooth_signal_gives_the_deflection_of_the_integral():
 
 def test_sampling_rate_has_no_effect_on_a_band_limited_signal():
     """MITRE12 eq. (B.11) has a misprint: with the plain DFT, d would grow with the rate."""
-    def at(rate):
+    def deflection_at(rate):
         t = np.arange(round(0.5 * rate)) / rate
         B = 1e-9 * np.stack([np.cos(8 * np.pi * t) + 0.5 * np.sin(20 * np.pi * t + 0.3),
                              np.sin(12 * np.pi * t)], axis=-1)
@@ -106,7 +106,7 @@ def test_sampling_rate_has_no_effect_on_a_band_limited_signal():
     S = mitre(np.array([4.0, 10.0, 6.0]))
     expected = 1e-9 * np.sqrt(np.sum(np.array([1.0, 0.25, 1.0]) / 4.0 / S))
     for rate in (22.0, 44.0, 90.0, 1000.0):
-        assert at(rate) == pytest.approx(expected, rel=1e-10)
+        assert deflection_at(rate) == pytest.approx(expected, rel=1e-10)
 
 
 def test_band_includes_its_edges_and_excludes_other_frequencies():
@@ -123,7 +123,7 @@ def test_band_includes_its_edges_and_excludes_other_frequencies():
             deflection(tone[:, :2], 22.0, mitre, band), rel=1e-6)
 
 
-def test_axes_add_up_and_missing_axes_are_ignored():
+def test_squared_deflections_of_axes_add_and_missing_axes_are_ignored():
     B = np.random.default_rng(2).standard_normal((4, 3, 11, 2)) * 1e-9
     d = deflection(B, 22.0, mitre, (3.0, 11.0))
     assert d.shape == (4, 3)
@@ -138,7 +138,7 @@ def test_axes_add_up_and_missing_axes_are_ignored():
     assert any_detection_probability([np.nan, np.nan]) == 0.0
 
 
-def test_detection_probability_has_its_fixed_points_and_increases():
+def test_detection_probability_has_known_values_and_increases():
     p_fa = np.array([1e-12, 1e-6, 0.01, 0.5])
     np.testing.assert_allclose(detection_probability(0.0, p_fa), p_fa, rtol=1e-9)
     np.testing.assert_allclose(detection_probability(norm.isf(p_fa), p_fa), 0.5, rtol=1e-12)

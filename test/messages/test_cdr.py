@@ -21,7 +21,7 @@ RANGES = {'bool': (0, 1), 'byte': (0, 255), **{
 
 
 def random_value(kind, package, rng):
-    """Random value of a type as named in a message definition of `package`."""
+    """Random value of the type `kind`, as named in a message definition of `package`."""
     if kind == 'string':
         return TEXTS[rng.integers(len(TEXTS))]
     if kind.startswith('float'):
@@ -68,7 +68,7 @@ def test_encoded_bytes_equal_those_of_mcap_ros2(name):
     assert [encoder(name)(message) for message in messages] == encoded_by_mcap_ros2(name, messages)
 
 
-def test_missing_fields_have_their_defaults():
+def test_missing_fields_have_the_defaults_of_the_definition():
     empty = decode(RawMessage('/markers', MARKER, 0, encoder(MARKER)({'pose': None}),
                               schema_of(MARKER)))
     orientation = empty.pose.orientation
@@ -100,7 +100,7 @@ def test_values_of_a_wrong_type_or_range_are_refused(name, message, error):
 def test_an_error_names_the_field():
     with pytest.raises(ValueError, match='^header: stamp: sec: beyond .*: 2147483648$'):
         encoder('geometry_msgs/msg/PoseStamped')({'header': {'stamp': {'sec': 2**31}}})
-    with pytest.raises(ValueError, match='^covariance: 35 elements, not 36$'):
+    with pytest.raises(ValueError, match='^covariance: expected 36 elements, got 35$'):
         encoder('geometry_msgs/msg/PoseWithCovariance')({'covariance': [0.0] * 35})
 
 

@@ -1,4 +1,4 @@
-"""Readings of several sensors in one message: conversion in both directions, and recordings."""
+"""FieldReadings messages: conversion to and from `Readings`, and recordings."""
 
 from array import array
 from collections import Counter
@@ -29,7 +29,10 @@ def message(content):
 
 
 def random_samples(n, known, rng, names=('mag_2', 'mag_1', 'sensor three')):
-    """`n` samples; some lack axes. Asymmetric covariances would reveal a transposition."""
+    """Create `n` samples, some with missing axes.
+
+    The covariances are asymmetric, so that a transposition would be detected.
+    """
     out = []
     for k in range(n):
         field = rng.standard_normal(3) * 1e-5
@@ -75,10 +78,11 @@ def test_arrays_follow_the_message_definition():
     assert content['field'] == array('d', [1, 2, 3, 0.5, 1.5, 2.5, 4, 5, 6])
     assert content['covariance'].tolist() == [
         1, 0, 0, 0, 2, 0, 0, 0, 3, *range(9), 1, 0, 0, 0, 1, 0, 0, 0, 1]
-    whole = [MagSample(7, 'b', np.ones(3), np.eye(3, dtype=int))]
-    assert readings_dict(batch(whole))['covariance'].tolist() == np.eye(3).ravel().tolist()
-    single = [MagSample(7, 'b', np.ones(3, dtype=np.float32), np.eye(3, dtype=np.float32))]
-    assert identical(samples_of(readings_of(message(readings_dict(batch(single))))),
+    integer = [MagSample(7, 'b', np.ones(3), np.eye(3, dtype=int))]
+    assert readings_dict(batch(integer))['covariance'].tolist() == np.eye(3).ravel().tolist()
+    single_precision = [MagSample(7, 'b', np.ones(3, dtype=np.float32),
+                                  np.eye(3, dtype=np.float32))]
+    assert identical(samples_of(readings_of(message(readings_dict(batch(single_precision))))),
                      [MagSample(7, 'b', np.ones(3), np.eye(3))])
 
 

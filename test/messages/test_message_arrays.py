@@ -1,4 +1,4 @@
-"""Messages decoded into arrays, compared with the decoder of single messages."""
+"""Vectorised decoding of messages, compared with the decoder of single messages."""
 
 import struct
 
@@ -68,13 +68,13 @@ def test_unknown_and_nan_covariances_are_distinguished():
     lambda m: m[:16] + b'\xff' + m[17:], lambda m: m[:21] + b'x' + m[22:]])
 def test_damaged_or_unusual_messages_are_left_to_the_decoder(damage):
     data = [message(k) for k in range(5)]
-    good = read(data)
+    undamaged = read(data)
     data[2] = damage(data[2])
     found = read(data)
     assert found.is_decoded.tolist() == [True, True, False, True, True]
     others = found.is_decoded
-    np.testing.assert_array_equal(found.field[others], good.field[others])
-    np.testing.assert_array_equal(found.stamp_ns[others], good.stamp_ns[others])
+    np.testing.assert_array_equal(found.field[others], undamaged.field[others])
+    np.testing.assert_array_equal(found.stamp_ns[others], undamaged.stamp_ns[others])
 
 
 def test_no_messages_give_empty_arrays():
@@ -110,7 +110,7 @@ def poses_of(messages, frame='map'):
 
 @pytest.mark.parametrize('frame', ['map', '', 'a much longer name', 'möp'])
 def test_poses_of_a_frame_equal_the_decoded_messages(frame):
-    """The name of another frame may have the same length."""
+    """Only poses in the frame are decoded, even if another frame name has the same length."""
     frames = ['map', 'utm', '', 'a', 'a much longer name', 'möp', 'odom']
     data = [pose_message(k, frames[k % len(frames)]) for k in range(28)]
     found = poses_of(data, frame)

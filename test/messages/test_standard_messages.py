@@ -44,7 +44,7 @@ def tracks():
     return found
 
 
-def test_sensor_transforms_equal_the_network():
+def test_sensor_transforms_equal_the_poses_in_the_network():
     network = line_network(4)
     messages = sensor_transform_dicts(network, 7)
     assert tuple(m['child_frame_id'] for m in messages) == network.names
@@ -78,11 +78,11 @@ def test_a_detection_has_the_probability_of_each_kind(tracks):
         pose = pose_message_dict(track, 'map')['pose']
         assert all(r['pose'] == pose for r in detection['results'])
     without_uncertainty = dataclasses.replace(track, topic_uncertainty=None)
-    for gone in (without_uncertainty, dataclasses.replace(track, ended=True)):
-        assert detections_3d_dict(gone, 'map')['detections'] == []
+    for unpublished in (without_uncertainty, dataclasses.replace(track, ended=True)):
+        assert detections_3d_dict(unpublished, 'map')['detections'] == []
 
 
-def test_a_magnet_has_a_class():
+def test_a_detection_of_a_magnet_has_the_class_magnet():
     from mag_tracking.pipeline import settings_for
     from mag_tracking.stages.track.manager import TrackManager
     network, frames, _ = magnet_frames(3)
@@ -97,8 +97,9 @@ def test_markers_have_a_namespace_per_kind_and_an_id_per_track(tracks):
     markers = track_markers(track, 'map')['markers']
     assert tuple(m['ns'] for m in markers) == TRACK_NAMESPACES
     assert all(m['id'] == 7 and m['lifetime'] == {'sec': LIFETIME_S} for m in markers)
-    gone = delete_markers(track, 'map')['markers']
-    assert [(m['ns'], m['id'], m['action']) for m in gone] == [(k, 7, 2) for k in TRACK_NAMESPACES]
+    deletions = delete_markers(track, 'map')['markers']
+    assert [(m['ns'], m['id'], m['action']) for m in deletions] \
+        == [(k, 7, 2) for k in TRACK_NAMESPACES]
     label = markers[2]['text']
     assert label.startswith(f'7 {track.kind} ') and label.endswith(' m/s')
     assert track_markers(tracks[True], 'map')['markers'][2]['text'].endswith(' m/s?')
@@ -111,8 +112,8 @@ def test_the_ellipsoid_matches_the_covariance_of_pose_topics(tracks):
         published = track.topic_uncertainty.covariance[:3, :3]
         np.testing.assert_allclose(
             sorted(scale.values()), 2 * 2.5003 * np.sqrt(np.linalg.eigvalsh(published)), rtol=1e-9)
-        own = 2 * 2.5003 * np.sqrt(np.linalg.eigvalsh(track.covariance[:3, :3])[-1])
-        assert (max(scale.values()) > 1.001 * own) <= ambiguous
+        track_diameter = 2 * 2.5003 * np.sqrt(np.linalg.eigvalsh(track.covariance[:3, :3])[-1])
+        assert (max(scale.values()) > 1.001 * track_diameter) <= ambiguous
 
 
 def test_sensor_markers_are_at_the_sensor_positions():

@@ -29,7 +29,7 @@ def page(vehicle_replays, road_network, tmp_path_factory):
 
 
 def show_pose(page, log, k):
-    """Move the slider to pose `k`."""
+    """Move the slider of the page to pose `k` of the log."""
     page.move_slider((log.stamp_ns[k] - log.stamp_ns[0]) / 1e9)
 
 
@@ -103,6 +103,6 @@ def test_measured_and_predicted_fields_match_the_track_log(page, log):
 
 
 def test_weights_of_all_arrivals_sum_to_one(page, log):
-    """For each pose, the log contains the total weight of every arrival."""
+    """For each pose, the log contains the weights of all arrivals."""
     total = [sum(weight for weight, *_ in row.values()) for row in log.arrivals]
     np.testing.assert_allclose(total, 1.0, atol=1e-9)

@@ -16,13 +16,13 @@ from support.browser import needs_browser
 from support.live_records import feed, poses
 
 MAX_DELAY_MS = 200.0
-"""Maximum median delay from the timestamp of a pose to its drawing."""
+"""[ms] Maximum median delay from the timestamp of a pose to the drawing of the pose."""
 SECOND_NS = 1_000_000_000
 
 
 @needs_browser
 def test_the_page_shows_all_tracked_poses(chromium, scene, server, records):
-    """Half of the poses are published before the page is opened."""
+    """Poses published before and after the page is opened are shown."""
     half = len(records) // 2
     feed(scene, records[:half])
     page = Opened(chromium, server.url)
@@ -102,33 +102,33 @@ def test_the_page_reconnects_after_a_restart_of_the_server(chromium, road_networ
 
 @needs_browser
 def test_markup_in_health_notes_is_shown_literally(chromium, scene, server):
-    evil = '<img src=x onerror="window.broken = true">'
-    scene.set_health([Note(ERROR, evil)], [])
+    markup = '<img src=x onerror="window.broken = true">'
+    scene.set_health([Note(ERROR, markup)], [])
     page = Opened(chromium, server.url)
     page.wait('document.getElementById("notes").children.length')
-    assert page.value('document.getElementById("notes").textContent') == evil
+    assert page.value('document.getElementById("notes").textContent') == markup
     assert page.value('window.broken === undefined')
     page.page.close()
 
 
 @needs_browser
 def test_a_target_that_stays_for_hours_needs_bounded_memory(chromium, scene, server, records):
-    """The bound applies to the browser, and to the server with and without viewers."""
+    """The memory of the browser is bounded, and so is the memory of the server without viewers."""
     template = [r for r in records if isinstance(r, FieldFrame)][-1]
     pose, stamp = poses(records)[30], template.stamp_ns
 
-    def stay(n):
+    def publish_poses(n):
         nonlocal stamp
         for _ in range(n):
             stamp += SECOND_NS // 10
             scene.add_frame(replace(template, stamp_ns=stamp))
             scene.add_track(replace(pose, stamp_ns=stamp))
 
-    stay(8_500)
+    publish_poses(8_500)
     page = Opened(chromium, server.url)
     page.wait('magTracking.connected && magTracking.scene?.tracks.length')
     for _ in range(2):
-        stay(1_000)
+        publish_poses(1_000)
         page.wait(f'magTracking.scene.latestNs === "{stamp}"')
         assert page.value('magTracking.scene.tracks[0].columns.t.length') <= 8_000
     last = page.value('(t => t[t.length - 1])(magTracking.scene.tracks[0].columns.t)')
@@ -139,6 +139,6 @@ def test_a_target_that_stays_for_hours_needs_bounded_memory(chromium, scene, ser
         ...Object.values(track.arrivals).flatMap(Object.values)].map(v => v.length))
         (magTracking.scene.tracks[0])""")
     assert len(set(lengths)) == 1
-    assert sum(len(message) for message in scene.whole()) < 10_000_000
+    assert sum(len(message) for message in scene.snapshot()) < 10_000_000
     assert page.complaints == []
     page.page.close()

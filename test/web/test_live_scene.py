@@ -13,7 +13,7 @@ from support.live_records import NS, feed, later, poses
 
 
 class Viewer:
-    """State of a page, built from messages; `tracks` is {key: times of the poses}."""
+    """State of a page that receives messages; `tracks` is {key: times of the poses [s]}."""
 
     def __init__(self):
         self.tracks, self.ended, self.scenes = {}, set(), 0
@@ -32,17 +32,17 @@ class Viewer:
 
 def follow(scene, records):
     """Create a viewer that receives frequent updates from the start."""
-    viewer = Viewer().receive(scene.news())
+    viewer = Viewer().receive(scene.updates())
     for k in range(0, len(records), 7):
         feed(scene, records[k:k + 7])
-        viewer.receive(scene.news())
+        viewer.receive(scene.updates())
     # The first message after the first record is the scene; rows follow it.
-    return viewer.receive(scene.news())
+    return viewer.receive(scene.updates())
 
 
 def test_early_and_late_viewers_have_the_same_tracks(scene, records):
     viewer = follow(scene, records)
-    late = Viewer().receive(scene.whole())
+    late = Viewer().receive(scene.snapshot())
     assert late.tracks == viewer.tracks and late.ended == viewer.ended == {1}
     assert len(viewer.tracks[1]) == len(poses(records))
     assert all(np.diff(viewer.tracks[1]) > 0.0)
@@ -51,20 +51,20 @@ def test_early_and_late_viewers_have_the_same_tracks(scene, records):
 @pytest.mark.parametrize('seconds', [40.0, 4000.0])
 def test_track_1_of_a_restarted_tracker_is_a_new_track(scene, records, seconds):
     viewer = follow(scene, records)
-    viewer.receive(scene.news())
+    viewer.receive(scene.updates())
     for part in (later(records, seconds),):
         feed(scene, part)
-        viewer.receive(scene.news())
+        viewer.receive(scene.updates())
     assert len(viewer.tracks) == 2
     assert [len(times) for times in viewer.tracks.values()] == [len(poses(records))] * 2
     assert viewer.scenes <= 2
 
 
 def test_a_track_after_a_killed_tracker_is_a_new_track(scene, records):
-    """The first track has no closing record; the next track begins minutes later."""
+    """Track 1 has no closing record; another track 1 begins minutes later."""
     viewer = follow(scene, records[:-1])
     feed(scene, later(records, 300.0))
-    viewer.receive(scene.news())
+    viewer.receive(scene.updates())
     assert len(viewer.tracks) == 2
 
 
@@ -75,21 +75,21 @@ def test_a_late_record_of_a_track_does_not_clear_the_page(scene, records):
     scene.add_frame(replace(last, stamp_ns=last.stamp_ns + 8 * NS))
     scenes = viewer.scenes
     scene.add_track(replace(poses(records)[-1], ended=True))
-    viewer.receive(scene.news())
+    viewer.receive(scene.updates())
     assert viewer.scenes == scenes and viewer.ended == {1}
 
 
 def test_a_looped_bag_clears_the_page(scene, records):
     viewer = follow(scene, records)
     scenes = viewer.scenes
-    viewer.receive(feed_and_get_news(scene, records[:60]))
+    viewer.receive(updates_after(scene, records[:60]))
     assert viewer.scenes == scenes + 1
     assert sum(map(len, viewer.tracks.values())) == len(poses(records[:60]))
 
 
-def feed_and_get_news(scene, records):
+def updates_after(scene, records):
     feed(scene, records)
-    return [*scene.news(), *scene.news()]
+    return [*scene.updates(), *scene.updates()]
 
 
 def test_old_tracks_and_excess_poses_are_removed(scene, records):
@@ -103,11 +103,11 @@ def test_old_tracks_and_excess_poses_are_removed(scene, records):
         scene.add_smoothed(track_id, np.zeros((400, 3)))
         scene.add_frame(replace(template, stamp_ns=stamp))
     late = Viewer()
-    scene.news()
-    rows = scene.news()
-    late.receive([*scene.whole()])
-    kept = sum(map(len, late.tracks.values()))
-    assert kept <= MAX_POSES
+    scene.updates()
+    rows = scene.updates()
+    late.receive([*scene.snapshot()])
+    n_kept = sum(map(len, late.tracks.values()))
+    assert n_kept <= MAX_POSES
     first = min(times[-1] for times in late.tracks.values())
     last = max(times[-1] for times in late.tracks.values())
     assert last - first <= HISTORY_S
@@ -118,7 +118,7 @@ def test_old_tracks_and_excess_poses_are_removed(scene, records):
 def test_nan_values_give_valid_json(scene, records):
     feed(scene, [replace(r, moment=np.full(3, np.nan), nis=np.nan)
                  if not isinstance(r, FieldFrame) else r for r in records])
-    messages = [*scene.news(), *scene.whole()]
+    messages = [*scene.updates(), *scene.snapshot()]
     assert messages
 
     def refuse(text):
@@ -129,7 +129,7 @@ def test_nan_values_give_valid_json(scene, records):
 
 
 def test_fields_are_those_of_the_sensors_near_the_target(records, road_network):
-    """A target moves along a road from the first sensors to the last."""
+    """Fields of eight sensors are sent while a target moves from the first sensor to the last."""
     n = 20
 
     class Road:
@@ -150,7 +150,7 @@ def test_fields_are_those_of_the_sensors_near_the_target(records, road_network):
         scene.add_frame(frame)
         scene.add_track(replace(pose, stamp_ns=frame.stamp_ns, predicted=field,
                                 nis_by_sensor=np.zeros(n)))
-        for message in map(json.loads, scene.news()):
+        for message in map(json.loads, scene.updates()):
             sent += [{f['sensor'] for f in t['fields']} for t in message.get('tracks', ())]
     assert {0, 1} <= sent[1] and {18, 19} <= sent[-1]
     assert {len(sensors) for sensors in sent} == {8}

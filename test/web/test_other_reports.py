@@ -31,7 +31,7 @@ def open_page(chromium, path):
 
 
 def check_and_close(page, path):
-    """Check that the page logged no error and loaded no other file; close the page."""
+    """Check that the page logged no error and loaded no other file, and close the page."""
     assert page.complaints == []
     assert page.requests == [path.as_uri()]
     page.page.close()
@@ -100,14 +100,14 @@ def test_the_doctor_report_shows_its_findings(chromium, tmp_path, capsys):
 
 
 def test_a_plan_report_keeps_the_digits_of_large_coordinates(chromium, tmp_path):
-    """UTM coordinates have seven digits before the decimal point."""
+    """UTM coordinates, with seven digits before the decimal point, keep their resolution."""
     network = yaml.safe_load(NETWORK_FILE.read_text())
     for sensor in network['sensors'].values():
         sensor['position'][0] += 6_500_000.0
-    far = tmp_path / 'far.yaml'
-    far.write_text(yaml.safe_dump(network))
+    network_file = tmp_path / 'far.yaml'
+    network_file.write_text(yaml.safe_dump(network))
     assert main(['plan', '--target', 'car', '--grid', '15', '--out', str(tmp_path),
-                 '--network', str(far)]) == 0
+                 '--network', str(network_file)]) == 0
     path = tmp_path / 'report.html'
     page = open_page(chromium, path)
     x = page.value('document.querySelector("#charts .plot").data.find(d => d.type === "heatmap").x')

@@ -19,7 +19,7 @@ from support.live_records import feed, poses
 
 
 def messages_until(url, until, seconds=60.0):
-    """Messages that a viewer receives until `until(message)` is true."""
+    """Messages received by a viewer up to the first message for which `until(message)` is true."""
     out = []
     with connect(url.replace('http', 'ws') + 'stream', max_size=None) as viewer:
         end = time.monotonic() + seconds
@@ -31,9 +31,9 @@ def messages_until(url, until, seconds=60.0):
 def test_ten_viewers_get_all_poses_although_another_disconnects(scene, server, records):
     urls = [server.url.replace('http', 'ws') + 'stream'] * 10
     viewers = [connect(url, max_size=None) for url in urls]
-    quitter = connect(urls[0], max_size=None)
+    disconnected = connect(urls[0], max_size=None)
     feed(scene, records[:len(records) // 2])
-    quitter.socket.close()
+    disconnected.socket.close()
     feed(scene, records[len(records) // 2:])
     expected = [p.stamp_ns for p in poses(records)]
     for viewer in viewers:
@@ -46,7 +46,7 @@ def test_ten_viewers_get_all_poses_although_another_disconnects(scene, server, r
         viewer.close()
 
 
-def test_a_slow_viewer_gets_the_whole_scene_later(scene, server, records, monkeypatch):
+def test_a_slow_viewer_gets_the_complete_scene_later(scene, server, records, monkeypatch):
     """The buffer is bounded, other viewers are served, and the slow viewer gets all poses."""
     # On a busy machine, the viewer of this test may read late.
     monkeypatch.setattr('mag_tracking.web.page_server.LAG_TIMEOUT_S', 600.0)
@@ -63,7 +63,7 @@ def reading_viewer(server):
 
 
 def read_until(raw, pattern, n=1, seconds=120.0):
-    """Read until a pattern has occurred `n` times; return how often it occurred."""
+    """Read until a pattern has occurred at least `n` times; return the number of occurrences."""
     found, rest = 0, b''
     raw.settimeout(seconds)
     while found < n:
@@ -121,18 +121,18 @@ def test_a_viewer_that_never_reads_is_disconnected(scene, records, monkeypatch):
 
 
 def test_a_scene_larger_than_the_buffer_is_followed_by_rows(scene, server, records):
-    """A new viewer of a long session first receives megabytes, which must not be sent twice."""
+    """A new viewer of a long session receives the complete scene, several megabytes, only once."""
     with reading_viewer(server) as quick:
         stamp = publish(scene, records, records[-1].stamp_ns, 7_900)
         while f'"latest_ns": "{stamp}"' not in quick.recv(60.0):
             pass
     with unreading_viewer(server) as slow:
-        received, due = b'', time.monotonic()
+        received, next_read = b'', time.monotonic()
         slow.settimeout(60.0)
         while b'"type": "rows"' not in received[-300_000:]:
             # The viewer reads so slowly that the server sees a full buffer.
-            due += 0.02
-            time.sleep(max(0.0, due - time.monotonic()))
+            next_read += 0.02
+            time.sleep(max(0.0, next_read - time.monotonic()))
             part = slow.recv(100_000)
             assert part
             received += part
@@ -158,10 +158,10 @@ def test_the_number_of_viewers_is_limited(scene, monkeypatch):
 
 def test_an_error_of_the_scene_is_reported_and_does_not_stop_the_server(caplog):
     class Broken:
-        def whole(self):
+        def snapshot(self):
             return ['{"type": "health", "notes": [], "tables": []}']
 
-        def news(self):
+        def updates(self):
             raise ValueError('broken')
 
     with PageServer(Broken(), port=0) as server:
@@ -207,7 +207,7 @@ def status_of(url, **headers):
 
 
 def test_without_a_token_only_local_requests_are_served(server):
-    """A foreign page may resolve its host name to this server, or open the socket in a script."""
+    """Requests with another host name or origin, such as those of a foreign page, are refused."""
     assert 'token' not in server.url
     assert status_of(server.url) == 200
     assert status_of(server.url + 'etc/passwd') == 404

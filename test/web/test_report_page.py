@@ -19,7 +19,7 @@ pytestmark = needs_browser
 
 RECORDING = 'junction_left_turns_to_rear'
 MAX_MB = 10.0
-EVIL = '</script><script>window.broken = true</script><b>left</b>'
+MARKUP = '</script><script>window.broken = true</script><b>left</b>'
 
 
 @pytest.fixture(scope='module')
@@ -33,7 +33,7 @@ def report(vehicle_replays, road_network):
 
 @pytest.fixture(scope='module')
 def shared_page(chromium, report):
-    """Page that is shared by several tests; each test moves the slider as required."""
+    """Page shared by several tests; each test must set the slider."""
     page = Opened(chromium, report[0].as_uri())
     page.wait('magTracking.drawn > 0')
     yield page
@@ -77,7 +77,7 @@ def test_fields_weights_and_innovations_match_the_run(shared_page, vehicle_repla
     np.testing.assert_allclose(columns(shared_page, 'nis').astype(float), per_axis, rtol=1e-6)
 
 
-def test_the_slider_moves_map_curves_and_text_together(shared_page, report):
+def test_the_slider_updates_map_curves_and_text(shared_page, report):
     t = columns(shared_page, 't')
     for k in (0, len(t) // 2, len(t) - 1):
         shared_page.move_slider(t[k])
@@ -111,7 +111,7 @@ def test_the_page_loads_no_other_file_and_logs_no_error(shared_page, report):
     assert report[0].stat().st_size < MAX_MB * 1e6
 
 
-def test_the_page_fits_the_width_of_a_telephone(chromium, report):
+def test_the_page_fits_the_width_of_a_phone(chromium, report):
     page = Opened(chromium, report[0].as_uri(), viewport={'width': 360, 'height': 740},
                   is_mobile=True, has_touch=True)
     page.wait('magTracking.drawn > 0')
@@ -127,9 +127,9 @@ def test_the_table_selects_each_track(chromium, vehicle_replays, road_network, t
     """The second track is a later copy of the first track at another position."""
     run, _ = vehicle_replays[RECORDING]
     later = second_track(run.logs[1])
-    both = type(run)({**run.summary, 'tracks': [*run.summary['tracks'], {
+    two_tracks = type(run)({**run.summary, 'tracks': [*run.summary['tracks'], {
         **run.summary['tracks'][0], 'id': 2}]}, {1: run.logs[1], 2: later}, run.smoothed, run.truth)
-    page = Opened(chromium, write_report(both, road_network, tmp_path).as_uri())
+    page = Opened(chromium, write_report(two_tracks, road_network, tmp_path).as_uri())
     page.wait('magTracking.drawn > 0')
     for track_id, log in ((2, later), (1, run.logs[1])):
         page.page.click(f'#tracks button:text-is("{track_id}")')
@@ -144,7 +144,7 @@ def test_the_table_selects_each_track(chromium, vehicle_replays, road_network, t
 
 
 def second_track(log):
-    """A copy of a log, one minute later and displaced."""
+    """Copy of a log with id 2, one minute later and displaced by (1.0, 0.5, 0.0) m."""
     from copy import deepcopy
 
     later = deepcopy(log)
@@ -155,19 +155,19 @@ def second_track(log):
 
 
 def test_markup_in_names_is_shown_literally(chromium, road_network, tmp_path):
-    """The user chooses the names of arrivals and files."""
+    """Names of arrivals and files, which users choose, are not interpreted as HTML."""
     settings = settings_for('vehicle', QUICK | {
-        'track.vehicle.arrival_names': [EVIL, 'right', 'rear']})
+        'track.vehicle.arrival_names': [MARKUP, 'right', 'rear']})
     recording = Recording(vehicle_path('straight_small_left'))
     run = replay(recording, road_network, settings, tmp_path)
-    run.summary['recording'] = EVIL
+    run.summary['recording'] = MARKUP
     page = Opened(chromium, write_report(run, road_network, tmp_path).as_uri())
     page.wait('magTracking.drawn > 0')
     page.move_slider(0.0)
     assert page.value('window.broken === undefined')
-    assert EVIL in page.value('document.getElementById("title").textContent')
+    assert MARKUP in page.value('document.getElementById("title").textContent')
     assert page.value('document.querySelectorAll("b, .plot b").length') == 0
-    assert EVIL in page.value('document.getElementById("weights").textContent')
+    assert MARKUP in page.value('document.getElementById("weights").textContent')
     assert page.complaints == []
     page.page.close()
 
@@ -190,7 +190,7 @@ def test_notes_tables_and_missing_values_are_shown(chromium, tmp_path):
 
 def test_a_report_of_very_many_poses_is_thinned_with_a_note(vehicle_replays, road_network,
                                                             tmp_path):
-    """A day of traffic has thousands of tracks, and the page must still open."""
+    """A report of 600 tracks stays below `MAX_MB`."""
     run, _ = vehicle_replays[RECORDING]
     n = 600
     logs = {}
