@@ -142,8 +142,8 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
                       'noise_std in the network file')
     if background.n_relearnt > n_reported:
         n_times = occurrences(background.n_relearnt - n_reported)
-        yield Finding(False, name, f'its background was relearnt {n_times} after a lasting change of '
-                      'the field', 'check for a parked vehicle or an object near it; '
+        yield Finding(False, name, f'its background was relearnt {n_times} after a lasting change '
+                      'of the field', 'check for a parked vehicle or an object near it; '
                       'calibrate.relearn_s: 0 disables relearning')
     if last is not None and frozen_since_ns is not None \
             and (last - frozen_since_ns) / NS > MAX_FROZEN_S:
