@@ -24,8 +24,8 @@ NO_STEADY_PATH = 'no_steady_path'
 ANOTHER_VEHICLE = 'another_vehicle'
 
 PERMANENT = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
-"""Doubts that persist until the end of a track, because they show that its path is distorted. Other
-implausible states may be corrected by later frames."""
+"""Doubts that persist until the end of a track, because they show that its path is distorted. Later
+frames may correct the causes of other doubts."""
 
 MEANINGS = {
     ANOTHER_PLACE: 'another position is still possible',

@@ -119,8 +119,8 @@ def _distinct_optima(settings: MagnetSettings, network: SensorNetwork, start: Fl
                      y: FloatArray, std: FloatArray, is_present: BoolArray
                      ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """States, covariances and costs of the distinct optima after refinement; may be empty."""
-    identity = np.zeros((len(start), 1, 3, 6))
-    dr_dx, dm_dx = identity.copy(), identity.copy()
+    zero = np.zeros((len(start), 1, 3, 6))
+    dr_dx, dm_dx = zero.copy(), zero.copy()
     dr_dx[:, 0, :, :3] = np.eye(3)
     dm_dx[:, 0, :, 3:] = np.eye(3)
 

@@ -85,7 +85,7 @@ class TrackManager:
         n_uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
                           for s in network.orientation_std)
         if n_uncertain:
-            self.counts['sensors whose orientation is hardly known'] = n_uncertain
+            self.counts['sensors with an orientation uncertainty above 15 degrees'] = n_uncertain
 
     def use_network(self, network: SensorNetwork) -> None:
         """Apply another calibration of the same sensors as soon as no track is running.
@@ -222,7 +222,7 @@ class TrackManager:
         return self.end_tracks('gap in the frames') if dt > self._settings.end_gap_s else []
 
     def _end_all(self, reason: str, stamp_ns: int | None) -> list[TrackRecord]:
-        """End every running track and the current disturbance, and return their records."""
+        """End all tracks and the current disturbance, and return their closing records."""
         tracks, self._tracks = self._tracks, []
         out = [record for track in tracks for record in track.end(reason)]
         if stamp_ns is None:
@@ -230,7 +230,7 @@ class TrackManager:
         return [*out, *self._unexplained(tracks, stamp_ns), *self._disturbances.end(stamp_ns)]
 
     def _unexplained(self, tracks: list[RunningTrack], stamp_ns: int) -> list[TrackRecord]:
-        """Start disturbances for the unexplained fields of `tracks`, and return their records."""
+        """Start or extend a disturbance by the unexplained fields of `tracks`; return records."""
         out: list[TrackRecord] = []
         for found in (found for track in tracks for found in track.unexplained):
             self.counts[DISTURBANCE_TRACKS] += 1

@@ -123,7 +123,7 @@ class NewTargetSearch:
                    key=lambda joint: joint.log_odds, default=None)
 
     def _all_starts(self, known: KnownVehicleHypothesis) -> list[WindowStart]:
-        """Starts of all explanations that are based on one hypothesis of the track."""
+        """Starts of the explanations that are derived from one hypothesis of the track."""
         starts = self._starts_beside(known) if self._may_add and self._is_improbable else []
         for i in range(self._n_targets):
             others = self._remove_vehicle(known, i)
@@ -135,7 +135,10 @@ class NewTargetSearch:
 
     def _best_of(self, starts: Sequence[WindowStart], track_evidence: float
                  ) -> JointExplanation | None:
-        """Refine starts and join them; `track_evidence` is the log-evidence of the track."""
+        """Refine starts and join them; None if none is usable.
+
+        `track_evidence` is the log-evidence of the track.
+        """
         refined = self._add_turning_starts(self._refine_starts(starts))
         prior = LOG_P_ARRIVAL if len(refined[0].kind) > self._n_targets else LOG_P_LOST
         bank, log_likelihood, log_w, paths = self._run_starts(refined)
@@ -195,7 +198,7 @@ class NewTargetSearch:
             self._filter, i, known.path[-1], self._window.frames[-1]) > DETECTABLE_ENERGY
 
     def _is_elsewhere(self, joint: JointExplanation) -> bool:
-        """Whether the vehicle that was searched for again was found far from its track."""
+        """Whether the relocated vehicle is more than `MIN_DISPLACEMENT_M` from its track."""
         n, now = self._n_one, self._bank.x[self._bank.best()]
         assert joint.replaced is not None
         found = joint.bank.x[joint.bank.best()]
@@ -208,8 +211,8 @@ class NewTargetSearch:
         n = self._n_one
         if self._n_targets == 1:
             sensor_P = self._sensors_at_start()
-            nowhere = np.zeros((len(self._search.times), len(sensor_P)))
-            return KnownVehicleHypothesis(nowhere[0], sensor_P, nowhere, (), (), 0.0, None)
+            sensor_path = np.zeros((len(self._search.times), len(sensor_P)))
+            return KnownVehicleHypothesis(sensor_path[0], sensor_P, sensor_path, (), (), 0.0, None)
         rows = np.delete(np.arange(known.path.shape[1]), np.arange(i * n, (i + 1) * n))
         return KnownVehicleHypothesis(
             known.x[rows], known.P[np.ix_(rows, rows)], known.path[:, rows],
@@ -329,12 +332,12 @@ class NewTargetSearch:
         now = FilterBank(bank.x[rows], bank.P[rows], log_w[rows] - log_sum_exp(log_w[rows]),
                          anchor.label.copy(), anchor.kind.copy(), np.arange(n), bank.nis[rows])
         n_frames = len(self._window.frames)
-        each = log_likelihood[rows] / n_frames
+        per_frame = log_likelihood[rows] / n_frames
         window = Window(anchor, self._window.is_updated, self._window.frames,
                         self._window.intervals,
                         [np.ascontiguousarray(paths[rows, k]) for k in range(n_frames)],
-                        [each.copy() for _ in range(n_frames)], float(log_sum_exp(log_w[rows])),
-                        self._window.max_hypotheses)
+                        [per_frame.copy() for _ in range(n_frames)],
+                        float(log_sum_exp(log_w[rows])), self._window.max_hypotheses)
         n_targets = len(starts[0].kind)
         return JointExplanation(now, window, self._filter_of(n_targets), log_odds,
                                 starts[0].replaced, n_targets > self._n_targets)

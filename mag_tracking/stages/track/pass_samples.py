@@ -20,13 +20,14 @@ MODEL_ERROR = 0.04
 """Error of the field of a row of dipoles, relative to the field; treated as noise."""
 
 NEAR_ERROR_LENGTH = 0.2
-"""[m] Near a sensor, the relative error is at least this length divided by the distance."""
+"""[m] Minimum product of relative field error and distance to the sensor, in samples that include the
+model error near the sensors."""
 
 MAX_SENSORS = 4
 """Maximum number of sensors in a fit. The sensors with the strongest fields are used."""
 
 N_STEPS, TOLERANCE = 30, 1e-3
-"""Maximum number of steps, and the relative improvement of the cost below which the search ends."""
+"""Maximum number of steps of a fit, and relative improvement of the cost below which it ends."""
 
 
 @dataclass(frozen=True)
@@ -148,9 +149,9 @@ class PassSamples:
         path : (10 + n_clocks,) array
             Path and clock offsets.
         cost : float
-            Sum of squared whitened residuals.
+            Sum of squared whitened residuals; infinite if no start is valid.
         P : (n_free, n_free) array
-            Covariance of the free parameters.
+            Covariance of the free parameters; zero for parameters that are not observable.
         """
         model = SteadyPass(self.t, self.positions, self.M, self.clock, free,
                            np.zeros(N_PATH + self.n_clocks), n_dipoles)

@@ -74,9 +74,9 @@ class Window:
     intervals: list[float]
     """[s] Time from the previous frame to each frame."""
     paths: list[FloatArray]
-    """(n_hyp, n_x) States at each frame at which the hypotheses of the anchor are linearised."""
+    """For each frame, states (n_hyp, n_x) at which the hypotheses of the anchor are linearised."""
     log_likelihoods: list[FloatArray]
-    """(n_hyp,) Log-likelihoods of each frame in the filter; -inf for dropped hypotheses."""
+    """For each frame, log-likelihoods (n_hyp,) in the filter; -inf for dropped hypotheses."""
     evidence: float
     """Log-evidence, in the filter, of the frames with which the anchor has not been updated."""
     max_hypotheses: int
@@ -149,6 +149,7 @@ class Relinearisation:
         predicted : (n_hyp, n_x) array
             States at which the frame was first linearised.
         log_likelihood : (n_hyp,) array
+            Log-likelihood of the frame for each hypothesis.
         evidence : float
             Log-density of the frame over all hypotheses.
         frame : FieldFrame
@@ -289,7 +290,7 @@ class Relinearisation:
         return self._gain.get(origin, 0.0)
 
     def _leading_rows(self, bank: FilterBank) -> IntArray:
-        """Indices of the heaviest hypotheses, up to the maximum number."""
+        """Indices of the heaviest hypotheses within `MAX_LOG_RATIO`, up to the maximum number."""
         n_affordable = MAX_ELEMENTS // (len(self._frames) * bank.x.shape[1]**2)
         order = np.argsort(-bank.log_w, kind='stable')
         leading: IntArray = order[bank.log_w[order] >= bank.log_w.max() - MAX_LOG_RATIO]
@@ -327,7 +328,7 @@ class Relinearisation:
 
 
 def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
-    """Replace the states `rows` of the bank in place, and the covariances where `P` is larger."""
+    """Replace the states of hypotheses `rows` in place, and smaller covariances by `P`."""
     bank_variance, path_variance = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P))
     bank.x[rows] = x
     bank.P[rows[path_variance > bank_variance]] = P[path_variance > bank_variance]
@@ -335,9 +336,10 @@ def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArr
 
 def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
                        nearly_linear: Callable[[FloatArray], FloatArray]) -> None:
-    """Adopt the larger covariances of paths, in place, widened by the difference of the states.
+    """Replace the covariances of hypotheses `rows` in place where `P` is larger.
 
-    A covariance is not adopted if it is too large for the next linear update.
+    The new covariance includes the difference between `x` and the state of the bank. It is not
+    adopted if it is too large for the next linear update.
     """
     difference = x - bank.x[rows]
     wide_P = P + difference[:, :, None] * difference[:, None]

@@ -105,7 +105,7 @@ class PathPrior:
                    MIN_SPEED_RATIO * min(vehicle.speeds))
 
     def nearest_line(self, theta: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Arrival line that is nearest in heading.
+        """Arrival line whose heading is nearest to the heading of each path.
 
         Parameters
         ----------
@@ -137,17 +137,17 @@ class PathPrior:
         J : (n, 7, 7) array
             Jacobian of the prediction.
         """
-        line, turned = self.nearest_line(theta)
-        aside = np.stack([-np.sin(self.headings), np.cos(self.headings)], axis=1)[line]
+        line, relative_heading = self.nearest_line(theta)
+        normals = np.stack([-np.sin(self.headings), np.cos(self.headings)], axis=1)[line]
         relative = theta.copy()
-        relative[:, 1] = np.einsum('ni,ni->n', theta[:, :2] - self.centre, aside)
-        relative[:, 4] = turned
+        relative[:, 1] = np.einsum('ni,ni->n', theta[:, :2] - self.centre, normals)
+        relative[:, 4] = relative_heading
         J = np.tile(np.diag(1.0 / self.std), (len(theta), 1, 1))
-        J[:, 1, :2] = aside / self.std[1]
+        J[:, 1, :2] = normals / self.std[1]
         return (self.mean - relative) / self.std, J
 
     def starts(self, vehicle: VehicleSettings, network: SensorNetwork) -> FloatArray:
-        """Grid of start paths; at time zero the vehicles are anywhere along the arrival lines.
+        """Grid of start paths; their positions at time zero cover the arrival lines.
 
         Parameters
         ----------
@@ -199,7 +199,7 @@ class StartGrid:
     bases : (3 n_samples, 3 n) array
         Whitened fields of unit moments: three columns for each path.
     gram : (n, 3, 3) array
-        A'A of the columns A of each path.
+        Gram matrix A'A of the three columns A of each path.
     prior_cost : (n,) array
         Squared normalised difference of each path from the mean of the prior.
     """
@@ -246,7 +246,7 @@ class SteadySearch:
         return self._marginal_whitener(self.samples.y - self.known)
 
     def _solve(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Basis (n, y, 9 m), information (n, 9 m, 9 m), its inverse, and estimate of moments.
+        """Basis (n, y, 9 m), information (n, 9 m, 9 m), its inverse, and moments (n, 9 m).
 
         The inverse is NaN or meaningless for a path through a sensor.
         """
@@ -334,13 +334,13 @@ class SteadySearch:
         are_moving = (path[:, SPEED_COLUMN::N_STRAIGHT] >= self.prior.min_speed).all(axis=1)
         return path, np.where(are_moving & self._are_detectable(path), cost, np.inf)
 
-    def best(self, grid: StartGrid, most: int) -> FloatArray:
+    def best(self, grid: StartGrid, max_paths: int) -> FloatArray:
         """Search for the paths of a single vehicle that explain the frames best.
 
         Parameters
         ----------
         grid : StartGrid
-        most : int
+        max_paths : int
             Maximum number of paths.
 
         Returns
@@ -350,7 +350,7 @@ class SteadySearch:
         """
         path, cost = self.refined(
             _best_distinct(grid.theta, self.cost(grid), START_TOLERANCE, N_STARTS))
-        return _best_distinct(path, cost, PATH_TOLERANCE, most)
+        return _best_distinct(path, cost, PATH_TOLERANCE, max_paths)
 
     def moments(self, theta: FloatArray) -> FloatArray:
         """Estimate the moments of the rows of dipoles on given paths.
@@ -386,15 +386,15 @@ class SteadySearch:
             self.columns, self._model.basis(path[None])[0] * self.prior.moment_std,
             self._model.derivative(path[None], p)[0] * FIRST_PATH_STD]))
 
-    def pairs(self, grid: StartGrid, most: int, most_second: int) -> list[FloatArray]:
+    def pairs(self, grid: StartGrid, max_paths: int, max_second: int) -> list[FloatArray]:
         """Search for the pairs of paths that explain the frames best.
 
         Parameters
         ----------
         grid : StartGrid
-        most : int
+        max_paths : int
             Maximum number of first paths.
-        most_second : int
+        max_second : int
             Maximum number of second paths for each first path.
 
         Returns
@@ -402,8 +402,8 @@ class SteadySearch:
         list of (2, 7) array
             The best pair first.
         """
-        starts = [np.append(first, second) for first in self.best(grid, most)
-                  for second in self.beside(first).best(grid, most_second)]
+        starts = [np.append(first, second) for first in self.best(grid, max_paths)
+                  for second in self.beside(first).best(grid, max_second)]
         pairs, cost = self.refined(np.array(starts).reshape(-1, 2 * N_STRAIGHT))
         cost = cost + self._log_determinant_of_moments(pairs)
         is_usable = np.isfinite(cost)

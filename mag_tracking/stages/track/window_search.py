@@ -1,4 +1,4 @@
-"""Samples of a window for the search for vehicles, given the fields of known vehicles."""
+"""Samples of a window, prepared for searches for vehicles in addition to known vehicles."""
 
 from functools import cached_property
 
@@ -90,7 +90,7 @@ class WindowSearch:
         """Fields (n, n_sensors, 3, q) due to errors of known vehicles, at one standard deviation.
 
         `H` (n, n_sensors, 3, n_t) are the derivatives along a path that ends with the state `x`
-        (n_x,), at times `t` (n,) [s] before its end.
+        (n_x,), at times `t` (n,) [s] relative to its end.
         """
         out = []
         for first in range(0, H.shape[-1], n_one):

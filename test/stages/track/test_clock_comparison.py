@@ -27,7 +27,7 @@ def comparison_of(passes, rows=FIRST_TWO, n_sensors=2):
 def test_consistent_passes_identify_the_clock_that_is_ahead():
     clocks = comparison_of([rigid_pass_of(0.1)] * 4)
     largest = clocks.largest_offset
-    assert (largest.sensor, largest.against, largest.n_passes) == (1, 0, 4)
+    assert (largest.sensor, largest.reference, largest.n_passes) == (1, 0, 4)
     assert clocks.largest_offset.offset_s == pytest.approx(0.1, rel=1e-6)
     assert clocks.largest_offset_s(FIRST_TWO) == pytest.approx(0.1, rel=1e-6)
     text = clocks.largest_offset.text(('left', 'right'))
@@ -46,7 +46,7 @@ def test_the_wrong_clock_of_several_is_identified(offset, message):
         rigid_pass = rigid_pass_of(np.delete(true - true[reference], reference),
                                    reference=reference)
         clocks = comparison_of([rigid_pass] * 3, np.arange(4), 4)
-        assert clocks.largest_offset.sensor == 2 and clocks.largest_offset.against is None
+        assert clocks.largest_offset.sensor == 2 and clocks.largest_offset.reference is None
         assert clocks.largest_offset.offset_s == pytest.approx(offset, abs=0.01)
         assert message in clocks.largest_offset.text('abcd')
         assert clocks.largest_offset_s(np.arange(4)) == pytest.approx(0.2, abs=0.01)

@@ -51,9 +51,9 @@ def test_a_filter_that_overfits_is_flagged_for_the_duration_of_the_window():
     evidence = TrackEvidence(2)
     is_doubtful = []
     for t, loss in ((0.0, -9.0), (1.0, 0.9), (1.1, 1.1), (3.0, 0.0), (3.2, -9.0)):
-        is_doubtful.append(evidence.doubts_filter(-loss * OVERFIT_NATS, round(t * NS), 2.0))
+        is_doubtful.append(evidence.update_filter_doubt(-loss * OVERFIT_NATS, round(t * NS), 2.0))
         reasons = {doubts.OVERFIT} if is_doubtful[-1] else {doubts.ANOTHER_PLACE}
-        evidence.note(reasons, round(t * NS))
+        evidence.update_doubts(reasons, round(t * NS))
     assert is_doubtful == [False, False, True, True, False]
     # The doubt applies to single poses, not to the whole track.
     assert not evidence.is_doubtful
@@ -70,12 +70,12 @@ def test_a_contradiction_flags_a_track_of_two_sensors_but_not_of_three(nis, is_d
     assert evidence.is_doubtful == is_doubtful
 
 
-@pytest.mark.parametrize('nis, is_coming, reason', [
+@pytest.mark.parametrize('nis, is_approaching, reason', [
     (6.0, False, 'out of reach'), (6.0, True, None), (1e4, False, LOST)])
-def test_an_approaching_vehicle_is_not_out_of_reach(nis, is_coming, reason):
+def test_an_approaching_vehicle_is_not_out_of_reach(nis, is_approaching, reason):
     evidence = TrackEvidence(2)
-    assert evidence.reason_to_end(pose(), 2.0, is_coming, SETTINGS) is None
-    assert evidence.reason_to_end(pose(nis), 7.0, is_coming, SETTINGS) == reason
+    assert evidence.reason_to_end(pose(), 2.0, is_approaching, SETTINGS) is None
+    assert evidence.reason_to_end(pose(nis), 7.0, is_approaching, SETTINGS) == reason
 
 
 def bank_of(places, weights, std=0.5, lengths=3.0):
@@ -131,8 +131,8 @@ def test_a_field_is_sensed_by_the_sensor_that_measures_it_and_noise_by_none():
 
 def test_smoothed_poses_keep_doubts_about_misfits_but_not_about_arrivals():
     evidence = TrackEvidence(2)
-    evidence.note({doubts.ANOTHER_ARRIVAL}, 1)
-    evidence.note({doubts.DISTURBANCE_MODEL, doubts.ANOTHER_PLACE}, 2)
+    evidence.update_doubts({doubts.ANOTHER_ARRIVAL}, 1)
+    evidence.update_doubts({doubts.DISTURBANCE_MODEL, doubts.ANOTHER_PLACE}, 2)
     assert [evidence.was_filter_doubtful(k) for k in (1, 2)] == [False, True]
 
 
@@ -184,13 +184,13 @@ def test_published_doubts_are_ordered_and_have_meanings():
 def test_a_transient_doubt_persists_for_a_tenth_of_a_second():
     """Poses that are unambiguous for only one frame are wrong more often than others."""
     evidence = TrackEvidence(2)
-    assert evidence.note({doubts.HEIGHT, doubts.ANOTHER_PLACE}, NS) == \
+    assert evidence.update_doubts({doubts.HEIGHT, doubts.ANOTHER_PLACE}, NS) == \
         {doubts.HEIGHT, doubts.ANOTHER_PLACE}
     # Doubts that the bank can resolve from one frame to the next do not persist.
-    assert evidence.note(set(), NS + round(0.08 * NS)) == {doubts.HEIGHT}
-    assert evidence.note({doubts.OVERFIT}, NS + round(0.16 * NS)) == {doubts.OVERFIT}
-    assert evidence.note(set(), NS + round(0.24 * NS)) == {doubts.OVERFIT}
-    assert evidence.note(set(), NS + round(0.32 * NS)) == set()
+    assert evidence.update_doubts(set(), NS + round(0.08 * NS)) == {doubts.HEIGHT}
+    assert evidence.update_doubts({doubts.OVERFIT}, NS + round(0.16 * NS)) == {doubts.OVERFIT}
+    assert evidence.update_doubts(set(), NS + round(0.24 * NS)) == {doubts.OVERFIT}
+    assert evidence.update_doubts(set(), NS + round(0.32 * NS)) == set()
     # Smoothed poses are doubtful only at the time at which the doubt was found.
     assert not evidence.was_filter_doubtful(NS + round(0.32 * NS))
     assert evidence.was_filter_doubtful(NS + round(0.16 * NS))
@@ -200,8 +200,8 @@ def test_a_doubt_with_a_past_start_flags_earlier_smoothed_poses():
     """A long vehicle that is tracked as two vehicles has wrong poses before the error is found."""
     evidence = TrackEvidence(2)
     evidence.flag_interval(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0, since_ns=3 * NS)
-    assert doubts.ANOTHER_VEHICLE in evidence.note(set(), 7 * NS)
-    assert doubts.ANOTHER_VEHICLE not in evidence.note(set(), 9 * NS)
+    assert doubts.ANOTHER_VEHICLE in evidence.update_doubts(set(), 7 * NS)
+    assert doubts.ANOTHER_VEHICLE not in evidence.update_doubts(set(), 9 * NS)
     assert [evidence.was_filter_doubtful(t * NS) for t in (2, 3, 5, 7, 9)] == [
         False, True, True, True, False]
     # Without a past start, no smoothed pose is doubtful.

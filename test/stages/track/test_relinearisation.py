@@ -317,10 +317,10 @@ def test_relinearisation_converges_to_a_batch_fit(turns):
 @pytest.mark.parametrize('turns', [False, True])
 def test_the_smoother_converges_to_a_batch_fit(turns):
     filter_, bank_of, y, expected = deterministic_target(24, turns)
-    states, left_out = smoothed_track(filter_, bank_of(1), frames_of(y),
+    states, n_excluded = smoothed_track(filter_, bank_of(1), frames_of(y),
                                       [0.0] + [PERIOD] * (len(y) - 1), relinearisations=9)
     x, P = states[-1]
-    assert not left_out
+    assert not n_excluded
     assert np.abs((x - expected) / np.sqrt(np.diagonal(P))).max() < 1e-2
 
 
