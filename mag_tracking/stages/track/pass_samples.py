@@ -20,8 +20,8 @@ MODEL_ERROR = 0.04
 """Error of the field of a row of dipoles, relative to the field; treated as noise."""
 
 NEAR_ERROR_LENGTH = 0.2
-"""[m] Minimum product of relative field error and distance to the sensor, in samples that include the
-model error near the sensors."""
+"""[m] Minimum product of the relative field error and the distance to the sensor, in samples that
+include the model error near the sensors."""
 
 MAX_SENSORS = 4
 """Maximum number of sensors in a fit. The sensors with the strongest fields are used."""

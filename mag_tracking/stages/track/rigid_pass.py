@@ -233,8 +233,8 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     short = _RowFits(_state_at_zero(straight), cost, bent_cost, data.n_free(N_SHORT) - N_PATH)
     long = _fit_long_row(data, straight, path, short.misfit > GOOD_MISFIT)
     misfit = short.misfit if short.misfit <= GOOD_MISFIT else min(short.misfit, long.misfit)
-    straight_paths = [f.straight for f in (short, long) if f.needs_no_bend
-                      and _is_of_vehicle(f.straight, data.positions)]
+    straight_paths = [f.straight_state for f in (short, long) if f.needs_no_bend
+                      and _is_of_vehicle(f.straight_state, data.positions)]
     free = np.concatenate([_STRAIGHT, N_PATH + np.arange(n_clocks)])
     path, cost_with_offsets, P = data.fit(N_SHORT, free, clock_starts)
     if not np.isfinite([cost, bent_cost, cost_with_offsets, misfit]).all():
@@ -247,16 +247,16 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     std[data.compared[is_known]] = np.sqrt(np.append(0.0, variance))[is_known]
     x = _state_at_zero(path)
     return RigidPass(stamp_ns, cost, bent_cost, cost_with_offsets,
-                     data.n_free(N_SHORT) - len(free), misfit, int(data.compared[0]), offset, std, x[:3], x[3:],
-                     np.reshape(straight_paths, (-1, 6)))
+                     data.n_free(N_SHORT) - len(free), misfit, int(data.compared[0]), offset,
+                     std, x[:3], x[3:], np.reshape(straight_paths, (-1, 6)))
 
 
 class _RowFits(NamedTuple):
     """Fits of one row of dipoles, on a straight path and on a bent path."""
 
-    straight: FloatArray
+    straight_state: FloatArray
     """(6,) Position and velocity of the straight path at time zero."""
-    cost: float
+    straight_cost: float
     bent_cost: float
     freedom: int
     """Degrees of freedom of the bent path."""
@@ -270,8 +270,8 @@ class _RowFits(NamedTuple):
     def needs_no_bend(self) -> bool:
         """Whether the straight path explains the pass, without a significant gain from a bend."""
         n_more = N_PATH - N_STRAIGHT
-        gain = (self.cost - self.bent_cost) / max(self.misfit, 1.0)
-        return bool(self.cost <= MAX_MISFIT * (self.freedom + n_more)
+        gain = (self.straight_cost - self.bent_cost) / max(self.misfit, 1.0)
+        return bool(self.straight_cost <= MAX_MISFIT * (self.freedom + n_more)
                     and gain <= chdtri(n_more, P_BEND))
 
 

@@ -18,10 +18,10 @@ from support.plain_filter import PlainFilter
 
 SIGMA = 4e-9
 N_LARGE = 23
-"""Number of sensors at which the updates of every case process only half of the covariance
-(`HALVED_FROM`)."""
+"""Number of sensors at which the updates of all cases process only half of the covariance (see
+`HALVED_FROM`)."""
 N_TARGETS = {'two rows that turn': 2, 'three points': 3}
-"""{case: number of vehicles that share a state}."""
+"""{case: number of vehicles that share a state}; 1 for all other cases."""
 CASES = {
     'two rows that turn': ('vehicle', {}),
     'three points': ('vehicle', POINT),
@@ -91,7 +91,7 @@ def assert_same(a, b, tolerance=1e-9):
 @pytest.mark.parametrize('n_sensors', [3, N_LARGE])
 @pytest.mark.parametrize('name', CASES)
 def test_a_bank_advanced_through_frames_matches_numpy(name, n_sensors):
-    """Some axes and one sensor are missing, and the sensors have different sampling times."""
+    """Some readings and one sensor are missing, and the sensors have different sampling times."""
     compiled, plain, bank, frames, intervals = case(name, n_sensors)
     other = bank.copy()
     for filter_, b in ((compiled, bank), (plain, other)):
@@ -100,11 +100,11 @@ def test_a_bank_advanced_through_frames_matches_numpy(name, n_sensors):
     for frame, dt in zip(frames, intervals, strict=True):
         other.x, other.P = bank.x.copy(), bank.P.copy()
         predicted, log_likelihood = compiled.advance(bank, frame, dt)
-        expected, of_plain = plain.advance(other, frame, dt)
+        expected, expected_log_likelihood = plain.advance(other, frame, dt)
         assert_same(bank, other)
         np.testing.assert_allclose(bank.nis, other.nis, rtol=1e-9)
         np.testing.assert_allclose(predicted, expected, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(log_likelihood, of_plain, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(log_likelihood, expected_log_likelihood, rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(bank.P, np.swapaxes(bank.P, 1, 2))
 
 
@@ -140,10 +140,10 @@ def test_a_hypothesis_at_a_sensor_is_ruled_out_and_the_others_are_not():
     alone = bank.alone(0)
     bank.x[1, :3] = compiled.observation.positions[1]
     _, log_likelihood = compiled.advance(bank, frames[0], 0.0)
-    _, of_one = compiled.advance(alone, frames[0], 0.0)
+    _, single_log_likelihood = compiled.advance(alone, frames[0], 0.0)
     assert log_likelihood[1] == -np.inf and np.isfinite(np.delete(log_likelihood, 1)).all()
     np.testing.assert_array_equal(alone.P[0], bank.P[0])
-    assert log_likelihood[0] == of_one[0]
+    assert log_likelihood[0] == single_log_likelihood[0]
     assert np.isfinite(bank.x).all() and np.isfinite(bank.P).all()
 
 
@@ -261,10 +261,10 @@ def test_two_vehicles_without_common_sensors_are_filtered_independently():
         C = np.tile(SIGMA**2 * np.eye(3), (4, 1, 1))
         log_likelihood = joint.advance(together, FieldFrame(
             k, field, C, np.ones(4), np.zeros(4), True), 0.1)[1]
-        of_each = [f.advance(b, FieldFrame(k, field[rows], C[rows], np.ones(2), np.zeros(2), True),
+        separate = [f.advance(b, FieldFrame(k, field[rows], C[rows], np.ones(2), np.zeros(2), True),
                              0.1)[1] for f, b, rows in zip(
                                  filters, banks, (slice(0, 2), slice(2, 4)), strict=True)]
-        assert log_likelihood[0] == pytest.approx(of_each[0][0] + of_each[1][0], rel=1e-9)
+        assert log_likelihood[0] == pytest.approx(separate[0][0] + separate[1][0], rel=1e-9)
         for i, bank in enumerate(banks):
             view, n_t = together.extract_target(i, len(model.state_names)), len(model.state_names)
             np.testing.assert_allclose(view.x[0, :n_t], bank.x[0, :n_t], rtol=1e-9, atol=1e-9)

@@ -52,8 +52,8 @@ N_X = N_T + (N_OWN + 3) * N_SENSORS
 
 
 def whole_derivative(H):
-    """Derivative (3 n_sensors, n_x) of the fields of all sensors; `plain_kalman.update` processes
-    one sensor at a time."""
+    """Derivative (3 n_sensors, n_x) of the fields of all sensors, from the derivative `H` of each
+    sensor."""
     out = np.zeros((3 * N_SENSORS, N_X))
     for j in range(N_SENSORS):
         rows = slice(3 * j, 3 * j + 3)
@@ -64,8 +64,8 @@ def whole_derivative(H):
 
 
 def problem(seed):
-    """(F, decay, diagonal of Q, C, H, measurements (n_steps, n_sensors, 3), some of them
-    missing)."""
+    """(F, decay, diagonal of Q, C, H, measurements (n_steps, n_sensors, 3)) of a linear target;
+    some measurements are missing."""
     rng = np.random.default_rng(seed)
     F = np.eye(N_T) + 0.2 * rng.standard_normal((N_T, N_T))
     decay, Q = rng.uniform(0.5, 1.0, N_X - N_T), rng.uniform(0.01, 0.1, N_X)
@@ -98,8 +98,8 @@ def steps_of(F, decay, Q, C, H, y, x, P, without=()):
 
 @pytest.mark.parametrize('unit', [1.0, 1e-8])
 def test_the_backward_pass_matches_least_squares_over_all_times(unit):
-    """Some axes, sensors and one time are missing. The unit makes some states as small as fields in
-    T."""
+    """Some axes, sensors and one time are missing. The smaller unit makes the sensor states as
+    small as fields in tesla."""
     F, decay, Q, C, H, y = problem(1)
     without = (3,)
     x0, P0 = np.random.default_rng(2).standard_normal((2, N_X)), np.diag(
@@ -217,8 +217,8 @@ def smoothing_study_of_cars(n):
 
 
 @pytest.mark.study
-@pytest.mark.xfail(strict=True, reason='0.68: 0.59 of the error of a filter that does not '
-                                       'relinearise, which is larger')
+@pytest.mark.xfail(strict=True, reason='the ratio is 0.68; relative to a filter without '
+                                       'relinearisation, it is 0.59')
 def test_smoothing_reduces_the_error_of_a_car_by_two_fifths():
     assert np.median(smoothing_study_of_cars(40)[0]) <= 0.6
 
@@ -365,7 +365,8 @@ def test_a_frame_that_contradicts_the_track_does_not_distort_it(size):
 
 @pytest.mark.study
 @pytest.mark.xfail(strict=True, reason=(
-    '0.50 m, 1.65 standard deviations: a different one of nearly equal hypotheses survives'))
+    'the difference is 0.50 m or 1.65 standard deviations, because a different one of nearly equal '
+    'hypotheses survives'))
 def test_a_frame_that_contradicts_the_track_does_not_distort_it_by_30_cm():
     """A vehicle model with a row of three dipoles achieved this accuracy."""
     plain, with_spike = paths_without_and_with_a_spike(1e-5)

@@ -129,7 +129,8 @@ def test_a_path_through_a_sensor_raises_no_error(miss):
 
 
 def test_pairs_are_ranked_by_the_density_of_the_frames():
-    """The density includes moments, backgrounds and noise; all pairs are in the same order."""
+    """The density includes moments, backgrounds and noise. The vehicles of all pairs have the same
+    order."""
     search, grid = search_of(FIRST_PATH, SECOND_PATH)
     pairs = search.pairs(grid, 3, 2)
     model, density = search.samples.straight_model(N_DIPOLES), []
@@ -154,7 +155,7 @@ def test_moments_of_a_pair_are_those_of_its_vehicles():
                                    atol=60.0)
 
 
-def test_pairs_belong_to_different_minima():
+def test_pairs_are_distinct_minima():
     search, grid = search_of(FIRST_PATH, SECOND_PATH)
     pairs = np.array(search.pairs(grid, 3, 2))
     apart = np.abs(pairs[:, None] - pairs)
