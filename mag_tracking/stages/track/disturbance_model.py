@@ -98,13 +98,13 @@ class DisturbanceModel:
         k = int(np.searchsorted(sensor, MAX_COMMON_SENSORS))
         remaining_density = remaining.log_density(
             sensor[k:] - MAX_COMMON_SENSORS, H[k:], y[k:], variance[k:], dt)
-        joint = self._log_w + remaining_density + [
+        log_joint = self._log_w + remaining_density + [
             covered.log_density(sensor[:k], H[:k], y[:k], variance[:k], dt),
             common.log_density(np.zeros(k, dtype=np.int64),
                                self._common_H[is_present[:len(self._common_H)]], y[:k],
                                variance[:k], dt)]
-        evidence = float(log_sum_exp(joint))
-        self._log_w = joint - evidence
+        evidence = float(log_sum_exp(log_joint))
+        self._log_w = log_joint - evidence
         return None if is_first else evidence
 
     def _initialise(self, noise: float) -> None:

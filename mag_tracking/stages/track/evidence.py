@@ -235,9 +235,10 @@ class TrackEvidence:
         self._doubtful_times = updated(
             self._doubtful_times, stamp_ns, bool(transient), MAX_SEGMENTS)
         self._last_found_ns |= dict.fromkeys(transient, stamp_ns)
-        return found | {reason for reason, when in self._last_found_ns.items()
-                        if (stamp_ns - when) / NS <= TRANSIENT_S} \
-            | {reason for reason, until in self._expiry_ns.items() if stamp_ns <= until}
+        return found | {reason for reason, found_ns in self._last_found_ns.items()
+                        if (stamp_ns - found_ns) / NS <= TRANSIENT_S} \
+            | {reason for reason, expiry_ns in self._expiry_ns.items()
+               if stamp_ns <= expiry_ns}
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
         """Whether the innovations of a frame are too large for the target model.

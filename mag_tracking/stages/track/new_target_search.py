@@ -157,12 +157,12 @@ class NewTargetSearch:
         anchor, paths = window.anchor.rows(rows), np.stack([p[rows] for p in window.paths], axis=1)
         begin = int(window.is_updated)
         before = bank.log_w[order] + window.evidence \
-            - np.sum([of_frame[rows] for of_frame in window.log_likelihoods[begin:]], axis=0)
-        along = self._filter.run_along(anchor, window.frames, window.intervals, paths,
-                                       passes=PASSES, step=STEP,
-                                       first_is_updated=window.is_updated)
-        is_usable = np.isfinite(along.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
-        track_log_likelihood = np.where(is_usable, along.log_likelihood, -np.inf)
+            - np.sum([values[rows] for values in window.log_likelihoods[begin:]], axis=0)
+        path_result = self._filter.run_along(anchor, window.frames, window.intervals, paths,
+                                             passes=PASSES, step=STEP,
+                                             first_is_updated=window.is_updated)
+        is_usable = np.isfinite(path_result.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
+        track_log_likelihood = np.where(is_usable, path_result.log_likelihood, -np.inf)
         return order, track_log_likelihood, before + track_log_likelihood, paths
 
     def _leading_indices(self, rows: IntArray, log_w: FloatArray) -> list[int]:
@@ -199,11 +199,11 @@ class NewTargetSearch:
 
     def _is_elsewhere(self, joint: JointExplanation) -> bool:
         """Whether the relocated vehicle is more than `MIN_DISPLACEMENT_M` from its track."""
-        n, now = self._n_one, self._bank.x[self._bank.best()]
+        n, current = self._n_one, self._bank.x[self._bank.best()]
         assert joint.replaced is not None
         found = joint.bank.x[joint.bank.best()]
         last = n * (self._n_targets - 1)
-        before = now[joint.replaced * n:joint.replaced * n + 2]
+        before = current[joint.replaced * n:joint.replaced * n + 2]
         return bool(np.hypot(*(found[last:last + 2] - before)) > MIN_DISPLACEMENT_M)
 
     def _remove_vehicle(self, known: KnownVehicleHypothesis, i: int) -> KnownVehicleHypothesis:
@@ -281,7 +281,7 @@ class NewTargetSearch:
         return out
 
     def _run_starts(self, starts: Sequence[WindowStart]
-             ) -> tuple[FilterBank, FloatArray, FloatArray, FloatArray]:
+                    ) -> tuple[FilterBank, FloatArray, FloatArray, FloatArray]:
         """Filter and smooth starts along their paths.
 
         Returns the bank at the last frame, log-likelihoods (n,), log-weights (n,) and paths (n,
@@ -293,13 +293,13 @@ class NewTargetSearch:
             labels_of([s.label for s in starts]), labels_of([s.kind for s in starts]), np.arange(n),
             np.full((n, len(self._vehicles.network)), np.nan))
         paths = np.array([s.path for s in starts])
-        along = self._filter_of(len(starts[0].kind)).run_along(
+        path_result = self._filter_of(len(starts[0].kind)).run_along(
             bank, window.frames, window.intervals, paths, passes=PASSES, step=STEP,
             first_is_updated=window.is_updated)
-        is_usable: BoolArray = np.isfinite(along.log_likelihood) \
+        is_usable: BoolArray = np.isfinite(path_result.log_likelihood) \
             & np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(bank.x).all(axis=1) \
             & [self._are_plausible(s, x) for s, x in zip(starts, bank.x, strict=True)]
-        log_likelihood = np.where(is_usable, along.log_likelihood, -np.inf)
+        log_likelihood = np.where(is_usable, path_result.log_likelihood, -np.inf)
         log_w = log_likelihood + [s.log_w for s in starts] - 0.5 * np.square(
             [overlap_depth(path, self._n_one, len(s.kind), self._vehicles.length_column) / DEPTH_STD
              for s, path in zip(starts, paths, strict=True)])
@@ -329,7 +329,7 @@ class NewTargetSearch:
         anchor = FilterBank(
             np.array([starts[k].x for k in rows]), np.array([starts[k].P for k in rows]),
             np.full(n, -np.log(n)), bank.label[rows], bank.kind[rows], np.arange(n), bank.nis[rows])
-        now = FilterBank(bank.x[rows], bank.P[rows], log_w[rows] - log_sum_exp(log_w[rows]),
+        latest = FilterBank(bank.x[rows], bank.P[rows], log_w[rows] - log_sum_exp(log_w[rows]),
                          anchor.label.copy(), anchor.kind.copy(), np.arange(n), bank.nis[rows])
         n_frames = len(self._window.frames)
         per_frame = log_likelihood[rows] / n_frames
@@ -339,5 +339,5 @@ class NewTargetSearch:
                         [per_frame.copy() for _ in range(n_frames)],
                         float(log_sum_exp(log_w[rows])), self._window.max_hypotheses)
         n_targets = len(starts[0].kind)
-        return JointExplanation(now, window, self._filter_of(n_targets), log_odds,
+        return JointExplanation(latest, window, self._filter_of(n_targets), log_odds,
                                 starts[0].replaced, n_targets > self._n_targets)

@@ -264,7 +264,7 @@ class Observation:
         return sum(h[1:], h[0]), np.concatenate(H, axis=3), np.asarray(variance)
 
     def _single_target_field(self, x: FloatArray, time_offset: FloatArray
-                      ) -> tuple[FloatArray, FloatArray, FloatArray]:
+                             ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Field of one target with states (n_hyp, n_one); see `sensor_fields`."""
         n_hyp, n, n_t = len(x), len(self.positions), self.n_one
         if not time_offset.any():

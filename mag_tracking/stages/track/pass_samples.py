@@ -120,15 +120,15 @@ class PassSamples:
         t = np.array([(f.stamp_ns - stamp_ns) / NS + f.time_offset[compared] for f in frames])
         y = field[:, compared].reshape(-1, 3)
         is_present = ~np.isnan(y)
-        of_sensor = np.tile(np.arange(n), len(frames))
+        sensor_index = np.tile(np.arange(n), len(frames))
         error = MODEL_ERROR**2 * energy[:, compared].ravel()
         W = np.linalg.inv(np.linalg.cholesky(C + error[:, None, None] * np.eye(3)))
         W = W * is_present[:, :, None] * is_present[:, None, :]
         background_columns = np.zeros((len(y), 3, n, 3))
-        background_columns[np.arange(len(y)), :, of_sensor] = W
+        background_columns[np.arange(len(y)), :, sensor_index] = W
         columns = background_columns.reshape(3 * len(y), 3 * n)
-        return cls(compared, np.nan_to_num(t).ravel(), network.positions[compared][of_sensor],
-                   W @ network.R_sw[compared][of_sensor], of_sensor - 1,
+        return cls(compared, np.nan_to_num(t).ravel(), network.positions[compared][sensor_index],
+                   W @ network.R_sw[compared][sensor_index], sensor_index - 1,
                    np.einsum('nij,nj->ni', W, np.nan_to_num(y)).ravel(),
                    columns[:, columns.any(axis=0)], int(np.count_nonzero(is_present)))
 

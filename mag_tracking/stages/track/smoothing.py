@@ -69,11 +69,11 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     paths = np.full((1, len(frames), bank.x.shape[1]), np.nan)
     for at, known in zip(paths[0], path, strict=False):
         at[:] = known
-    along = bank_filter.run_along(
+    path_result = bank_filter.run_along(
         bank.alone(0), frames, intervals, paths, passes=relinearisations + 1, step=1.0,
         first_is_updated=updated, rejects_outliers=True, wants_covariances=True)
-    n_excluded = np.count_nonzero(~along.used[0, int(updated):])
-    return list(zip(paths[0], along.covariances[0], strict=True)), int(n_excluded)
+    n_excluded = np.count_nonzero(~path_result.used[0, int(updated):])
+    return list(zip(paths[0], path_result.covariances[0], strict=True)), int(n_excluded)
 
 
 @dataclass

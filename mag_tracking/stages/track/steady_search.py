@@ -116,12 +116,12 @@ class PathPrior:
         -------
         line : (n,) int array
             Index in `headings`.
-        off : (n,) array, rad
+        relative_heading : (n,) array, rad
             Heading of the path relative to the line.
         """
-        off = (theta[:, 4, None] - self.headings + np.pi) % (2.0 * np.pi) - np.pi
-        line: IntArray = np.abs(off).argmin(axis=1)
-        return line, off[np.arange(len(theta)), line]
+        relative_headings = (theta[:, 4, None] - self.headings + np.pi) % (2.0 * np.pi) - np.pi
+        line: IntArray = np.abs(relative_headings).argmin(axis=1)
+        return line, relative_headings[np.arange(len(theta)), line]
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals of paths with respect to the prior.
@@ -304,11 +304,12 @@ class SteadySearch:
         A, _, inverse, p = self._solve(theta)
         derivative = self._model.derivative(paths, p.reshape(len(paths), -1))
         D = self._marginal_whitener(_joined_columns(derivative, m))
-        moved = inverse @ (np.swapaxes(A, 1, 2) @ D)
-        off, off_J = self.prior.residual_and_jacobian(paths)
-        return (np.hstack([self._y - np.einsum('nyi,ni->ny', A, p), -p / std, off.reshape(n, -1)]),
-                np.concatenate([D - A @ moved, -moved / std[:, None], _block_diagonal(off_J, m)],
-                               axis=1))
+        moment_jacobian = inverse @ (np.swapaxes(A, 1, 2) @ D)
+        prior_residual, prior_J = self.prior.residual_and_jacobian(paths)
+        return (np.hstack([self._y - np.einsum('nyi,ni->ny', A, p), -p / std,
+                           prior_residual.reshape(n, -1)]),
+                np.concatenate([D - A @ moment_jacobian, -moment_jacobian / std[:, None],
+                                _block_diagonal(prior_J, m)], axis=1))
 
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
         """Refine paths by Levenberg-Marquardt steps.

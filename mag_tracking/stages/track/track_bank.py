@@ -134,18 +134,18 @@ class TrackBank:
         self.filter.configure(settings)
         self._relinearisation.restart()
 
-    def begin(self, first: FieldFrame, now: FieldFrame) -> None:
+    def begin(self, first: FieldFrame, detection: FieldFrame) -> None:
         """Move the bank back to the first frame of the track, and start to store frames.
 
         Parameters
         ----------
         first : FieldFrame
             First frame of the track.
-        now : FieldFrame
-            Frame at which the bank was created.
+        detection : FieldFrame
+            Frame of the detection, at which the bank was created.
         """
-        if first is not now:
-            self.filter.move(self.bank, (first.stamp_ns - now.stamp_ns) / NS)
+        if first is not detection:
+            self.filter.move(self.bank, (first.stamp_ns - detection.stamp_ns) / NS)
         start = InitialBank.of(self.bank, self.filter.observation.n_target)
         self._whole_track.begin(copy(start), self.filter)
         self._relinearisation.begin(start)

@@ -97,8 +97,8 @@ class WindowSearch:
             H_one = H[..., first:first + n_one]
             by_velocity = H_one[..., 3:6] + t[:, None, None, None] * H_one[..., :3]
             hard = self._vehicles.hard_moments(x[first:first + n_one])
-            of_moment = H_one[..., 6:6 + hard.size].reshape(*H_one.shape[:3], -1, 3).mean(axis=3)
+            by_moment = H_one[..., 6:6 + hard.size].reshape(*H_one.shape[:3], -1, 3).mean(axis=3)
             magnitude = float(np.linalg.norm(hard.sum(axis=0)))
             out += [KNOWN_STD * H_one[..., :3], KNOWN_STD * by_velocity,
-                    KNOWN_MOMENT_RATIO * magnitude * of_moment]
+                    KNOWN_MOMENT_RATIO * magnitude * by_moment]
         return np.concatenate(out, axis=3)

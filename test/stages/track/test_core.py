@@ -213,11 +213,11 @@ def test_an_invalid_hypothesis_does_not_affect_the_others(name):
         b, p = bank.copy(), paths.copy()
         if is_invalid:
             b.P[0] *= -1.0
-        along = compiled.run_along(b, frames, intervals, p, passes=3, step=0.5,
-                                   first_is_updated=False, wants_covariances=True)
-        found.append((b.x[1:], b.P[1:], p[1:], along.covariances[1:], along.log_likelihood[1:],
-                      along.unsettled[1:]))
-    assert along.log_likelihood[0] == -np.inf
+        path_result = compiled.run_along(b, frames, intervals, p, passes=3, step=0.5,
+                                         first_is_updated=False, wants_covariances=True)
+        found.append((b.x[1:], b.P[1:], p[1:], path_result.covariances[1:],
+                      path_result.log_likelihood[1:], path_result.unsettled[1:]))
+    assert path_result.log_likelihood[0] == -np.inf
     for expected, got in zip(*found, strict=True):
         np.testing.assert_array_equal(got, expected)
 
@@ -226,9 +226,9 @@ def test_a_path_through_infinity_has_not_converged():
     compiled, _, bank, frames, intervals = case('point', n_hyp=2)
     paths = np.repeat(bank.x[:, None], len(frames), axis=1)
     paths[0, 2] = np.inf
-    along = compiled.run_along(bank, frames, intervals, paths, passes=1, step=0.5,
-                               first_is_updated=False)
-    assert np.isnan(along.unsettled[0]) and np.isfinite(along.unsettled[1])
+    path_result = compiled.run_along(bank, frames, intervals, paths, passes=1, step=0.5,
+                                     first_is_updated=False)
+    assert np.isnan(path_result.unsettled[0]) and np.isfinite(path_result.unsettled[1])
 
 
 def test_the_number_of_vehicles_that_share_a_state_is_bounded():
@@ -276,16 +276,16 @@ def test_two_vehicles_without_common_sensors_are_filtered_independently():
 def joint_bank(a, b, n_t):
     """Bank of one hypothesis with the targets and sensors of two banks."""
     n_own = (a.x.shape[1] - n_t) // 2 - 3
-    places = [(bank, np.arange(n_t), i * n_t + np.arange(n_t)) for i, bank in enumerate((a, b))]
+    columns = [(bank, np.arange(n_t), i * n_t + np.arange(n_t)) for i, bank in enumerate((a, b))]
     for i, bank in enumerate((a, b)):
         own = np.arange(2 * n_own)
-        places.append((bank, n_t + own, 2 * n_t + i * 2 * n_own + own))
+        columns.append((bank, n_t + own, 2 * n_t + i * 2 * n_own + own))
         background = np.arange(6)
-        places.append((bank, n_t + 2 * n_own + background,
-                       2 * n_t + 4 * n_own + 6 * i + background))
+        columns.append((bank, n_t + 2 * n_own + background,
+                        2 * n_t + 4 * n_own + 6 * i + background))
     n_x = 2 * a.x.shape[1]
     x, P = np.zeros((1, n_x)), np.zeros((1, n_x, n_x))
-    for bank, of, to in places:
+    for bank, of, to in columns:
         x[0, to] = bank.x[0, of]
         P[0, to[:, None], to] = bank.P[0][np.ix_(of, of)]
     both = [np.stack([getattr(a, name), getattr(b, name)], axis=1) for name in ('label', 'kind')]

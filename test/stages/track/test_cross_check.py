@@ -132,8 +132,8 @@ def test_the_third_car_past_a_wrong_clock_is_flagged_from_its_first_pose():
     assert all(t.ambiguous for t in last)
     print(pipeline.track.clock_warning)
     assert 'the clock of mag_2 is' in pipeline.track.clock_warning
-    right, pipeline = records_of(world.readings, world.network, **LINEARISED_ONCE)
-    assert not any(doubts.CLOCKS_APART in t.doubts for t in right if isinstance(t, Track))
+    correct, pipeline = records_of(world.readings, world.network, **LINEARISED_ONCE)
+    assert not any(doubts.CLOCKS_APART in t.doubts for t in correct if isinstance(t, Track))
     assert pipeline.track.clock_warning == ''
 
 
@@ -141,21 +141,21 @@ def test_the_difference_of_a_track_is_its_distance_from_the_fitted_path():
     """After the pass the difference stays constant."""
     check = CrossCheck(ROAD)
     slow = np.where(np.arange(10) == 3, 14.0, STRAIGHT)
-    away, states = [], []
+    distances, states = [], []
     for frame in steady_frames(np.random.default_rng(9), until_s=6.0):
         t = frame.stamp_ns / 1e9
         check.add(frame, state_at(t, slow if t > 0.0 else STRAIGHT))
         found = check.doubts(0.0)
-        away.append(np.hypot(*check.difference[:2]))
+        distances.append(np.hypot(*check.difference[:2]))
         # A difference larger than the length of a long vehicle means another position.
-        assert found == ({doubts.ANOTHER_PLACE} if away[-1] > 8.0 else set())
+        assert found == ({doubts.ANOTHER_PLACE} if distances[-1] > 8.0 else set())
         if check.latest is None:
-            assert away[-1] == 0.0
+            assert distances[-1] == 0.0
         elif t < 3.0:
             # A long row also explains the pass at another speed; the nearer path is used.
-            assert 3.0 * t - 1.0 < away[-1] < 6.0 * t + 1.0
+            assert 3.0 * t - 1.0 < distances[-1] < 6.0 * t + 1.0
         states.append((frame.stamp_ns, state_at(t), np.eye(6)))
-    assert away[-1] == away[-20] > 15.0 and check.is_doubtful
+    assert distances[-1] == distances[-20] > 15.0 and check.is_doubtful
     # Smoothed states have their own differences; these states are on the true path.
     far = [(stamp_ns, state_at(stamp_ns / 1e9, slow), P) for stamp_ns, _, P in states]
     assert all(np.hypot(*d[:2]) < 2.0 for d in check.differences(states))
@@ -179,16 +179,16 @@ def test_a_fit_keeps_the_time_of_its_own_peak():
     """Two more sensors measure a stronger field later, so the pass has a later peak."""
     network = network_of([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0], [12.0, -3.5, 0.0], [12.0, 3.5, 0.0]])
     path = np.where(np.arange(10) == 3, 8.0, np.where(np.arange(10) == 4, 0.0, STRAIGHT))
-    check, away, peaks = CrossCheck(network), [], set()
+    check, distances, peaks = CrossCheck(network), [], set()
     for frame in steady_frames(np.random.default_rng(3), network, path, until_s=4.0):
         state = state_at(frame.stamp_ns / 1e9, path)
         check.add(frame, state)
         assert check.doubts(0.0) == set()
-        away.append(np.hypot(*check.difference[:2]))
+        distances.append(np.hypot(*check.difference[:2]))
         if check.latest is not None:
             peaks.add(check.latest.stamp_ns)
-    print(f'largest difference {max(away):.2f} m')
-    assert len(peaks) > 1 and max(away) < 1.5
+    print(f'largest difference {max(distances):.2f} m')
+    assert len(peaks) > 1 and max(distances) < 1.5
 
 
 def test_a_pass_that_begins_at_its_peak_has_no_difference():
@@ -200,14 +200,14 @@ def test_a_pass_that_begins_at_its_peak_has_no_difference():
 
 def test_the_difference_is_included_in_published_covariances(monkeypatch):
     """The difference of each state is patched to five metres along x."""
-    away = np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    monkeypatch.setattr(RigidPass, 'difference', lambda *_: away)
+    difference = np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    monkeypatch.setattr(RigidPass, 'difference', lambda *_: difference)
     world = simulated_world('a car', 'clouds', 0)
     records, _ = records_of(world.readings, world.network, **LINEARISED_ONCE)
-    for kind, share in ((Track, 0.3), (SmoothedPose, 1.0)):
+    for kind, fraction in ((Track, 0.3), (SmoothedPose, 1.0)):
         std = np.array([np.sqrt(r.covariance[0, 0]) for r in records if isinstance(r, kind)])
         print(f'{kind.__name__}: {std.round(1)} m')
-        assert np.mean(std > 5.0 - 1e-6) >= share
+        assert np.mean(std > 5.0 - 1e-6) >= fraction
     # Poses before the pass do not include the difference.
     assert std.size and min(np.sqrt(r.covariance[0, 0]) for r in records
                             if isinstance(r, Track)) < 2.0

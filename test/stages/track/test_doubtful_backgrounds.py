@@ -70,12 +70,12 @@ def test_poses_are_ambiguous_from_the_start_of_the_doubt(pass_frames):
 
 
 def test_doubtful_backgrounds_of_unused_sensors_have_no_effect(pass_frames):
-    two = {'track.max_sensors': 2}
-    _, plain = run_tracker(pass_frames, {}, two)
+    two_sensors = {'track.max_sensors': 2}
+    _, plain = run_tracker(pass_frames, {}, two_sensors)
     unused = {name for name in pass_frames[0].names if run_tracker(
-        pass_frames, {name: [(0.0, None)]}, two)[0].counts[DOUBTFUL_TRACKS] == 0}
+        pass_frames, {name: [(0.0, None)]}, two_sensors)[0].counts[DOUBTFUL_TRACKS] == 0}
     assert len(unused) == 1
-    _, poses = run_tracker(pass_frames, {unused.pop(): [(0.0, None)]}, two)
+    _, poses = run_tracker(pass_frames, {unused.pop(): [(0.0, None)]}, two_sensors)
     assert [t.ambiguous for t in poses] == [t.ambiguous for t in plain]
 
 

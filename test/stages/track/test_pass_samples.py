@@ -21,8 +21,8 @@ def samples_of(network, clocks, path=STRAIGHT):
 def starts_of(path, free, n=3):
     """Start values (n, n_free) at increasing distances from the true path."""
     truth = np.append(path, np.zeros(3))[free]
-    away = np.random.default_rng(6).standard_normal((n, len(free))) * [[0.02], [0.05], [0.1]][:n]
-    return truth + away * np.where(free >= N_STRAIGHT, 0.1, 1.0)
+    errors = np.random.default_rng(6).standard_normal((n, len(free))) * [[0.02], [0.05], [0.1]][:n]
+    return truth + errors * np.where(free >= N_STRAIGHT, 0.1, 1.0)
 
 
 @pytest.mark.parametrize('n_dipoles', [1, 3, 5])
@@ -77,9 +77,9 @@ def test_the_pseudo_inverse_of_the_fit_matches_numpy():
     model = SteadyPass(data.t, data.positions, data.M, data.clock, free,
                        np.zeros(N_PATH + data.n_clocks), 3)
     problem = SeparableProblem(model, data.y, data.backgrounds)
-    twice, cost, P = data.fit(3, np.sort(np.append(free, 0)), np.append(
+    doubled_theta, cost, P = data.fit(3, np.sort(np.append(free, 0)), np.append(
         STRAIGHT[0], STRAIGHT[:N_STRAIGHT])[None])
-    _, J = problem.residual_and_jacobian(twice[None, free])
+    _, J = problem.residual_and_jacobian(doubled_theta[None, free])
     doubled = J[0][:, np.sort(np.append(free, 0))]
     expected = pseudo_inverse((doubled.T @ doubled)[None])[0]
     assert np.isfinite(cost)

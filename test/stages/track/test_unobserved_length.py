@@ -16,9 +16,9 @@ def default_unobserved_length():
     return UnobservedLength([0.0, 3.0, 9.0], [0.0, 1.0, 3.0])
 
 
-def at(place, heading=0.0, speed=8.0):
+def at(position, heading=0.0, speed=8.0):
     x = np.zeros(19)
-    x[:2], x[3:5] = place, [speed * np.cos(heading), speed * np.sin(heading)]
+    x[:2], x[3:5] = position, [speed * np.cos(heading), speed * np.sin(heading)]
     return x
 
 
@@ -36,11 +36,11 @@ def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(comp
     a car is unchanged."""
     model, x, found = RowVehicle(np.zeros(3), np.ones(3)), at([0.0, 0.0], 0.5 * np.pi), {}
     x[18] = length
-    for kind, usual, std in (('car', 3.0, 1.0), ('truck', 9.0, 3.0)):
+    for kind, mean_length, std in (('car', 3.0, 1.0), ('truck', 9.0, 3.0)):
         found[kind] = smoothed_pose(
-            model, VehicleOrientation(), x, P, unobserved_length=UnobservedLength([usual], [std]),
-            difference=np.zeros(6), stamp_ns=0, id=1, kind=0, kinds=(kind,), ambiguous=False,
-            complete=complete).covariance - P[:6, :6]
+            model, VehicleOrientation(), x, P,
+            unobserved_length=UnobservedLength([mean_length], [std]), difference=np.zeros(6),
+            stamp_ns=0, id=1, kind=0, kinds=(kind,), ambiguous=False, complete=complete).covariance - P[:6, :6]
     assert not found['car'].any()
     along = found['truck'][1, 1]
     assert along == pytest.approx(np.square(middle_offsets(5.0, 1.5, False)).mean(), rel=0.02)
@@ -88,9 +88,9 @@ def test_a_car_is_certain_once_a_truck_would_have_been_sensed(heading):
 
 def test_the_distance_along_the_path_counts_around_a_corner():
     unobserved_length = default_unobserved_length()
-    for place, heading, is_uncertain in (([-4.0, 1.0], 0.0, True), ([1.0, 1.0], 0.0, True),
-                                    ([2.0, 0.0], -1.5, True), ([2.0, -2.0], -1.5, False)):
-        x = at(place, heading)
+    for position, heading, is_uncertain in (([-4.0, 1.0], 0.0, True), ([1.0, 1.0], 0.0, True),
+                                            ([2.0, 0.0], -1.5, True), ([2.0, -2.0], -1.5, False)):
+        x = at(position, heading)
         unobserved_length.update(x, P, np.zeros((1, 3)), True)
         assert unobserved_length.covariance(x, P, 3.0, CAR).any() == is_uncertain
 
@@ -100,9 +100,9 @@ def test_only_a_sensor_near_the_path_confirms_the_length():
         [[-100.0, 500.0, 0.0], [0.0, 3.0, 0.0]])
     unobserved_length.update(at([-20.0, 0.0]), P, far, True)
     assert unobserved_length.covariance(at([-20.0, 0.0]), P, 3.0, CAR).any()
-    for places, is_certain in ((np.zeros((0, 3)), True), (far, False)):
+    for positions, is_certain in ((np.zeros((0, 3)), True), (far, False)):
         # No sensor measured the vehicle, or its position is ambiguous.
-        unobserved_length.update(at([20.0, 0.0]), P, places, is_certain)
+        unobserved_length.update(at([20.0, 0.0]), P, positions, is_certain)
         assert unobserved_length.covariance(at([20.0, 0.0]), P, 3.0, CAR).any()
 
 
