@@ -59,7 +59,7 @@ def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
 
 
 def _vehicle_factors(settings: TrackSettings) -> dict[str, int]:
-    """Factors whose product is the number of starting hypotheses of a vehicle, by name."""
+    """Numbers whose product is the number of starting hypotheses of a vehicle, by name."""
     vehicle = settings.vehicle
     return {**{name: len(getattr(vehicle, name))
                for name in ('kinds', 'arrival_names', 'lateral_offsets', 'speeds')},

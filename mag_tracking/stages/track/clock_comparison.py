@@ -169,7 +169,10 @@ class ClockComparison:
             for j in np.flatnonzero(is_known))
 
     def _offsets(self) -> tuple[FloatArray, FloatArray]:
-        """Time (n, n) [s] by which the row's clock is ahead of the column's, and its std (n, n)."""
+        """Time (n, n) [s] by which the clock of a row is ahead of that of a column, and its std.
+
+        The standard deviations (n, n) [s] are infinite on the diagonal.
+        """
         # The common offset of all clocks is not observable; the prior fixes it.
         prior = np.eye(len(self._vector)) / PRIOR_STD_S**2
         covariance: FloatArray = np.linalg.inv(self._information + prior).astype(np.float64)

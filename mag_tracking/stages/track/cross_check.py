@@ -177,7 +177,7 @@ class CrossCheck:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the latest fit contradicts the track."""
+        """Whether the latest fit raises any doubt about the track."""
         return bool(self._pass_doubts())
 
     def finish(self, clocks: ClockComparison, rows: IntArray) -> None:

@@ -86,8 +86,8 @@ class VehicleSettings:
     induced_share: float = param(
         0.4, 'Fraction of the initial moment that a field of 50 uT would induce: soft iron D = '
         'share x moment x mu0 / 50 uT along each axis of the vehicle, m = Rz (m0 + D Rz^T B0/mu0). '
-        'TSP14 Tables V and VI give 0.26 for a car (its D times three); T10 Table 6.9, as fitted '
-        'here, gives 0.42. The setting has no effect if the network has no earth field.', '',
+        'TSP14 Tables V and VI give 0.26 for a car (three times the tabulated D); a fit to T10 '
+        'Table 6.9 gives 0.42. The setting has no effect if the network has no earth field.', '',
         (0.0, 10.0))
     induced_share_std: float = param(
         0.3, 'Standard deviation of the induced share. It applies twice: in common to the three '

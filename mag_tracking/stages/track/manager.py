@@ -212,7 +212,7 @@ class TrackManager:
         return self._end_all('input ended', self._last_ns)
 
     def _end_at_gap(self, frame: FieldFrame) -> list[TrackRecord]:
-        """End all tracks after a jump back in time or too long a gap, and return their records."""
+        """End all tracks after a backward time jump or a long gap, and return their records."""
         if self._last_ns is None:
             return []
         dt = (frame.stamp_ns - self._last_ns) / NS

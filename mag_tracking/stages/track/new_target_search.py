@@ -135,7 +135,7 @@ class NewTargetSearch:
 
     def _best_of(self, starts: Sequence[WindowStart], track_evidence: float
                  ) -> JointExplanation | None:
-        """Refine starts and join them; None if none is usable.
+        """Joint explanation of the refined starts; None if no start is usable.
 
         `track_evidence` is the log-evidence of the track.
         """
@@ -237,7 +237,10 @@ class NewTargetSearch:
 
     def _starts_on(self, known: KnownVehicleHypothesis, paths: FloatArray, moments: FloatArray,
                    replaced: int | None) -> list[WindowStart]:
-        """Starts that add new vehicles, with `paths` (k, 7) and `moments` (k, 3, 3), to `known`."""
+        """Starts with the known vehicles and k new vehicles, one for each combination of kinds.
+
+        The new vehicles have the `paths` (k, 7) and the `moments` (k, 3, 3).
+        """
         n_known, times = len(known.kind) * self._n_one, self._search.times
         labels = self._search.prior.nearest_line(paths)[0].tolist()
         starts = []

@@ -227,7 +227,7 @@ class Relinearisation:
 
     @property
     def window(self) -> Window | None:
-        """Frames and paths of the window; None if it is empty."""
+        """Frames and paths of the window; None if it is empty or about to restart."""
         if self._anchor is None or self._is_stale or not self._frames:
             return None
         begin = int(self._is_updated)
@@ -329,7 +329,7 @@ class Relinearisation:
 
 
 def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
-    """Replace the states of hypotheses `rows` in place, and smaller covariances by `P`."""
+    """Replace states `rows` of the bank in place, and each covariance that is smaller than `P`."""
     bank_variance, path_variance = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P))
     bank.x[rows] = x
     bank.P[rows[path_variance > bank_variance]] = P[path_variance > bank_variance]

@@ -178,7 +178,7 @@ class RigidPass:
 
     @property
     def needs_clock_offsets(self) -> bool:
-        """Whether only a straight path with clock offsets explains the pass."""
+        """Whether clock offsets are significant, and displace the target by `MIN_DISTANCE`."""
         offset = float(np.nanmax(np.abs(self.offset)))
         if not self.is_explained or offset > MAX_OFFSET or offset * self.speed < MIN_DISTANCE:
             return False

@@ -134,7 +134,7 @@ class WholeTrack:
             self._start = _TrackStart(copy(bank_filter), bank)
 
     def resume(self, window: Window, bank_filter: BankFilter) -> None:
-        """Restart with a window of another filter; all of its frames count as published.
+        """Restart with a window of another filter; the frames of the window count as published.
 
         Parameters
         ----------
@@ -293,7 +293,7 @@ class FixedLag:
             self._frames, self._states(bank_filter, bank, best), strict=True) if lagged.published]
 
     def _states(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[State]:
-        """Smoothed states of the stored frames, without the relinearisation, which is too slow."""
+        """Smoothed states of the stored frames; relinearisation is omitted to save time."""
         oldest = self._frames[0]
         single, row = bank.alone(best), np.flatnonzero(oldest.origin == bank.origin[best])
         single.x, single.P = oldest.x[row].copy(), oldest.P[row].copy()

@@ -246,7 +246,7 @@ class SteadySearch:
         return self._marginal_whitener(self.samples.y - self.known)
 
     def _solve(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Basis (n, y, 9 m), information (n, 9 m, 9 m), its inverse, and moments (n, 9 m).
+        """Basis (n, y, 9 m), information (n, 9 m, 9 m) and its inverse, and moments (n, 9 m).
 
         The inverse is NaN or meaningless for a path through a sensor.
         """

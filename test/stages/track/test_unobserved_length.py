@@ -40,7 +40,8 @@ def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(comp
         found[kind] = smoothed_pose(
             model, VehicleOrientation(), x, P,
             unobserved_length=UnobservedLength([mean_length], [std]), difference=np.zeros(6),
-            stamp_ns=0, id=1, kind=0, kinds=(kind,), ambiguous=False, complete=complete).covariance - P[:6, :6]
+            stamp_ns=0, id=1, kind=0, kinds=(kind,), ambiguous=False,
+            complete=complete).covariance - P[:6, :6]
     assert not found['car'].any()
     along = found['truck'][1, 1]
     assert along == pytest.approx(np.square(middle_offsets(5.0, 1.5, False)).mean(), rel=0.02)
