@@ -17,8 +17,8 @@ from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
 MAX_SINGLE_SENSOR_S = 0.5
-"""Maximum total time for which only one of several sensors may support a track [s]. After this
-time, the track stays ambiguous."""
+"""Maximum total time in which only one of several sensors measures a target [s]. If this time is
+exceeded, the track stays ambiguous."""
 
 LOST = 'target lost'
 OUT_OF_REACH = 'out of reach'

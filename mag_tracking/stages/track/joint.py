@@ -21,8 +21,8 @@ overtakes another at a speed ratio above `OVERTAKING_RATIO` [nats]. Such traffic
 flipped axis or a train with a similar field."""
 
 CROSSING_COSINE = 0.9
-"""Two vehicles cross if the cosine of the angle between their velocities is smaller than this in
-magnitude."""
+"""Two vehicles cross if the absolute cosine of the angle between their velocities is below this
+value."""
 
 OVERTAKING_RATIO = 1.8
 """Maximum plausible speed ratio of two vehicles that move in the same direction."""

@@ -35,7 +35,8 @@ STARTED_IN_TAIL = 'tracks started in a larger field after the target of a detect
 
 RESTART_ENERGY_RATIO = 4.0
 """Minimum energy of the frame in which a track starts after a lost track, relative to the maximum
-energy of the lost track (twice the field). While a vehicle departs, its field only decreases."""
+energy of the lost track. A ratio of 4 corresponds to twice the field. The field of a departing
+vehicle only decreases."""
 
 
 class TrackManager:

@@ -38,9 +38,9 @@ PASSES, STEP = 3, 0.5
 """Number of Gauss-Newton steps along each path, and their damping factor."""
 
 MAX_KNOWN, MAX_FIRST, MAX_SECOND = 2, 3, 2
-"""Maximum number of hypotheses of a single tracked vehicle that are tried, of first new vehicles
-for each hypothesis, and of second new vehicles for each first one. With several tracked vehicles,
-only the best hypothesis is tried."""
+"""Maximum numbers of tried hypotheses of a single tracked vehicle, of first new vehicles for each
+hypothesis, and of second new vehicles for each first one. If several vehicles are tracked, only the
+best hypothesis is tried."""
 
 MAX_LOSS_NATS, MAX_EXPLANATIONS = 10.0, 12
 """Maximum difference in log-probability between the best and another retained explanation [nats],
@@ -193,7 +193,7 @@ class NewTargetSearch:
             self._filter.are_long(np.array([known.kind[i]]))[0])
 
     def _is_sensed(self, known: KnownVehicleHypothesis, i: int) -> bool:
-        """Whether the sensors sense vehicle `i` in the last frame."""
+        """Whether the field of vehicle `i` is detectable in the last frame."""
         return field_energy(
             self._filter, i, known.path[-1], self._window.frames[-1]) > DETECTABLE_ENERGY
 

@@ -50,7 +50,7 @@ CONVERGED = 0.3
 deviations of the position."""
 
 ATTEMPTED, FAILED = 'paths relinearised', 'paths relinearised without success'
-"""Keys of the event counts."""
+"""Keys of the event counts: all relinearised paths, and paths whose states were not adopted."""
 
 MAX_FRAMES = 64
 """Maximum number of frames in a window. When the window moves, at most half of this number remain.

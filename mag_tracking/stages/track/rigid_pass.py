@@ -79,7 +79,7 @@ class RigidPass:
     """Cost of a path with acceleration and turn rate, without clock offsets."""
     cost_with_offsets: float
     """Cost of a straight path at constant speed with free clock offsets."""
-    freedom: int
+    degrees_of_freedom: int
     """Degrees of freedom of the fit with free clock offsets."""
     misfit: float
     """Reduced chi-square of a bent path with a short or, if needed, a long row; about 1 if it
@@ -109,7 +109,7 @@ class RigidPass:
     @property
     def is_explained(self) -> bool:
         """Whether a straight path explains the pass, if necessary with free clock offsets."""
-        return self.cost_with_offsets <= GOOD_MISFIT * self.freedom
+        return self.cost_with_offsets <= GOOD_MISFIT * self.degrees_of_freedom
 
     def closest(self, positions: FloatArray) -> FloatArray:
         """Point of the path that is closest to a sensor.
@@ -160,7 +160,7 @@ class RigidPass:
     @property
     def widening(self) -> float:
         """Factor for the variances: the reduced chi-square with free clock offsets, at least 1."""
-        return max(self.cost_with_offsets / self.freedom, 1.0)
+        return max(self.cost_with_offsets / self.degrees_of_freedom, 1.0)
 
     def clock_variance(self, sensor: int) -> float:
         """Variance of the clock offset of a sensor, including the model error.
@@ -258,20 +258,20 @@ class _RowFits(NamedTuple):
     """(6,) Position and velocity of the straight path at time zero."""
     straight_cost: float
     bent_cost: float
-    freedom: int
+    degrees_of_freedom: int
     """Degrees of freedom of the bent path."""
 
     @property
     def misfit(self) -> float:
         """Reduced chi-square of the bent path."""
-        return self.bent_cost / self.freedom
+        return self.bent_cost / self.degrees_of_freedom
 
     @property
     def needs_no_bend(self) -> bool:
         """Whether the straight path explains the pass, without a significant gain from a bend."""
         n_more = N_PATH - N_STRAIGHT
         gain = (self.straight_cost - self.bent_cost) / max(self.misfit, 1.0)
-        return bool(self.straight_cost <= MAX_MISFIT * (self.freedom + n_more)
+        return bool(self.straight_cost <= MAX_MISFIT * (self.degrees_of_freedom + n_more)
                     and gain <= chdtri(n_more, P_BEND))
 
 

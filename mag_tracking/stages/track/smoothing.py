@@ -35,8 +35,8 @@ predictions far from the sensors. One relinearisation does not reach convergence
 tracks of turning cars and trucks, but degrade the track of a car along a corridor of sensors."""
 
 MAX_ELEMENTS = 10_000_000
-"""Maximum product of frames and squared number of states. It corresponds to 80 MB and less than a
-second."""
+"""Maximum product of frames and squared number of states. It corresponds to 80 MB of memory, and to
+less than a second of computing time."""
 
 
 def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[FieldFrame],

@@ -35,8 +35,8 @@ SPEED_COLUMN = PATH.index('speed')
 """Column of the speed in a path."""
 
 MIN_STD = 1e-3
-"""[m], [m/s], [A m^2] Standard deviation of parameters without a spread in the settings, such as
-the length of a point."""
+"""[m], [m/s], [A m^2] Minimum standard deviation of a parameter. It applies to parameters without a
+spread in the settings, such as the length of a point."""
 
 MIN_SPEED_RATIO = 0.2
 """Minimum speed of an arriving vehicle, relative to the lowest starting speed."""

@@ -163,7 +163,7 @@ def bank_after_one_frame(extra, linear):
 
 
 @pytest.mark.parametrize('extra, is_wider', [(0.5, True), (-1e-3, False)])
-def test_a_converged_path_determines_the_state_and_the_wider_covariance(extra, is_wider):
+def test_a_converged_path_replaces_the_state_and_a_smaller_covariance(extra, is_wider):
     filter_, bank, relinearisation = bank_after_one_frame(extra, np.inf)
     x, P = bank.x.copy(), bank.P.copy()
     assert relinearisation.relinearise_leading(filter_, bank)[relinearise.FAILED] == 0
