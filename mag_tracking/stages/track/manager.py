@@ -231,7 +231,7 @@ class TrackManager:
         return [*out, *self._unexplained(tracks, stamp_ns), *self._disturbances.end(stamp_ns)]
 
     def _unexplained(self, tracks: list[RunningTrack], stamp_ns: int) -> list[TrackRecord]:
-        """Start or extend a disturbance by the unexplained fields of `tracks`; return records."""
+        """Start or extend a disturbance with the unexplained fields of `tracks`; return records."""
         out: list[TrackRecord] = []
         for found in (found for track in tracks for found in track.unexplained):
             self.counts[DISTURBANCE_TRACKS] += 1

@@ -40,7 +40,7 @@ class SensorRejection:
         self.clear()
 
     def clear(self) -> None:
-        """Clear the memory of the sensors that were rejected in the previous frame."""
+        """Clear the list of sensors that were rejected in the previous frame."""
         self._rejected: tuple[int, ...] = ()
 
     def advance(self, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame, dt: float

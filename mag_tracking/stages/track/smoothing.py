@@ -193,6 +193,7 @@ class WholeTrack:
         Returns
         -------
         states : list of TrackState
+            Empty if the track cannot be smoothed as a whole.
         n_excluded : int
             Number of frames that were excluded because they contradict the hypothesis.
         """

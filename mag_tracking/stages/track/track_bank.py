@@ -224,7 +224,7 @@ class TrackBank:
             self.filter, self.bank, best)
 
     def smoothed(self, best: int, counts: bool = True) -> list[TrackState]:
-        """Smoothed states of all stored frames.
+        """Smoothed states of the published frames; empty if the whole track cannot be smoothed.
 
         Parameters
         ----------

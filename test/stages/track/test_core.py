@@ -91,7 +91,7 @@ def assert_same(a, b, tolerance=1e-9):
 @pytest.mark.parametrize('n_sensors', [3, N_LARGE])
 @pytest.mark.parametrize('name', CASES)
 def test_a_bank_advanced_through_frames_matches_numpy(name, n_sensors):
-    """Some readings and one sensor are missing, and the sensors have different sampling times."""
+    """In some frames, an axis or a sensor is missing, or the sampling times of sensors differ."""
     compiled, plain, bank, frames, intervals = case(name, n_sensors)
     other = bank.copy()
     for filter_, b in ((compiled, bank), (plain, other)):

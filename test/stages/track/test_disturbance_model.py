@@ -108,8 +108,8 @@ def test_the_first_frame_after_a_handover_is_not_compared():
 def test_the_evidence_stays_finite_over_gaps_with_rotated_sensors(gap_s):
     """Each update correlates all components of the field.
 
-    If the covariances were not symmetrised after each update, rounding errors would make them
-    indefinite.
+    If one half of each covariance were not copied to the other half, rounding errors would make the
+    covariance indefinite.
     """
     network, rng = line_network(4), np.random.default_rng(2)
     R = np.linalg.qr(rng.standard_normal((4, 3, 3)))[0]
