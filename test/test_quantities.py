@@ -51,7 +51,8 @@ SUMMARY = {
     (2, ('2 tracks lost their target: ', '2 sensors have an ',
          '2 tracks were too long to smooth '))])
 def test_nouns_in_notes_agree_with_the_number(n, beginnings):
-    counts = {f'tracks ended: {LOST}': n, 'sensors whose orientation is hardly known': n,
+    counts = {f'tracks ended: {LOST}': n,
+              'sensors with an orientation uncertainty above 15 degrees': n,
               'tracks too long to smooth': n}
     texts = [note.text for note in notes_of({**SUMMARY, 'counts': {'track': counts}})]
     assert all(text.startswith(b) for text, b in zip(texts, beginnings, strict=True)), texts

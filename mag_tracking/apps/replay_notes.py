@@ -92,7 +92,7 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(WARNING, quantity(n_lost, 'track lost its target', 'tracks lost their target')
                    + ': check the orientations in the network file; other possible causes are '
                    'simultaneous targets, or a kind of target that the settings do not include')
-    n_uncertain = counts.get('sensors whose orientation is hardly known', 0)
+    n_uncertain = counts.get('sensors with an orientation uncertainty above 15 degrees', 0)
     if n_uncertain:
         yield Note(WARNING, quantity(n_uncertain, 'sensor has', 'sensors have')
                    + ' an orientation uncertainty of more than 15 degrees in the network file: '

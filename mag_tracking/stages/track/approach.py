@@ -17,9 +17,9 @@ GROWTH_RATIO = 10.0
 MIN_LOG2_RATIO = -0.25
 """Minimum log2 ratio of the durations of the first and the second half of the growth. The
 theoretical value is 0.55 for a target that approaches at constant speed, and -0.83 for a target
-that starts from rest next to a sensor. A sudden jump of the field gives a smaller value."""
+that starts from rest next to a sensor. The value of a sudden jump of the field is near 0."""
 
-STEADY_FRACTION = 0.85
+FALL_FRACTION = 0.85
 """If the field falls below this fraction of its previous maximum while the target is sensed, the
 target has passed its first sensor, and the test passes."""
 
@@ -61,12 +61,12 @@ class Approach:
         return not self._is_open and self._is_doubtful()
 
     def _is_doubtful(self) -> bool:
-        """Whether the growth contradicts the field of a target that approaches from afar."""
+        """Whether the field grows unlike the field of a target that approaches from afar."""
         time, levels = np.array(self._times), np.array(self._levels)
         growth = growth_of(time, levels, SENSED_LEVEL, GROWTH_RATIO * SENSED_LEVEL)
         # If the field falls before it reaches the highest level, the target has passed its first
         # sensor.
-        is_falling = levels < STEADY_FRACTION * np.maximum.accumulate(levels)
+        is_falling = levels < FALL_FRACTION * np.maximum.accumulate(levels)
         if growth is None or (is_falling & (levels > SENSED_LEVEL)).any():
             return False
         std = LEVEL_TIME_STD * float(np.median(np.diff(time)))

@@ -16,7 +16,8 @@ struct Bank {
     INLINE const double* lengths(int p) const { return near_field_length + p * n_targets; }
 };
 
-// Output; may alias the bank, because each hypothesis is completed before the next is read.
+// Output of an update. It may alias the bank, because each hypothesis is completed before the next
+// one is read.
 struct Advanced {
     double *x, *P, *predicted, *log_likelihood, *nis;
 };

@@ -19,7 +19,7 @@ from mag_tracking.stages.track.unobserved_length import MAX_CAR_ROW
 
 LINEAR_FRACTION = 0.25
 """Displacement over which the field is approximately linear, as a fraction of the distance to the
-nearest sensor. The cube of that distance then changes by a factor of two."""
+nearest sensor. The cube of that distance then changes by a factor of about two."""
 
 SAME_TIME_FRACTION = 0.05
 """A frame whose samples span less than this fraction of the interval since the previous frame is
@@ -153,7 +153,7 @@ class BankFilter:
                  iterations: int, keeps_prior: bool = False) -> tuple[FloatArray, FloatArray]:
         """Advance a bank, and return predicted states (n_hyp, n_x) and log-likelihoods (n_hyp,).
 
-        With 0 iterations, the bank is only predicted.
+        The prediction is skipped unless `moves` is true. The update is skipped with 0 iterations.
         """
         n_hyp = len(bank)
         decay, variance = self.observation.drift(np.asarray(dt), self._settings.background_drift)
@@ -222,7 +222,7 @@ class BankFilter:
 
     def _frames(self, frames: Sequence[FieldFrame], intervals: Sequence[float]
                 ) -> dict[str, FloatArray]:
-        """Measurements and process noise of the frames, keyed by compiled filter argument."""
+        """Arrays of the frames for the compiled `run_along`, by the names of its arguments."""
         dt = np.array(intervals, dtype=float)
         decay, variance = self.observation.drift(dt, self._settings.background_drift)
         return {'field': np.array([frame.field for frame in frames]),
@@ -251,7 +251,7 @@ class BankFilter:
         return np.round(offset / TIME_RESOLUTION_S) * TIME_RESOLUTION_S
 
     def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
-        """Variance of the model error in the field of a hypothesis.
+        """Variance per axis of the model error in the field of a hypothesis, for each sensor.
 
         Only the part of the error that is uncorrelated with the previous frame is included.
 
@@ -399,7 +399,7 @@ class BankFilter:
 
 
 class NoTarget:
-    """Filter for the hypothesis that there is no target and only the backgrounds drift.
+    """Filter of the backgrounds under the hypothesis that there is no target.
 
     Its log-density is the reference for the evidence of a target.
 
@@ -457,7 +457,7 @@ def known_covariance(covariance: FloatArray) -> FloatArray:
     Returns
     -------
     (..., 3, 3) array, T²
-        Free of NaN.
+        Without NaN.
     """
     missing = np.isnan(covariance)
     return np.where(missing, np.eye(3), covariance) if missing.any() else covariance

@@ -44,7 +44,8 @@ def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
     Raises
     ------
     SettingsError
-        If the starting hypotheses, or `MIN_HYPOTHESES` with all sensors, exceed `MAX_BYTES`.
+        If the starting hypotheses, or `MIN_HYPOTHESES` hypotheses with the maximum number of
+        sensors, exceed `MAX_BYTES`.
     """
     _check_bank('track.vehicle', _vehicle_factors(settings), settings,
                 sensors_at_start(settings, network, model), model)
@@ -58,7 +59,7 @@ def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
 
 
 def _vehicle_factors(settings: TrackSettings) -> dict[str, int]:
-    """Factors whose product is the number of starting hypotheses of a vehicle, by name."""
+    """Numbers whose product is the number of starting hypotheses of a vehicle, by name."""
     vehicle = settings.vehicle
     return {**{name: len(getattr(vehicle, name))
                for name in ('kinds', 'arrival_names', 'lateral_offsets', 'speeds')},
@@ -67,7 +68,7 @@ def _vehicle_factors(settings: TrackSettings) -> dict[str, int]:
 
 
 def sensors_at_start(settings: TrackSettings, network: SensorNetwork, model: SourceModel) -> int:
-    """Number of sensors with which a track starts.
+    """Number of sensors with which a track starts, limited by `START_BYTES` for a vehicle.
 
     Parameters
     ----------
@@ -103,10 +104,10 @@ def max_sensors(observation: Observation, n_hyp: int) -> int:
     return _max_affordable_sensors(n_hyp, observation.n_target, observation.n_own + 3)
 
 
-def _max_affordable_sensors(n_hyp: int, n_target: int, n_of_sensor: int) -> int:
+def _max_affordable_sensors(n_hyp: int, n_target: int, n_per_sensor: int) -> int:
     """Maximum number of sensors of a bank within `START_BYTES`; see `max_sensors`."""
     n_states = math.isqrt(START_BYTES // (_FLOAT_BYTES * n_hyp))
-    return max((n_states - n_target) // n_of_sensor, MIN_SENSORS_AT_START)
+    return max((n_states - n_target) // n_per_sensor, MIN_SENSORS_AT_START)
 
 
 def max_hypotheses(observation: Observation, n_sensors: int) -> int:

@@ -29,7 +29,7 @@ class ClockOffset:
 
     sensor: int
     """Index of the sensor in the network."""
-    against: int | None
+    reference: int | None
     """Index of the reference sensor; None if the clock is compared with all other sensors."""
     offset_s: float
     """Time by which the clock is ahead [s]; negative if it is slow."""
@@ -51,8 +51,8 @@ class ClockOffset:
         str
         """
         name = names[self.sensor]
-        reference = 'the other clocks' if self.against is None \
-            else f'the clock of {names[self.against]}'
+        reference = 'the other clocks' if self.reference is None \
+            else f'the clock of {names[self.reference]}'
         relation = 'ahead of' if self.offset_s > 0.0 else 'behind'
         correction = 'increase' if self.offset_s > 0.0 else 'decrease'
         passes = f'{self.n_passes} passes' if self.n_passes > 1 else 'one pass'
@@ -121,53 +121,58 @@ class ClockComparison:
         return ClockOffset(j, None, float(median[k]), float(std[j, behind_k]),
                            int(self._n_passes[j]))
 
-    def add(self, found: RigidPass, rows: IntArray) -> None:
+    def add(self, rigid_pass: RigidPass, rows: IntArray) -> None:
         """Add a pass to the estimate.
 
-        A pass is ignored if no straight path explains it, or if the vehicle is so slow that the
-        fit hardly depends on the clocks.
+        A pass is ignored if no straight path explains it, if a bent path explains it significantly
+        better, or if the vehicle is so slow that the fit hardly depends on the clocks.
 
         Parameters
         ----------
-        found : RigidPass
+        rigid_pass : RigidPass
         rows : (n,) int array
             Indices of the sensors of the pass in the network.
         """
-        is_slow = found.speed * MAX_OFFSET < MIN_DISTANCE
-        if is_slow or not (found.is_explained and found.is_straight):
+        is_slow = rigid_pass.speed * MAX_OFFSET < MIN_DISTANCE
+        if is_slow or not (rigid_pass.is_explained and rigid_pass.is_straight):
             return
-        is_known = np.abs(found.offset) <= MAX_OFFSET
-        is_known[found.reference] = False
-        factor = CONTRADICTED_FACTOR if self._contradicts(found, rows, is_known) \
+        is_known = np.abs(rigid_pass.offset) <= MAX_OFFSET
+        is_known[rigid_pass.reference] = False
+        factor = CONTRADICTED_FACTOR if self._contradicts(rigid_pass, rows, is_known) \
             else FORGETTING_FACTOR
         self._information *= factor
         self._vector *= factor
         for j in np.flatnonzero(is_known):
             direction = np.zeros(len(self._vector))
-            direction[rows[j]], direction[rows[found.reference]] = 1.0, -1.0
-            self._information += np.outer(direction, direction) / found.clock_variance(j)
-            self._vector += direction * found.offset[j] / found.clock_variance(j)
+            direction[rows[j]], direction[rows[rigid_pass.reference]] = 1.0, -1.0
+            self._information += np.outer(direction, direction) / rigid_pass.clock_variance(j)
+            self._vector += direction * rigid_pass.offset[j] / rigid_pass.clock_variance(j)
         if is_known.any():
             self._n_passes[rows[is_known]] += 1
-            self._n_passes[rows[found.reference]] += 1
+            self._n_passes[rows[rigid_pass.reference]] += 1
         self._weight = 1.0 + factor * self._weight
-        self._slowness = 1.0 / found.speed + factor * self._slowness
+        self._slowness = 1.0 / rigid_pass.speed + factor * self._slowness
         offset, std = self._offsets()
-        # An offset is harmless if a vehicle of average speed travels less than a metre in this
-        # time.
+        # An offset is harmless if a vehicle of average speed travels less than `MIN_DISTANCE` in
+        # this time.
         min_offset = MIN_DISTANCE * self._slowness / self._weight
         self._offset_s = np.where(
             (offset > SIGNIFICANT_STDS * std) & (offset > min_offset), offset, 0.0)
 
-    def _contradicts(self, fit: RigidPass, rows: IntArray, is_known: BoolArray) -> bool:
+    def _contradicts(self, rigid_pass: RigidPass, rows: IntArray, is_known: BoolArray) -> bool:
         """Whether a pass contradicts the previous estimate for any clock in the mask `is_known`."""
         offset, std = self._offsets()
-        reference = rows[fit.reference]
-        return any(abs(fit.offset[j] - offset[rows[j], reference]) > SIGNIFICANT_STDS * np.sqrt(
-            fit.clock_variance(j) + std[rows[j], reference]**2) for j in np.flatnonzero(is_known))
+        reference = rows[rigid_pass.reference]
+        return any(
+            abs(rigid_pass.offset[j] - offset[rows[j], reference]) > SIGNIFICANT_STDS * np.sqrt(
+                rigid_pass.clock_variance(j) + std[rows[j], reference]**2)
+            for j in np.flatnonzero(is_known))
 
     def _offsets(self) -> tuple[FloatArray, FloatArray]:
-        """Time (n, n) [s] by which the row's clock is ahead of the column's, and its std (n, n)."""
+        """Time (n, n) [s] by which the clock of a row is ahead of that of a column, and its std.
+
+        The standard deviations (n, n) [s] are infinite on the diagonal.
+        """
         # The common offset of all clocks is not observable; the prior fixes it.
         prior = np.eye(len(self._vector)) / PRIOR_STD_S**2
         covariance: FloatArray = np.linalg.inv(self._information + prior).astype(np.float64)

@@ -27,7 +27,7 @@ class CompiledFilter {
         positions_.assign(p, p + 3 * n);
         R_sw_.assign(r, r + 9 * n);
         if ((n_angles != 0 && n_angles != 3) || (n_errors != 0 && n_errors != 3))
-            throw py::value_error("n_angles and n_errors: expected 0 or three states");
+            throw py::value_error("n_angles and n_errors: expected zero or three states");
         if (target.n() > MAX_TARGET_STATES)
             throw py::value_error("n_states: more states than the maximum of " +
                                   std::to_string(MAX_TARGET_STATES));
@@ -115,7 +115,7 @@ class CompiledFilter {
             const double l10 = C[3] / C[0], l20 = C[6] / C[0], e1 = C[4] - l10 * C[3];
             const double e21 = C[7] - l20 * C[3];
             if (!(C[0] > 0.0 && e1 > 0.0 && C[8] - l20 * C[6] - e21 / e1 * e21 > 0.0))
-                throw py::value_error("the noise of a sensor is not positive definite");
+                throw py::value_error("the noise covariance of a sensor is not positive definite");
         }
     }
 
@@ -206,7 +206,8 @@ Magnet magnet(Vector density, double angular_density) {
 
 PYBIND11_MODULE(core, module) {
     using namespace mag_tracking;
-    module.doc() = "The filters of the tracker, compiled; see bank_filter.py and pass_samples.py.";
+    module.doc() =
+        "Compiled filters and pass fit of the tracker; see bank_filter.py and pass_samples.py.";
     add_filter(module, "RowVehicleFilter", row_vehicle);
     add_filter(module, "VehiclesFilter", vehicles);
     add_filter(module, "MagnetFilter", magnet);

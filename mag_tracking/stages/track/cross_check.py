@@ -43,7 +43,8 @@ STEADY_S = 1.5
 to be constant [s]."""
 
 LATE_MISFIT = 8.0
-"""Maximum misfit of fits after `STEADY_S`, in which the turn rate of a car may have changed."""
+"""Maximum misfit (reduced chi-square) of a fit after `STEADY_S`. The turn rate of a car may have
+changed by then."""
 
 
 class _FrameSummary(NamedTuple):
@@ -57,7 +58,7 @@ class _FrameSummary(NamedTuple):
 
 
 class CrossCheck:
-    """Cross-check of a track against fits of a steady path to the whole pass.
+    """Cross-check of a track against fits of a steady path to all frames of the pass.
 
     Parameters
     ----------
@@ -68,8 +69,8 @@ class CrossCheck:
     latest : RigidPass or None
         Latest fit; None before the vehicle has passed.
     difference : (6,) array, m and m/s
-        `RigidPass.difference` of the latest state; after the pass, the difference of the last state
-        in the pass.
+        `RigidPass.difference` of the latest state; zero before the first fit. After the pass, the
+        difference of the last state in the pass.
     """
 
     def __init__(self, network: SensorNetwork) -> None:
@@ -109,7 +110,7 @@ class CrossCheck:
         self._frames.append(frame)
 
     def _is_in_pass(self, frame: FieldFrame) -> bool:
-        """Whether a frame belongs to the pass, by its time relative to the maximum of the field."""
+        """Whether a frame is from `BEFORE_S` before to `AFTER_S` after the maximum of the field."""
         assert self._peak is not None
         return -BEFORE_S * NS <= frame.stamp_ns - self._peak.stamp_ns <= AFTER_S * NS
 
@@ -176,11 +177,11 @@ class CrossCheck:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the latest fit contradicts the track."""
+        """Whether the latest fit raises any doubt about the track."""
         return bool(self._pass_doubts())
 
     def finish(self, clocks: ClockComparison, rows: IntArray) -> None:
-        """Fit the pass a last time at the end of the track, and update the clock comparison.
+        """Fit the pass if a fit is due at the end of the track; update the clock comparison.
 
         Parameters
         ----------

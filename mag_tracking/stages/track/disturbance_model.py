@@ -79,8 +79,9 @@ class DisturbanceModel:
 
         Returns
         -------
-        float or None
-            None for the first frame after a handover.
+        float or None, nats
+            None for the first frame with readings after a handover; 0 for frames before the first
+            reading.
         """
         is_present = np.isfinite(frame.field.ravel())
         noise = np.einsum('jii->ji', frame.covariance)
@@ -97,13 +98,13 @@ class DisturbanceModel:
         k = int(np.searchsorted(sensor, MAX_COMMON_SENSORS))
         remaining_density = remaining.log_density(
             sensor[k:] - MAX_COMMON_SENSORS, H[k:], y[k:], variance[k:], dt)
-        joint = self._log_w + remaining_density + [
+        log_joint = self._log_w + remaining_density + [
             covered.log_density(sensor[:k], H[:k], y[:k], variance[:k], dt),
             common.log_density(np.zeros(k, dtype=np.int64),
                                self._common_H[is_present[:len(self._common_H)]], y[:k],
                                variance[:k], dt)]
-        evidence = float(log_sum_exp(joint))
-        self._log_w = joint - evidence
+        evidence = float(log_sum_exp(log_joint))
+        self._log_w = log_joint - evidence
         return None if is_first else evidence
 
     def _initialise(self, noise: float) -> None:
@@ -125,9 +126,9 @@ class DisturbanceModel:
 def _common_field_matrix(network: SensorNetwork) -> FloatArray:
     """Matrix (3 n_sensors, m) from a common field and the backgrounds to the axes of each sensor.
 
-    The field has a uniform component and, from `MIN_GRADIENT_SENSORS` sensors on, a gradient.
+    The field has a uniform component and, with at least `MIN_GRADIENT_SENSORS` sensors, a gradient.
     Without sources inside the network, the gradient is symmetric and traceless. It has five
-    parameters, in units of a field over the radius of the network.
+    parameters: the changes of the field [T] from the centre of the network to its edge.
     """
     n, R_sw = len(network), network.R_sw
     field = np.tile(np.eye(3), (n, 1, 1))

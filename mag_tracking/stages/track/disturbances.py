@@ -1,4 +1,4 @@
-"""Disturbances: fields that started a track but that no target explains."""
+"""Disturbances: fields that start a track, but that no target explains."""
 
 from dataclasses import dataclass, replace
 
@@ -11,7 +11,7 @@ from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.records import FieldFrame
 
 P_FALSE_ALARM = 1e-6
-"""Probability per frame that noise alone marks a sensor as affected."""
+"""Probability that the noise of a sensor alone marks it as affected in a frame."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,7 @@ class Disturbances:
         ----------
         found : UnexplainedField
         stamp_ns : int, ns
+            Timestamp of the record.
 
         Returns
         -------
@@ -91,6 +92,7 @@ class Disturbances:
         Parameters
         ----------
         stamp_ns : int, ns
+            Timestamp of the record.
 
         Returns
         -------

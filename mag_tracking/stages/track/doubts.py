@@ -24,8 +24,8 @@ NO_STEADY_PATH = 'no_steady_path'
 ANOTHER_VEHICLE = 'another_vehicle'
 
 PERMANENT = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
-"""Doubts that persist until the end of a track, because they show that its path is distorted. Other
-implausible states may be corrected by later frames."""
+"""Doubts that persist until the end of a track, because they show that its path is distorted. Later
+frames may correct the causes of other doubts."""
 
 MEANINGS = {
     ANOTHER_PLACE: 'another position is still possible',
@@ -34,8 +34,8 @@ MEANINGS = {
                           'the track began while the target of a lost track was still detected',
     SENSORS_AT_ONE_PLACE: 'the network has one sensor, or all sensors are within two metres: range '
                           'and moment are not observable and follow from the settings',
-    ONE_SENSOR: 'only one of several sensors provides readings, or too much of the track is based '
-                'on a single sensor',
+    ONE_SENSOR: 'only one of several sensors provides readings, or did so for more than 0.5 s of '
+                'the track',
     FELT_BY_ONE_SENSOR: 'only one sensor senses the target: range and moment are not observable '
                         'and follow from the settings',
     DOUBTFUL_BACKGROUND: 'the background of a sensor is doubtful',

@@ -17,13 +17,13 @@ from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
 MAX_SINGLE_SENSOR_S = 0.5
-"""Maximum total time for which only one of several sensors may support a track [s]. After this
-time, the track stays ambiguous."""
+"""Maximum total time in which only one of several sensors measures a target [s]. If this time is
+exceeded, the track stays ambiguous."""
 
 LOST = 'target lost'
 OUT_OF_REACH = 'out of reach'
 UNEXPLAINED = 'unexplained'
-"""Reasons for the end of a track."""
+"""Reasons to end a track."""
 
 UNEXPLAINED_S = 3.0
 """A track ends when a disturbance has explained its frames better than a target for this time [s],
@@ -48,7 +48,7 @@ noise by this number of standard deviations."""
 
 TRANSIENT_DOUBTS = (doubts.OVERFIT, doubts.DISTURBANCE_MODEL, doubts.INNOVATIONS, doubts.MISFIT,
                     doubts.HEIGHT, doubts.OFF_THE_ROAD, doubts.NO_STEADY_PATH)
-"""Doubts that concern the filter at individual frames. Smoothing resolves them only in part."""
+"""Doubts about the state of the filter in single frames. Smoothing resolves them only in part."""
 
 TRANSIENT_S = 0.1
 """Time for which a transient doubt persists after the frame in which it was found [s]. A doubt that
@@ -217,32 +217,34 @@ class TrackEvidence:
         """Whether fewer than two sensors have sensed the target."""
         return int(np.count_nonzero(self.sensed)) < 2
 
-    def note(self, found: set[str], stamp_ns: int) -> set[str]:
-        """Record the doubts about the pose of a frame, and add the earlier doubts that persist.
+    def update_doubts(self, found: set[str], stamp_ns: int) -> set[str]:
+        """Store the doubts about the pose of a frame, and add the earlier doubts that persist.
 
         Parameters
         ----------
         found : set of str
+            Doubts that were found in this frame.
         stamp_ns : int, ns
 
         Returns
         -------
         set of str
-            Doubts of this frame and earlier doubts that persist.
+            Doubts in `found` and earlier doubts that persist.
         """
         transient = found.intersection(TRANSIENT_DOUBTS)
         self._doubtful_times = updated(
             self._doubtful_times, stamp_ns, bool(transient), MAX_SEGMENTS)
         self._last_found_ns |= dict.fromkeys(transient, stamp_ns)
-        return found | {reason for reason, when in self._last_found_ns.items()
-                        if (stamp_ns - when) / NS <= TRANSIENT_S} \
-            | {reason for reason, until in self._expiry_ns.items() if stamp_ns <= until}
+        return found | {reason for reason, found_ns in self._last_found_ns.items()
+                        if (stamp_ns - found_ns) / NS <= TRANSIENT_S} \
+            | {reason for reason, expiry_ns in self._expiry_ns.items()
+               if stamp_ns <= expiry_ns}
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
-        """Check whether a normalised innovation is too large for the target model.
+        """Whether the innovations of a frame are too large for the target model.
 
-        With at most two sensors, a contradiction also marks the track as doubtful, because many
-        paths fit the fields. With more sensors, later frames correct the track.
+        If the track uses at most two sensors, a contradiction also marks the track as doubtful,
+        because many paths fit the fields. With more sensors, later frames correct the track.
 
         Parameters
         ----------
@@ -287,10 +289,11 @@ class TrackEvidence:
             self.flag(doubts.INNOVATIONS)
         return reasons
 
-    def doubts_filter(self, gain: float, stamp_ns: int, window_s: float) -> bool:
-        """Return whether the filter is doubtful: it fitted recent frames much better than the path.
+    def update_filter_doubt(self, gain: float, stamp_ns: int, window_s: float) -> bool:
+        """Update the doubt about the filter, and return whether the filter is doubtful.
 
-        Starts or extends the doubt if `gain` is below `-OVERFIT_NATS`.
+        The filter is doubtful from a frame in which `gain` is below `-OVERFIT_NATS` until
+        `window_s` later. It then fits the frames much better than the path of its hypothesis does.
 
         Parameters
         ----------
@@ -311,7 +314,7 @@ class TrackEvidence:
         return stamp_ns <= self._overfit_expiry_ns
 
     def was_filter_doubtful(self, stamp_ns: int) -> bool:
-        """Whether the filter was doubtful at an earlier time.
+        """Whether a transient doubt or a flagged interval affects the smoothed pose at a time.
 
         Parameters
         ----------
@@ -323,20 +326,20 @@ class TrackEvidence:
         """
         return are_doubtful((*self._doubtful_times, *self._smoothed_segments), stamp_ns)
 
-    def support(self, by_one_sensor: bool, dt: float) -> None:
-        """Add up the time with one measuring sensor; flag the track if this time is too long.
+    def count_single_sensor_time(self, is_single_sensor: bool, dt: float) -> None:
+        """Update the total time with one measuring sensor, and flag the track if it is too long.
 
         A single sensor determines neither the scale of a track nor which of two mirror images is
         correct. The other sensors do not always correct the error when they measure again.
 
         Parameters
         ----------
-        by_one_sensor : bool
+        is_single_sensor : bool
             Whether only one of several sensors measured.
         dt : float, s
             Time since the previous frame.
         """
-        self._single_sensor_s += dt if by_one_sensor else 0.0
+        self._single_sensor_s += dt if is_single_sensor else 0.0
         if self._single_sensor_s > MAX_SINGLE_SENSOR_S:
             self.flag(doubts.ONE_SENSOR)
 
@@ -350,7 +353,7 @@ class TrackEvidence:
         """Whether the latest field contradicted the track."""
         return self._n_consecutive_misfits > 0
 
-    def reason_to_end(self, track: Track, spread: float, is_coming: bool,
+    def reason_to_end(self, track: Track, spread: float, is_approaching: bool,
                       settings: TrackSettings) -> str | None:
         """Update the end conditions with a pose, and return the reason to end the track.
 
@@ -361,8 +364,8 @@ class TrackEvidence:
         spread : float, m
             Standard deviation of the horizontal position of the published hypothesis alone.
             Differences between hypotheses are excluded, because they do not depend on the distance
-            of the target.
-        is_coming : bool
+            to the target.
+        is_approaching : bool
             Whether the target is approaching the sensors. An approaching target is not out of
             reach, however uncertain its position.
         settings : TrackSettings
@@ -378,7 +381,7 @@ class TrackEvidence:
         self._n_consecutive_misfits = self._n_consecutive_misfits + 1 if misfit else 0
         if self._n_consecutive_misfits > 1:
             return LOST
-        if spread > settings.end_std > self._min_spread and not is_coming:
+        if spread > settings.end_std > self._min_spread and not is_approaching:
             return LOST if misfit else OUT_OF_REACH
         self._min_spread = min(self._min_spread, spread)
         return None

@@ -118,9 +118,9 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
 def _distinct_optima(settings: MagnetSettings, network: SensorNetwork, start: FloatArray,
                      y: FloatArray, std: FloatArray, is_present: BoolArray
                      ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """States, covariances and costs of the distinct optima after refinement; may be empty."""
-    identity = np.zeros((len(start), 1, 3, 6))
-    dr_dx, dm_dx = identity.copy(), identity.copy()
+    """States (n, 12), covariances (n, 12, 12) and costs (n,) of the distinct refined optima."""
+    zero = np.zeros((len(start), 1, 3, 6))
+    dr_dx, dm_dx = zero.copy(), zero.copy()
     dr_dx[:, 0, :, :3] = np.eye(3)
     dm_dx[:, 0, :, 3:] = np.eye(3)
 

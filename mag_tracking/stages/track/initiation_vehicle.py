@@ -86,8 +86,8 @@ class VehicleSettings:
     induced_share: float = param(
         0.4, 'Fraction of the initial moment that a field of 50 uT would induce: soft iron D = '
         'share x moment x mu0 / 50 uT along each axis of the vehicle, m = Rz (m0 + D Rz^T B0/mu0). '
-        'TSP14 Tables V and VI give 0.26 for a car (its D times three); T10 Table 6.9, as fitted '
-        'here, gives 0.42. The setting has no effect if the network has no earth field.', '',
+        'TSP14 Tables V and VI give 0.26 for a car (three times the tabulated D); a fit to T10 '
+        'Table 6.9 gives 0.42. The setting has no effect if the network has no earth field.', '',
         (0.0, 10.0))
     induced_share_std: float = param(
         0.3, 'Standard deviation of the induced share. It applies twice: in common to the three '
@@ -253,7 +253,10 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
 
 
 def _add_turning_hypotheses(bank: FilterBank, model: RowVehicle, fraction: float) -> FilterBank:
-    """Bank with a turning copy of each hypothesis; the same bank if turning is disabled."""
+    """Bank with a turning copy of each hypothesis; `bank` itself if turning is disabled.
+
+    A `fraction` of the weight belongs to the turning copies.
+    """
     if not model.turn_acceleration:
         return bank
     n, w = len(bank), len(model.state_names) - 1
@@ -281,7 +284,11 @@ class _MeasuredEnergy:
 def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
                         measured: _MeasuredEnergy, R: FloatArray, moments: FloatArray,
                         height: float) -> FloatArray:
-    """First position (n_offsets, n_moments, 3) on each line with at least the measured energy."""
+    """First position on each line at which the field of a moment has the measured energy.
+
+    The shape is (n_offsets, n_moments, 3). A field that never reaches the energy yields the last
+    position of the line, next to the outermost sensor.
+    """
     along = (network.positions - network.centre) @ R[:, 0]
     distance = np.linspace(settings.max_start_distance, 0.0, 160) - along.min()
     line = np.array([network.centre[0], network.centre[1], height])
@@ -298,18 +305,18 @@ def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
 
 def _initial_states(settings: VehicleSettings, kind: int, positions: FloatArray,
                     velocities: FloatArray, hard: FloatArray) -> FloatArray:
-    """States (n_offsets n_speeds n_moments, n_t) of `RowVehicle`.
+    """States (n_offsets * n_speeds * n_moments, n_t) of `RowVehicle`.
 
     The inputs are `positions` (n_offsets, n_moments, 3), `velocities` (n_speeds, 3) and the total
     hard iron moments `hard` (n_moments, 3).
     """
     d = _n_dipoles(settings)
-    turns = int(settings.turn_acceleration > 0.0)
-    x = np.empty((len(positions), len(velocities), len(hard), 8 + 3 * d + min(d, 2) + turns))
+    n_turn = int(settings.turn_acceleration > 0.0)
+    x = np.empty((len(positions), len(velocities), len(hard), 8 + 3 * d + min(d, 2) + n_turn))
     x[..., :3], x[..., 3:6] = positions[:, None], velocities[:, None]
     x[..., 6:6 + 3 * d] = np.tile(hard / d, d)
     x[..., 6 + 3 * d:] = [*[soft_iron(settings, kind)] * 3, *[settings.lengths[kind]] * (d > 1),
-                          *[0.0] * turns]
+                          *[0.0] * n_turn]
     return x.reshape(-1, x.shape[-1])
 
 

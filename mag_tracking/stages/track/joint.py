@@ -11,18 +11,18 @@ from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, field_energies
 from mag_tracking.stages.track.relinearisation import Window
 
 CONFIDENT_NATS = 15.0
-"""Explanations with lower log-odds are marked as doubtful for a limited time [nats]. The limit is
-high, because the evidence treats model errors as independent between frames and is
-overconfident."""
+"""Log-odds below which an explanation is marked as doubtful for a limited time [nats]. The limit is
+high, because the evidence is overconfident: it treats model errors as independent between
+frames."""
 
 IMPLAUSIBLE_NATS = 60.0
-"""The limit in place of `CONFIDENT_NATS` if a new vehicle crosses another vehicle, or if one
-overtakes at a speed ratio above `OVERTAKING_RATIO` [nats]. Such traffic is rarer than a flipped
-axis or a train with a similar field."""
+"""Limit that replaces `CONFIDENT_NATS` if a new vehicle crosses another vehicle, or if one vehicle
+overtakes another at a speed ratio above `OVERTAKING_RATIO` [nats]. Such traffic is rarer than a
+flipped axis or a train with a similar field."""
 
 CROSSING_COSINE = 0.9
-"""Two vehicles cross if the cosine of the angle between their velocities is smaller than this in
-magnitude."""
+"""Two vehicles cross if the absolute cosine of the angle between their velocities is below this
+value."""
 
 OVERTAKING_RATIO = 1.8
 """Maximum plausible speed ratio of two vehicles that move in the same direction."""

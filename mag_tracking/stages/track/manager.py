@@ -35,7 +35,8 @@ STARTED_IN_TAIL = 'tracks started in a larger field after the target of a detect
 
 RESTART_ENERGY_RATIO = 4.0
 """Minimum energy of the frame in which a track starts after a lost track, relative to the maximum
-energy of the lost track (twice the field). While a vehicle departs, its field only decreases."""
+energy of the lost track. A ratio of 4 corresponds to twice the field. The field of a departing
+vehicle only decreases."""
 
 
 class TrackManager:
@@ -85,7 +86,7 @@ class TrackManager:
         n_uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
                           for s in network.orientation_std)
         if n_uncertain:
-            self.counts['sensors whose orientation is hardly known'] = n_uncertain
+            self.counts['sensors with an orientation uncertainty above 15 degrees'] = n_uncertain
 
     def use_network(self, network: SensorNetwork) -> None:
         """Apply another calibration of the same sensors as soon as no track is running.
@@ -212,7 +213,7 @@ class TrackManager:
         return self._end_all('input ended', self._last_ns)
 
     def _end_at_gap(self, frame: FieldFrame) -> list[TrackRecord]:
-        """End all tracks after a jump back in time or too long a gap, and return their records."""
+        """End all tracks after a backward time jump or a long gap, and return their records."""
         if self._last_ns is None:
             return []
         dt = (frame.stamp_ns - self._last_ns) / NS
@@ -222,7 +223,7 @@ class TrackManager:
         return self.end_tracks('gap in the frames') if dt > self._settings.end_gap_s else []
 
     def _end_all(self, reason: str, stamp_ns: int | None) -> list[TrackRecord]:
-        """End every running track and the current disturbance, and return their records."""
+        """End all tracks and the current disturbance, and return their closing records."""
         tracks, self._tracks = self._tracks, []
         out = [record for track in tracks for record in track.end(reason)]
         if stamp_ns is None:
@@ -230,7 +231,7 @@ class TrackManager:
         return [*out, *self._unexplained(tracks, stamp_ns), *self._disturbances.end(stamp_ns)]
 
     def _unexplained(self, tracks: list[RunningTrack], stamp_ns: int) -> list[TrackRecord]:
-        """Start disturbances for the unexplained fields of `tracks`, and return their records."""
+        """Start or extend a disturbance with the unexplained fields of `tracks`; return records."""
         out: list[TrackRecord] = []
         for found in (found for track in tracks for found in track.unexplained):
             self.counts[DISTURBANCE_TRACKS] += 1

@@ -63,6 +63,7 @@ class Member:
     Parameters
     ----------
     id : int
+        Track identifier.
     target : Target
     sensors : SensorSubset
         Sensors that the track uses.
@@ -86,7 +87,7 @@ class Member:
     is_lost : bool
         Whether the member ended while the target was still detected.
     early : list of TrackState
-        Smoothed states of the time before the target shared its state with other targets.
+        Smoothed states at times before the target shared its state with other targets.
     slot : int
         Index of the target in the joint states that are stored for smoothing.
     """
@@ -95,7 +96,7 @@ class Member:
                  clocks: ClockComparison, begin_ns: int) -> None:
         self.id, self._target, self._counts, self._clocks = id, target, counts, clocks
         self.begin_ns, self._sensors = begin_ns, sensors
-        self.evidence, self._plausibility = TrackEvidence(len(sensors.whole)), Plausibility()
+        self.evidence, self._plausibility = TrackEvidence(len(sensors.full_network)), Plausibility()
         self.cross_check = CrossCheck(sensors.network)
         self.last: Track | None = None
         self.ended: str | None = None
@@ -144,7 +145,7 @@ class Member:
             Minimum Bayes factor of a target against a disturbance.
         """
         self.evidence.flag_start(doubts.NOT_SEEN_APPROACHING in first.evidence.doubts,
-                                 self._sensors.whole, False)
+                                 self._sensors.full_network, False)
         self.evidence.bayes_factor.add(first.evidence.bayes_factor.log_ratio, stamp_ns, ratio)
 
     def distance_from(self, stamps_ns: Sequence[int], path: FloatArray) -> float:
@@ -162,8 +163,8 @@ class Member:
             0 if no position was published at these timestamps.
         """
         position_at = dict(zip(stamps_ns, path, strict=True))
-        distances = [float(np.hypot(*(place - position_at[stamp_ns])))
-                     for stamp_ns, place in self._recent_positions if stamp_ns in position_at]
+        distances = [float(np.hypot(*(position - position_at[stamp_ns])))
+                     for stamp_ns, position in self._recent_positions if stamp_ns in position_at]
         return float(np.mean(distances)) if distances else 0.0
 
     def publish(self, update: BankUpdate, view: MemberView) -> Track:
@@ -191,12 +192,13 @@ class Member:
         measured: BoolArray = ~np.isnan(frame.field)
         measuring = np.flatnonzero(measured.any(axis=1))
         is_single_sensor = len(sensors.network) > 1 and len(measuring) == 1
-        self.evidence.support(is_single_sensor, dt)
+        self.evidence.count_single_sensor_time(is_single_sensor, dt)
         if self._unobserved_length is not None:
             self._unobserved_length.update(
                 view.bank.x[best], view.bank.P[best], sensors.network.positions[measuring],
                 self.last is not None and (self.evidence.is_doubtful or not self.last.ambiguous))
-        reasons = self.evidence.note(self._doubts(update, view, is_single_sensor), frame.stamp_ns)
+        reasons = self.evidence.update_doubts(
+            self._doubts(update, view, is_single_sensor), frame.stamp_ns)
         excess = 1.0 if self._target.starts_anywhere else self.evidence.innovations.excess
         return sensors.for_whole_network(published_track(
             view.bank, best, self._target.model, self._target.orientation, self._target.arrivals,
@@ -251,7 +253,7 @@ class Member:
 
     def _overfits(self, update: BankUpdate, view: MemberView) -> bool:
         """Update the doubt about the filter, and return whether the filter is doubtful."""
-        overfits = self.evidence.doubts_filter(view.gain, update.frame.stamp_ns,
+        overfits = self.evidence.update_filter_doubt(view.gain, update.frame.stamp_ns,
                                                update.settings.relinearise_window_s)
         if overfits:
             self._counts['doubtful poses: the filter fits better than its path'] += 1
@@ -271,11 +273,11 @@ class Member:
             None if the track continues.
         """
         assert self.last is not None
-        is_coming = not self._target.starts_anywhere and sensors.is_approached_by(self.last)
-        return self.evidence.reason_to_end(self.last, self._position_std, is_coming, settings)
+        is_approaching = not self._target.starts_anywhere and sensors.is_approached_by(self.last)
+        return self.evidence.reason_to_end(self.last, self._position_std, is_approaching, settings)
 
     def unexplained(self, uniform: float) -> UnexplainedField | None:
-        """Field of the track if no target has ever explained it.
+        """Field of the track, if no target has explained it in any frame.
 
         Parameters
         ----------
@@ -295,7 +297,7 @@ class Member:
 
     def states_of(self, slot: int, n_one: int, states: Iterable[TrackState],
                   end_ns: float = np.inf) -> list[TrackState]:
-        """States of the target, extracted from the states of all members within its lifetime.
+        """States of the target within its lifetime, extracted from the states of all members.
 
         Parameters
         ----------

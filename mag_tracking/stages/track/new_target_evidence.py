@@ -10,7 +10,7 @@ P_FALSE_ALARM = 1e-3
 """Probability per test that noise alone triggers a comparison with other explanations."""
 
 WINDOW_S, MIN_INTERVAL_S = 0.25, 0.15
-"""Duration of the latest frames that are tested, and minimum interval before a comparison that
+"""Duration of the tested frames, and minimum interval between any comparison and the next one that
 improbable innovations trigger [s]."""
 
 LONG_INTERVAL_S, INTERVAL_GROWTH = 0.3, 1.5
@@ -51,8 +51,8 @@ class NewTargetEvidence:
         degrees_of_freedom : int
         stamp_ns : int, ns
         rejected : bool
-            Whether one of two sensors was rejected, which counts like a large innovation. With more
-            sensors, the majority shows that the rejected sensor is faulty.
+            Whether one of two sensors was rejected, which has the effect of improbable innovations.
+            With more sensors, the majority shows that the rejected sensor is faulty.
         is_long : bool
             Whether the best hypothesis is a long vehicle.
         """
@@ -85,7 +85,7 @@ class NewTargetEvidence:
         return reason
 
     def accepts(self, log_odds: float) -> bool:
-        """Return whether another explanation is accepted, and store whether it is probable.
+        """Whether another explanation is accepted; store whether a repetition would be accepted.
 
         Parameters
         ----------

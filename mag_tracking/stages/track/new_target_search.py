@@ -38,9 +38,9 @@ PASSES, STEP = 3, 0.5
 """Number of Gauss-Newton steps along each path, and their damping factor."""
 
 MAX_KNOWN, MAX_FIRST, MAX_SECOND = 2, 3, 2
-"""Maximum number of hypotheses of a single tracked vehicle that are tried, of first new vehicles
-for each hypothesis, and of second new vehicles for each first one. With several tracked vehicles,
-only the best hypothesis is tried."""
+"""Maximum numbers of tried hypotheses of a single tracked vehicle, of first new vehicles for each
+hypothesis, and of second new vehicles for each first one. If several vehicles are tracked, only the
+best hypothesis is tried."""
 
 MAX_LOSS_NATS, MAX_EXPLANATIONS = 10.0, 12
 """Maximum difference in log-probability between the best and another retained explanation [nats],
@@ -123,7 +123,7 @@ class NewTargetSearch:
                    key=lambda joint: joint.log_odds, default=None)
 
     def _all_starts(self, known: KnownVehicleHypothesis) -> list[WindowStart]:
-        """Starts of all explanations that are based on one hypothesis of the track."""
+        """Starts of the explanations that are derived from one hypothesis of the track."""
         starts = self._starts_beside(known) if self._may_add and self._is_improbable else []
         for i in range(self._n_targets):
             others = self._remove_vehicle(known, i)
@@ -135,7 +135,10 @@ class NewTargetSearch:
 
     def _best_of(self, starts: Sequence[WindowStart], track_evidence: float
                  ) -> JointExplanation | None:
-        """Refine starts and join them; `track_evidence` is the log-evidence of the track."""
+        """Joint explanation of the refined starts; None if no start is usable.
+
+        `track_evidence` is the log-evidence of the track.
+        """
         refined = self._add_turning_starts(self._refine_starts(starts))
         prior = LOG_P_ARRIVAL if len(refined[0].kind) > self._n_targets else LOG_P_LOST
         bank, log_likelihood, log_w, paths = self._run_starts(refined)
@@ -154,12 +157,12 @@ class NewTargetSearch:
         anchor, paths = window.anchor.rows(rows), np.stack([p[rows] for p in window.paths], axis=1)
         begin = int(window.is_updated)
         before = bank.log_w[order] + window.evidence \
-            - np.sum([of_frame[rows] for of_frame in window.log_likelihoods[begin:]], axis=0)
-        along = self._filter.run_along(anchor, window.frames, window.intervals, paths,
-                                       passes=PASSES, step=STEP,
-                                       first_is_updated=window.is_updated)
-        is_usable = np.isfinite(along.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
-        track_log_likelihood = np.where(is_usable, along.log_likelihood, -np.inf)
+            - np.sum([values[rows] for values in window.log_likelihoods[begin:]], axis=0)
+        path_result = self._filter.run_along(anchor, window.frames, window.intervals, paths,
+                                             passes=PASSES, step=STEP,
+                                             first_is_updated=window.is_updated)
+        is_usable = np.isfinite(path_result.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
+        track_log_likelihood = np.where(is_usable, path_result.log_likelihood, -np.inf)
         return order, track_log_likelihood, before + track_log_likelihood, paths
 
     def _leading_indices(self, rows: IntArray, log_w: FloatArray) -> list[int]:
@@ -190,17 +193,17 @@ class NewTargetSearch:
             self._filter.are_long(np.array([known.kind[i]]))[0])
 
     def _is_sensed(self, known: KnownVehicleHypothesis, i: int) -> bool:
-        """Whether the sensors sense vehicle `i` in the last frame."""
+        """Whether the field of vehicle `i` is detectable in the last frame."""
         return field_energy(
             self._filter, i, known.path[-1], self._window.frames[-1]) > DETECTABLE_ENERGY
 
     def _is_elsewhere(self, joint: JointExplanation) -> bool:
-        """Whether the vehicle that was searched for again was found far from its track."""
-        n, now = self._n_one, self._bank.x[self._bank.best()]
+        """Whether the relocated vehicle is more than `MIN_DISPLACEMENT_M` from its track."""
+        n, current = self._n_one, self._bank.x[self._bank.best()]
         assert joint.replaced is not None
         found = joint.bank.x[joint.bank.best()]
         last = n * (self._n_targets - 1)
-        before = now[joint.replaced * n:joint.replaced * n + 2]
+        before = current[joint.replaced * n:joint.replaced * n + 2]
         return bool(np.hypot(*(found[last:last + 2] - before)) > MIN_DISPLACEMENT_M)
 
     def _remove_vehicle(self, known: KnownVehicleHypothesis, i: int) -> KnownVehicleHypothesis:
@@ -208,8 +211,8 @@ class NewTargetSearch:
         n = self._n_one
         if self._n_targets == 1:
             sensor_P = self._sensors_at_start()
-            nowhere = np.zeros((len(self._search.times), len(sensor_P)))
-            return KnownVehicleHypothesis(nowhere[0], sensor_P, nowhere, (), (), 0.0, None)
+            sensor_path = np.zeros((len(self._search.times), len(sensor_P)))
+            return KnownVehicleHypothesis(sensor_path[0], sensor_P, sensor_path, (), (), 0.0, None)
         rows = np.delete(np.arange(known.path.shape[1]), np.arange(i * n, (i + 1) * n))
         return KnownVehicleHypothesis(
             known.x[rows], known.P[np.ix_(rows, rows)], known.path[:, rows],
@@ -234,7 +237,10 @@ class NewTargetSearch:
 
     def _starts_on(self, known: KnownVehicleHypothesis, paths: FloatArray, moments: FloatArray,
                    replaced: int | None) -> list[WindowStart]:
-        """Starts that add new vehicles, with `paths` (k, 7) and `moments` (k, 3, 3), to `known`."""
+        """Starts with the known vehicles and k new vehicles, one for each combination of kinds.
+
+        The new vehicles have the `paths` (k, 7) and the `moments` (k, 3, 3).
+        """
         n_known, times = len(known.kind) * self._n_one, self._search.times
         labels = self._search.prior.nearest_line(paths)[0].tolist()
         starts = []
@@ -278,7 +284,7 @@ class NewTargetSearch:
         return out
 
     def _run_starts(self, starts: Sequence[WindowStart]
-             ) -> tuple[FilterBank, FloatArray, FloatArray, FloatArray]:
+                    ) -> tuple[FilterBank, FloatArray, FloatArray, FloatArray]:
         """Filter and smooth starts along their paths.
 
         Returns the bank at the last frame, log-likelihoods (n,), log-weights (n,) and paths (n,
@@ -290,13 +296,13 @@ class NewTargetSearch:
             labels_of([s.label for s in starts]), labels_of([s.kind for s in starts]), np.arange(n),
             np.full((n, len(self._vehicles.network)), np.nan))
         paths = np.array([s.path for s in starts])
-        along = self._filter_of(len(starts[0].kind)).run_along(
+        path_result = self._filter_of(len(starts[0].kind)).run_along(
             bank, window.frames, window.intervals, paths, passes=PASSES, step=STEP,
             first_is_updated=window.is_updated)
-        is_usable: BoolArray = np.isfinite(along.log_likelihood) \
+        is_usable: BoolArray = np.isfinite(path_result.log_likelihood) \
             & np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(bank.x).all(axis=1) \
             & [self._are_plausible(s, x) for s, x in zip(starts, bank.x, strict=True)]
-        log_likelihood = np.where(is_usable, along.log_likelihood, -np.inf)
+        log_likelihood = np.where(is_usable, path_result.log_likelihood, -np.inf)
         log_w = log_likelihood + [s.log_w for s in starts] - 0.5 * np.square(
             [overlap_depth(path, self._n_one, len(s.kind), self._vehicles.length_column) / DEPTH_STD
              for s, path in zip(starts, paths, strict=True)])
@@ -326,15 +332,15 @@ class NewTargetSearch:
         anchor = FilterBank(
             np.array([starts[k].x for k in rows]), np.array([starts[k].P for k in rows]),
             np.full(n, -np.log(n)), bank.label[rows], bank.kind[rows], np.arange(n), bank.nis[rows])
-        now = FilterBank(bank.x[rows], bank.P[rows], log_w[rows] - log_sum_exp(log_w[rows]),
+        latest = FilterBank(bank.x[rows], bank.P[rows], log_w[rows] - log_sum_exp(log_w[rows]),
                          anchor.label.copy(), anchor.kind.copy(), np.arange(n), bank.nis[rows])
         n_frames = len(self._window.frames)
-        each = log_likelihood[rows] / n_frames
+        per_frame = log_likelihood[rows] / n_frames
         window = Window(anchor, self._window.is_updated, self._window.frames,
                         self._window.intervals,
                         [np.ascontiguousarray(paths[rows, k]) for k in range(n_frames)],
-                        [each.copy() for _ in range(n_frames)], float(log_sum_exp(log_w[rows])),
-                        self._window.max_hypotheses)
+                        [per_frame.copy() for _ in range(n_frames)],
+                        float(log_sum_exp(log_w[rows])), self._window.max_hypotheses)
         n_targets = len(starts[0].kind)
-        return JointExplanation(now, window, self._filter_of(n_targets), log_odds,
+        return JointExplanation(latest, window, self._filter_of(n_targets), log_odds,
                                 starts[0].replaced, n_targets > self._n_targets)

@@ -11,8 +11,8 @@ from mag_tracking.physics.mounting import rotated_fields
 from mag_tracking.physics.sources import SourceModel
 
 MAX_ROTATION = np.deg2rad(15.0)
-"""[rad] Maximum standard deviation of a mounting angle. Larger values are limited to it, because
-rotations are approximated to first order. `TrackManager` counts the affected sensors."""
+"""[rad] Maximum standard deviation of a mounting angle. Larger values are reduced to this maximum,
+because rotations are approximated to first order. `TrackManager` counts the affected sensors."""
 
 TIME_RESOLUTION_S = 1e-3
 """[s] Resolution of sampling times. At 20 m/s, a target moves two centimetres in this time."""
@@ -30,7 +30,7 @@ def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
     Returns
     -------
     (n_sensors, 3, 3) array, rad^2
-        About the axes of the sensor.
+        Covariances of the rotations about the axes of the sensor.
     """
     std = [np.full(3, mounting_std) if s is None else np.minimum(s, MAX_ROTATION)
            for s in network.orientation_std]
@@ -185,7 +185,7 @@ class Observation:
         return x
 
     def distance_to_nearest(self, x: FloatArray) -> FloatArray:
-        """Distance from any target to the nearest sensor.
+        """Smallest distance between a target and a sensor.
 
         Parameters
         ----------
@@ -215,7 +215,7 @@ class Observation:
         return positions
 
     def drift(self, dt: FloatArray, background_density: float) -> tuple[FloatArray, FloatArray]:
-        """Decay and process noise of the sensor states.
+        """Decay and process noise of the sensor states over an interval.
 
         Parameters
         ----------
@@ -264,7 +264,7 @@ class Observation:
         return sum(h[1:], h[0]), np.concatenate(H, axis=3), np.asarray(variance)
 
     def _single_target_field(self, x: FloatArray, time_offset: FloatArray
-                      ) -> tuple[FloatArray, FloatArray, FloatArray]:
+                             ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Field of one target with states (n_hyp, n_one); see `sensor_fields`."""
         n_hyp, n, n_t = len(x), len(self.positions), self.n_one
         if not time_offset.any():
@@ -346,7 +346,7 @@ class Observation:
 
     def model_error(self, x: FloatArray, near_field_length: FloatArray, field_error: float
                     ) -> FloatArray:
-        """Variance of the model error of a state.
+        """Variance per axis of the model error in the field of a state, for each sensor.
 
         Parameters
         ----------

@@ -20,13 +20,14 @@ MODEL_ERROR = 0.04
 """Error of the field of a row of dipoles, relative to the field; treated as noise."""
 
 NEAR_ERROR_LENGTH = 0.2
-"""[m] Near a sensor, the relative error is at least this length divided by the distance."""
+"""[m] Minimum product of the relative field error and the distance to the sensor, in samples that
+include the model error near the sensors."""
 
 MAX_SENSORS = 4
 """Maximum number of sensors in a fit. The sensors with the strongest fields are used."""
 
 N_STEPS, TOLERANCE = 30, 1e-3
-"""Maximum number of steps, and the relative improvement of the cost below which the search ends."""
+"""Maximum number of steps of a fit, and relative improvement of the cost below which it ends."""
 
 
 @dataclass(frozen=True)
@@ -119,15 +120,15 @@ class PassSamples:
         t = np.array([(f.stamp_ns - stamp_ns) / NS + f.time_offset[compared] for f in frames])
         y = field[:, compared].reshape(-1, 3)
         is_present = ~np.isnan(y)
-        of_sensor = np.tile(np.arange(n), len(frames))
+        sensor_index = np.tile(np.arange(n), len(frames))
         error = MODEL_ERROR**2 * energy[:, compared].ravel()
         W = np.linalg.inv(np.linalg.cholesky(C + error[:, None, None] * np.eye(3)))
         W = W * is_present[:, :, None] * is_present[:, None, :]
         background_columns = np.zeros((len(y), 3, n, 3))
-        background_columns[np.arange(len(y)), :, of_sensor] = W
+        background_columns[np.arange(len(y)), :, sensor_index] = W
         columns = background_columns.reshape(3 * len(y), 3 * n)
-        return cls(compared, np.nan_to_num(t).ravel(), network.positions[compared][of_sensor],
-                   W @ network.R_sw[compared][of_sensor], of_sensor - 1,
+        return cls(compared, np.nan_to_num(t).ravel(), network.positions[compared][sensor_index],
+                   W @ network.R_sw[compared][sensor_index], sensor_index - 1,
                    np.einsum('nij,nj->ni', W, np.nan_to_num(y)).ravel(),
                    columns[:, columns.any(axis=0)], int(np.count_nonzero(is_present)))
 
@@ -148,9 +149,9 @@ class PassSamples:
         path : (10 + n_clocks,) array
             Path and clock offsets.
         cost : float
-            Sum of squared whitened residuals.
+            Sum of squared whitened residuals; infinite if no start is valid.
         P : (n_free, n_free) array
-            Covariance of the free parameters.
+            Covariance of the free parameters; zero for parameters that are not observable.
         """
         model = SteadyPass(self.t, self.positions, self.M, self.clock, free,
                            np.zeros(N_PATH + self.n_clocks), n_dipoles)

@@ -10,11 +10,11 @@ from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
 from mag_tracking.stages.track.observation import Observation
 
 P_MOUNTING = 0.05
-"""Probability that the estimated mounting angles of correctly mounted sensors exceed the limit."""
+"""Probability that the estimated mounting angles of correctly mounted sensors are flagged."""
 
 P_HEIGHT = 1e-3
-"""Probability that the height of a vehicle differs from the height of its kind by more than the
-limit."""
+"""Probability that the height of a vehicle is flagged, although it follows the distribution of its
+kind."""
 
 LANE_STDS, LANE_STDS_LATER = 1.645, 3.0
 """Maximum distance of a vehicle from the outermost configured lane, in standard deviations: at its
@@ -22,7 +22,7 @@ closest point to any sensor, and at later times, when it may have turned off. On
 on that lane exceeds the first limit."""
 
 MIN_SPEED = 1.0
-"""[m/s] The heading of a slower vehicle is undefined."""
+"""[m/s] Minimum speed of a vehicle that has a heading."""
 
 MAX_RELATIVE_MOVE = 0.75
 """Maximum motion of a target within a frame, relative to its distance to the second nearest sensor.
@@ -77,7 +77,7 @@ class Plausibility:
 
     def _update_road_check(self, bank: FilterBank, settings: VehicleSettings,
                            positions: FloatArray) -> None:
-        """Update the closest point of each hypothesis, and whether this point was off the road."""
+        """Update the smallest distance of each hypothesis to a sensor, and its off-road flag."""
         n_added = max(int(bank.origin.max()) + 1 - len(self._nearest), 0)
         self._nearest = np.append(self._nearest, np.full(n_added, np.inf))
         self._was_off_road = np.append(self._was_off_road, np.zeros(n_added, dtype=bool))

@@ -99,15 +99,15 @@ class VehicleOrientation:
         flags : (3,) tuple of bool
             Whether the rotation about the x, y and z axis of the body is unobservable.
         """
-        speed2 = x[3] ** 2 + x[4] ** 2
+        squared_speed = x[3] ** 2 + x[4] ** 2
         T = np.zeros((3, len(x)))
-        if speed2 > 0.0:
-            T[2, 3], T[2, 4] = -x[4] / speed2, x[3] / speed2
-        yaw_known = speed2 > 0.0 and T[2] @ P @ T[2] < UNOBSERVED_VARIANCE
-        if not yaw_known:
+        if squared_speed > 0.0:
+            T[2, 3], T[2, 4] = -x[4] / squared_speed, x[3] / squared_speed
+        is_yaw_known = squared_speed > 0.0 and T[2] @ P @ T[2] < UNOBSERVED_VARIANCE
+        if not is_yaw_known:
             T[:] = 0.0
-        unobserved = np.diag([1.0, 1.0, 0.0 if yaw_known else 1.0]) * UNOBSERVED_VARIANCE
-        return self.quaternions(x[None])[0], T, unobserved, (True, True, not yaw_known)
+        unobserved = np.diag([1.0, 1.0, 0.0 if is_yaw_known else 1.0]) * UNOBSERVED_VARIANCE
+        return self.quaternions(x[None])[0], T, unobserved, (True, True, not is_yaw_known)
 
     def quaternions(self, x: FloatArray) -> FloatArray:
         """Quaternions of several states.

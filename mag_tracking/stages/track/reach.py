@@ -10,8 +10,8 @@ from mag_tracking.stages.track.relinearisation import Window
 
 NEGLIGIBLE_ENERGY, WEAK_ENERGY = 0.1, 1.0
 """Squared norm of the whitened field per frame below which a target that moves away is removed
-from a joint track. The larger limit applies if the track has the maximum number of targets. It is
-also the limit up to which the field of a target does not disturb other targets."""
+from a joint track. The larger limit applies if the track has the maximum number of targets. Up to
+the larger limit, the field of a target does not disturb other targets."""
 
 DETECTABLE_ENERGY = 4.0
 """Minimum squared norm of the whitened field of a detectable target. For a tracked vehicle, it

@@ -50,7 +50,7 @@ CONVERGED = 0.3
 deviations of the position."""
 
 ATTEMPTED, FAILED = 'paths relinearised', 'paths relinearised without success'
-"""Keys of the event counts."""
+"""Keys of the event counts: all relinearised paths, and paths whose states were not adopted."""
 
 MAX_FRAMES = 64
 """Maximum number of frames in a window. When the window moves, at most half of this number remain.
@@ -74,9 +74,9 @@ class Window:
     intervals: list[float]
     """[s] Time from the previous frame to each frame."""
     paths: list[FloatArray]
-    """(n_hyp, n_x) States at each frame at which the hypotheses of the anchor are linearised."""
+    """For each frame, states (n_hyp, n_x) at which the hypotheses of the anchor are linearised."""
     log_likelihoods: list[FloatArray]
-    """(n_hyp,) Log-likelihoods of each frame in the filter; -inf for dropped hypotheses."""
+    """For each frame, log-likelihoods (n_hyp,) in the filter; -inf for dropped hypotheses."""
     evidence: float
     """Log-evidence, in the filter, of the frames with which the anchor has not been updated."""
     max_hypotheses: int
@@ -149,6 +149,7 @@ class Relinearisation:
         predicted : (n_hyp, n_x) array
             States at which the frame was first linearised.
         log_likelihood : (n_hyp,) array
+            Log-likelihood of the frame for each hypothesis.
         evidence : float
             Log-density of the frame over all hypotheses.
         frame : FieldFrame
@@ -163,12 +164,12 @@ class Relinearisation:
         if len(bank) < len(self._anchor) // 2:
             self._keep_hypotheses(self._anchor, np.isin(self._anchor.origin, bank.origin))
         rows = _rows(self._anchor, bank)
-        path, of_frame = self._anchor.x.copy(), np.full(len(self._anchor), -np.inf)
-        path[rows], of_frame[rows] = predicted, log_likelihood
+        path, anchor_log_likelihood = self._anchor.x.copy(), np.full(len(self._anchor), -np.inf)
+        path[rows], anchor_log_likelihood[rows] = predicted, log_likelihood
         self._frames.append(frame)
         self._intervals.append(dt)
         self._paths.append(path)
-        self._log_likelihoods.append(of_frame)
+        self._log_likelihoods.append(anchor_log_likelihood)
         self._evidence.append(evidence)
         if self._last_ns is None:
             self._last_ns = frame.stamp_ns
@@ -177,7 +178,7 @@ class Relinearisation:
         """Drop all hypotheses of the anchor that are not in `mask`."""
         anchor.keep(mask)
         self._paths = [path[mask] for path in self._paths]
-        self._log_likelihoods = [of_frame[mask] for of_frame in self._log_likelihoods]
+        self._log_likelihoods = [values[mask] for values in self._log_likelihoods]
 
     def relinearise_leading(self, bank_filter: BankFilter, bank: FilterBank) -> 'Counter[str]':
         """Relinearise the leading hypotheses of a bank in place, if the interval has elapsed.
@@ -203,29 +204,30 @@ class Relinearisation:
             return Counter()
         leading = self._leading_rows(bank)
         rows = _rows(anchor, bank)[leading]
-        ends = anchor.rows(rows)
+        relinearised = anchor.rows(rows)
         paths = np.stack([path[rows] for path in self._paths], axis=1)
-        along = self._run_along(bank_filter, ends, paths, PASSES)
-        is_finite = np.isfinite(along.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
+        path_result = self._run_along(bank_filter, relinearised, paths, PASSES)
+        is_finite = np.isfinite(path_result.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
         for path, improved in zip(self._paths, np.swapaxes(paths, 0, 1), strict=True):
             path[rows[is_finite]] = improved[is_finite]
         filtered = np.sum(self._log_likelihoods[int(self._is_updated):], axis=0)[rows]
-        gain = np.subtract(along.log_likelihood, filtered, where=is_finite,
+        gain = np.subtract(path_result.log_likelihood, filtered, where=is_finite,
                            out=np.full(len(rows), -np.inf))
         self._gain = dict(zip(anchor.origin[rows[is_finite]].tolist(), gain[is_finite].tolist(),
                               strict=True))
-        converged = along.unsettled <= CONVERGED
+        converged = path_result.unsettled <= CONVERGED
         is_accepted = is_finite & converged & (
             (gain >= 0.0) | ~bank_filter.are_long(bank.kind[leading]))
-        _replace_states(bank, leading[is_accepted], ends.x[is_accepted], ends.P[is_accepted])
+        _replace_states(bank, leading[is_accepted], relinearised.x[is_accepted],
+                        relinearised.P[is_accepted])
         is_rejected = is_finite & ~is_accepted
-        _widen_covariances(bank, leading[is_rejected], ends.x[is_rejected], ends.P[is_rejected],
-                           bank_filter.nearly_linear)
+        _widen_covariances(bank, leading[is_rejected], relinearised.x[is_rejected],
+                           relinearised.P[is_rejected], bank_filter.nearly_linear)
         return Counter({ATTEMPTED: len(is_accepted), FAILED: int(np.count_nonzero(~is_accepted))})
 
     @property
     def window(self) -> Window | None:
-        """Frames and paths of the window; None if it is empty."""
+        """Frames and paths of the window; None if it is empty or about to restart."""
         if self._anchor is None or self._is_stale or not self._frames:
             return None
         begin = int(self._is_updated)
@@ -289,7 +291,7 @@ class Relinearisation:
         return self._gain.get(origin, 0.0)
 
     def _leading_rows(self, bank: FilterBank) -> IntArray:
-        """Indices of the heaviest hypotheses, up to the maximum number."""
+        """Indices of the heaviest hypotheses within `MAX_LOG_RATIO`, up to the maximum number."""
         n_affordable = MAX_ELEMENTS // (len(self._frames) * bank.x.shape[1]**2)
         order = np.argsort(-bank.log_w, kind='stable')
         leading: IntArray = order[bank.log_w[order] >= bank.log_w.max() - MAX_LOG_RATIO]
@@ -298,10 +300,10 @@ class Relinearisation:
     def _move_window(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
                      bank: FilterBank) -> FilterBank | InitialBank:
         """Shorten the window to its nominal duration once the frames cover twice this duration."""
-        now, n_frames = self._frames[-1].stamp_ns, len(self._frames)
-        if now - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MAX_FRAMES:
+        now_ns, n_frames = self._frames[-1].stamp_ns, len(self._frames)
+        if now_ns - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MAX_FRAMES:
             return anchor
-        n = next(k for k, f in enumerate(self._frames) if now - f.stamp_ns <= self._window_ns
+        n = next(k for k, f in enumerate(self._frames) if now_ns - f.stamp_ns <= self._window_ns
                  and n_frames - k <= MAX_FRAMES // 2)
         return self._move_to(bank_filter, anchor, bank, n)
 
@@ -327,7 +329,7 @@ class Relinearisation:
 
 
 def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
-    """Replace the states `rows` of the bank in place, and the covariances where `P` is larger."""
+    """Replace states `rows` of the bank in place, and each covariance that is smaller than `P`."""
     bank_variance, path_variance = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P))
     bank.x[rows] = x
     bank.P[rows[path_variance > bank_variance]] = P[path_variance > bank_variance]
@@ -335,15 +337,17 @@ def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArr
 
 def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
                        nearly_linear: Callable[[FloatArray], FloatArray]) -> None:
-    """Adopt the larger covariances of paths, in place, widened by the difference of the states.
+    """Replace the covariances of hypotheses `rows` in place where `P` is larger.
 
-    A covariance is not adopted if it is too large for the next linear update.
+    The new covariance includes the difference between `x` and the state of the bank. It is not
+    adopted if it is too large for the next linear update.
     """
     difference = x - bank.x[rows]
     wide_P = P + difference[:, :, None] * difference[:, None]
-    own_variance, path_variance, total = (
+    own_variance, path_variance, wide_variance = (
         np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P, wide_P))
-    is_wider = (path_variance > own_variance) & (total < np.square(nearly_linear(bank.x[rows])))
+    is_wider = (path_variance > own_variance) \
+        & (wide_variance < np.square(nearly_linear(bank.x[rows])))
     bank.P[rows[is_wider]] = wide_P[is_wider]
 
 

@@ -73,13 +73,13 @@ class RigidPass:
 
     stamp_ns: int
     """Time of the strongest field; time zero of the paths."""
-    straight: float
+    straight_cost: float
     """Cost of a straight path at constant speed, without clock offsets."""
-    bent: float
+    bent_cost: float
     """Cost of a path with acceleration and turn rate, without clock offsets."""
     cost_with_offsets: float
     """Cost of a straight path at constant speed with free clock offsets."""
-    freedom: int
+    degrees_of_freedom: int
     """Degrees of freedom of the fit with free clock offsets."""
     misfit: float
     """Reduced chi-square of a bent path with a short or, if needed, a long row; about 1 if it
@@ -109,10 +109,10 @@ class RigidPass:
     @property
     def is_explained(self) -> bool:
         """Whether a straight path explains the pass, if necessary with free clock offsets."""
-        return self.cost_with_offsets <= GOOD_MISFIT * self.freedom
+        return self.cost_with_offsets <= GOOD_MISFIT * self.degrees_of_freedom
 
     def closest(self, positions: FloatArray) -> FloatArray:
-        """Closest point of the path to any sensor.
+        """Point of the path that is closest to a sensor.
 
         Parameters
         ----------
@@ -160,7 +160,7 @@ class RigidPass:
     @property
     def widening(self) -> float:
         """Factor for the variances: the reduced chi-square with free clock offsets, at least 1."""
-        return max(self.cost_with_offsets / self.freedom, 1.0)
+        return max(self.cost_with_offsets / self.degrees_of_freedom, 1.0)
 
     def clock_variance(self, sensor: int) -> float:
         """Variance of the clock offset of a sensor, including the model error.
@@ -178,18 +178,19 @@ class RigidPass:
 
     @property
     def needs_clock_offsets(self) -> bool:
-        """Whether only a straight path with clock offsets explains the pass."""
+        """Whether clock offsets are significant, and displace the target by `MIN_DISTANCE`."""
         offset = float(np.nanmax(np.abs(self.offset)))
         if not self.is_explained or offset > MAX_OFFSET or offset * self.speed < MIN_DISTANCE:
             return False
-        gains = (np.array([self.straight, self.bent]) - self.cost_with_offsets) / self.widening
+        gains = (np.array([self.straight_cost, self.bent_cost])
+                 - self.cost_with_offsets) / self.widening
         prior_cost = float(np.nansum(np.square(self.offset / OFFSET_STD)))
         return bool((gains - prior_cost > chdtri(self.n_clocks, [P_CLOCKS, P_BEND])).all())
 
     @property
     def is_straight(self) -> bool:
         """Whether turn rate and acceleration do not improve the fit significantly."""
-        gain = (min(self.straight, self.cost_with_offsets) - self.bent) / self.widening
+        gain = (min(self.straight_cost, self.cost_with_offsets) - self.bent_cost) / self.widening
         return bool(gain <= chdtri(N_PATH - N_STRAIGHT, P_BEND))
 
 
@@ -220,23 +221,23 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
                       np.arctan2(starts[:, 4], starts[:, 3]), starts[:, 5],
                       np.full(len(starts), LENGTH)], axis=1)
     straight, cost, _ = data.fit(N_SHORT, _STRAIGHT, first)
-    bends, offset_starts = straight[None, _BENT], [(straight[_STRAIGHT], SMALL_OFFSET)]
+    bent_starts, offset_starts = straight[None, _BENT], [(straight[_STRAIGHT], SMALL_OFFSET)]
     if cost > GOOD_MISFIT * (data.n_free(N_SHORT) - N_STRAIGHT):
         # If the vehicle turned, or if the clock offsets are large, the straight path is misleading.
-        bends = np.vstack([bends, [np.append(first[0], [0.0, turn, 0.0])
-                                   for turn in (-START_TURN_RATE, START_TURN_RATE)]])
+        bent_starts = np.vstack([bent_starts, [np.append(first[0], [0.0, turn, 0.0])
+                                               for turn in (-START_TURN_RATE, START_TURN_RATE)]])
         offset_starts.append((first[0], LARGE_OFFSET))
-    clocks = np.array([np.append(p, np.full(n_clocks, sign * offset))
-                       for p, offset in offset_starts for sign in (-1.0, 1.0)])
-    path, bent, _ = data.fit(N_SHORT, _BENT, bends)
-    short = _RowFits(_state_at_zero(straight), cost, bent, data.n_free(N_SHORT) - N_PATH)
+    clock_starts = np.array([np.append(p, np.full(n_clocks, sign * offset))
+                             for p, offset in offset_starts for sign in (-1.0, 1.0)])
+    path, bent_cost, _ = data.fit(N_SHORT, _BENT, bent_starts)
+    short = _RowFits(_state_at_zero(straight), cost, bent_cost, data.n_free(N_SHORT) - N_PATH)
     long = _fit_long_row(data, straight, path, short.misfit > GOOD_MISFIT)
     misfit = short.misfit if short.misfit <= GOOD_MISFIT else min(short.misfit, long.misfit)
-    straight_paths = [f.straight for f in (short, long) if f.needs_no_bend
-                      and _is_of_vehicle(f.straight, data.positions)]
+    straight_paths = [f.straight_state for f in (short, long) if f.needs_no_bend
+                      and _is_of_vehicle(f.straight_state, data.positions)]
     free = np.concatenate([_STRAIGHT, N_PATH + np.arange(n_clocks)])
-    path, cost_with_offsets, P = data.fit(N_SHORT, free, clocks)
-    if not np.isfinite([cost, bent, cost_with_offsets, misfit]).all():
+    path, cost_with_offsets, P = data.fit(N_SHORT, free, clock_starts)
+    if not np.isfinite([cost, bent_cost, cost_with_offsets, misfit]).all():
         return None
     offset, std = np.full(len(network), np.nan), np.full(len(network), np.nan)
     # An unobservable offset has zero variance in a pseudo-inverse.
@@ -245,32 +246,32 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     offset[data.compared[is_known]] = np.append(0.0, path[N_PATH:])[is_known]
     std[data.compared[is_known]] = np.sqrt(np.append(0.0, variance))[is_known]
     x = _state_at_zero(path)
-    return RigidPass(stamp_ns, cost, bent, cost_with_offsets, data.n_free(N_SHORT) - len(free),
-                     misfit, int(data.compared[0]), offset, std, x[:3], x[3:],
-                     np.reshape(straight_paths, (-1, 6)))
+    return RigidPass(stamp_ns, cost, bent_cost, cost_with_offsets,
+                     data.n_free(N_SHORT) - len(free), misfit, int(data.compared[0]), offset,
+                     std, x[:3], x[3:], np.reshape(straight_paths, (-1, 6)))
 
 
 class _RowFits(NamedTuple):
     """Fits of one row of dipoles, on a straight path and on a bent path."""
 
-    straight: FloatArray
+    straight_state: FloatArray
     """(6,) Position and velocity of the straight path at time zero."""
-    cost: float
-    cost_bent: float
-    freedom: int
+    straight_cost: float
+    bent_cost: float
+    degrees_of_freedom: int
     """Degrees of freedom of the bent path."""
 
     @property
     def misfit(self) -> float:
         """Reduced chi-square of the bent path."""
-        return self.cost_bent / self.freedom
+        return self.bent_cost / self.degrees_of_freedom
 
     @property
     def needs_no_bend(self) -> bool:
         """Whether the straight path explains the pass, without a significant gain from a bend."""
         n_more = N_PATH - N_STRAIGHT
-        gain = (self.cost - self.cost_bent) / max(self.misfit, 1.0)
-        return bool(self.cost <= MAX_MISFIT * (self.freedom + n_more)
+        gain = (self.straight_cost - self.bent_cost) / max(self.misfit, 1.0)
+        return bool(self.straight_cost <= MAX_MISFIT * (self.degrees_of_freedom + n_more)
                     and gain <= chdtri(n_more, P_BEND))
 
 
@@ -282,8 +283,8 @@ def _fit_long_row(data: PassSamples, straight: FloatArray, bent: FloatArray, add
     starts[2:, PATH.index('length')] = LONG_LENGTH
     path, cost, _ = near.fit(N_LONG, _STRAIGHT, starts[::2, _STRAIGHT])
     extra = starts[[0, 1, 3]] if adds_starts else starts[:0]
-    _, cost_bent, _ = near.fit(N_LONG, _BENT, np.vstack([path[None, _BENT], extra[:, _BENT]]))
-    return _RowFits(_state_at_zero(path), cost, cost_bent, data.n_free(N_LONG) - N_PATH)
+    _, bent_cost, _ = near.fit(N_LONG, _BENT, np.vstack([path[None, _BENT], extra[:, _BENT]]))
+    return _RowFits(_state_at_zero(path), cost, bent_cost, data.n_free(N_LONG) - N_PATH)
 
 
 def _state_at_zero(path: FloatArray) -> FloatArray:
@@ -293,6 +294,6 @@ def _state_at_zero(path: FloatArray) -> FloatArray:
 
 
 def _is_of_vehicle(state: FloatArray, positions: FloatArray) -> bool:
-    """Whether distance to the sensors (n, 3) and speed of a state (6,) are those of a vehicle."""
+    """Whether a state (6,) is within `MAX_DISTANCE` of a sensor (n, 3) and below `MAX_SPEED`."""
     nearest = np.linalg.norm(state[:3] - positions, axis=1).min()
     return bool(nearest < MAX_DISTANCE and np.linalg.norm(state[3:]) < MAX_SPEED)

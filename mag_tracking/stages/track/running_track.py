@@ -43,7 +43,7 @@ DOUBTED_S = 3.0
 """[s] Duration of the doubt about the uncertain vehicles of an accepted explanation."""
 
 TrackRecord = Track | SmoothedPose | Disturbance
-"""Output of the tracker."""
+"""Record that the tracker returns: pose, smoothed pose or disturbance."""
 
 
 class RunningTrack:
@@ -107,7 +107,7 @@ class RunningTrack:
 
     @property
     def _final_sensors(self) -> SensorSubset:
-        """Sensors that the track uses once all of its sensors have been added."""
+        """Sensors of the track after the remaining sensors have been added."""
         return self._bank.later_sensors or self._bank.sensors
 
     def configure(self, settings: TrackSettings) -> None:
@@ -140,12 +140,12 @@ class RunningTrack:
 
     def begin(self, frame: FieldFrame, recent: list[FieldFrame], approach_unobserved: bool = False
               ) -> list[TrackRecord]:
-        """Process the frames before the detection; return the records of the detection's frame.
+        """Process the frames up to the detection, and return the records of the detection frame.
 
         Parameters
         ----------
         frame : FieldFrame
-            Frame of the detection, of the whole network.
+            Frame of the detection, with all sensors of the network.
         recent : list of FieldFrame
             Frames before the detection, oldest first.
         approach_unobserved : bool, optional
@@ -160,7 +160,7 @@ class RunningTrack:
         first.evidence.flag_start(
             approach_unobserved
             or observed_ns < MIN_OBSERVED_FRACTION * self._settings.lookback_s * NS,
-            self._final_sensors.whole, self._target.starts_anywhere)
+            self._final_sensors.full_network, self._target.starts_anywhere)
         first.begin_ns = frame.stamp_ns
         self._bank.begin(recent[0] if recent else frame, frame)
         dt = 0.0
@@ -180,7 +180,7 @@ class RunningTrack:
         Parameters
         ----------
         frame : FieldFrame
-            Frame of the whole network.
+            Frame with all sensors of the network.
         dt : float, s
             Time since the previous frame.
         publish : bool, optional
@@ -194,26 +194,26 @@ class RunningTrack:
             return []
         for member in () if self._target.starts_anywhere else self.members:
             member.evidence.check_approach(self._final_sensors.part_of(frame))
-        advance = self._bank.advance(self._bank.sensors.part_of(frame), dt)
-        if not self._update_evidence(advance):
+        frame_update = self._bank.advance(self._bank.sensors.part_of(frame), dt)
+        if not self._update_evidence(frame_update):
             return self.end('no hypothesis explains the field')
-        self._bank.keep(advance, publish)
+        self._bank.store_and_prune(frame_update, publish)
         best = self.bank.best()
-        self._update_new_target_evidence(advance, best)
+        self._update_new_target_evidence(frame_update, best)
         if not publish and not self._bank.is_lagged:
             return []
         views = [self._view(i, best) for i in range(len(self.members))]
-        lagged = self._bank.lagged(best, advance.frame, dt, publish)
+        lagged = self._bank.lagged(best, frame_update.frame, dt, publish)
         lagged_poses = [pose for i, view in enumerate(views) for pose in self._smoothed(
             i, view, False, lagged, self.members[i].is_doubtful(self._settings))]
         if not publish:
             return []
-        update = BankUpdate(advance.frame, dt, self.bank, self._bank.filter, self._bank.sensors,
-                            self._settings)
+        update = BankUpdate(frame_update.frame, dt, self.bank, self._bank.filter,
+                            self._bank.sensors, self._settings)
         out: list[TrackRecord] = [member.publish(update, view)
                                   for member, view in zip(self.members, views, strict=True)]
         self._handover_due = best if self._bank.sensors.is_part else None
-        return [*out, *lagged_poses, *self._end_lost_members(advance.frame)]
+        return [*out, *lagged_poses, *self._end_lost_members(frame_update.frame)]
 
     def _view(self, i: int, best: int) -> MemberView:
         """View of member `i` alone; `best` is the index of the best joint hypothesis."""
@@ -221,14 +221,14 @@ class RunningTrack:
         row = best if bank is self.bank else bank.best()
         return MemberView(bank, row, self._bank.single_target, self._bank.gain(row))
 
-    def _update_evidence(self, advance: FrameUpdate) -> bool:
+    def _update_evidence(self, frame_update: FrameUpdate) -> bool:
         """Update the evidence of the members; return False if no hypothesis explains the frame."""
-        frame, dt = advance.frame, advance.dt
-        if advance.n_rejected and np.count_nonzero(frame.n_samples) <= advance.n_rejected:
+        frame, dt = frame_update.frame, frame_update.dt
+        if frame_update.n_rejected and np.count_nonzero(frame.n_samples) <= frame_update.n_rejected:
             # Without a majority of sensors, the track itself may be wrong.
             for member in self.members:
                 member.evidence.flag(doubts.SENSORS_CONTRADICT)
-        if not np.isfinite(advance.evidence):
+        if not np.isfinite(frame_update.evidence):
             self.counts['frames that no hypothesis explains'] += 1
             return False
         best = self.bank.best()
@@ -236,10 +236,10 @@ class RunningTrack:
         disturbance_model = self._disturbance_model.log_density(
             frame, dt, self._bank.filter.model_error(self.bank, best, dt))
         for i, member in enumerate(self.members):
-            member.evidence.add(advance.evidence - no_target)
+            member.evidence.add(frame_update.evidence - no_target)
             if disturbance_model is not None:
                 member.evidence.bayes_factor.add(
-                    advance.evidence - disturbance_model, frame.stamp_ns,
+                    frame_update.evidence - disturbance_model, frame.stamp_ns,
                     self._settings.min_bayes_factor)
             own_frame, first = self._member_frame(i, best, frame, dt), \
                 i * self._bank.single_target.n_target
@@ -249,12 +249,12 @@ class RunningTrack:
                     own_frame, self.bank.x[best, first:first + self._bank.single_target.n_target])
         return True
 
-    def _update_new_target_evidence(self, advance: FrameUpdate, best: int) -> None:
+    def _update_new_target_evidence(self, frame_update: FrameUpdate, best: int) -> None:
         """Update the evidence for new targets with the innovations of hypothesis `best`."""
-        bank, frame = self.bank, advance.frame
+        bank, frame = self.bank, frame_update.frame
         self._new_target_evidence.add(
             float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
-            frame.stamp_ns, advance.n_rejected > 0 and len(frame.field) == 2,
+            frame.stamp_ns, frame_update.n_rejected > 0 and len(frame.field) == 2,
             bool(self._bank.filter.are_long(bank.kind[best:best + 1])[0]))
 
     def _member_frame(self, i: int, best: int, frame: FieldFrame, dt: float) -> FieldFrame:
@@ -338,7 +338,7 @@ class RunningTrack:
 
     @property
     def unexplained(self) -> list[UnexplainedField]:
-        """Measured fields of ended members, where no target has explained the field."""
+        """Fields of the ended members that no target has explained."""
         found = [m.unexplained(self._disturbance_model.uniform) for m in self.members if m.ended]
         return [u for u in found if u is not None]
 
@@ -379,7 +379,7 @@ class RunningTrack:
         return None
 
     def admit(self, joint: JointExplanation, id: int) -> None:
-        """Replace the hypotheses by a joint explanation of recent frames, and add its new vehicle.
+        """Replace the hypotheses by a joint explanation, and add its new vehicle, if any.
 
         Parameters
         ----------

@@ -22,8 +22,8 @@ _States: TypeAlias = tuple[FloatArray, FloatArray]
 
 SENSORS_PER_REJECTION = 8
 """Number of measuring sensors for each sensor that may be rejected. With fewer sensors, one may be
-rejected. If more rejections are needed, the track itself is wrong. The majority is no proof of the
-track, because sensors far from the target fit any hypothesis."""
+rejected. If more rejections are needed, the track itself is wrong. A majority of fitting sensors
+does not confirm the track, because sensors far from the target fit any hypothesis."""
 
 
 class SensorRejection:
@@ -40,7 +40,7 @@ class SensorRejection:
         self.clear()
 
     def clear(self) -> None:
-        """Clear the memory of the sensors that were rejected in the previous frame."""
+        """Clear the list of sensors that were rejected in the previous frame."""
         self._rejected: tuple[int, ...] = ()
 
     def advance(self, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame, dt: float
@@ -61,7 +61,7 @@ class SensorRejection:
             States before the update.
         log_likelihood : (n_hyp,) array
         frame : FieldFrame
-            The frame that was used, in which rejected sensors are missing.
+            Frame of the update, in which rejected sensors are missing.
         counts : Counter of str
             Number of rejections by description; one count per rejected sensor.
         """

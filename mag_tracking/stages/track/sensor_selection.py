@@ -16,16 +16,16 @@ from mag_tracking.stages.track.observation import angle_priors
 from mag_tracking.stages.track.settings import TrackSettings
 
 PREDICTION_S = 0.5
-"""[s] Sensors are selected for the position predicted over this time."""
+"""[s] Prediction horizon of the position near which sensors are selected."""
 
 
-def nearest_sensors(positions: FloatArray, place: FloatArray, n: int) -> IntArray:
+def nearest_sensors(positions: FloatArray, position: FloatArray, n: int) -> IntArray:
     """Indices of the sensors nearest to a position.
 
     Parameters
     ----------
     positions : (n_sensors, 3) array, m
-    place : (2,) array, m
+    position : (2,) array, m
     n : int
         Number of sensors.
 
@@ -34,23 +34,23 @@ def nearest_sensors(positions: FloatArray, place: FloatArray, n: int) -> IntArra
     (n,) int array
         Indices in ascending order.
     """
-    distance = np.hypot(*(positions[:, :2] - place).T)
+    distance = np.hypot(*(positions[:, :2] - position).T)
     return np.sort(np.argsort(distance, kind='stable')[:n])
 
 
-def offset_from_nearest(place: FloatArray, positions: FloatArray) -> FloatArray:
+def offset_from_nearest(position: FloatArray, positions: FloatArray) -> FloatArray:
     """Horizontal vector from the nearest sensor to a position.
 
     Parameters
     ----------
-    place : (2,) array, m
+    position : (2,) array, m
     positions : (n_sensors, 3) array, m
 
     Returns
     -------
     (2,) array, m
     """
-    offset: FloatArray = place - positions[nearest_sensors(positions, place, 1)[0], :2]
+    offset: FloatArray = position - positions[nearest_sensors(positions, position, 1)[0], :2]
     return offset
 
 
@@ -76,13 +76,13 @@ class SensorSubset:
 
     Parameters
     ----------
-    whole : SensorNetwork
+    full_network : SensorNetwork
     rows : (n,) int array, optional
         Indices of the sensors in ascending order; all sensors by default.
 
     Attributes
     ----------
-    whole : SensorNetwork
+    full_network : SensorNetwork
     is_part : bool
         Whether the sensors are a selection.
     rows : (n,) int array
@@ -91,20 +91,20 @@ class SensorSubset:
         Network of the selected sensors.
     """
 
-    def __init__(self, whole: SensorNetwork, rows: IntArray | None = None) -> None:
-        self.whole = whole
+    def __init__(self, full_network: SensorNetwork, rows: IntArray | None = None) -> None:
+        self.full_network = full_network
         self.is_part = rows is not None
-        self.rows: IntArray = np.arange(len(whole)) if rows is None else rows
-        self.network = whole if rows is None else whole.part(rows)
+        self.rows: IntArray = np.arange(len(full_network)) if rows is None else rows
+        self.network = full_network if rows is None else full_network.part(rows)
 
     @classmethod
-    def near(cls, whole: SensorNetwork, place: FloatArray, n: int) -> 'SensorSubset':
-        """The sensors nearest to a position.
+    def near(cls, full_network: SensorNetwork, position: FloatArray, n: int) -> 'SensorSubset':
+        """Create the subset of the sensors nearest to a position.
 
         Parameters
         ----------
-        whole : SensorNetwork
-        place : (2,) array, m
+        full_network : SensorNetwork
+        position : (2,) array, m
         n : int
             Number of sensors.
 
@@ -112,7 +112,7 @@ class SensorSubset:
         -------
         SensorSubset
         """
-        return cls(whole, nearest_sensors(whole.positions, place, n))
+        return cls(full_network, nearest_sensors(full_network.positions, position, n))
 
     def part_of(self, frame: FieldFrame) -> FieldFrame:
         """Readings of these sensors from a frame of the whole network.
@@ -128,7 +128,7 @@ class SensorSubset:
         return part_of_frame(frame, self.rows) if self.is_part else frame
 
     def ahead_of(self, state: FloatArray, n: int) -> 'SensorSubset':
-        """The sensors nearest to the predicted position of a target.
+        """Subset of the sensors nearest to the predicted position of a target.
 
         Parameters
         ----------
@@ -141,9 +141,10 @@ class SensorSubset:
         SensorSubset
             The same object if it already contains the nearer half of these sensors.
         """
-        place = state[:2] + PREDICTION_S * state[3:5]
-        is_enough = np.isin(nearest_sensors(self.whole.positions, place, n // 2), self.rows).all()
-        return self if is_enough else SensorSubset.near(self.whole, place, n)
+        position = state[:2] + PREDICTION_S * state[3:5]
+        is_enough = np.isin(
+            nearest_sensors(self.full_network.positions, position, n // 2), self.rows).all()
+        return self if is_enough else SensorSubset.near(self.full_network, position, n)
 
     def is_approached_by(self, track: Track) -> bool:
         """Whether a track moves towards its nearest sensor.
@@ -171,7 +172,8 @@ class SensorSubset:
         -------
         Track
         """
-        return for_whole_network(track, self.rows, self.whole, settings) if self.is_part else track
+        return for_whole_network(track, self.rows, self.full_network, settings) if self.is_part \
+            else track
 
 
 def exchange_sensor_states(bank: FilterBank, before: IntArray, after: IntArray,

@@ -28,12 +28,12 @@ class TrackSettings:
         'The scale is not observable from one sensor: moment and range follow from the configured '
         'moments, heights and offsets alone. Such tracks are always ambiguous.')
     field_error: float = param(
-        0.04, 'Error of the predicted field relative to its magnitude (gains and axes of the '
-        'sensors, shape of the target).',
+        0.04, 'Error of the predicted field relative to its magnitude, due to the gains and axes '
+        'of the sensors and the shape of the target.',
         '', (0.0, 10.0), live=True)
     model_error_time_s: float = param(
-        0.3, 'Correlation time of the model error near the target (first-order Gauss-Markov states '
-        'of each sensor). With it, the weight of the error does not depend on the frame period. 0 '
+        0.3, 'Correlation time of the model error near the target. The error is a first-order '
+        'Gauss-Markov process at each sensor, so its weight does not depend on the frame period. 0 '
         'selects independent noise in every frame, which is faster with many sensors.', 's',
         (0.0, 60.0))
     background_std: float = param(
@@ -55,14 +55,14 @@ class TrackSettings:
         (1.0, 1e12), live=True)
     iterations: int = param(
         1, 'Number of linearisations per update. More than one helps if the field is far more '
-        'informative than the prediction (magnets). For vehicles, the iterations converge to the '
-        'wrong side of the sensor.', '', (1, 20), live=True)
+        'informative than the prediction (magnets). For vehicles, further iterations may converge '
+        'to the wrong side of the sensor.', '', (1, 20), live=True)
     max_sensors: int = param(
         16, 'Maximum number of sensors of a track. In a larger network, a track uses the nearest '
-        'sensors. After they change, the track is not smoothed at its end. For the initial '
+        'sensors. After a change of sensors, the track is not smoothed at its end. For the initial '
         'hypotheses of a vehicle, the memory limit (250 MB) may allow only about ten sensors. The '
-        'remaining sensors are then added at the detection, where smoothing begins in this case, '
-        'or as the vehicle moves.', '', (2, 1000))
+        'remaining sensors are then added at the detection or as the vehicle moves. If they are '
+        'added at the detection, smoothing begins there.', '', (2, 1000))
     max_joint_targets: int = param(
         4, 'Maximum number of vehicles with overlapping fields that are tracked jointly. '
         'Each additional vehicle adds computing time. 1 disables joint tracking.', '', (1, 4))
@@ -78,9 +78,9 @@ class TrackSettings:
         'the correct hypothesis is often lost if few are kept.', '', (1, 100000), live=True)
     relinearise_window_s: float = param(
         2.0, 'Duration of the window over which the leading hypotheses of a running track are '
-        'relinearised along their smoothed paths. It contains the frames of one to two times this '
-        'duration, and no more than 64. 0 disables relinearisation, which reduces the computing '
-        'time by a fifth.', 's', (0.0, 60.0))
+        'relinearised along their smoothed paths. It covers one to two times this duration, and at '
+        'most 64 frames. 0 disables relinearisation, which reduces the computing time by a fifth.',
+        's', (0.0, 60.0))
     relinearise_interval_s: float = param(
         0.15, 'Interval between relinearisations. Their cost grows with the number of sensors; at '
         '100 frames per second, 0.5 is recommended.', 's', (0.0, 60.0))
@@ -92,7 +92,7 @@ class TrackSettings:
         'sensors, and two vehicles that are tracked as one. If a straight path explains the pass '
         'but leads to another position, the covariance covers this position, too.', live=True)
     lookback_s: float = param(
-        1.0, 'Time before the detection at which a track begins; it uses stored frames. Fields '
+        1.0, 'Duration of the stored frames before the detection with which a track begins. Fields '
         'that are too weak for a detection still contain information about the origin of the '
         'target.', 's', (0.0, 60.0))
     end_std: float = param(

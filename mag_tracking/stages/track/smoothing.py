@@ -30,13 +30,13 @@ TrackState: TypeAlias = tuple[int, FloatArray, FloatArray]
 """Timestamp [ns], state (n_x,) and covariance (n_x, n_x)."""
 
 RELINEARISATIONS = 1
-"""Number of relinearisations of the whole track at the previous result. They correct for inaccurate
+"""Number of relinearisations of a track along its previous result. They correct for inaccurate
 predictions far from the sensors. One relinearisation does not reach convergence. Four improve the
 tracks of turning cars and trucks, but degrade the track of a car along a corridor of sensors."""
 
 MAX_ELEMENTS = 10_000_000
-"""Maximum product of frames and squared number of states. It corresponds to 80 MB and less than a
-second."""
+"""Maximum product of frames and squared number of states. It corresponds to 80 MB of memory, and to
+less than a second of computing time."""
 
 
 def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[FieldFrame],
@@ -63,17 +63,17 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     -------
     states : list of (x (n_x,), P (n_x, n_x))
         Smoothed state at each frame.
-    left_out : int
+    n_excluded : int
         Number of frames that were excluded because they contradict the hypothesis.
     """
     paths = np.full((1, len(frames), bank.x.shape[1]), np.nan)
     for at, known in zip(paths[0], path, strict=False):
         at[:] = known
-    along = bank_filter.run_along(
+    path_result = bank_filter.run_along(
         bank.alone(0), frames, intervals, paths, passes=relinearisations + 1, step=1.0,
         first_is_updated=updated, rejects_outliers=True, wants_covariances=True)
-    left_out = np.count_nonzero(~along.used[0, int(updated):])
-    return list(zip(paths[0], along.covariances[0], strict=True)), int(left_out)
+    n_excluded = np.count_nonzero(~path_result.used[0, int(updated):])
+    return list(zip(paths[0], path_result.covariances[0], strict=True)), int(n_excluded)
 
 
 @dataclass
@@ -134,7 +134,7 @@ class WholeTrack:
             self._start = _TrackStart(copy(bank_filter), bank)
 
     def resume(self, window: Window, bank_filter: BankFilter) -> None:
-        """Restart with a window of another filter; all of its frames count as published.
+        """Restart with a window of another filter; the frames of the window count as published.
 
         Parameters
         ----------
@@ -193,18 +193,20 @@ class WholeTrack:
         Returns
         -------
         states : list of TrackState
-        left_out : int
+            Empty if the track cannot be smoothed as a whole.
+        n_excluded : int
             Number of frames that were excluded because they contradict the hypothesis.
         """
         start = self._start
         if start is None or not self._frames:
             return [], 0
         origin = int(bank.origin[best])
-        one = start.bank.rows(np.flatnonzero(start.bank.origin == origin))
-        states, left_out = smoothed_track(start.bank_filter, one, self._frames, self._intervals,
-                                          self._is_updated, path=start.path_of(origin))
+        single = start.bank.rows(np.flatnonzero(start.bank.origin == origin))
+        states, n_excluded = smoothed_track(
+            start.bank_filter, single, self._frames, self._intervals, self._is_updated,
+            path=start.path_of(origin))
         return [(frame.stamp_ns, x, P) for frame, (x, P), published in zip(
-            self._frames, states, self._is_published, strict=True) if published], left_out
+            self._frames, states, self._is_published, strict=True) if published], n_excluded
 
 
 class _LaggedFrame(NamedTuple):
@@ -292,9 +294,9 @@ class FixedLag:
             self._frames, self._states(bank_filter, bank, best), strict=True) if lagged.published]
 
     def _states(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[State]:
-        """Smoothed states of the stored frames, without relinearisation, which is too slow here."""
+        """Smoothed states of the stored frames; relinearisation is omitted to save time."""
         oldest = self._frames[0]
-        one, row = bank.alone(best), np.flatnonzero(oldest.origin == bank.origin[best])
-        one.x, one.P = oldest.x[row].copy(), oldest.P[row].copy()
-        return smoothed_track(bank_filter, one, [k.frame for k in self._frames],
+        single, row = bank.alone(best), np.flatnonzero(oldest.origin == bank.origin[best])
+        single.x, single.P = oldest.x[row].copy(), oldest.P[row].copy()
+        return smoothed_track(bank_filter, single, [k.frame for k in self._frames],
                               [k.dt for k in self._frames], updated=True, relinearisations=0)[0]

@@ -35,8 +35,8 @@ SPEED_COLUMN = PATH.index('speed')
 """Column of the speed in a path."""
 
 MIN_STD = 1e-3
-"""[m], [m/s], [A m^2] Standard deviation of parameters without a spread in the settings, such as
-the length of a point."""
+"""[m], [m/s], [A m^2] Minimum standard deviation of a parameter. It applies to parameters without a
+spread in the settings, such as the length of a point."""
 
 MIN_SPEED_RATIO = 0.2
 """Minimum speed of an arriving vehicle, relative to the lowest starting speed."""
@@ -105,7 +105,7 @@ class PathPrior:
                    MIN_SPEED_RATIO * min(vehicle.speeds))
 
     def nearest_line(self, theta: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Arrival line that is nearest in heading.
+        """Arrival line whose heading is nearest to the heading of each path.
 
         Parameters
         ----------
@@ -116,12 +116,12 @@ class PathPrior:
         -------
         line : (n,) int array
             Index in `headings`.
-        off : (n,) array, rad
+        relative_heading : (n,) array, rad
             Heading of the path relative to the line.
         """
-        off = (theta[:, 4, None] - self.headings + np.pi) % (2.0 * np.pi) - np.pi
-        line: IntArray = np.abs(off).argmin(axis=1)
-        return line, off[np.arange(len(theta)), line]
+        relative_headings = (theta[:, 4, None] - self.headings + np.pi) % (2.0 * np.pi) - np.pi
+        line: IntArray = np.abs(relative_headings).argmin(axis=1)
+        return line, relative_headings[np.arange(len(theta)), line]
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals of paths with respect to the prior.
@@ -137,17 +137,17 @@ class PathPrior:
         J : (n, 7, 7) array
             Jacobian of the prediction.
         """
-        line, turned = self.nearest_line(theta)
-        aside = np.stack([-np.sin(self.headings), np.cos(self.headings)], axis=1)[line]
+        line, relative_heading = self.nearest_line(theta)
+        normals = np.stack([-np.sin(self.headings), np.cos(self.headings)], axis=1)[line]
         relative = theta.copy()
-        relative[:, 1] = np.einsum('ni,ni->n', theta[:, :2] - self.centre, aside)
-        relative[:, 4] = turned
+        relative[:, 1] = np.einsum('ni,ni->n', theta[:, :2] - self.centre, normals)
+        relative[:, 4] = relative_heading
         J = np.tile(np.diag(1.0 / self.std), (len(theta), 1, 1))
-        J[:, 1, :2] = aside / self.std[1]
+        J[:, 1, :2] = normals / self.std[1]
         return (self.mean - relative) / self.std, J
 
     def starts(self, vehicle: VehicleSettings, network: SensorNetwork) -> FloatArray:
-        """Grid of start paths; at time zero the vehicles are anywhere along the arrival lines.
+        """Grid of start paths; their positions at time zero cover the arrival lines.
 
         Parameters
         ----------
@@ -199,7 +199,7 @@ class StartGrid:
     bases : (3 n_samples, 3 n) array
         Whitened fields of unit moments: three columns for each path.
     gram : (n, 3, 3) array
-        A'A of the columns A of each path.
+        Gram matrix A'A of the three columns A of each path.
     prior_cost : (n,) array
         Squared normalised difference of each path from the mean of the prior.
     """
@@ -246,7 +246,7 @@ class SteadySearch:
         return self._marginal_whitener(self.samples.y - self.known)
 
     def _solve(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Basis (n, y, 9 m), information (n, 9 m, 9 m), its inverse, and estimate of moments.
+        """Basis (n, y, 9 m), information (n, 9 m, 9 m) and its inverse, and moments (n, 9 m).
 
         The inverse is NaN or meaningless for a path through a sensor.
         """
@@ -304,11 +304,12 @@ class SteadySearch:
         A, _, inverse, p = self._solve(theta)
         derivative = self._model.derivative(paths, p.reshape(len(paths), -1))
         D = self._marginal_whitener(_joined_columns(derivative, m))
-        moved = inverse @ (np.swapaxes(A, 1, 2) @ D)
-        off, off_J = self.prior.residual_and_jacobian(paths)
-        return (np.hstack([self._y - np.einsum('nyi,ni->ny', A, p), -p / std, off.reshape(n, -1)]),
-                np.concatenate([D - A @ moved, -moved / std[:, None], _block_diagonal(off_J, m)],
-                               axis=1))
+        moment_jacobian = inverse @ (np.swapaxes(A, 1, 2) @ D)
+        prior_residual, prior_J = self.prior.residual_and_jacobian(paths)
+        return (np.hstack([self._y - np.einsum('nyi,ni->ny', A, p), -p / std,
+                           prior_residual.reshape(n, -1)]),
+                np.concatenate([D - A @ moment_jacobian, -moment_jacobian / std[:, None],
+                                _block_diagonal(prior_J, m)], axis=1))
 
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
         """Refine paths by Levenberg-Marquardt steps.
@@ -334,13 +335,13 @@ class SteadySearch:
         are_moving = (path[:, SPEED_COLUMN::N_STRAIGHT] >= self.prior.min_speed).all(axis=1)
         return path, np.where(are_moving & self._are_detectable(path), cost, np.inf)
 
-    def best(self, grid: StartGrid, most: int) -> FloatArray:
+    def best(self, grid: StartGrid, max_paths: int) -> FloatArray:
         """Search for the paths of a single vehicle that explain the frames best.
 
         Parameters
         ----------
         grid : StartGrid
-        most : int
+        max_paths : int
             Maximum number of paths.
 
         Returns
@@ -350,7 +351,7 @@ class SteadySearch:
         """
         path, cost = self.refined(
             _best_distinct(grid.theta, self.cost(grid), START_TOLERANCE, N_STARTS))
-        return _best_distinct(path, cost, PATH_TOLERANCE, most)
+        return _best_distinct(path, cost, PATH_TOLERANCE, max_paths)
 
     def moments(self, theta: FloatArray) -> FloatArray:
         """Estimate the moments of the rows of dipoles on given paths.
@@ -386,15 +387,15 @@ class SteadySearch:
             self.columns, self._model.basis(path[None])[0] * self.prior.moment_std,
             self._model.derivative(path[None], p)[0] * FIRST_PATH_STD]))
 
-    def pairs(self, grid: StartGrid, most: int, most_second: int) -> list[FloatArray]:
+    def pairs(self, grid: StartGrid, max_paths: int, max_second: int) -> list[FloatArray]:
         """Search for the pairs of paths that explain the frames best.
 
         Parameters
         ----------
         grid : StartGrid
-        most : int
+        max_paths : int
             Maximum number of first paths.
-        most_second : int
+        max_second : int
             Maximum number of second paths for each first path.
 
         Returns
@@ -402,8 +403,8 @@ class SteadySearch:
         list of (2, 7) array
             The best pair first.
         """
-        starts = [np.append(first, second) for first in self.best(grid, most)
-                  for second in self.beside(first).best(grid, most_second)]
+        starts = [np.append(first, second) for first in self.best(grid, max_paths)
+                  for second in self.beside(first).best(grid, max_second)]
         pairs, cost = self.refined(np.array(starts).reshape(-1, 2 * N_STRAIGHT))
         cost = cost + self._log_determinant_of_moments(pairs)
         is_usable = np.isfinite(cost)

@@ -29,7 +29,7 @@ class FrameUpdate:
     """Result of the prediction and update of a bank with a frame."""
 
     frame: FieldFrame
-    """The part of the frame that was used."""
+    """Frame of the update, in which rejected sensors are missing."""
     dt: float
     """[s] Time since the previous frame."""
     predicted: FloatArray
@@ -134,18 +134,18 @@ class TrackBank:
         self.filter.configure(settings)
         self._relinearisation.restart()
 
-    def begin(self, first: FieldFrame, now: FieldFrame) -> None:
+    def begin(self, first: FieldFrame, detection: FieldFrame) -> None:
         """Move the bank back to the first frame of the track, and start to store frames.
 
         Parameters
         ----------
         first : FieldFrame
             First frame of the track.
-        now : FieldFrame
-            Frame at which the bank was created.
+        detection : FieldFrame
+            Frame of the detection, at which the bank was created.
         """
-        if first is not now:
-            self.filter.move(self.bank, (first.stamp_ns - now.stamp_ns) / NS)
+        if first is not detection:
+            self.filter.move(self.bank, (first.stamp_ns - detection.stamp_ns) / NS)
         start = InitialBank.of(self.bank, self.filter.observation.n_target)
         self._whole_track.begin(copy(start), self.filter)
         self._relinearisation.begin(start)
@@ -170,23 +170,23 @@ class TrackBank:
         return FrameUpdate(used, dt, predicted, log_likelihood, self.bank.reweight(log_likelihood),
                            len(rejected))
 
-    def keep(self, advance: FrameUpdate, publish: bool) -> None:
+    def store_and_prune(self, frame_update: FrameUpdate, publish: bool) -> None:
         """Store a frame, drop improbable hypotheses, and relinearise the leading ones if due.
 
         Parameters
         ----------
-        advance : FrameUpdate
+        frame_update : FrameUpdate
         publish : bool
             Whether a pose is published for the frame.
         """
         s, bank = self._settings, self.bank
-        self._relinearisation.add(bank, advance.predicted, advance.log_likelihood,
-                                  advance.evidence, advance.frame, advance.dt)
+        self._relinearisation.add(bank, frame_update.predicted, frame_update.log_likelihood,
+                                  frame_update.evidence, frame_update.frame, frame_update.dt)
         self._counts['hypotheses dropped'] += bank.prune(
             -np.log(s.prune_ratio),
             s.max_hypotheses if publish else max(s.max_hypotheses, s.max_initial_hypotheses))
         self._counts.update(self._relinearisation.relinearise_leading(self.filter, bank))
-        self._whole_track.add(bank, advance.frame, advance.dt, publish)
+        self._whole_track.add(bank, frame_update.frame, frame_update.dt, publish)
 
     def lagged(self, best: int, frame: FieldFrame, dt: float, publish: bool) -> list[TrackState]:
         """Add a frame to the fixed-lag smoother; return the states of frames older than the lag.
@@ -224,7 +224,7 @@ class TrackBank:
             self.filter, self.bank, best)
 
     def smoothed(self, best: int, counts: bool = True) -> list[TrackState]:
-        """Smoothed states of all stored frames.
+        """Smoothed states of the published frames; empty if the whole track cannot be smoothed.
 
         Parameters
         ----------
@@ -237,9 +237,9 @@ class TrackBank:
         -------
         list of TrackState
         """
-        states, left_out = self._whole_track.smoothed(self.bank, best)
+        states, n_excluded = self._whole_track.smoothed(self.bank, best)
         if counts:
-            self._counts['frames left out of smoothing'] += left_out
+            self._counts['frames left out of smoothing'] += n_excluded
             self._counts['tracks too long to smooth'] += self._whole_track.is_too_long
         return states
 

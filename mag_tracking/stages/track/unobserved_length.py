@@ -8,7 +8,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.stages.track.sensor_selection import offset_from_nearest
 
 MAX_CAR_ROW = 4.0
-"""[m] Maximum length of the row of a car, whose iron is approximately in its middle."""
+"""[m] Maximum length of the row of dipoles of a car. Longer vehicles also extend beyond the row."""
 
 MIN_SPEED_STDS = 3.0
 """A vehicle has a heading if its speed exceeds this number of standard deviations."""
@@ -83,14 +83,14 @@ class UnobservedLength:
         (2, 2) array, m^2
         """
         hidden = 0.5 * (self._lengths - length)
-        square = np.maximum(hidden, 0.0)**2 + 0.25 * self._stds**2
+        second_moment = np.maximum(hidden, 0.0)**2 + 0.25 * self._stds**2
         # A longer vehicle would have been observed once its middle has passed a sensor.
         is_possible = ((self._lengths > self._lengths[kind]) & (hidden > 0.0)
                        & (self._distance_travelled < hidden))
-        variance = square[is_possible].sum() / len(self._lengths)
+        variance = second_moment[is_possible].sum() / len(self._lengths)
         if self._lengths[kind] > MAX_CAR_ROW:
             is_sensed = self._distance_travelled >= hidden[kind]
-            variance += square[kind] / (3.0 if is_sensed else 1.0)
+            variance += second_moment[kind] / (3.0 if is_sensed else 1.0)
         forward = self._direction(x, P)
         covariance: FloatArray = variance * np.outer(forward, forward)
         return covariance

@@ -18,7 +18,7 @@ from mag_tracking.stages.track.initiation_vehicle import (
 )
 
 MIN_MOMENT = 1e-6
-"""[A m^2] The direction of a smaller moment is undefined."""
+"""[A m^2] Minimum magnitude of a moment that has a direction."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,8 @@ class VehicleState:
               ) -> tuple[FloatArray, FloatArray]:
         """Prior of a vehicle that arrives on a given path.
 
-        It equals the prior at the start of a track, but the moment has the estimated direction.
+        The mean lies on the path, and its moment has the estimated direction. All other values
+        equal the prior at the start of a track.
 
         Parameters
         ----------
@@ -106,19 +107,21 @@ class VehicleState:
         x[:, :3], x[:, 3:6] = theta[:3] + times[:, None] * velocity, velocity
         ordered = moments[::-1] if length < 0.0 else moments
         is_point = s.length_stds[kind] == 0.0
-        each = np.tile(moments.sum(axis=0) / d, (d, 1)) if is_point else _resampled(ordered, d)
-        x[:, 6:6 + 3 * d] = (each @ R - soft_D * self._model.induction @ R / d).ravel()
+        dipole_moments = np.tile(moments.sum(axis=0) / d, (d, 1)) if is_point \
+            else _resampled(ordered, d)
+        x[:, 6:6 + 3 * d] = (dipole_moments @ R - soft_D * self._model.induction @ R / d).ravel()
         x[:, 6 + 3 * d:9 + 3 * d] = soft_D
         if d > 1:
             x[:, 9 + 3 * d] = s.lengths[kind] if is_point else abs(length)
         return x
 
     def hard_moments(self, x: FloatArray) -> FloatArray:
-        """Permanent moments of a state.
+        """Hard iron moments of the dipoles of a vehicle.
 
         Parameters
         ----------
         x : (n_t,) array
+            State of the vehicle.
 
         Returns
         -------

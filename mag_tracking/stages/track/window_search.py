@@ -1,4 +1,4 @@
-"""Samples of a window for the search for vehicles, given the fields of known vehicles."""
+"""Samples of a window, prepared for searches for vehicles in addition to known vehicles."""
 
 from functools import cached_property
 
@@ -90,15 +90,15 @@ class WindowSearch:
         """Fields (n, n_sensors, 3, q) due to errors of known vehicles, at one standard deviation.
 
         `H` (n, n_sensors, 3, n_t) are the derivatives along a path that ends with the state `x`
-        (n_x,), at times `t` (n,) [s] before its end.
+        (n_x,), at times `t` (n,) [s] relative to its end.
         """
         out = []
         for first in range(0, H.shape[-1], n_one):
             H_one = H[..., first:first + n_one]
             by_velocity = H_one[..., 3:6] + t[:, None, None, None] * H_one[..., :3]
             hard = self._vehicles.hard_moments(x[first:first + n_one])
-            of_moment = H_one[..., 6:6 + hard.size].reshape(*H_one.shape[:3], -1, 3).mean(axis=3)
+            by_moment = H_one[..., 6:6 + hard.size].reshape(*H_one.shape[:3], -1, 3).mean(axis=3)
             magnitude = float(np.linalg.norm(hard.sum(axis=0)))
             out += [KNOWN_STD * H_one[..., :3], KNOWN_STD * by_velocity,
-                    KNOWN_MOMENT_RATIO * magnitude * of_moment]
+                    KNOWN_MOMENT_RATIO * magnitude * by_moment]
         return np.concatenate(out, axis=3)

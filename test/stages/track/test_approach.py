@@ -1,4 +1,4 @@
-"""Approach test: which growth of a field is accepted, and which growth is flagged."""
+"""Approach test: accepted and flagged growth of a field."""
 
 import numpy as np
 import pytest

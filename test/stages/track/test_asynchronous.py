@@ -84,7 +84,8 @@ def test_tracks_of_slow_asynchronous_sensors_are_consistent():
 
 
 def rotating_magnet(offset, rate=0.4, n=60, dt=0.27):
-    """(network, frames, positions) of a magnet that circles and rotates above nine sensors."""
+    """(network, frames, positions (n, 3) [m]) of a magnet that circles and rotates above nine
+    sensors."""
     network, still, _ = magnet_frames(1)
     rng = np.random.default_rng(3)
 
@@ -104,7 +105,7 @@ def rotating_magnet(offset, rate=0.4, n=60, dt=0.27):
 
 
 def errors_of(network, frames, truth):
-    """Position errors [m] and NEES of the tracks, without the first ten frames."""
+    """(position errors [m], NEES per axis) of the tracks, without the first ten frames."""
     stage = TrackManager(network, settings_for('magnet').track)
     tracks = [t for f in frames for t in stage.feed(f)]
     e = (np.array([t.position for t in tracks]) - truth)[10:]
@@ -142,7 +143,8 @@ def test_a_magnet_above_sensors_that_are_read_sequentially_is_tracked():
 
 @pytest.mark.parametrize('gap_s', [2.0, 5.0, 15.0])
 def test_a_magnet_is_found_again_after_a_long_gap(gap_s):
-    """Wrong poses are ambiguous. After three frames the track is correct again."""
+    """Wrong poses are ambiguous. Three frames after the gap, all poses are correct and
+    unambiguous."""
     network, frames, truth = rotating_magnet(np.zeros(9), n=40 + round(gap_s / 0.1), dt=0.1)
     keep = np.r_[0:20, -20:0]
     frames, truth = [frames[k] for k in keep], truth[keep]
@@ -159,8 +161,8 @@ def test_a_magnet_is_found_again_after_a_long_gap(gap_s):
 
 
 def tracks_with_contradiction(manager, sizes):
-    """`Track`s from ten frames with a constant field and frames with random fields of these RMS
-    values [T]."""
+    """`Track`s from ten frames with a constant field, followed by frames with random fields whose
+    RMS values [T] are `sizes`."""
     C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
     rng = np.random.default_rng(1)
     records = []
@@ -182,8 +184,8 @@ def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_restarted():
 
 @pytest.mark.parametrize('lookback_s', [1.0, 0.0])
 def test_twice_the_field_of_a_lost_vehicle_starts_an_ambiguous_track(lookback_s):
-    """While a vehicle departs, its field only decreases. A field twice as strong must therefore
-    belong to another target."""
+    """The field of a departing vehicle only decreases. A field that is twice as strong must
+    therefore belong to another target."""
     stage = TrackManager(line_network(2), settings_for(
         'vehicle', {'track.lookback_s': lookback_s}).track)
     tracks = tracks_with_contradiction(stage, [1e-4] * 19 + [2.1e-4])

@@ -46,7 +46,7 @@ def test_too_many_hypotheses_of_a_magnet_are_rejected(changes, message):
 
 
 def bytes_at_start(n, settings):
-    """Memory [bytes] of the covariances of all hypotheses of a vehicle that starts with `n`
+    """Memory [bytes] of the covariances of all hypotheses of a vehicle whose track starts with `n`
     sensors."""
     network = line_network(n)
     target = target_of(settings, network)
@@ -94,9 +94,9 @@ def test_a_magnet_starts_with_max_sensors():
 def test_the_number_of_retained_hypotheses_is_limited_by_memory(n):
     settings, network = settings_for('vehicle').track, line_network(2)
     observation = BankFilter(network, target_of(settings, network).model, settings).observation
-    kept, each = bank_size.max_hypotheses(observation, n), 8 * observation.n_states(n)**2
-    assert (kept == bank_size.MIN_HYPOTHESES if n == 90
-            else kept * each <= bank_size.WIDER_BYTES < (kept + 1) * each)
+    n_hyp, size = bank_size.max_hypotheses(observation, n), 8 * observation.n_states(n)**2
+    assert (n_hyp == bank_size.MIN_HYPOTHESES if n == 90
+            else n_hyp * size <= bank_size.WIDER_BYTES < (n_hyp + 1) * size)
 
 
 def test_more_sensors_than_fit_into_memory_are_rejected():

@@ -27,7 +27,7 @@ def comparison_of(passes, rows=FIRST_TWO, n_sensors=2):
 def test_consistent_passes_identify_the_clock_that_is_ahead():
     clocks = comparison_of([rigid_pass_of(0.1)] * 4)
     largest = clocks.largest_offset
-    assert (largest.sensor, largest.against, largest.n_passes) == (1, 0, 4)
+    assert (largest.sensor, largest.reference, largest.n_passes) == (1, 0, 4)
     assert clocks.largest_offset.offset_s == pytest.approx(0.1, rel=1e-6)
     assert clocks.largest_offset_s(FIRST_TWO) == pytest.approx(0.1, rel=1e-6)
     text = clocks.largest_offset.text(('left', 'right'))
@@ -40,25 +40,27 @@ def test_consistent_passes_identify_the_clock_that_is_ahead():
 @pytest.mark.parametrize('offset, message', [(-0.2, 'behind the other clocks'),
                                              (0.2, 'ahead of the other clocks')])
 def test_the_wrong_clock_of_several_is_identified(offset, message):
-    """Each sensor is the reference once."""
+    """Each sensor is the reference of the passes once."""
     for reference in range(4):
         true = np.array([0.0, 0.0, offset, 0.0])
         rigid_pass = rigid_pass_of(np.delete(true - true[reference], reference),
                                    reference=reference)
         clocks = comparison_of([rigid_pass] * 3, np.arange(4), 4)
-        assert clocks.largest_offset.sensor == 2 and clocks.largest_offset.against is None
+        assert clocks.largest_offset.sensor == 2 and clocks.largest_offset.reference is None
         assert clocks.largest_offset.offset_s == pytest.approx(offset, abs=0.01)
         assert message in clocks.largest_offset.text('abcd')
         assert clocks.largest_offset_s(np.arange(4)) == pytest.approx(0.2, abs=0.01)
 
 
 def test_offsets_within_their_standard_deviations_identify_no_clock():
-    """At 60 m/s every offset is harmful, but offsets of four standard deviations are rare."""
+    """At 60 m/s, all of these offsets move a vehicle by more than a metre, but offsets above four
+    standard deviations are rare."""
     rng = np.random.default_rng(1)
     std = float(np.hypot(0.05, 0.5 / 60.0))
-    named = sum(comparison_of([rigid_pass_of(std * rng.standard_normal(), std=0.05, speed=60.0)
-                               for _ in range(4)]).largest_offset is not None for _ in range(300))
-    assert named <= 1
+    n_identified = sum(
+        comparison_of([rigid_pass_of(std * rng.standard_normal(), std=0.05, speed=60.0)
+                       for _ in range(4)]).largest_offset is not None for _ in range(300))
+    assert n_identified <= 1
     # Offsets that are four times as large identify a clock.
     assert sum(comparison_of([rigid_pass_of(4.0 * std * rng.standard_normal(), std=0.05, speed=60.0)
                               for _ in range(4)]).largest_offset is not None
@@ -72,8 +74,8 @@ def test_a_single_pass_identifies_a_clock_but_does_not_flag_later_tracks():
 
 
 def test_passes_of_other_sensors_do_not_count_for_a_clock():
-    """There are ten passes of the first two sensors, and one or two passes of the next two, whose
-    clocks differ."""
+    """Ten passes compare the first two clocks. One or two passes compare the next two clocks, which
+    differ."""
     clocks = comparison_of([rigid_pass_of(0.0)] * 10, FIRST_TWO, 4)
     clocks.add(rigid_pass_of(0.3), np.array([2, 3]))
     assert clocks.largest_offset_s(np.arange(4)) == 0.0

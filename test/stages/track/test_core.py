@@ -18,10 +18,10 @@ from support.plain_filter import PlainFilter
 
 SIGMA = 4e-9
 N_LARGE = 23
-"""Number of sensors at which the updates of every case process only half of the covariance
-(`HALVED_FROM`)."""
+"""Number of sensors at which the updates of all cases process only half of the covariance (see
+`HALVED_FROM`)."""
 N_TARGETS = {'two rows that turn': 2, 'three points': 3}
-"""{case: number of vehicles that share a state}."""
+"""{case: number of vehicles that share a state}; 1 for all other cases."""
 CASES = {
     'two rows that turn': ('vehicle', {}),
     'three points': ('vehicle', POINT),
@@ -91,7 +91,7 @@ def assert_same(a, b, tolerance=1e-9):
 @pytest.mark.parametrize('n_sensors', [3, N_LARGE])
 @pytest.mark.parametrize('name', CASES)
 def test_a_bank_advanced_through_frames_matches_numpy(name, n_sensors):
-    """Some axes and one sensor are missing, and the sensors have different sampling times."""
+    """In some frames, an axis or a sensor is missing, or the sampling times of sensors differ."""
     compiled, plain, bank, frames, intervals = case(name, n_sensors)
     other = bank.copy()
     for filter_, b in ((compiled, bank), (plain, other)):
@@ -100,11 +100,11 @@ def test_a_bank_advanced_through_frames_matches_numpy(name, n_sensors):
     for frame, dt in zip(frames, intervals, strict=True):
         other.x, other.P = bank.x.copy(), bank.P.copy()
         predicted, log_likelihood = compiled.advance(bank, frame, dt)
-        expected, of_plain = plain.advance(other, frame, dt)
+        expected, expected_log_likelihood = plain.advance(other, frame, dt)
         assert_same(bank, other)
         np.testing.assert_allclose(bank.nis, other.nis, rtol=1e-9)
         np.testing.assert_allclose(predicted, expected, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(log_likelihood, of_plain, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(log_likelihood, expected_log_likelihood, rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(bank.P, np.swapaxes(bank.P, 1, 2))
 
 
@@ -140,10 +140,10 @@ def test_a_hypothesis_at_a_sensor_is_ruled_out_and_the_others_are_not():
     alone = bank.alone(0)
     bank.x[1, :3] = compiled.observation.positions[1]
     _, log_likelihood = compiled.advance(bank, frames[0], 0.0)
-    _, of_one = compiled.advance(alone, frames[0], 0.0)
+    _, single_log_likelihood = compiled.advance(alone, frames[0], 0.0)
     assert log_likelihood[1] == -np.inf and np.isfinite(np.delete(log_likelihood, 1)).all()
     np.testing.assert_array_equal(alone.P[0], bank.P[0])
-    assert log_likelihood[0] == of_one[0]
+    assert log_likelihood[0] == single_log_likelihood[0]
     assert np.isfinite(bank.x).all() and np.isfinite(bank.P).all()
 
 
@@ -213,11 +213,11 @@ def test_an_invalid_hypothesis_does_not_affect_the_others(name):
         b, p = bank.copy(), paths.copy()
         if is_invalid:
             b.P[0] *= -1.0
-        along = compiled.run_along(b, frames, intervals, p, passes=3, step=0.5,
-                                   first_is_updated=False, wants_covariances=True)
-        found.append((b.x[1:], b.P[1:], p[1:], along.covariances[1:], along.log_likelihood[1:],
-                      along.unsettled[1:]))
-    assert along.log_likelihood[0] == -np.inf
+        path_result = compiled.run_along(b, frames, intervals, p, passes=3, step=0.5,
+                                         first_is_updated=False, wants_covariances=True)
+        found.append((b.x[1:], b.P[1:], p[1:], path_result.covariances[1:],
+                      path_result.log_likelihood[1:], path_result.unsettled[1:]))
+    assert path_result.log_likelihood[0] == -np.inf
     for expected, got in zip(*found, strict=True):
         np.testing.assert_array_equal(got, expected)
 
@@ -226,9 +226,9 @@ def test_a_path_through_infinity_has_not_converged():
     compiled, _, bank, frames, intervals = case('point', n_hyp=2)
     paths = np.repeat(bank.x[:, None], len(frames), axis=1)
     paths[0, 2] = np.inf
-    along = compiled.run_along(bank, frames, intervals, paths, passes=1, step=0.5,
-                               first_is_updated=False)
-    assert np.isnan(along.unsettled[0]) and np.isfinite(along.unsettled[1])
+    path_result = compiled.run_along(bank, frames, intervals, paths, passes=1, step=0.5,
+                                     first_is_updated=False)
+    assert np.isnan(path_result.unsettled[0]) and np.isfinite(path_result.unsettled[1])
 
 
 def test_the_number_of_vehicles_that_share_a_state_is_bounded():
@@ -261,10 +261,10 @@ def test_two_vehicles_without_common_sensors_are_filtered_independently():
         C = np.tile(SIGMA**2 * np.eye(3), (4, 1, 1))
         log_likelihood = joint.advance(together, FieldFrame(
             k, field, C, np.ones(4), np.zeros(4), True), 0.1)[1]
-        of_each = [f.advance(b, FieldFrame(k, field[rows], C[rows], np.ones(2), np.zeros(2), True),
+        separate = [f.advance(b, FieldFrame(k, field[rows], C[rows], np.ones(2), np.zeros(2), True),
                              0.1)[1] for f, b, rows in zip(
                                  filters, banks, (slice(0, 2), slice(2, 4)), strict=True)]
-        assert log_likelihood[0] == pytest.approx(of_each[0][0] + of_each[1][0], rel=1e-9)
+        assert log_likelihood[0] == pytest.approx(separate[0][0] + separate[1][0], rel=1e-9)
         for i, bank in enumerate(banks):
             view, n_t = together.extract_target(i, len(model.state_names)), len(model.state_names)
             np.testing.assert_allclose(view.x[0, :n_t], bank.x[0, :n_t], rtol=1e-9, atol=1e-9)
@@ -276,16 +276,16 @@ def test_two_vehicles_without_common_sensors_are_filtered_independently():
 def joint_bank(a, b, n_t):
     """Bank of one hypothesis with the targets and sensors of two banks."""
     n_own = (a.x.shape[1] - n_t) // 2 - 3
-    places = [(bank, np.arange(n_t), i * n_t + np.arange(n_t)) for i, bank in enumerate((a, b))]
+    columns = [(bank, np.arange(n_t), i * n_t + np.arange(n_t)) for i, bank in enumerate((a, b))]
     for i, bank in enumerate((a, b)):
         own = np.arange(2 * n_own)
-        places.append((bank, n_t + own, 2 * n_t + i * 2 * n_own + own))
+        columns.append((bank, n_t + own, 2 * n_t + i * 2 * n_own + own))
         background = np.arange(6)
-        places.append((bank, n_t + 2 * n_own + background,
-                       2 * n_t + 4 * n_own + 6 * i + background))
+        columns.append((bank, n_t + 2 * n_own + background,
+                        2 * n_t + 4 * n_own + 6 * i + background))
     n_x = 2 * a.x.shape[1]
     x, P = np.zeros((1, n_x)), np.zeros((1, n_x, n_x))
-    for bank, of, to in places:
+    for bank, of, to in columns:
         x[0, to] = bank.x[0, of]
         P[0, to[:, None], to] = bank.P[0][np.ix_(of, of)]
     both = [np.stack([getattr(a, name), getattr(b, name)], axis=1) for name in ('label', 'kind')]

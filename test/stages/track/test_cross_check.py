@@ -47,7 +47,7 @@ def test_fits_follow_the_cpa_at_increasing_intervals():
     ({'path': FAST_PATH}, FAST_PATH, doubts.FRAMES_TOO_LONG),
     ({'change': lambda B: np.clip(B, -3e-7, 3e-7)}, STRAIGHT, doubts.NO_STEADY_PATH)])
 def test_faults_found_in_the_whole_pass_flag_the_track(of_frames, path, expected):
-    """The doubt begins after the vehicle has passed, and is permanent."""
+    """The doubt begins after the vehicle has passed, and persists."""
     check = CrossCheck(ROAD)
     rows = run_check(check, steady_frames(np.random.default_rng(2), **of_frames), path)
     assert not rows[15][1]
@@ -104,7 +104,7 @@ def test_a_fit_stays_valid_if_later_frames_allow_none():
     assert doubts.CLOCKS_APART in found
 
 
-def tracks_of(readings, network, **changes):
+def records_of(readings, network, **changes):
     pipeline = Pipeline(network, settings_for('vehicle', changes))
     records = pipeline.feed(readings) + pipeline.flush()
     return [r for r in records if not getattr(r, 'ended', False)], pipeline
@@ -113,8 +113,8 @@ def tracks_of(readings, network, **changes):
 def test_the_cross_check_can_be_disabled():
     world = simulated_world('clocks 200 ms apart', 'clouds', 1)
     for on in (True, False):
-        records, pipeline = tracks_of(world.readings, world.network,
-                                      **{'track.cross_check': on})
+        records, pipeline = records_of(world.readings, world.network,
+                                       **{'track.cross_check': on})
         assert any(doubts.CLOCKS_APART in t.doubts for t in records if isinstance(t, Track)) is on
         # The smoothed poses of the whole track are ambiguous.
         assert all(t.ambiguous for t in records if isinstance(t, SmoothedPose)) is on
@@ -124,7 +124,7 @@ def test_the_third_car_past_a_wrong_clock_is_flagged_from_its_first_pose():
     rng = np.random.default_rng(5)
     world = ambient_world(rng, 'clouds', None, 75.0, cars=3)
     readings = spoiler.apply(world.readings, spoiler.delayed('mag_2', 0.25))
-    records, pipeline = tracks_of(readings, world.network, **LINEARISED_ONCE)
+    records, pipeline = records_of(readings, world.network, **LINEARISED_ONCE)
     tracks = [r for r in records if isinstance(r, Track)]
     last = [r for r in records if isinstance(r, Track | SmoothedPose)
             and r.id == max(t.id for t in tracks)]
@@ -132,8 +132,8 @@ def test_the_third_car_past_a_wrong_clock_is_flagged_from_its_first_pose():
     assert all(t.ambiguous for t in last)
     print(pipeline.track.clock_warning)
     assert 'the clock of mag_2 is' in pipeline.track.clock_warning
-    right, pipeline = tracks_of(world.readings, world.network, **LINEARISED_ONCE)
-    assert not any(doubts.CLOCKS_APART in t.doubts for t in right if isinstance(t, Track))
+    correct, pipeline = records_of(world.readings, world.network, **LINEARISED_ONCE)
+    assert not any(doubts.CLOCKS_APART in t.doubts for t in correct if isinstance(t, Track))
     assert pipeline.track.clock_warning == ''
 
 
@@ -141,26 +141,27 @@ def test_the_difference_of_a_track_is_its_distance_from_the_fitted_path():
     """After the pass the difference stays constant."""
     check = CrossCheck(ROAD)
     slow = np.where(np.arange(10) == 3, 14.0, STRAIGHT)
-    away, states = [], []
+    distances, states = [], []
     for frame in steady_frames(np.random.default_rng(9), until_s=6.0):
         t = frame.stamp_ns / 1e9
         check.add(frame, state_at(t, slow if t > 0.0 else STRAIGHT))
         found = check.doubts(0.0)
-        away.append(np.hypot(*check.difference[:2]))
+        distances.append(np.hypot(*check.difference[:2]))
         # A difference larger than the length of a long vehicle means another position.
-        assert found == ({doubts.ANOTHER_PLACE} if away[-1] > 8.0 else set())
+        assert found == ({doubts.ANOTHER_PLACE} if distances[-1] > 8.0 else set())
         if check.latest is None:
-            assert away[-1] == 0.0
+            assert distances[-1] == 0.0
         elif t < 3.0:
             # A long row also explains the pass at another speed; the nearer path is used.
-            assert 3.0 * t - 1.0 < away[-1] < 6.0 * t + 1.0
+            assert 3.0 * t - 1.0 < distances[-1] < 6.0 * t + 1.0
         states.append((frame.stamp_ns, state_at(t), np.eye(6)))
-    assert away[-1] == away[-20] > 15.0 and check.is_doubtful
+    assert distances[-1] == distances[-20] > 15.0 and check.is_doubtful
     # Smoothed states have their own differences; these states are on the true path.
     far = [(stamp_ns, state_at(stamp_ns / 1e9, slow), P) for stamp_ns, _, P in states]
     assert all(np.hypot(*d[:2]) < 2.0 for d in check.differences(states))
-    of_far = [np.hypot(*d[:2]) for d in check.differences(far)]
-    assert len(of_far) == len(states) and of_far[0] > 5.0 and of_far[-1] == of_far[-20] > 15.0
+    far_distances = [np.hypot(*d[:2]) for d in check.differences(far)]
+    assert len(far_distances) == len(states) and far_distances[0] > 5.0 \
+        and far_distances[-1] == far_distances[-20] > 15.0
     # If the fit covers none of the states, the latest difference of the running track is used.
     assert check.differences(far[-3:]) == [check.difference] * 3
 
@@ -175,19 +176,19 @@ def test_smoothed_states_before_the_fitted_pass_have_the_difference_of_its_start
 
 
 def test_a_fit_keeps_the_time_of_its_own_peak():
-    """Two further sensors measure a stronger field later."""
+    """Two more sensors measure a stronger field later, so the pass has a later peak."""
     network = network_of([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0], [12.0, -3.5, 0.0], [12.0, 3.5, 0.0]])
     path = np.where(np.arange(10) == 3, 8.0, np.where(np.arange(10) == 4, 0.0, STRAIGHT))
-    check, away, peaks = CrossCheck(network), [], set()
+    check, distances, peaks = CrossCheck(network), [], set()
     for frame in steady_frames(np.random.default_rng(3), network, path, until_s=4.0):
         state = state_at(frame.stamp_ns / 1e9, path)
         check.add(frame, state)
         assert check.doubts(0.0) == set()
-        away.append(np.hypot(*check.difference[:2]))
+        distances.append(np.hypot(*check.difference[:2]))
         if check.latest is not None:
             peaks.add(check.latest.stamp_ns)
-    print(f'largest difference {max(away):.2f} m')
-    assert len(peaks) > 1 and max(away) < 1.5
+    print(f'largest difference {max(distances):.2f} m')
+    assert len(peaks) > 1 and max(distances) < 1.5
 
 
 def test_a_pass_that_begins_at_its_peak_has_no_difference():
@@ -198,17 +199,17 @@ def test_a_pass_that_begins_at_its_peak_has_no_difference():
 
 
 def test_the_difference_is_included_in_published_covariances(monkeypatch):
-    """The difference of every path is patched to five metres along x."""
-    away = np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    monkeypatch.setattr(RigidPass, 'difference', lambda *_: away)
+    """The difference of each state is patched to five metres along x."""
+    difference = np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    monkeypatch.setattr(RigidPass, 'difference', lambda *_: difference)
     world = simulated_world('a car', 'clouds', 0)
-    records, _ = tracks_of(world.readings, world.network, **LINEARISED_ONCE)
-    for kind, share in ((Track, 0.3), (SmoothedPose, 1.0)):
+    records, _ = records_of(world.readings, world.network, **LINEARISED_ONCE)
+    for kind, fraction in ((Track, 0.3), (SmoothedPose, 1.0)):
         std = np.array([np.sqrt(r.covariance[0, 0]) for r in records if isinstance(r, kind)])
         print(f'{kind.__name__}: {std.round(1)} m')
-        assert np.mean(std > 5.0 - 1e-6) >= share
+        assert np.mean(std > 5.0 - 1e-6) >= fraction
     # Poses before the pass do not include the difference.
     assert std.size and min(np.sqrt(r.covariance[0, 0]) for r in records
                             if isinstance(r, Track)) < 2.0
-    without, _ = tracks_of(world.readings, world.network, **{'track.cross_check': False})
+    without, _ = records_of(world.readings, world.network, **{'track.cross_check': False})
     assert not any(r.covariance[0, 0] > 24.0 for r in without if isinstance(r, SmoothedPose))

@@ -1,4 +1,4 @@
-"""Disturbance model: evidence for common fields and fields of single sensors, and handovers."""
+"""Disturbance model: evidence for common fields and for independent fields, and handovers."""
 
 import dataclasses
 
@@ -24,8 +24,9 @@ def frames(network, fields, dt=0.08, seed=0):
 
 
 def total_log_density(model, sequence, dt=0.08):
-    none = np.zeros(len(sequence[0].field))
-    return sum(model.log_density(f, dt if k else 0.0, none) or 0.0 for k, f in enumerate(sequence))
+    no_error = np.zeros(len(sequence[0].field))
+    return sum(model.log_density(f, dt if k else 0.0, no_error) or 0.0
+               for k, f in enumerate(sequence))
 
 
 def slow_waves(t, network, own):
@@ -40,7 +41,7 @@ def slow_waves(t, network, own):
 
 @pytest.mark.parametrize('n_sensors', [2, 4, 10])
 @pytest.mark.parametrize('own', [True, False])
-def test_a_uniform_field_is_distinguished_from_fields_of_single_sensors(n_sensors, own):
+def test_a_uniform_field_is_distinguished_from_independent_fields(n_sensors, own):
     network = line_network(n_sensors)
     model = DisturbanceModel(network, 2e-8)
     fields = slow_waves(np.arange(0.0, 8.0, 0.08), network, own)
@@ -91,33 +92,33 @@ def test_the_first_frame_after_a_handover_is_not_compared():
     network = line_network(2)
     field = 1e-6 + slow_waves(np.arange(0.0, 4.0, 0.08), network, True)
     sequence = frames(network, field)
-    model, none = DisturbanceModel(network, 2e-8, is_handover=True), np.zeros(2)
-    assert model.log_density(sequence[0], 0.0, none) is None
+    model, no_error = DisturbanceModel(network, 2e-8, is_handover=True), np.zeros(2)
+    assert model.log_density(sequence[0], 0.0, no_error) is None
     # Afterwards, the evidence equals the evidence without the jump, except for the cost of an
     # unknown rate of change.
-    rest = sum(model.log_density(f, 0.08, none) for f in sequence[1:])
+    rest = sum(model.log_density(f, 0.08, no_error) for f in sequence[1:])
     before = DisturbanceModel(network, 2e-8)
     smooth = frames(network, field - 1e-6)
-    before.log_density(smooth[0], 0.0, none)
-    assert rest == pytest.approx(sum(before.log_density(f, 0.08, none) for f in smooth[1:]),
+    before.log_density(smooth[0], 0.0, no_error)
+    assert rest == pytest.approx(sum(before.log_density(f, 0.08, no_error) for f in smooth[1:]),
                                  abs=60.0)
 
 
 @pytest.mark.parametrize('gap_s', [2.0, 20.0, 60.0])
 def test_the_evidence_stays_finite_over_gaps_with_rotated_sensors(gap_s):
-    """Each update mixes all components.
+    """Each update correlates all components of the field.
 
-    Unless one half of each covariance is mirrored, rounding errors grow until the covariance is
-    indefinite.
+    If one half of each covariance were not copied to the other half, rounding errors would make the
+    covariance indefinite.
     """
     network, rng = line_network(4), np.random.default_rng(2)
     R = np.linalg.qr(rng.standard_normal((4, 3, 3)))[0]
     network = dataclasses.replace(
         network, R_ws=R * np.sign(np.linalg.det(R))[:, None, None])
-    other = DisturbanceModel(network, 5e-9)
+    model = DisturbanceModel(network, 5e-9)
     C = np.tile(1.6e-17 * np.eye(3), (4, 1, 1))
     for k in range(2500):
         field = network.R_sw @ (1e-6 * np.sin(0.05 * k) * np.array([1.0, 0.5, -0.3])) \
             + 4e-9 * rng.standard_normal((4, 3))
         frame = FieldFrame(k, field, C, np.ones(4, dtype=np.int64), np.zeros(4))
-        assert np.isfinite(other.log_density(frame, gap_s if k % 50 == 49 else 0.08, np.zeros(4)))
+        assert np.isfinite(model.log_density(frame, gap_s if k % 50 == 49 else 0.08, np.zeros(4)))

@@ -17,7 +17,7 @@ from support.samples import one, simulate
 UNAMBIGUOUS_WITHOUT_DOUBT = ('junction_left_to_right', 'junction_left_turns_to_rear')
 DOUBTFUL_TRACKS = 'tracks with a doubtful background'
 SETTINGS = settings_for('vehicle', QUICK)
-"""Settings of a fast tracker: the doubt does not depend on the target model."""
+"""Settings of a fast target model; the doubt does not depend on the model."""
 
 
 @pytest.fixture(scope='module')
@@ -70,17 +70,17 @@ def test_poses_are_ambiguous_from_the_start_of_the_doubt(pass_frames):
 
 
 def test_doubtful_backgrounds_of_unused_sensors_have_no_effect(pass_frames):
-    two = {'track.max_sensors': 2}
-    _, plain = run_tracker(pass_frames, {}, two)
+    two_sensors = {'track.max_sensors': 2}
+    _, plain = run_tracker(pass_frames, {}, two_sensors)
     unused = {name for name in pass_frames[0].names if run_tracker(
-        pass_frames, {name: [(0.0, None)]}, two)[0].counts[DOUBTFUL_TRACKS] == 0}
+        pass_frames, {name: [(0.0, None)]}, two_sensors)[0].counts[DOUBTFUL_TRACKS] == 0}
     assert len(unused) == 1
-    _, poses = run_tracker(pass_frames, {unused.pop(): [(0.0, None)]}, two)
+    _, poses = run_tracker(pass_frames, {unused.pop(): [(0.0, None)]}, two_sensors)
     assert [t.ambiguous for t in poses] == [t.ambiguous for t in plain]
 
 
 def test_the_calibration_state_message_contains_doubtful_intervals():
-    """The message contains the latest doubtful interval of each sensor that has one."""
+    """For each sensor, the message contains the latest doubtful interval, if there is one."""
     network = read_network(NETWORK_FILE)
     pipeline = Pipeline(network, settings_for('vehicle'))
     assert times_in_message(pipeline) == {name: () for name in network.names}
@@ -103,8 +103,7 @@ def times_in_message(pipeline):
 
 @pytest.mark.parametrize('name', UNAMBIGUOUS_WITHOUT_DOUBT)
 def test_a_vehicle_after_dense_traffic_is_tracked_and_ambiguous(name):
-    """The data contain no quiet interval, so no pose is unambiguous. The batch size does not
-    matter."""
+    """The data contain no quiet interval, so all poses are ambiguous, for any batch size."""
     network, readings = read_network(NETWORK_FILE), after_dense_traffic(name, 7.0)
     pipeline, other = (Pipeline(network, SETTINGS) for _ in range(2))
     tracks = poses_of(pipeline.feed(readings) + pipeline.flush())
@@ -121,7 +120,8 @@ def poses_of(records):
 
 @pytest.mark.parametrize('name', UNAMBIGUOUS_WITHOUT_DOUBT)
 def test_poses_after_dense_traffic_are_unambiguous_without_the_doubt(name):
-    """Therefore the ambiguity in the previous test is due to the doubt."""
+    """The tracker ignores the doubtful intervals here. The ambiguity of these poses is therefore
+    due to the intervals."""
     pipeline = Pipeline(read_network(NETWORK_FILE), SETTINGS)
     pipeline.track.set_doubtful_times = lambda times: None
     tracks = poses_of(pipeline.feed(after_dense_traffic(name, 7.0)) + pipeline.flush())

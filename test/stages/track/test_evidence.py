@@ -31,13 +31,13 @@ def pose(nis=6.0):
 def test_noise_contradicts_a_track_with_the_nominal_probability():
     rng = np.random.default_rng(0)
     nis = rng.chisquare(6, 3_000_000)
-    is_doubtful = 0
+    n_doubtful = 0
     for value in nis[nis > 25.0]:
         evidence = TrackEvidence(2)
         evidence.contradicts(value * np.array([0.3, 0.7]), 6)
-        is_doubtful += evidence.is_doubtful
+        n_doubtful += evidence.is_doubtful
     # The number of doubtful tracks has a Poisson distribution with mean 30.
-    assert 10 < is_doubtful < 60 and len(nis) * CONTRADICTION == pytest.approx(30.0)
+    assert 10 < n_doubtful < 60 and len(nis) * CONTRADICTION == pytest.approx(30.0)
 
 
 def test_a_track_that_was_contradicted_once_stays_doubtful():
@@ -51,9 +51,9 @@ def test_a_filter_that_overfits_is_flagged_for_the_duration_of_the_window():
     evidence = TrackEvidence(2)
     is_doubtful = []
     for t, loss in ((0.0, -9.0), (1.0, 0.9), (1.1, 1.1), (3.0, 0.0), (3.2, -9.0)):
-        is_doubtful.append(evidence.doubts_filter(-loss * OVERFIT_NATS, round(t * NS), 2.0))
+        is_doubtful.append(evidence.update_filter_doubt(-loss * OVERFIT_NATS, round(t * NS), 2.0))
         reasons = {doubts.OVERFIT} if is_doubtful[-1] else {doubts.ANOTHER_PLACE}
-        evidence.note(reasons, round(t * NS))
+        evidence.update_doubts(reasons, round(t * NS))
     assert is_doubtful == [False, False, True, True, False]
     # The doubt applies to single poses, not to the whole track.
     assert not evidence.is_doubtful
@@ -70,26 +70,26 @@ def test_a_contradiction_flags_a_track_of_two_sensors_but_not_of_three(nis, is_d
     assert evidence.is_doubtful == is_doubtful
 
 
-@pytest.mark.parametrize('nis, is_coming, reason', [
+@pytest.mark.parametrize('nis, is_approaching, reason', [
     (6.0, False, 'out of reach'), (6.0, True, None), (1e4, False, LOST)])
-def test_an_approaching_vehicle_is_not_out_of_reach(nis, is_coming, reason):
+def test_an_approaching_vehicle_is_not_out_of_reach(nis, is_approaching, reason):
     evidence = TrackEvidence(2)
-    assert evidence.reason_to_end(pose(), 2.0, is_coming, SETTINGS) is None
-    assert evidence.reason_to_end(pose(nis), 7.0, is_coming, SETTINGS) == reason
+    assert evidence.reason_to_end(pose(), 2.0, is_approaching, SETTINGS) is None
+    assert evidence.reason_to_end(pose(nis), 7.0, is_approaching, SETTINGS) == reason
 
 
-def bank_of(places, weights, std=0.5, lengths=3.0):
-    n, model = len(places), RowVehicle(np.zeros(3), np.ones(3))
+def bank_of(positions, weights, std=0.5, lengths=3.0):
+    n, model = len(positions), RowVehicle(np.zeros(3), np.ones(3))
     n_t = len(model.state_names)
     x = np.zeros((n, n_t))
-    x[:, 0], x[:, 3], x[:, n_t - 1] = places, 8.0, lengths
+    x[:, 0], x[:, 3], x[:, n_t - 1] = positions, 8.0, lengths
     bank = FilterBank.from_targets(x, np.tile(std**2 * np.eye(n_t), (n, 1, 1)), np.zeros(n, int), 2,
                                    1e-8)
     bank.log_w = np.log(weights)
     return bank, model
 
 
-def test_hypotheses_at_one_place_are_merged_in_the_covariance():
+def test_hypotheses_at_one_position_are_merged_in_the_covariance():
     """The covariance about the published hypothesis matches samples of the mixture."""
     bank, model = bank_of([0.0, 1.0, -0.5], [0.5, 0.3, 0.2])
     rng = np.random.default_rng(1)
@@ -99,7 +99,7 @@ def test_hypotheses_at_one_place_are_merged_in_the_covariance():
         np.square(samples).mean(), rel=0.01)
 
 
-def test_hypotheses_at_other_places_do_not_widen_the_covariance():
+def test_hypotheses_at_other_positions_do_not_widen_the_covariance():
     bank, model = bank_of([0.0, 40.0], [0.9, 0.1])
     np.testing.assert_allclose(covariance_about(bank, 0, model, bank.is_separated(0)),
                                0.25 * np.eye(len(model.state_names)))
@@ -131,8 +131,8 @@ def test_a_field_is_sensed_by_the_sensor_that_measures_it_and_noise_by_none():
 
 def test_smoothed_poses_keep_doubts_about_misfits_but_not_about_arrivals():
     evidence = TrackEvidence(2)
-    evidence.note({doubts.ANOTHER_ARRIVAL}, 1)
-    evidence.note({doubts.DISTURBANCE_MODEL, doubts.ANOTHER_PLACE}, 2)
+    evidence.update_doubts({doubts.ANOTHER_ARRIVAL}, 1)
+    evidence.update_doubts({doubts.DISTURBANCE_MODEL, doubts.ANOTHER_PLACE}, 2)
     assert [evidence.was_filter_doubtful(k) for k in (1, 2)] == [False, True]
 
 
@@ -158,7 +158,7 @@ def test_a_track_that_no_target_ever_explained_ends():
     assert end_of(lambda k: np.nan) is None
 
 
-def test_a_failed_comparison_removes_the_favour_permanently():
+def test_no_target_is_favoured_after_a_failed_comparison():
     bayes_factor = TrackEvidence(2).bayes_factor
     for k, value in enumerate([50.0, np.nan, 50.0]):
         bayes_factor.add(value, k, 20.0)
@@ -182,29 +182,29 @@ def test_published_doubts_are_ordered_and_have_meanings():
 
 
 def test_a_transient_doubt_persists_for_a_tenth_of_a_second():
-    """Poses that are unambiguous for only one frame are wrong more often than others."""
+    """Poses that would be unambiguous for only one frame are wrong more often than other poses."""
     evidence = TrackEvidence(2)
-    assert evidence.note({doubts.HEIGHT, doubts.ANOTHER_PLACE}, NS) == \
+    assert evidence.update_doubts({doubts.HEIGHT, doubts.ANOTHER_PLACE}, NS) == \
         {doubts.HEIGHT, doubts.ANOTHER_PLACE}
     # Doubts that the bank can resolve from one frame to the next do not persist.
-    assert evidence.note(set(), NS + round(0.08 * NS)) == {doubts.HEIGHT}
-    assert evidence.note({doubts.OVERFIT}, NS + round(0.16 * NS)) == {doubts.OVERFIT}
-    assert evidence.note(set(), NS + round(0.24 * NS)) == {doubts.OVERFIT}
-    assert evidence.note(set(), NS + round(0.32 * NS)) == set()
+    assert evidence.update_doubts(set(), NS + round(0.08 * NS)) == {doubts.HEIGHT}
+    assert evidence.update_doubts({doubts.OVERFIT}, NS + round(0.16 * NS)) == {doubts.OVERFIT}
+    assert evidence.update_doubts(set(), NS + round(0.24 * NS)) == {doubts.OVERFIT}
+    assert evidence.update_doubts(set(), NS + round(0.32 * NS)) == set()
     # Smoothed poses are doubtful only at the time at which the doubt was found.
     assert not evidence.was_filter_doubtful(NS + round(0.32 * NS))
     assert evidence.was_filter_doubtful(NS + round(0.16 * NS))
 
 
-def test_a_doubt_with_a_past_start_flags_earlier_smoothed_poses():
+def test_a_doubt_that_began_earlier_flags_earlier_smoothed_poses():
     """A long vehicle that is tracked as two vehicles has wrong poses before the error is found."""
     evidence = TrackEvidence(2)
     evidence.flag_interval(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0, since_ns=3 * NS)
-    assert doubts.ANOTHER_VEHICLE in evidence.note(set(), 7 * NS)
-    assert doubts.ANOTHER_VEHICLE not in evidence.note(set(), 9 * NS)
+    assert doubts.ANOTHER_VEHICLE in evidence.update_doubts(set(), 7 * NS)
+    assert doubts.ANOTHER_VEHICLE not in evidence.update_doubts(set(), 9 * NS)
     assert [evidence.was_filter_doubtful(t * NS) for t in (2, 3, 5, 7, 9)] == [
         False, True, True, True, False]
-    # Without a past start, no smoothed pose is doubtful.
+    # Without an earlier beginning, no smoothed pose is doubtful.
     evidence = TrackEvidence(2)
     evidence.flag_interval(doubts.ANOTHER_VEHICLE, 5 * NS, 3.0)
     assert not any(evidence.was_filter_doubtful(t * NS) for t in range(10))

@@ -25,7 +25,8 @@ def start(frame, network, relative_std=0.0, own_covariance=None):
 
 
 def test_the_hypothesis_on_the_side_that_fits_better_is_heavier():
-    """A flat board without z axes cannot distinguish above from below; one noisy z axis can."""
+    """A flat board without z axes cannot distinguish a magnet above it from one below it; a noisy z
+    axis can."""
     network, frames, truth = magnet_frames(1)
     field = np.einsum('jik,jk->ji', network.R_ws, frames[0].field)
     network = dataclasses.replace(network, R_ws=np.repeat(np.eye(3)[None], 9, axis=0))
@@ -93,7 +94,7 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
 
 @pytest.mark.parametrize('missing', [None, 0])
 def test_a_vehicle_starts_where_its_field_first_has_the_frame_energy(missing):
-    """At the previous position on its path, the field has less energy."""
+    """At the previous position on the line, the field has less energy than the frame."""
     network = line_network(6)
     vehicle = settings_for('vehicle', POINT).track.vehicle
     std = np.array([1e-8, 2e-8, 4e-8])
@@ -126,12 +127,12 @@ def test_a_vehicle_starts_where_its_field_first_has_the_frame_energy(missing):
     assert reached.mean() > 0.5
     # A vehicle that never reaches the energy starts at the outermost sensor.
     np.testing.assert_allclose(before[~reached], 0.0, atol=1e-9)
-    coming = reached & (before < vehicle.max_start_distance - 1e-9)
-    assert coming.mean() > 0.5
-    assert (energy(vehicle.max_start_distance / 159.0)[coming] < required).all()
+    starts_inside = reached & (before < vehicle.max_start_distance - 1e-9)
+    assert starts_inside.mean() > 0.5
+    assert (energy(vehicle.max_start_distance / 159.0)[starts_inside] < required).all()
 
 
-def test_a_start_is_as_certain_as_the_model_is_accurate():
+def test_the_start_covariance_includes_the_model_error():
     network, frames, truth = magnet_frames(1)
     certain, uncertain = start(frames[0], network), start(frames[0], network, relative_std=0.05)
     assert np.trace(uncertain.P[0, :3, :3]) > 100.0 * np.trace(certain.P[0, :3, :3])
@@ -146,8 +147,8 @@ def test_a_start_is_as_certain_as_the_model_is_accurate():
     assert 0.4 < np.mean(nees) < 1.6
 
 
-def test_residuals_of_the_fit_widen_the_start():
-    """The errors exceed the declared noise, but the residuals reveal them."""
+def test_residuals_of_the_fit_widen_the_start_covariance():
+    """The errors exceed the declared noise, and the residuals show this."""
     network, frames, truth = magnet_frames(1)
     rng = np.random.default_rng(3)
     nees = []

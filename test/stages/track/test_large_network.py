@@ -1,4 +1,4 @@
-"""Limit on the number of hypotheses in `config/large_network.yaml`: its effect on the poses."""
+"""Effect on the poses of the limited number of hypotheses in `config/large_network.yaml`."""
 
 import numpy as np
 import pytest

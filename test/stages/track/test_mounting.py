@@ -21,21 +21,21 @@ from support.samples import one, simulate
 from support.track_runs import NOISE, drive
 
 
-def case():
+def fields_and_angles():
     rng = np.random.default_rng(4)
     return (rng.standard_normal((5, 3, 3)), rng.standard_normal((5, 3, 3, 4)),
             0.2 * rng.standard_normal((5, 3, 3)))
 
 
 def test_zero_angles_change_nothing():
-    h, H, angles = case()
+    h, H, angles = fields_and_angles()
     rotated, derivative = rotated_fields(h, H, 0.0 * angles)
     np.testing.assert_array_equal(rotated, h)
     np.testing.assert_array_equal(derivative[..., :4], H)
 
 
 def test_small_angles_are_a_rotation_to_first_order():
-    h, H, angles = case()
+    h, H, angles = fields_and_angles()
     for scale in (1e-1, 1e-2, 1e-3):
         R = rotation_from_quaternion(quaternion_from_rotation_vector(scale * angles))
         rotated, derivative = rotated_fields(h, H, scale * angles)
@@ -47,8 +47,8 @@ def test_small_angles_are_a_rotation_to_first_order():
 
 
 def test_derivatives_by_state_and_angle_match_finite_differences():
-    """The field is a linear function of the state here, so H is the derivative of the field."""
-    h, H, angles = case()
+    """The field without rotation is linear in the state here, with the derivative H."""
+    h, H, angles = fields_and_angles()
 
     def field(v):
         return rotated_fields(h + (H @ v[:4]), H, (v[4:].reshape(3, 3) + angles))[0]
@@ -195,7 +195,7 @@ def test_orientation_covariances_are_rotated_into_sensor_frames():
         assert not block[:3, 3:].any()
 
 
-def test_angle_covariances_are_those_of_each_sensor():
+def test_angle_covariances_are_the_blocks_of_each_sensor():
     o = observation(line_network(3))
     n = o.n_target + 3 * o.n_own + 9
     A = np.random.default_rng(0).standard_normal((n, n))

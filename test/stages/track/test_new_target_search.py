@@ -53,8 +53,8 @@ def test_improbable_innovations_and_rejected_sensors_trigger_a_search(innovation
 def test_a_long_vehicle_triggers_searches_at_increasing_intervals():
     found = searches(6.0, n=60, is_long=True)
     assert {reason for _, reason in found} == {LONG_VEHICLE}
-    waits = np.diff([k for k, _ in found]) * PERIOD / NS
-    assert waits[0] >= LONG_INTERVAL_S and (np.diff(waits) > 0.0).all()
+    intervals = np.diff([k for k, _ in found]) * PERIOD / NS
+    assert intervals[0] >= LONG_INTERVAL_S and (np.diff(intervals) > 0.0).all()
 
 
 def test_a_less_probable_target_is_accepted_when_it_is_found_twice():
@@ -87,7 +87,7 @@ def test_weak_explanations_and_replacements_of_a_vehicle_by_two_are_flagged(
 @pytest.mark.parametrize('new', [[0.0, 10.0], [8.0, 8.0], [19.0, 0.0], [5.0, 0.0]])
 @pytest.mark.parametrize('n_before', [1, 2])
 def test_vehicles_that_cross_or_overtake_fast_are_flagged_up_to_sixty_nats(new, n_before):
-    """The number of earlier vehicles makes no difference."""
+    """The limit does not depend on the number of earlier vehicles."""
     velocities = [[10.0, 0.0], [-9.0, 1.0]][:n_before] + [new]
     all_members = tuple(range(n_before + 1))
     assert joint_of(velocities, 59.0).doubtful(7) == all_members
@@ -109,7 +109,7 @@ def test_a_stationary_vehicle_has_no_direction(standing):
 
 
 def test_directions_of_earlier_vehicles_are_not_compared():
-    """Two vehicles cross already; the new one is within 26 degrees of both."""
+    """The two earlier vehicles cross. The heading of the new one is within 26 degrees of both."""
     before, new = [[10.0, 4.8], [10.0, -4.8]], [10.0, 0.0]
     assert joint_of([*before, new], 16.0).doubtful(7) == ()
     assert joint_of([new, *before], 16.0).doubtful(7) == (0, 1, 2)
@@ -118,14 +118,14 @@ def test_directions_of_earlier_vehicles_are_not_compared():
 @pytest.mark.parametrize('first, second, flagged', [
     ([0.0, 10.0], [10.0, 0.0], (0, 1, 2)), ([10.0, 0.0], [0.0, 10.0], (0, 1, 2)),
     ([-10.0, 0.0], [10.0, 0.0], ()), ([-10.0, 0.0], [-11.0, 0.0], (1, 2))])
-def test_both_vehicles_that_replace_one_are_compared(first, second, flagged):
+def test_two_vehicles_that_replace_one_are_compared_with_all_others(first, second, flagged):
     """The first vehicle is unrelated; the last two replace another vehicle."""
     assert joint_of([[12.0, 0.0], first, second], 16.0, 0).doubtful(7) == flagged
 
 
 def test_only_a_vehicle_at_another_position_is_flagged():
-    for elsewhere in ([0.0, 10.0], [9.0, 0.0]):
-        joint = joint_of([[10.0, 0.0], elsewhere], 16.0, 0, adds=False)
+    for velocity in ([0.0, 10.0], [9.0, 0.0]):
+        joint = joint_of([[10.0, 0.0], velocity], 16.0, 0, adds=False)
         assert joint.doubtful(7) == (1,)
 
 
@@ -148,14 +148,14 @@ def test_overlap_of_vehicles_is_measured_along_a_lane():
         assert overlap_depth(path, 7, 2, 6) == pytest.approx(depth)
 
 
-def test_a_block_is_inserted_into_a_covariance_without_correlation():
+def test_an_inserted_block_is_uncorrelated_with_the_covariance():
     P = inserted(np.full((3, 3), 2.0), np.full((2, 2), 5.0), 1)
     rows = [0, 3, 4]
     assert (P[np.ix_(rows, rows)] == 2.0).all() and (P[1:3, 1:3] == 5.0).all()
     assert not P[np.ix_(rows, [1, 2])].any()
 
 
-def test_pairs_are_sorted_like_the_first_one():
+def test_a_pair_is_returned_in_the_order_of_the_first_pair():
     first = np.array([[0.0, 0.0], [10.0, 0.0]])
     for pair in (first + 1.0, (first + 1.0)[::-1]):
         np.testing.assert_array_equal(in_order_of(first, pair), first + 1.0)
@@ -253,7 +253,7 @@ def following():
 
 
 def test_smoothed_poses_are_complete_after_one_of_two_vehicles_leaves(following):
-    """Poses from the time before the two vehicles shared a state are included."""
+    """The smoothed poses begin before the two vehicles share a state."""
     scene, records = following
     tracks = [r for r in records if isinstance(r, Track)]
     ends = {t.id: t.stamp_ns for t in tracks if t.ended}
@@ -267,14 +267,14 @@ def test_smoothed_poses_are_complete_after_one_of_two_vehicles_leaves(following)
 
 
 @pytest.mark.parametrize('is_first', [True, False])
-def test_the_replacement_at_the_earlier_place_keeps_the_track(is_first):
-    places = np.array([[0.0, 0.0], [30.0, 0.0]])
+def test_the_vehicle_at_the_earlier_positions_continues_the_track(is_first):
+    positions = np.array([[0.0, 0.0], [30.0, 0.0]])
 
     class Known:
         """Member whose poses were at one of the positions."""
 
         def distance_from(self, stamps, path):
-            return float(np.hypot(*(path - places[0 if is_first else 1]).T).mean())
+            return float(np.hypot(*(path - positions[0 if is_first else 1]).T).mean())
 
     class Found:
         """Joint explanation in which two vehicles replace the second vehicle, at these
@@ -283,7 +283,7 @@ def test_the_replacement_at_the_earlier_place_keeps_the_track(is_first):
         replaced = 1
         bank = SimpleNamespace(best=lambda: 0)
         window = SimpleNamespace(
-            paths=[np.array([[9.0, 9.0, *places.ravel()]])] * 3,
+            paths=[np.array([[9.0, 9.0, *positions.ravel()]])] * 3,
             frames=[SimpleNamespace(stamp_ns=k) for k in range(3)])
 
     other, old, new = object(), Known(), object()

@@ -20,9 +20,9 @@ def samples_of(network, clocks, path=STRAIGHT):
 
 def starts_of(path, free, n=3):
     """Start values (n, n_free) at increasing distances from the true path."""
-    whole = np.append(path, np.zeros(3))[free]
-    away = np.random.default_rng(6).standard_normal((n, len(free))) * [[0.02], [0.05], [0.1]][:n]
-    return whole + away * np.where(free >= N_STRAIGHT, 0.1, 1.0)
+    truth = np.append(path, np.zeros(3))[free]
+    errors = np.random.default_rng(6).standard_normal((n, len(free))) * [[0.02], [0.05], [0.1]][:n]
+    return truth + errors * np.where(free >= N_STRAIGHT, 0.1, 1.0)
 
 
 @pytest.mark.parametrize('n_dipoles', [1, 3, 5])
@@ -32,8 +32,8 @@ def starts_of(path, free, n=3):
     (ROAD, STRAIGHT, (0.1,), np.append(np.arange(N_STRAIGHT), N_PATH)),
     (FOUR, STRAIGHT, (0.0, 0.1, 0.0), np.append(np.arange(N_STRAIGHT), N_PATH + np.arange(3)))])
 def test_the_fit_of_a_pass_matches_numpy(network, path, clocks, free, n_dipoles):
-    """Each fit has a single start, because a fit returns only the best result. Iterations amplify
-    rounding errors, so the tolerance is wide."""
+    """Each fit has a single start, because only the best of several fits is returned. Iterations
+    amplify rounding errors, so the tolerance is wide."""
     data = samples_of(network, clocks, path)
     if n_dipoles == 1:
         # One dipole has no length.
@@ -71,15 +71,15 @@ def test_undetermined_parameters_have_zero_variance():
 
 
 def test_the_pseudo_inverse_of_the_fit_matches_numpy():
-    """One parameter is listed twice, so only the sum of both copies is determined."""
+    """One free parameter is listed twice, so the information matrix is singular."""
     data = samples_of(ROAD, (0.0,))
     free = np.arange(N_STRAIGHT)
     model = SteadyPass(data.t, data.positions, data.M, data.clock, free,
                        np.zeros(N_PATH + data.n_clocks), 3)
     problem = SeparableProblem(model, data.y, data.backgrounds)
-    twice, cost, P = data.fit(3, np.sort(np.append(free, 0)), np.append(
+    doubled_theta, cost, P = data.fit(3, np.sort(np.append(free, 0)), np.append(
         STRAIGHT[0], STRAIGHT[:N_STRAIGHT])[None])
-    _, J = problem.residual_and_jacobian(twice[None, free])
+    _, J = problem.residual_and_jacobian(doubled_theta[None, free])
     doubled = J[0][:, np.sort(np.append(free, 0))]
     expected = pseudo_inverse((doubled.T @ doubled)[None])[0]
     assert np.isfinite(cost)
@@ -88,7 +88,7 @@ def test_the_pseudo_inverse_of_the_fit_matches_numpy():
 
 @pytest.mark.parametrize('length', [1e-1, 1e-2, 1e-3])
 def test_the_fit_of_almost_coincident_dipoles_matches_numpy(length):
-    """The start is evaluated without any step."""
+    """The cost and covariance are computed at the start, without any step."""
     data = samples_of(ROAD, (0.0,))
     free = np.array([PATH.index('x'), PATH.index('length')])
     fixed = np.append(STRAIGHT, 0.0)

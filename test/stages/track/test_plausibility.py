@@ -75,7 +75,7 @@ def test_a_path_is_evaluated_where_it_is_nearest_to_a_sensor(y, after, expected)
 
 
 def test_the_path_of_each_hypothesis_is_stored():
-    """The path is retained while another hypothesis is published."""
+    """The doubts of a hypothesis include its earlier states, even if it was not published then."""
     plausibility, observation = Plausibility(), observation_of()
     paths = {5: ((0.0, 7.0), (4.0, 0.0)), 2: ((0.0, 1.0), (4.0, 7.0))}
     for k in range(2):

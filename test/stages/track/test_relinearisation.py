@@ -36,7 +36,7 @@ class LinearFilter(StepByStep):
 
     linear = np.inf
     bonus = 0.0
-    """Added to the log-likelihood when linearisation points are given."""
+    """Value added to the log-likelihood of updates along a path."""
     long = False
 
     def __init__(self):
@@ -69,7 +69,8 @@ class LinearFilter(StepByStep):
 
 
 def compare_with_plain(filter_, relinearisation, n=40, restarts_at=(), prune=True):
-    """(bank, bank without relinearisation, Counter) after `n` frames with a gap."""
+    """(bank, bank without relinearisation, Counter) after `n` frames with a gap; both banks are
+    compared after each frame."""
     rng, counts, stamp_ns = np.random.default_rng(0), Counter(), 0
     bank = FilterBank.from_targets(rng.standard_normal((12, N_T)), np.tile(np.eye(N_T), (12, 1, 1)),
                                    np.zeros(12, dtype=int), 1, 1.0)
@@ -109,8 +110,8 @@ def compare_with_plain(filter_, relinearisation, n=40, restarts_at=(), prune=Tru
 @pytest.mark.parametrize('passes', [relinearise.PASSES, 8])
 def test_relinearisation_does_not_change_a_linear_target(
         monkeypatch, window_s, interval_s, restarts_at, passes):
-    """This holds for any interval and window, and while hypotheses are pruned. Few passes do not
-    converge."""
+    """This holds for any interval and window, and while hypotheses are pruned. With few passes,
+    paths do not converge."""
     monkeypatch.setattr(relinearise, 'PASSES', passes)
     filter_ = LinearFilter()
     _, _, counts = compare_with_plain(
@@ -132,7 +133,8 @@ def test_the_path_of_a_long_vehicle_is_accepted_unless_it_fits_worse(
 
 
 class LessCertainFilter(LinearFilter):
-    """Filter whose variance of the first state changes by `extra` along a path."""
+    """Filter that adds `extra` to the variance of the first state and 0.1 to the second state along
+    a path."""
 
     extra = 0.0
 
@@ -161,7 +163,7 @@ def bank_after_one_frame(extra, linear):
 
 
 @pytest.mark.parametrize('extra, is_wider', [(0.5, True), (-1e-3, False)])
-def test_a_converged_path_determines_the_state_and_the_wider_covariance(extra, is_wider):
+def test_a_converged_path_replaces_the_state_and_a_smaller_covariance(extra, is_wider):
     filter_, bank, relinearisation = bank_after_one_frame(extra, np.inf)
     x, P = bank.x.copy(), bank.P.copy()
     assert relinearisation.relinearise_leading(filter_, bank)[relinearise.FAILED] == 0
@@ -211,8 +213,8 @@ def test_a_path_with_an_invalid_covariance_is_rejected():
 
 @pytest.mark.parametrize('window_s, max_frames', [(0.5, 64), (60.0, 10)])
 def test_relinearisation_covers_twice_the_window_at_most(monkeypatch, window_s, max_frames):
-    """Frames are at least 0.05 s apart. In addition to the passes, the anchor moves over half of
-    the frames."""
+    """Frames are at least 0.05 s apart. In addition to the passes, one run moves the anchor over
+    half of the frames."""
     monkeypatch.setattr(relinearise, 'MAX_FRAMES', max_frames)
     filter_ = LinearFilter()
     compare_with_plain(filter_, Relinearisation(0.0, window_s, 5), n=90)
@@ -317,10 +319,10 @@ def test_relinearisation_converges_to_a_batch_fit(turns):
 @pytest.mark.parametrize('turns', [False, True])
 def test_the_smoother_converges_to_a_batch_fit(turns):
     filter_, bank_of, y, expected = deterministic_target(24, turns)
-    states, left_out = smoothed_track(filter_, bank_of(1), frames_of(y),
+    states, n_excluded = smoothed_track(filter_, bank_of(1), frames_of(y),
                                       [0.0] + [PERIOD] * (len(y) - 1), relinearisations=9)
     x, P = states[-1]
-    assert not left_out
+    assert not n_excluded
     assert np.abs((x - expected) / np.sqrt(np.diagonal(P))).max() < 1e-2
 
 

@@ -97,8 +97,8 @@ def test_a_fit_needs_two_sensors_and_enough_frames(change):
 
 def test_the_cpa_is_that_of_the_nearest_sensor():
     fit = fit_of(steady_frames(np.random.default_rng(8)))
-    away = np.linalg.norm(fit.closest(ROAD.positions) - ROAD.positions, axis=1)
-    assert away.min() == pytest.approx(3.5, abs=0.2)
+    distances = np.linalg.norm(fit.closest(ROAD.positions) - ROAD.positions, axis=1)
+    assert distances.min() == pytest.approx(3.5, abs=0.2)
     assert fit.speed == pytest.approx(20.0, rel=0.1)
 
 

@@ -70,7 +70,7 @@ def with_fault(frame, *rows, size=1.0):
 
 
 def without_sensors(frame, *rows):
-    """The frame that alignment returns if these sensors are missing."""
+    """Frame as the alignment would return it without readings of sensors `rows`."""
     rows = list(rows)
     field, covariance = frame.field.copy(), frame.covariance.copy()
     n_samples, offset = frame.n_samples.copy(), frame.time_offset.copy()
@@ -235,7 +235,7 @@ def test_the_second_of_two_wrong_sensors_is_sought_among_the_others():
         1 + 16 + 1 + 15 + 1, sorted(near))
 
 
-def test_the_frame_has_to_fit_the_hypothesis_that_leads_by_weight():
+def test_the_frame_must_fit_the_heaviest_hypothesis():
     """Another hypothesis explains the frame, but its weight is negligible."""
     bank_filter, bank, frame, names = situation(n_hyp=2)
     bank.x[1, bank_filter.observation.n_target + 3 * 2:][:3] = FAULT_FIELD
@@ -293,7 +293,7 @@ def test_a_fault_of_one_of_two_sensors_makes_the_track_ambiguous():
         pipeline, tracks, (begin, _) = tracked_pass(
             2, fault, seed=1, lasting_s=MAX_SINGLE_SENSOR_S - 0.2)
         flags[fault] = [t.ambiguous for t in tracks if t.stamp_ns / NS > begin + 0.5]
-        rejections = [what for what in pipeline.track.counts if 'was rejected' in what]
+        rejections = [event for event in pipeline.track.counts if 'was rejected' in event]
         assert bool(rejections) == bool(fault)
     assert len(flags['swaps axes']) > 10 and all(flags['swaps axes'])
     assert not any(flags[None])
@@ -308,7 +308,7 @@ WRONG_REJECTION = pytest.param(3, 0, marks=pytest.mark.xfail(strict=True, reason
 def test_a_fault_of_one_of_several_sensors_leaves_the_track_unambiguous(n_sensors, seed):
     pipeline, tracks, (begin, end) = tracked_pass(n_sensors, 'swaps axes', seed)
     assert pipeline.track.counts['frames in which mag_2 was rejected'] > 3
-    assert [what for what in pipeline.track.counts if 'was rejected' in what] == [
+    assert [event for event in pipeline.track.counts if 'was rejected' in event] == [
         'frames in which mag_2 was rejected']
     assert not any(t.ambiguous for t in tracks if t.stamp_ns / NS > end + 0.3)
     # The poses report which sensors were used.
@@ -321,7 +321,7 @@ def test_a_fault_of_one_of_several_sensors_leaves_the_track_unambiguous(n_sensor
 
 def test_a_track_that_is_fitted_to_the_wrong_two_sensors_is_ambiguous():
     pipeline, tracks, (_, end) = tracked_pass(3, 'swaps axes', 0)
-    assert [what for what in pipeline.track.counts if 'was rejected' in what]
+    assert [event for event in pipeline.track.counts if 'was rejected' in event]
     after = [t.ambiguous for t in tracks if t.stamp_ns / NS > end + 0.3]
     assert len(after) > 10 and all(after)
 
@@ -329,10 +329,10 @@ def test_a_track_that_is_fitted_to_the_wrong_two_sensors_is_ambiguous():
 def test_no_sensor_is_rejected_without_a_fault():
     pipeline, tracks, _ = tracked_pass(3, None)
     assert len(tracks) > 20
-    assert not [what for what in pipeline.track.counts if 'was rejected' in what]
+    assert not [event for event in pipeline.track.counts if 'was rejected' in event]
 
 
-def test_a_new_network_during_a_rejection_waits_for_the_end_of_the_track():
+def test_a_new_network_during_a_rejection_does_not_affect_the_track():
     pipeline, tracks, _ = tracked_pass(3, 'swaps axes', network_at=0.5)
     _, expected, _ = tracked_pass(3, 'swaps axes')
     assert [(t.stamp_ns, t.position.tobytes(), t.ambiguous) for t in tracks] == [

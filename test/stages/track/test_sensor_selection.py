@@ -45,16 +45,16 @@ def test_states_of_common_sensors_are_retained(n_own):
     assert bank.x.shape == (4, n_x) and bank.P.shape == (4, n_x, n_x)
     assert np.isnan(bank.nis).all() and bank.nis.shape == (4, 4)
 
-    def places(j, n):
+    def columns_of(j, n):
         return [*range(8 + n_own * j, 8 + n_own * (j + 1)),
                 *range(8 + n_own * n + 3 * j, 8 + n_own * n + 3 * j + 3)]
-    old = [*range(8), *places(1, 3), *places(2, 3)]
-    new = [*range(8), *places(0, 4), *places(2, 4)]
+    old = [*range(8), *columns_of(1, 3), *columns_of(2, 3)]
+    new = [*range(8), *columns_of(0, 4), *columns_of(2, 4)]
     np.testing.assert_array_equal(bank.x[:, new], x[:, old])
     np.testing.assert_array_equal(bank.P[np.ix_(range(4), new, new)],
                                   P[np.ix_(range(4), old, old)])
     for k in (1, 3):
-        here = places(k, 4)
+        here = columns_of(k, 4)
         others = [i for i in range(n_x) if i not in here]
         assert not bank.x[:, here].any() and not bank.P[np.ix_(range(4), here, others)].any()
         expected = np.diag([*np.diagonal(prior[k]), *[0.0625] * 3])
@@ -156,24 +156,24 @@ def frames():
 
 def track_frames(frames, changes, doubtful=None, start=slice(None)):
     """(`TrackManager`, live tracks) after the frames have been fed."""
-    network, every = frames
+    network, all_frames = frames
     tracker, tracks = manager.TrackManager(network, settings_for('vehicle', changes).track), []
     tracker.set_doubtful_times(doubtful or {})
-    for frame in every[start]:
+    for frame in all_frames[start]:
         tracks += [r for r in tracker.feed(frame) if isinstance(r, Track) and not r.ended]
     return tracker, tracks
 
 
 def test_sensors_that_join_without_measurements_change_nothing(monkeypatch, frames):
-    """The states are predicted only once to the frame in which the sensors join."""
-    network, every = frames
-    first = next(f for f in every if f.target_present)
+    """This shows that the states are predicted only once to the frame in which the sensors join."""
+    network, all_frames = frames
+    first = next(f for f in all_frames if f.target_present)
     near = nearest_sensors(network.positions, network.positions[
         np.argmax(np.linalg.norm(np.nan_to_num(first.field), axis=1)), :2], 4)
     far = np.setdiff1d(np.arange(12), near)
     silent = [dataclasses.replace(
         f, field=np.where(np.isin(np.arange(12), far)[:, None], np.nan, f.field),
-        n_samples=np.where(np.isin(np.arange(12), far), 0, f.n_samples)) for f in every]
+        n_samples=np.where(np.isin(np.arange(12), far), 0, f.n_samples)) for f in all_frames]
     monkeypatch.setattr(manager, 'sensors_at_start', lambda *_: 4)
     runs = [track_frames((network, silent), {**POINT, 'track.relinearise_window_s': 0.0,
                                              'track.max_sensors': limit})[1] for limit in (4, 12)]
@@ -208,8 +208,8 @@ def test_the_approach_is_checked_with_the_same_sensors_in_all_frames(monkeypatch
 
 
 def test_the_first_pose_is_flagged_for_a_sensor_that_joins_with_it(monkeypatch, frames):
-    network, every = frames
-    first = next(f for f in every if f.target_present)
+    network, all_frames = frames
+    first = next(f for f in all_frames if f.target_present)
     far = network.names[int(np.nanargmin(np.linalg.norm(first.field, axis=1)))]
     for n in (1000, 4):
         monkeypatch.setattr(manager, 'sensors_at_start', lambda *_, n=n: n)
@@ -220,10 +220,10 @@ def test_the_first_pose_is_flagged_for_a_sensor_that_joins_with_it(monkeypatch, 
 
 def test_a_network_of_at_most_max_sensors_is_used_completely():
     network = line_network(6, tilt=0.02)
-    some, whole = ([r for r in drive(network, {'track.max_sensors': n})[0]
+    limited, unlimited = ([r for r in drive(network, {'track.max_sensors': n})[0]
                     if isinstance(r, Track)] for n in (6, 1000))
-    assert len(some) == len(whole) > 20
-    for a, b in zip(some, whole, strict=True):
+    assert len(limited) == len(unlimited) > 20
+    for a, b in zip(limited, unlimited, strict=True):
         np.testing.assert_array_equal(a.position, b.position)
         np.testing.assert_array_equal(a.predicted, b.predicted)
 

@@ -52,8 +52,8 @@ N_X = N_T + (N_OWN + 3) * N_SENSORS
 
 
 def whole_derivative(H):
-    """Derivative (3 n_sensors, n_x) of the fields of all sensors; `plain_kalman.update` processes
-    one sensor at a time."""
+    """Derivative (3 n_sensors, n_x) of the fields of all sensors, from the derivative `H` of each
+    sensor."""
     out = np.zeros((3 * N_SENSORS, N_X))
     for j in range(N_SENSORS):
         rows = slice(3 * j, 3 * j + 3)
@@ -63,9 +63,9 @@ def whole_derivative(H):
     return out
 
 
-def problem(seed):
-    """(F, decay, diagonal of Q, C, H, measurements (n_steps, n_sensors, 3), some of them
-    missing)."""
+def linear_problem(seed):
+    """(F, decay, diagonal of Q, C, H, measurements (n_steps, n_sensors, 3)) of a linear target;
+    some measurements are missing."""
     rng = np.random.default_rng(seed)
     F = np.eye(N_T) + 0.2 * rng.standard_normal((N_T, N_T))
     decay, Q = rng.uniform(0.5, 1.0, N_X - N_T), rng.uniform(0.01, 0.1, N_X)
@@ -98,9 +98,9 @@ def steps_of(F, decay, Q, C, H, y, x, P, without=()):
 
 @pytest.mark.parametrize('unit', [1.0, 1e-8])
 def test_the_backward_pass_matches_least_squares_over_all_times(unit):
-    """Some axes, sensors and one time are missing. The unit makes some states as small as fields in
-    T."""
-    F, decay, Q, C, H, y = problem(1)
+    """Some axes, sensors and one time are missing. The smaller unit makes the sensor states as
+    small as fields in tesla."""
+    F, decay, Q, C, H, y = linear_problem(1)
     without = (3,)
     x0, P0 = np.random.default_rng(2).standard_normal((2, N_X)), np.diag(
         np.random.default_rng(3).uniform(1.0, 9.0, N_X))
@@ -129,7 +129,7 @@ def test_the_backward_pass_matches_least_squares_over_all_times(unit):
 
 def test_exactly_known_states_do_not_change():
     """One state has no variance and two are identical, so the covariance is singular."""
-    F, decay, Q, C, H, y = problem(4)
+    F, decay, Q, C, H, y = linear_problem(4)
     F, Q, P0 = np.eye(N_T), 0.0 * Q, np.diag(np.r_[1.0, 1.0, 0.0, 2.0, np.ones(N_X - N_T)])
     P0[0, 1] = P0[1, 0] = 1.0
     x0 = np.zeros((1, N_X))
@@ -145,7 +145,7 @@ def test_exactly_known_states_do_not_change():
         np.testing.assert_allclose(P[0, :N_T, :N_T], steps[-1].P[0, :N_T, :N_T], atol=1e-10)
 
 
-def run(body, changes, seed=0, speed=10.0):
+def run_pass(body, changes, seed=0, speed=10.0):
     """(records, function that returns true positions at timestamps) of a straight pass."""
     network = line_network(2, tilt=0.0)
     samples, t, position, _ = simulate(network, body, Path(np.array([-70.0, -1.2]), 0.0, speed),
@@ -180,7 +180,8 @@ def smoothing_study(bodies, changes):
     """
     ratios, whole, nees = [], [], []
     for seed, body in enumerate(bodies):
-        records, truth = run(body, changes, seed, np.random.default_rng(seed).uniform(8.0, 18.0))
+        records, truth = run_pass(
+            body, changes, seed, np.random.default_rng(seed).uniform(8.0, 18.0))
         live = [r for r in records if isinstance(r, Track) and not r.ended]
         smoothed = [r for r in records if isinstance(r, SmoothedPose)]
         assert [s.stamp_ns for s in smoothed] == [t.stamp_ns for t in live]
@@ -217,8 +218,8 @@ def smoothing_study_of_cars(n):
 
 
 @pytest.mark.study
-@pytest.mark.xfail(strict=True, reason='0.68: 0.59 of the error of a filter that does not '
-                                       'relinearise, which is larger')
+@pytest.mark.xfail(strict=True, reason='the ratio is 0.68; relative to a filter without '
+                                       'relinearisation, it is 0.59')
 def test_smoothing_reduces_the_error_of_a_car_by_two_fifths():
     assert np.median(smoothing_study_of_cars(40)[0]) <= 0.6
 
@@ -235,8 +236,8 @@ def test_smoothed_poses_of_cars_are_more_accurate_and_consistent(n):
 def test_smoothing_at_the_linearisation_of_the_filter_reproduces_its_pose(monkeypatch):
     """The last smoothed pose is the last filtered one."""
     monkeypatch.setattr(smooth_module.smoothed_track, '__defaults__', (False, 0))
-    records, _ = run(point_body([250.0, -150.0, 80.0], 4.0, 0.5),
-                     {'track.relinearise_window_s': 0.0})
+    records, _ = run_pass(point_body([250.0, -150.0, 80.0], 4.0, 0.5),
+                          {'track.relinearise_window_s': 0.0})
     live = [r for r in records if isinstance(r, Track) and not r.ended]
     smoothed = [r for r in records if isinstance(r, SmoothedPose)]
     np.testing.assert_allclose(smoothed[-1].position, live[-1].position, rtol=0, atol=1e-9)
@@ -248,7 +249,7 @@ def test_smoothing_at_the_linearisation_of_the_filter_reproduces_its_pose(monkey
 
 
 def test_smoothing_reduces_the_covariance_of_poses():
-    records, _ = run(point_body([250.0, -150.0, 80.0], 4.0, 0.5), POINT)
+    records, _ = run_pass(point_body([250.0, -150.0, 80.0], 4.0, 0.5), POINT)
     live = [r for r in records if isinstance(r, Track) and not r.ended]
     smoothed = [r for r in records if isinstance(r, SmoothedPose)]
     spread = [[np.trace(p.covariance[:2, :2]) for p in poses] for poses in (smoothed, live)]
@@ -261,7 +262,7 @@ def test_smoothing_reduces_the_covariance_of_poses():
 def test_fixed_lag_smoothing_returns_every_pose_once_after_the_lag():
     lag = 0.5
     body = point_body([250.0, -150.0, 80.0], 4.0, 0.5)
-    records, truth = run(body, {**POINT, 'track.smoothing_lag_s': lag})
+    records, truth = run_pass(body, {**POINT, 'track.smoothing_lag_s': lag})
     now, lagged, live, ended = None, [], [], False
     for r in records:
         ended = ended or (isinstance(r, Track) and r.ended)
@@ -276,7 +277,7 @@ def test_fixed_lag_smoothing_returns_every_pose_once_after_the_lag():
     smoothed_rms, rms = (np.sqrt(np.mean(errors_of(a, truth)[0]**2)) for a in (lagged, live))
     assert smoothed_rms < 0.7 * rms
     # The filtered poses do not depend on smoothing.
-    plain = [r for r in run(body, POINT)[0] if isinstance(r, Track) and not r.ended]
+    plain = [r for r in run_pass(body, POINT)[0] if isinstance(r, Track) and not r.ended]
     np.testing.assert_array_equal([t.position for t in live], [t.position for t in plain])
 
 
@@ -289,7 +290,7 @@ def pass_of(body, seed=0):
 
 def test_smoothing_can_be_disabled_and_tracks_that_are_too_long_are_counted():
     body = point_body([250.0, -150.0, 80.0], 4.0, 0.5)
-    disabled, _ = run(body, {**POINT, 'track.max_smoothing_s': 0.0})
+    disabled, _ = run_pass(body, {**POINT, 'track.max_smoothing_s': 0.0})
     assert not [r for r in disabled if isinstance(r, SmoothedPose)]
     network, samples, _, _ = pass_of(body)
     pipeline = Pipeline(network, settings_for('vehicle', {
@@ -365,7 +366,8 @@ def test_a_frame_that_contradicts_the_track_does_not_distort_it(size):
 
 @pytest.mark.study
 @pytest.mark.xfail(strict=True, reason=(
-    '0.50 m, 1.65 standard deviations: a different one of nearly equal hypotheses survives'))
+    'the difference is 0.50 m or 1.65 standard deviations, because a different one of nearly equal '
+    'hypotheses survives'))
 def test_a_frame_that_contradicts_the_track_does_not_distort_it_by_30_cm():
     """A vehicle model with a row of three dipoles achieved this accuracy."""
     plain, with_spike = paths_without_and_with_a_spike(1e-5)
@@ -387,6 +389,6 @@ def test_smoothed_poses_of_a_lost_track_are_ambiguous():
 
 def test_long_tracks_of_many_states_are_not_smoothed(monkeypatch):
     monkeypatch.setattr(smooth_module, 'MAX_ELEMENTS', 20 * 35**2)
-    records, _ = run(point_body([250.0, -150.0, 80.0], 4.0, 0.5), {})
+    records, _ = run_pass(point_body([250.0, -150.0, 80.0], 4.0, 0.5), {})
     assert [r for r in records if isinstance(r, Track)]
     assert not [r for r in records if isinstance(r, SmoothedPose)]

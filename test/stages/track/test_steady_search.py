@@ -86,8 +86,8 @@ def test_the_field_of_a_known_vehicle_is_not_another_vehicle():
 def test_the_gradient_of_the_cost_is_exact(truths):
     """Kaufman's Jacobian yields the exact gradient, also for two vehicles together."""
     search, _ = search_of(*truths)
-    off = np.array([0.3, 0.2, 0.1, -0.5, 0.02, 0.01, 0.3])
-    theta = np.concatenate([truth + off for truth in truths])[None]
+    offset = np.array([0.3, 0.2, 0.1, -0.5, 0.02, 0.01, 0.3])
+    theta = np.concatenate([truth + offset for truth in truths])[None]
     r, J = search.residual_and_jacobian(theta)
     gradient = -2.0 * np.einsum('nyi,ny->ni', J, r)[0]
     step = 1e-5
@@ -129,7 +129,8 @@ def test_a_path_through_a_sensor_raises_no_error(miss):
 
 
 def test_pairs_are_ranked_by_the_density_of_the_frames():
-    """The density includes moments, backgrounds and noise; all pairs are in the same order."""
+    """The density includes moments, backgrounds and noise. The vehicles of all pairs have the same
+    order."""
     search, grid = search_of(FIRST_PATH, SECOND_PATH)
     pairs = search.pairs(grid, 3, 2)
     model, density = search.samples.straight_model(N_DIPOLES), []
@@ -137,9 +138,9 @@ def test_pairs_are_ranked_by_the_density_of_the_frames():
         columns = [A * search.prior.moment_std for A in model.basis(pair)]
         C = np.hstack([search.columns, *columns])
         S = np.eye(len(C)) + C @ C.T
-        off = search.prior.residual_and_jacobian(pair)[0]
+        residual = search.prior.residual_and_jacobian(pair)[0]
         density.append(search.samples.y @ np.linalg.solve(S, search.samples.y)
-                       + np.linalg.slogdet(S)[1] + (off**2).sum())
+                       + np.linalg.slogdet(S)[1] + (residual**2).sum())
         kept, swapped = (np.hypot(*(pair[order, :2] - pairs[0][:, :2]).T).sum()
                          for order in ([0, 1], [1, 0]))
         assert kept <= swapped
@@ -154,12 +155,12 @@ def test_moments_of_a_pair_are_those_of_its_vehicles():
                                    atol=60.0)
 
 
-def test_pairs_belong_to_different_minima():
+def test_pairs_are_distinct_minima():
     search, grid = search_of(FIRST_PATH, SECOND_PATH)
     pairs = np.array(search.pairs(grid, 3, 2))
-    apart = np.abs(pairs[:, None] - pairs)
+    differences = np.abs(pairs[:, None] - pairs)
     assert len(pairs) > 1
-    assert all((apart[i, k] > 0.3).any() for i in range(len(pairs)) for k in range(i))
+    assert all((differences[i, k] > 0.3).any() for i in range(len(pairs)) for k in range(i))
 
 
 @pytest.mark.parametrize('stationary', [0, 1])

@@ -25,11 +25,11 @@ UNIT = st.floats(-1.0, 1.0)
 VECTORS = st.tuples(UNIT, UNIT, UNIT).map(np.array)
 
 
-def track_of(weights, places, headings, policy=MIXTURE, std=0.5, **extra):
+def track_of(weights, positions, headings, policy=MIXTURE, std=0.5, **extra):
     """`Track` of a bank of points along x that move at 8 m/s; the first hypothesis is published."""
-    n, model = len(places), RowVehicle(np.zeros(3), np.ones(3), n_dipoles=1)
+    n, model = len(positions), RowVehicle(np.zeros(3), np.ones(3), n_dipoles=1)
     x = np.zeros((n, 12))
-    x[:, 0], x[:, 6] = places, 100.0
+    x[:, 0], x[:, 6] = positions, 100.0
     x[:, 3], x[:, 4] = 8.0 * np.cos(headings), 8.0 * np.sin(headings)
     bank = FilterBank(x, np.tile(std**2 * np.eye(12), (n, 1, 1)), np.log(weights), np.arange(n),
                       np.zeros(n, int), np.arange(n), np.ones((n, 2)))
@@ -42,11 +42,11 @@ def track_of(weights, places, headings, policy=MIXTURE, std=0.5, **extra):
 
 def test_the_covariance_of_the_mixture_matches_samples():
     """Position, heading and their correlation about the published pose are compared."""
-    weights, places, headings = [0.6, 0.3, 0.1], [0.0, 20.0, -9.0], [0.0, np.pi - 0.2, 0.3]
-    track = track_of(weights, places, headings)
+    weights, positions, headings = [0.6, 0.3, 0.1], [0.0, 20.0, -9.0], [0.0, np.pi - 0.2, 0.3]
+    track = track_of(weights, positions, headings)
     rng = np.random.default_rng(0)
     which = rng.choice(3, 400_000, p=weights)
-    x = np.array(places)[which] + 0.5 * rng.standard_normal(len(which))
+    x = np.array(positions)[which] + 0.5 * rng.standard_normal(len(which))
     yaw = np.array(headings)[which] + 0.5 / 8.0 * rng.standard_normal(len(which))
     C = pose_covariance(track.topic_uncertainty)
     assert C[0, 0] == pytest.approx(np.square(x).mean(), rel=0.01)
@@ -84,7 +84,7 @@ def test_ambiguous_poses_are_published_according_to_the_policy(policy, weights, 
         assert (twist[0, 0] == pytest.approx(0.25)) == own
 
 
-def test_second_moment_of_one_member_is_its_covariance():
+def test_the_second_moment_of_a_single_hypothesis_is_its_covariance():
     P = np.diag([1.0, 4.0])
     np.testing.assert_array_equal(second_moment(np.ones(1), np.zeros((1, 2)), P[None]), P)
 

@@ -153,7 +153,8 @@ def test_poses_of_a_filter_that_fits_better_than_its_path_are_ambiguous(
     tracks, pipeline, truth = drive(line_network(2), point_body([200.0, -150.0, 80.0], 5.0, 0.5),
                                     Path(np.array([-70.0, -1.2]), 0.0, 10.0), POINT)
     live = [t for t in tracks if not t.ended]
-    near = [t.ambiguous for t, place in zip(live, truth, strict=True) if np.hypot(*place) < 5.0]
+    near = [t.ambiguous for t, position in zip(live, truth, strict=True)
+            if np.hypot(*position) < 5.0]
     assert len(near) > 8 and set(near) == {is_flagged}
     assert bool(pipeline.track.counts[OVERFITS]) == is_flagged
 

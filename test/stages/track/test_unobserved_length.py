@@ -12,13 +12,13 @@ P = 0.04 * np.eye(19)
 SMALL, CAR, TRUCK = range(3)
 
 
-def length_of_vehicles():
+def default_unobserved_length():
     return UnobservedLength([0.0, 3.0, 9.0], [0.0, 1.0, 3.0])
 
 
-def at(place, heading=0.0, speed=8.0):
+def at(position, heading=0.0, speed=8.0):
     x = np.zeros(19)
-    x[:2], x[3:5] = place, [speed * np.cos(heading), speed * np.sin(heading)]
+    x[:2], x[3:5] = position, [speed * np.cos(heading), speed * np.sin(heading)]
     return x
 
 
@@ -32,14 +32,15 @@ def middle_offsets(length, half_std, is_sensed, n=400_000):
 @pytest.mark.parametrize('complete', [True, False])
 @pytest.mark.parametrize('length', [5.0, -5.0])
 def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(complete, length):
-    """The variance along the heading grows by the excess length. The covariance of a car is
-    unchanged."""
+    """The variance along the heading includes the part of a truck beyond its row. The covariance of
+    a car is unchanged."""
     model, x, found = RowVehicle(np.zeros(3), np.ones(3)), at([0.0, 0.0], 0.5 * np.pi), {}
     x[18] = length
-    for kind, usual, std in (('car', 3.0, 1.0), ('truck', 9.0, 3.0)):
+    for kind, mean_length, std in (('car', 3.0, 1.0), ('truck', 9.0, 3.0)):
         found[kind] = smoothed_pose(
-            model, VehicleOrientation(), x, P, unobserved_length=UnobservedLength([usual], [std]),
-            difference=np.zeros(6), stamp_ns=0, id=1, kind=0, kinds=(kind,), ambiguous=False,
+            model, VehicleOrientation(), x, P,
+            unobserved_length=UnobservedLength([mean_length], [std]), difference=np.zeros(6),
+            stamp_ns=0, id=1, kind=0, kinds=(kind,), ambiguous=False,
             complete=complete).covariance - P[:6, :6]
     assert not found['car'].any()
     along = found['truck'][1, 1]
@@ -50,7 +51,7 @@ def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(comp
 
 @pytest.mark.parametrize('length', [4.0, 8.9])
 def test_a_truck_that_has_been_sensed_may_have_its_iron_at_either_end(length):
-    unobserved_length = length_of_vehicles()
+    unobserved_length = default_unobserved_length()
     for beyond in (-9.0, 8.0):
         unobserved_length.update(at([beyond, 0.0]), P, np.zeros((1, 3)), True)
         expected = np.square(middle_offsets(length, 1.5, beyond > 0.0)).mean()
@@ -58,8 +59,8 @@ def test_a_truck_that_has_been_sensed_may_have_its_iron_at_either_end(length):
         assert found[0, 0] == pytest.approx(expected, rel=0.02)
 
 
-def test_a_row_longer_than_its_kind_hides_only_the_spread_of_lengths():
-    unobserved_length = length_of_vehicles()
+def test_only_the_spread_of_lengths_remains_for_a_row_longer_than_its_kind():
+    unobserved_length = default_unobserved_length()
     found = [unobserved_length.covariance(at([-9.0, 0.0]), P, length, TRUCK)[0, 0]
              for length in (9.0, 15.0)]
     np.testing.assert_allclose(found, 1.5**2)
@@ -68,7 +69,7 @@ def test_a_row_longer_than_its_kind_hides_only_the_spread_of_lengths():
 def test_an_approaching_car_may_be_the_front_of_a_truck():
     """The variance matches a mixture in which one vehicle in three is a truck with its middle 3 m
     further back."""
-    added = length_of_vehicles().covariance(at([-20.0, 0.0]), P, 3.0, CAR)
+    added = default_unobserved_length().covariance(at([-20.0, 0.0]), P, 3.0, CAR)
     rng = np.random.default_rng(0)
     is_truck = rng.random(400_000) < 1.0 / 3.0
     behind = is_truck * 0.5 * (9.0 + 3.0 * rng.standard_normal(len(is_truck)) - 3.0)
@@ -78,34 +79,36 @@ def test_an_approaching_car_may_be_the_front_of_a_truck():
 
 @pytest.mark.parametrize('heading', [0.0, 2.0, np.pi])
 def test_a_car_is_certain_once_a_truck_would_have_been_sensed(heading):
-    unobserved_length, forward = length_of_vehicles(), np.array([np.cos(heading), np.sin(heading)])
-    for beyond, is_open in ((-9.0, True), (2.9, True), (3.1, False), (8.0, False)):
+    unobserved_length, forward = default_unobserved_length(), np.array(
+        [np.cos(heading), np.sin(heading)])
+    for beyond, is_uncertain in ((-9.0, True), (2.9, True), (3.1, False), (8.0, False)):
         x = at(beyond * forward, heading)
         unobserved_length.update(x, P, np.zeros((1, 3)), True)
-        assert unobserved_length.covariance(x, P, 3.0, CAR).any() == is_open
+        assert unobserved_length.covariance(x, P, 3.0, CAR).any() == is_uncertain
 
 
 def test_the_distance_along_the_path_counts_around_a_corner():
-    unobserved_length = length_of_vehicles()
-    for place, heading, is_open in (([-4.0, 1.0], 0.0, True), ([1.0, 1.0], 0.0, True),
-                                    ([2.0, 0.0], -1.5, True), ([2.0, -2.0], -1.5, False)):
-        x = at(place, heading)
+    unobserved_length = default_unobserved_length()
+    for position, heading, is_uncertain in (([-4.0, 1.0], 0.0, True), ([1.0, 1.0], 0.0, True),
+                                            ([2.0, 0.0], -1.5, True), ([2.0, -2.0], -1.5, False)):
+        x = at(position, heading)
         unobserved_length.update(x, P, np.zeros((1, 3)), True)
-        assert unobserved_length.covariance(x, P, 3.0, CAR).any() == is_open
+        assert unobserved_length.covariance(x, P, 3.0, CAR).any() == is_uncertain
 
 
 def test_only_a_sensor_near_the_path_confirms_the_length():
-    unobserved_length, far = length_of_vehicles(), np.array([[-100.0, 500.0, 0.0], [0.0, 3.0, 0.0]])
+    unobserved_length, far = default_unobserved_length(), np.array(
+        [[-100.0, 500.0, 0.0], [0.0, 3.0, 0.0]])
     unobserved_length.update(at([-20.0, 0.0]), P, far, True)
     assert unobserved_length.covariance(at([-20.0, 0.0]), P, 3.0, CAR).any()
-    for places, is_certain in ((np.zeros((0, 3)), True), (far, False)):
+    for positions, is_certain in ((np.zeros((0, 3)), True), (far, False)):
         # No sensor measured the vehicle, or its position is ambiguous.
-        unobserved_length.update(at([20.0, 0.0]), P, places, is_certain)
+        unobserved_length.update(at([20.0, 0.0]), P, positions, is_certain)
         assert unobserved_length.covariance(at([20.0, 0.0]), P, 3.0, CAR).any()
 
 
 def test_a_vehicle_that_stops_keeps_its_heading():
-    unobserved_length = length_of_vehicles()
+    unobserved_length = default_unobserved_length()
     unobserved_length.update(at([-5.0, 0.0]), P, SENSORS, True)
     moving = unobserved_length.covariance(at([-4.0, 0.0]), P, 3.0, CAR)
     for heading in (0.0, 2.0, 4.0):
