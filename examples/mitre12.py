@@ -66,7 +66,7 @@ PRIOR_STD = np.array([30.0, 5.0, 10.0 * MPH, np.radians(15.0), 100.0, 100.0])
 PRIOR = np.diag(PRIOR_STD**-2)
 Y0_KNOWN = np.diag([0.0, np.inf, 0.0, 0.0, 0.0, 0.0])
 FIRST_FOUR = np.diag(np.where(np.arange(6) < 4, PRIOR_STD**-2, 0.0))
-"""Prior if the product in (26) ends at four, as printed: without M1 and M2."""
+"""Prior information if the product in eq. (26) ends at four, as printed: without M1 and M2."""
 BOUND_CPA = 25.0
 ALONG = -np.pi / 2
 AS_PUBLISHED = SAMPLING_RATE / N_SAMPLES
@@ -76,7 +76,10 @@ CHOSEN = 'road to the north, DFT divided by N'
 
 
 def moment(vehicle, azimuth=0.0):
-    """Induced moment (3,) [A m²]: along the road, left, up; `azimuth` of the road [rad]."""
+    """Induced moment (3,) [A m²], with components along the road, to the left and upwards.
+
+    `azimuth` is the azimuth of the road [rad].
+    """
     dip, declination = np.radians(59.0), np.radians(-11.0)
     field = 57e-6 * np.array([np.cos(declination - azimuth) * np.cos(dip),
                               -np.sin(declination - azimuth) * np.cos(dip), -np.sin(dip)])
@@ -84,8 +87,7 @@ def moment(vehicle, azimuth=0.0):
 
 
 def places(x0, y0, v, theta):
-    """Positions of the source relative to the sensor during a period, (..., 11, 3) m; (7), (8).
-    """
+    """Source positions relative to the sensor during a period, (..., 11, 3) [m]; eqs. (7), (8)."""
     t = np.arange(N_SAMPLES) / SAMPLING_RATE
     x, y = (np.asarray(start)[..., None] + v * t * direction for start, direction in
             ((x0, -np.sin(theta)), (y0, np.cos(theta))))
@@ -94,8 +96,9 @@ def places(x0, y0, v, theta):
 
 
 def detection(m, cpa, starts, sensors, scale=AS_PUBLISHED):
-    """Detection probability (n_starts, n_sensors) of periods that start at `starts` [m] along the
-    road.
+    """Detection probability (n_starts, n_sensors) of one period, by start position and sensor.
+
+    `starts` and `sensors` are positions along the road [m].
 
     `scale` multiplies the physical deflection.
     """
@@ -106,13 +109,16 @@ def detection(m, cpa, starts, sensors, scale=AS_PUBLISHED):
 
 
 def at_least_once(m, cpa, sensors=ONE, phase=0.0, scale=AS_PUBLISHED):
-    """Probability (6) of at least one detection in a drive; `phase` shifts the start [periods]."""
+    """Probability of at least one detection in a drive, eq. (6).
+
+    `phase` shifts the start of the first period, in units of a period.
+    """
     starts = SPEED * PERIOD * (np.arange(-20, 20) + phase)
     return any_detection_probability(detection(m, cpa, starts, sensors, scale))
 
 
 def most_in_a_period(m, cpa, sensors=ONE, scale=AS_PUBLISHED):
-    """Maximum detection probability (5) of one period over all start positions."""
+    """Maximum over all start positions of the detection probability of one period, eq. (5)."""
     starts = np.linspace(-60.0, 60.0, 961)
     return any_detection_probability(detection(m, cpa, starts, sensors, scale), axis=-1).max()
 
@@ -123,14 +129,15 @@ def cpa_where(probability, target):
 
 
 def noise_std():
-    """Noise standard deviation of a sample [T], from S_n + S_s over the two-sided band.
-    """
+    """Noise standard deviation of a sample [T], from S_n + S_s over the two-sided band."""
     return np.sqrt(2.0 * quad(lambda f: noise_spectrum(f, BACKGROUND, RESOLUTION, BAND[1]),
                               *BAND, epsabs=0.0)[0])
 
 
 def jacobian(z):
-    """Jacobian (11, 2, 6) of the field with respect to z = (x0, y0, v, theta, M1, M2), by (7), (8).
+    """Jacobian (11, 2, 6) of the field with respect to z = (x0, y0, v, theta, M1, M2).
+
+    The positions follow eqs. (7) and (8).
     """
     x0, y0, v, theta, m1, m2 = z
     dB_dr, dB_dm = dipole_jacobians(-places(x0, y0, v, theta), np.array([m1, m2, 0.0]))
@@ -143,13 +150,16 @@ def jacobian(z):
 
 
 def measured(x0, v=SPEED, vehicle='car'):
-    """Information matrix (6, 6) about z from the samples of one period; (18)."""
+    """Fisher information matrix (6, 6) of z from the samples of one period, eq. (18)."""
     z = [x0, BOUND_CPA, v, ALONG, *moment(vehicle)[:2]]
     return information(jacobian(z), noise_std()**2 * np.eye(2))
 
 
 def std_bounds(information_matrix, prior=None):
-    """Bounds on the standard deviations (6,) in the units of `STATES`; (18), (28)."""
+    """Cramér-Rao bounds (6,) on the standard deviations, in the units of `STATES`.
+
+    The bounds follow eq. (18) without a prior, and eq. (28) with a prior.
+    """
     return np.sqrt(np.diag(bound(information_matrix, prior))) * [scale for *_, scale in STATES]
 
 
@@ -201,13 +211,19 @@ def figure_4():
 
 
 def phi_std_bound(C, x0, sign):
-    """Bound on phi [deg] by (19) from the bound `C` on z; (20) has x/r^2 with the `sign` -1."""
+    """Bound on the standard deviation of phi [deg], eq. (19), from the covariance bound `C` of z.
+
+    `sign` is the sign of x/r^2, which is -1 in eq. (20) as printed.
+    """
     row = np.array([-BOUND_CPA, sign * x0]) / (x0**2 + BOUND_CPA**2)
     return np.degrees(np.sqrt(row @ C[:2, :2] @ row))
 
 
 def draw_bounds(axes, at, matrices, prior):
-    """Draw the six bounds against `at`; dashed for known y0 where a bound is infinite."""
+    """Plot the six bounds against `at`.
+
+    If most values of a bound are infinite, the bound for known y0 is plotted as a dashed line.
+    """
     bounds = np.array([std_bounds(J, prior) for J in matrices])
     bounds_known_y0 = np.array([std_bounds(J, Y0_KNOWN) for J in matrices])
     for i, (name, unit, scale) in enumerate(STATES):
@@ -224,7 +240,10 @@ def draw_bounds(axes, at, matrices, prior):
 
 
 def bounds_figure(rows, xlabel, title):
-    """Panels without and with prior, one row of panels for each (name, at, matrices)."""
+    """Plot the bounds without prior (left) and with prior (right).
+
+    Each entry (name, at, matrices) of `rows` has one row of panels.
+    """
     figure = Figure(figsize=(10.5, 0.8 + 4.2 * len(rows)), layout='constrained')
     grid = figure.subplots(len(rows), 2, squeeze=False)
     for (left, right), (name, at, matrices) in zip(grid, rows, strict=True):

@@ -23,7 +23,7 @@ from mag_tracking.settings import param
 
 END, ESCAPE = b'\xc0', b'\xdb'
 LONGEST = 2 * 16
-"""Length of a packet in which every byte is escaped."""
+"""Maximum length of a packet, in which every byte is escaped [bytes]."""
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ GRID = np.arange(-30, 31) / 5.0
 
 
 def sensor_information(sensor, m=M):
-    """Information (9, 9) about [r0, v0, m] from one sensor at (3,) [m]; eq. (5.2)."""
+    """Information matrix (9, 9) of [r0, v0, m] from one sensor at `sensor` (3,) [m], eq. (5.2)."""
     t = SAMPLE_TIME * np.arange(N_SAMPLES)[:, None]
     dB_dd, dB_dm = dipole_jacobians(sensor - (R0 + t * V0), m)
     return information(np.concatenate([-dB_dd, -t[:, :, None] * dB_dd, dB_dm], axis=-1) / K_DIPOLE)
@@ -55,7 +55,7 @@ def seen_by(sensors, m=M):
 
 
 def information_map():
-    """Information (n_y, n_x, 9, 9) of the first sensor and a second sensor at each grid point."""
+    """Information matrices (n_y, n_x, 9, 9) with a second sensor at each point of the grid."""
     places = np.stack(np.broadcast_arrays(GRID, GRID[:, None], 0.0), axis=-1)
     return sensor_information(ONE[0]) + np.apply_along_axis(sensor_information, -1, places)
 
@@ -69,15 +69,17 @@ def condition_map(J, scale=None):
 
 
 def about_cpa(J):
-    """Information about [r at the CPA, v0, m] instead of [r0, v0, m]."""
+    """Transform an information matrix of [r0, v0, m] to [r at the CPA, v0, m]."""
     t_cpa = -(R0 @ V0) / (V0 @ V0)
     T = np.eye(9) - t_cpa * np.eye(9, k=3) * (np.arange(9) < 3)[:, None]
     return T.T @ J @ T
 
 
 def condition_maps():
-    """Condition numbers for three state vectors: of eq. (5.1), with the position at the CPA, and
-    scaled by eq. (5.11).
+    """Maps of the condition number for three state vectors.
+
+    The state vectors are that of eq. (5.1), the same with the position at the CPA, and that of
+    eq. (5.1) scaled by eq. (5.11).
     """
     J = information_map()
     return {'plain': condition_map(J), 'cpa': condition_map(about_cpa(J)),
@@ -85,9 +87,10 @@ def condition_maps():
 
 
 def best_place(numbers, same_side=False):
-    """Position (x, y) and value of the minimum, at least 1 m from the line of the path.
+    """Position (x, y) [m] of the second sensor with the smallest condition number, and this number.
 
-    `same_side` excludes positions across the path from the first sensor.
+    Only positions at least 1 m from the line of the path are considered. `same_side` excludes
+    positions across the path from the first sensor.
     """
     y = GRID[:, None]
     masked = np.where((np.abs(y - 1.0) > 0.999) & ((y < 1.0) | (not same_side)), numbers, np.inf)
@@ -159,7 +162,10 @@ def figure_5_4():
 
 
 def comparison(maps):
-    """Compute the values that are compared with T10, by name; `maps` is from `condition_maps`."""
+    """Compute the values that are compared with T10, by name.
+
+    `maps` is the result of `condition_maps`.
+    """
     up, h = np.array([0.0, 0.0, 1.0]), energy_threshold(P_FA, 3)
     one, two = seen_by(ONE), seen_by(TWO)
     d = -(R0 + SAMPLE_TIME * np.arange(N_SAMPLES)[:, None] * V0)
@@ -181,7 +187,7 @@ def comparison(maps):
 
 
 def report(n):
-    """Report of the agreements with T10 and the differences from T10."""
+    """Report that compares the values of `comparison` with T10."""
     def place(name):
         (x, y), number = n[name]
         return f'{number:.0f} at [{x:.1f}, {y:.1f}]'

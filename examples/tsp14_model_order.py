@@ -28,7 +28,7 @@ PUBLISHED = {'cars': ((10.0, 51.0), (1.3, 1.6)), 'large': ((142.0, 360.0), (76.7
 
 
 def passes(rate, orders=(1, 2, 3, 4, 5)):
-    """Fit the pass of each recording at one of `RATES`; return one `FittedPass` per recording."""
+    """Fit the pass in each recording, at a rate of `RATES`; return one `FittedPass` per pass."""
     network, settings = read_network(ROOT / 'config/network.yaml'), settings_for('vehicle')
     settings = dataclasses.replace(settings, calibrate=replace(
         settings.calibrate, {'decimate_to_hz': RATES[rate]}))

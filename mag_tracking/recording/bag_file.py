@@ -117,7 +117,7 @@ class BagFile:
                 reported = position
 
     def _raw(self, start_ns: int | None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Iterate over (topic, type, log time, bytes); stop at damage, and count it as a loss."""
+        """Iterate over (topic, type, log time [ns], bytes); at damage, count a loss and stop."""
         n = 0
         with self._open_reader() as reader:
             try:

@@ -105,7 +105,7 @@ def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
 
 
 def _trusted_quantities(fit: PassFit, centre: FloatArray) -> dict[str, float]:
-    """Trusted quantities of a fit by column."""
+    """Values of the trusted quantities of a fit, by column; others are omitted."""
     quantities: dict[str, Iterable[float]] = {}
     if 'speed' in fit.trusted:
         quantities['speed sd_speed'] = fit.speed

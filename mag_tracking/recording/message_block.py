@@ -135,7 +135,7 @@ class MessageBlock:
         Parameters
         ----------
         which : int array or slice
-            Indices of the messages, in any order.
+            Indices of the messages. The order of the indices is kept.
 
         Returns
         -------

@@ -167,7 +167,9 @@ class Recorder:
             self._latched[name].append(message)
 
     def tick(self, now_ns: int) -> None:
-        """Flush, split and retry when due; to be called several times per second.
+        """Flush or split the file, and retry failed metadata, when due.
+
+        To be called several times per second.
 
         Parameters
         ----------

@@ -88,7 +88,7 @@ def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> 
 
 
 def first_knock(shocks: Mapping[str, tuple[FloatArray, FloatArray]]) -> float:
-    """Time of the first acceleration above 30 % of the maximum of its sensor.
+    """Time of the first acceleration that exceeds 30 % of the maximum of the same sensor.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def _plot_headings(axes: Axes, found: _Calibration, stated: _Network) -> None:
     axes.set_yticks(range(n), [literal(name) for name in stated.names])
     axes.invert_yaxis()
     axes.set_title('rotation about the vertical (90 %)', fontsize=10)
-    axes.set_xlabel('[degrees]')
+    axes.set_xlabel('rotation [degrees]')
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
 

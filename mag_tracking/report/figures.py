@@ -119,7 +119,7 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
 def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
     """Plot the best hypothesis of each arrival direction where its weight exceeds `MIN_DRAWN`.
 
-    A track with a single direction has no such curves.
+    Nothing is plotted for a track with a single direction.
     """
     colours = _colours(log)
     if len(colours) < 2:

@@ -135,7 +135,7 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
         axes.set_ylabel(f'field [{unit}]')
         axes.grid(alpha=0.3)
         legend_beside(axes)
-    axes.set_xlabel('time from the strongest field [s]')
+    axes.set_xlabel('time relative to the strongest field [s]')
     figure.suptitle(f'{literal(title)}: measured (dots), fitted (lines), 90 % bands', fontsize=11)
     return figure
 

@@ -135,7 +135,7 @@ def _plot_displacements(figure: SubFigure, axes: Axes, found: _Survey, suspect: 
     axes.plot(positions[:, a], positions[:, b], 'k.', ms=3, zorder=3, label='nominal positions')
     if suspect.any():
         axes.plot(positions[suspect, a], positions[suspect, b], 'o', ms=12, mfc='none', mew=1.5,
-                  color=_SUSPECT_COLOUR, label='does not fit')
+                  color=_SUSPECT_COLOUR, label='suspect sensor')
     if len(positions) <= _MAX_NAMES:
         for name, position in zip(found.network.names, positions, strict=True):
             axes.annotate(literal(name), position[[a, b]], xytext=(3, -8),
@@ -197,7 +197,7 @@ def _plot_pose_residuals(axes: Axes, found: _Survey) -> None:
     axes.set_ylim(0.0)
     axes.axhline(1.0, color='k', lw=0.8, ls=':')
     axes.set_title('residual of the poses, relative to the noise'
-                   + (f'; do not fit: {suspect.sum()} (red)' if suspect.any() else ''),
+                   + (f'; suspect: {suspect.sum()} (red)' if suspect.any() else ''),
                    fontsize=10, loc='left')
     axes.grid(alpha=0.3)
     axes.set_xlabel('row of the table')

@@ -23,7 +23,7 @@ MIN_POSES, TRACK_SIZE = 4, 2_500
 MAX_EXTENT = 6.0
 """Maximum margin of the map around the network, as a multiple of the span of the network."""
 MIN_REACH_M = 10.0
-"""Maximum margin of the map around a single sensor [m]."""
+"""Maximum margin of the map around a network without extent, such as a single sensor [m]."""
 
 
 class Sensors(Protocol):

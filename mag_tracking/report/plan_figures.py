@@ -114,7 +114,9 @@ def _levels(values: FloatArray, factor: float) -> FloatArray:
 
 
 def position_figure(plan: _Plan) -> Figure:
-    """Plot a map of the position's Cramér-Rao bound (std) for a whole pass through each point.
+    """Plot a map of the Cramér-Rao bound on the position, for a whole pass through each point.
+
+    The bound is a standard deviation.
 
     Parameters
     ----------

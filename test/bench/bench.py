@@ -1,10 +1,10 @@
 """Update of the filter bank, compared with loops of filterpy filters.
 
-A bank of hypotheses of a point vehicle is updated with one frame of 2 to 100 sensors. The peers
-compute the same update with a loop of filterpy EKFs, with a model that loops over the sensors or
-with a vectorised model. Each figure is the ratio of the peer's time to the bank's time, as the
-median over rounds. Both times are measured alternately on one thread. The aims are ratios of 350,
-120, 40 and 25 for 2, 8, 32 and 100 sensors, against the model that loops over the sensors.
+A bank of hypotheses of a point vehicle is updated with one frame of 2 to 100 sensors. Two
+peers compute the same update with a loop of filterpy EKFs. The model of the first peer loops over
+the sensors; the model of the second peer is vectorised. Each figure is the ratio of the peer's time
+to the bank's time, as the median over rounds. Both times are measured alternately on one thread.
+The aims are ratios of 350, 120, 40 and 25 for 2, 8, 32 and 100 sensors, against the first peer.
 """
 
 import os
@@ -42,7 +42,7 @@ N_TARGET = 12
 
 
 def moment(x):
-    """Moment (3,) of a vehicle's state and its Jacobian (3, 12).
+    """Magnetic moment (3,) [A m²] of a vehicle with the state `x` (12,), and its Jacobian (3, 12).
 
     ICASSP11 eq. (8), with a tensor that is diagonal in the axes of the vehicle.
     """
@@ -63,7 +63,7 @@ def moment(x):
 
 
 def dipole(d, m):
-    """Field of a dipole at one point and its Jacobians, in textbook form."""
+    """Field (3,) [T] of a dipole at the position `d` from it; its Jacobians about `d` and `m`."""
     n2 = d @ d
     k3 = 1e-7 / n2**1.5
     dm = d @ m
@@ -199,7 +199,7 @@ def bank_case(n_sensors, n_hyp, rng, turned):
 
 
 def bank_ratio(peer_class, n_sensors, turned, n_hyp=64, rounds=12, repeats=100):
-    """Time an update; return (median, minimum and maximum ratio, times [us] of bank and peer)."""
+    """Time updates; return (median, minimum, maximum ratio, time [us] of bank, time of peer)."""
     rng = np.random.default_rng(n_sensors)
     bank_filter, positions, R_sw, bank, frame = bank_case(n_sensors, n_hyp, rng, turned)
     x, P = bank.x, bank.P

@@ -72,7 +72,7 @@ def timed_searches():
 
 
 def recordings(figures, folder):
-    """Track the recordings; return their numbers of [(unflagged, wrong unflagged)] poses."""
+    """Track the recordings; return [(number of unflagged poses, number of wrong ones of these)]."""
     counted = []
     for path in with_progress_bar(sorted(folder.glob('*.truth.json')), 'recordings'):
         name = path.name.removesuffix('.truth.json')
@@ -96,7 +96,7 @@ def recordings(figures, folder):
 
 
 def simulated(figures, seeds):
-    """Track the worlds of the second simulator; return [(unflagged, unflagged and wrong)] poses."""
+    """Track worlds of the second simulator; return the same numbers as `recordings`."""
     counted = []
     for how in ('meeting', 'following', 'traffic'):
         scores = [tracked(busy(how, n, 'boxes', seed))[0]
@@ -111,7 +111,7 @@ def simulated(figures, seeds):
 
 
 def single_vehicles(passes):
-    """Track single vehicles; return the numbers of [(unflagged, wrong unflagged)] poses.
+    """Track single vehicles; return the same numbers as `recordings`.
 
     The vehicles are in the bundled recordings, and in passes of each kind of the second simulator.
     """

@@ -37,7 +37,7 @@ MIN_CORRECT, MAX_CALIBRATION_ERROR = 0.95, 0.05
 
 
 def body_of(rng, name, simulator):
-    """Random body of a vehicle of a class; motorcycles are heavy touring motorcycles."""
+    """Create a random body of the class `name`; motorcycles are heavy touring motorcycles."""
     if name == 'motorcycle':
         return small(rng, simulator, rng.uniform(1.9, 2.3), rng.uniform(40.0, 120.0))
     return (car if name == 'car' else truck)(rng, simulator)

@@ -79,7 +79,10 @@ def vehicle(seed, kind):
 
 
 def one_pass(seed, kind, changes, flaws):
-    """Track a pass; return (filtered errors, smoothed errors, is ambiguous at CPA) or None."""
+    """Track a pass; return (filtered errors, smoothed errors, is ambiguous at the CPA).
+
+    Returns None without a track.
+    """
     network = read_network(NETWORK)
     body, path, duration = vehicle(seed, kind)
     samples, t, position, _ = simulate(network, body, path, 100.0, duration,

@@ -21,7 +21,7 @@ from support.bundled import ROOT
 FOLDER = ROOT / 'benchmarks'
 LATEST, HISTORY = FOLDER / 'latest.json', FOLDER / 'history.jsonl'
 MAX_RATIO = 1.15
-"""Factor by which a reported figure is worse than the best earlier figure."""
+"""A figure is reported if it is worse than the best earlier figure by more than this factor."""
 RUNS = 5
 RED, PLAIN = '\033[31m', '\033[0m'
 
@@ -83,7 +83,7 @@ def machine():
 
 
 def worse(run, before):
-    """List (benchmark, name, figure, best earlier value) of figures that got worse or are NaN.
+    """List the figures that are worse or NaN, as (benchmark, name, figure, best earlier value).
 
     `before` contains the earlier runs on the same kind of machine.
     """

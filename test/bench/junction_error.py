@@ -76,7 +76,10 @@ def true_motion(data, truth):
 
 
 def magnetic_centre(network, row):
-    """Fit dipoles; return centre (3,) [m] in the body frame, half length [m], moments and cost."""
+    """Fit dipoles that move along the true path.
+
+    Returns (centre (3,) [m] in the body frame, half length [m], moments [A m²], normalised cost).
+    """
     reader = SampleReader(Recording(vehicle_path(NAME)), network)
     collector = PassCollector(network, settings_for('vehicle'))
     passes = [p for s in recorded(reader) for p in collector.feed(one(s))] + collector.flush()

@@ -149,7 +149,10 @@ def start(folder, n, parameters, sequential, batches, is_one_process):
 
 
 def open_pages(n):
-    """Start the server of the live page and `n` viewers that read all its data."""
+    """Start the server of the live page, and a process of `n` viewers that read all its data.
+
+    Returns ({name: server process}, viewer process).
+    """
     server = subprocess.Popen(
         [Path(sys.executable).with_name('mag-tracking'), 'watch', '--port', '0'],
         stdout=subprocess.PIPE, text=True)

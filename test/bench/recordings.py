@@ -34,8 +34,8 @@ from support.situation_worlds import FOUR, car, straight, usual
 RUNS = 5
 """Number of simulated passes of each control and simulator."""
 MIN_UNFLAGGED_RATIO = 0.95
-"""Minimum ratio of the number of unflagged poses to the number with the other checkout, for correct
-poses in each row and for all poses in the total."""
+"""Minimum ratio of the number of unflagged poses to this number with the other checkout. It applies
+to the correct poses of each recording or control, and to all poses of the total."""
 MAX_ERROR = 1.03
 """Maximum ratio of an error to the error with the other checkout."""
 SURE, RIGHT = 'unflagged', f'unflagged, within {WRONG_M:g} m'
@@ -80,7 +80,7 @@ def figures_of_recording(recording, network, preset, folder):
 
 
 def figures_of_control(name):
-    """Track `RUNS` passes by each simulator live; return the numbers of poses."""
+    """Track `RUNS` passes of a control by each simulator live; return the numbers of poses."""
     total = {SURE: 0, RIGHT: 0}
     for s, simulator in enumerate(SIMULATORS):
         for seed in range(RUNS):

@@ -24,7 +24,7 @@ from support.situations import SITUATIONS, simulated_world, verdict
 MIN_EVENTS = 0.9
 """Minimum fraction of runs with a disturbance among runs with a detection but no vehicle."""
 MAX_COST = 0.1
-"""Maximum fraction of the time of a tracked frame for the disturbance model and the tests."""
+"""Maximum fraction of the processing time of a frame for the disturbance model and the tests."""
 
 HEAD = """# Situations
 
@@ -71,7 +71,7 @@ def event_counts(found):
 
 
 def cost():
-    """Fraction of the time of a tracked frame for the disturbance model and the tests."""
+    """Fraction of the processing time of a frame for the disturbance model and the tests."""
     spent = {'_update_evidence': 0.0, '_doubts': 0.0, 'step': 0.0}
     owner = {'_update_evidence': RunningTrack, '_doubts': Member, 'step': RunningTrack}
 

@@ -39,7 +39,7 @@ FAULTS = {
 
 
 def faults_of(what):
-    """List of functions that apply a fault of `FAULTS` to `Readings`; empty for `none`."""
+    """Functions that apply the fault `what` of `FAULTS` to `Readings`; an empty list for 'none'."""
     if not FAULTS[what]:
         return []
     fault, *arguments = FAULTS[what]

@@ -113,9 +113,9 @@ def test_inconsistent_sensors_and_poses_are_named(tmp_path, capsys, monkeypatch)
     assert lines[8].endswith(','.join(map(str, [*positions[7].tolist(), *axes[7].tolist()])))
     labels = [t.get_text() for f in figures[0].subfigs for a in f.axes for t in
               (a.get_legend().get_texts() if a.get_legend() else [])]
-    assert 'does not fit' in labels
+    assert 'suspect sensor' in labels
     titles = [a.get_title(loc='left') for f in figures[0].subfigs for a in f.axes]
-    assert any('do not fit: 1' in title for title in titles)
+    assert any('suspect: 1' in title for title in titles)
 
 
 # Rejected calibrations, settings and invalid input.

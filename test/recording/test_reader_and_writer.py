@@ -152,7 +152,7 @@ def test_a_truncated_file_is_read_up_to_its_end(tmp_path):
     assert [m.log_time_ns for m in messages] == sorted(m.log_time_ns for m in messages)
 
 
-def test_flipped_bytes_cost_only_their_chunk_and_are_reported(tmp_path):
+def test_flipped_bytes_lose_only_their_chunk_and_are_reported(tmp_path):
     path = tmp_path / 'a.mcap'
     write(path, 15_000)
     data = bytearray(path.read_bytes())

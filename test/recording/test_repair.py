@@ -91,7 +91,7 @@ def test_repair_keeps_the_order_of_many_files(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['a_0.mcap', 'a_12.mcap'])
-def test_an_empty_file_after_a_crash_costs_no_other_file(tmp_path, name):
+def test_an_empty_file_after_a_crash_affects_no_other_file(tmp_path, name):
     """The empty file is the first file, or a later file that had just been created."""
     recorder, _ = started(tmp_path / 'a', split_ns=S)
     for k in range(24):

@@ -142,7 +142,7 @@ class Drive:
     """[s] Approximate duration of the swerve."""
 
     def _on_path(self, t):
-        """Time (n,) at which the `Path` reaches the travelled distance, at its initial speed."""
+        """Times (n,) [s] at which `path` reaches the distances travelled at the times `t`."""
         width = self.change_s / 4.0
         z, z0 = (t - self.change_at) / width, -self.change_at / width
         # This is the integral of a logistic step.

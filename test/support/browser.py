@@ -76,7 +76,7 @@ class Page:
             return pose ? [pose.x[0], pose.y[0]] : null; })()''')
 
     def lines(self):
-        """Time at which the vertical line of each plot is drawn."""
+        """Current time [s] at which each plot has its vertical line."""
         return self.value('''[...document.querySelectorAll('#field .plot'),
             ...['weights', 'innovation', 'speed'].map(id => document.getElementById(id))]
             .map(plot => plot.layout.shapes[0].x0)''')

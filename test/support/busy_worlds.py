@@ -83,7 +83,7 @@ def pair(rng, how, at_s):
 
 
 def busy(how, n_sensors, simulator, seed, n=4, trucks=TRUCKS):
-    """Simulate `n` pairs that meet or follow, or up to 3 `n` vehicles in traffic; a `World`.
+    """Simulate a `World` with `n` pairs of vehicles, or with up to 3 `n` vehicles in free traffic.
 
     `how` is 'meeting', 'following' or 'traffic'.
     """

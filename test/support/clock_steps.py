@@ -17,7 +17,7 @@ def stream(n, begin, end, step=10, skip=()):
 
 
 def stepped(arrivals, which, begin, end, by):
-    """Copy arrivals with the clocks of the sensors `which` ahead by `by` from `begin` to `end`."""
+    """Copy arrivals; from `begin` to `end`, the clocks of the sensors `which` are ahead by `by`."""
     return [(j, t + by if j in which and begin <= t < end else t) for j, t in arrivals]
 
 

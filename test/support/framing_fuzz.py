@@ -35,7 +35,7 @@ class Case(NamedTuple):
     encode_random_frame: Callable
     """Function from a `random.Random` to (bytes, [Reading, ...])."""
     end_of_garbage: bytes = b''
-    """Bytes after garbage that would otherwise merge with the next frame."""
+    """Bytes appended to garbage, so that it does not merge with the next frame."""
     garbage: tuple = GARBAGE
     """Kinds of garbage that cannot be valid frames."""
     chance: float = 0.0

@@ -122,7 +122,7 @@ def certificate(folder):
 
 
 class ScriptedBroker:
-    """Accepts one connection, answers each message with the next response, then stays silent."""
+    """Accepts one connection, and answers each message with the next of the given responses."""
 
     def __init__(self, *responses):
         self._responses = responses

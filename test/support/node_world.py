@@ -110,7 +110,7 @@ class World:
             self._executor.shutdown()
 
     def wait(self, condition, seconds=MAX_S):
-        """Spin at 100 Hz until `condition()` is true or `seconds` have passed; return its value."""
+        """Spin at 100 Hz until `condition()` is true or `seconds` have passed; return the value."""
         end = time.monotonic() + seconds
         while not (value := condition()) and time.monotonic() < end:
             self._executor.spin_until_future_complete(Future(), 0.01)

@@ -63,7 +63,7 @@ def together(first, second):
 
 
 def unknowns_at(path, moments, seconds):
-    """Shift time zero of `path` later by `seconds`; return path and moments as fit unknowns."""
+    """Move the reference time of `path` later by `seconds`; return the unknowns of a fit."""
     moved = path.copy()
     moved[:3] += seconds * path[3:6]
     return np.concatenate([moved, moments.ravel()])

@@ -84,7 +84,7 @@ def are_wrong(error, deviation):
 
 
 def errors_of(poses, t, position):
-    """Horizontal (error [m], its std [m], NEES per axis, true position (n, 2) [m]) of poses."""
+    """Horizontal errors of poses: (error [m], its std [m], NEES per axis, true position [m])."""
     stamps = np.array([r.stamp_ns for r in poses]) / 1e9
     true = np.stack([np.interp(stamps, t, position[:, k]) for k in (0, 1)], axis=1)
     error = np.array([r.position[:2] for r in poses]).reshape(-1, 2) - true

@@ -186,7 +186,7 @@ def direction(rng):
 
 
 def hum(rng, simulator, frequency, rate):
-    """A power line to one side, whose field is larger at the nearer sensor."""
+    """A power line beside the road adds a field, which is larger at the nearer sensor."""
     near = rng.uniform(0.5, 1.0, 2)
     v = rng.uniform(1e-7, 3e-7) * direction(rng)
     omega = 2.0 * np.pi * frequency * rng.uniform(0.9995, 1.0005)

@@ -33,7 +33,7 @@ def stands(a_world, body=0):
 
 
 def is_one_track(name, run):
-    """Whether one track covers a vehicle from before its stop until 2 s after it."""
+    """Whether one track covers a vehicle from before its stop until 2 s after the stop."""
     a_world = simulated_world(name, SIMULATORS[run % 2], run // 2)
     pipeline = Pipeline(a_world.network, settings_for('vehicle'))
     poses = poses_of(pipeline.feed(a_world.readings) + pipeline.flush())
@@ -73,9 +73,9 @@ def background_recovery_s(run):
 
 
 def error_after_parked(run):
-    """(median error [m] or inf, n_sure, n_wrong) of the first vehicle after the parked vehicle.
+    """Track the first vehicle after a parked vehicle: (median error [m], n_unflagged, n_wrong).
 
-    The readings are processed offline, with a prescan.
+    The readings are processed offline, with a prescan. The error is inf without a track.
     """
     a_world = simulated_world('there at the start, then cars', SIMULATORS[run % 2], run // 2)
     pipeline = Pipeline(a_world.network, settings_for('vehicle'))
