@@ -165,8 +165,8 @@ def _stamp(path: str | PathLike[str], line: int, column: str, text: str) -> int:
         stamp = int(text) if column == 'stamp_ns' else None
     except ValueError:
         stamp = None
-    exact = stamp if stamp is not None else \
+    time_ns = stamp if stamp is not None else \
         number(path, line, column, text, True) * _NS_PER_UNIT[column]
-    if abs(exact) > LATEST_NS:
+    if abs(time_ns) > LATEST_NS:
         raise RecordingError(f'{path}: row {line}: {column} is {text.strip()}, not a valid time')
-    return round(exact)
+    return round(time_ns)

@@ -23,7 +23,7 @@ SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
 SCALE_1D = 1.645
 """Half width of a 90 % interval, in standard deviations."""
 
-MIN_DRAWN = 0.01
+MIN_WEIGHT = 0.01
 """Minimum weight of a plotted hypothesis. Less probable hypotheses are omitted for clarity."""
 
 
@@ -117,7 +117,7 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
 
 
 def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
-    """Plot the best hypothesis of each arrival direction where its weight exceeds `MIN_DRAWN`.
+    """Plot the best hypothesis of each arrival direction where its weight exceeds `MIN_WEIGHT`.
 
     Nothing is plotted for a track with a single direction.
     """
@@ -125,7 +125,7 @@ def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
     if len(colours) < 2:
         return
     for name, colour in colours.items():
-        rows = [row[name] for row in log.arrivals if name in row and row[name][0] > MIN_DRAWN]
+        rows = [row[name] for row in log.arrivals if name in row and row[name][0] > MIN_WEIGHT]
         if not rows:
             continue
         points = _without_switches(np.array([position[:2] for _, position, _ in rows]),
@@ -167,14 +167,14 @@ def weights_figure(log: TrackLog) -> Figure:
     return figure
 
 
-def field_figure(log: TrackLog, network: _Network, most: int = 8) -> Figure:
+def field_figure(log: TrackLog, network: _Network, max_sensors: int = 8) -> Figure:
     """Plot the measured field and the field of the best hypothesis, per sensor and axis.
 
     Parameters
     ----------
     log : TrackLog
     network : SensorNetwork
-    most : int
+    max_sensors : int
         Maximum number of sensors. In a larger network, only the sensors with the strongest fields
         are plotted, and the title states how many.
 
@@ -185,7 +185,7 @@ def field_figure(log: TrackLog, network: _Network, most: int = 8) -> Figure:
     measured, predicted = np.array(log.measured), np.array(log.predicted)
     strength = np.nan_to_num(np.nanmax(np.abs(np.where(np.isnan(measured), 0.0, measured)),
                                        axis=(0, 2)))
-    rows = np.sort(np.argsort(-strength, kind='stable')[:most])
+    rows = np.sort(np.argsort(-strength, kind='stable')[:max_sensors])
     columns = 2 if len(rows) > 1 else 1
     lines = -(-len(rows) // columns)
     figure = Figure(figsize=(9.5, 1.2 + 2.4 * lines), layout='constrained')

@@ -86,7 +86,7 @@ class _FittedPass(Protocol):
     def chosen(self) -> _Fit | None: ...
 
 
-def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
+def pass_figure(fit: _Fit, title: str, max_sensors: int = 6) -> Figure:
     """Plot the measured and the fitted field, with bands that should contain 90 % of the readings.
 
     The bands include noise and `PassFit.robust_covariance`. If the normalised cost exceeds 1,
@@ -96,7 +96,7 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
     ----------
     fit : PassFit
     title : str
-    most : int
+    max_sensors : int
         Maximum number of sensors. In a larger network, only the sensors with the strongest fields
         are plotted.
 
@@ -111,7 +111,7 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
     data = fit.data
     level = fit.predicted - target_alone(fit)
     strength = {j: np.nanmax(np.abs(data.field - level)[data.sensor == j]) for j in data.sensors}
-    strongest = sorted(sorted(strength, key=lambda j: -strength[j])[:most])
+    strongest = sorted(sorted(strength, key=lambda j: -strength[j])[:max_sensors])
     f, unit = field_unit(max(strength.values()))
     factor = max(1.0, fit.normalised_cost)
     figure = Figure(figsize=(10.0, 1.0 + 2.6 * len(strongest)), layout='constrained')

@@ -9,7 +9,7 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.pass_fitter import PassFitter
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.pipeline import settings_for
-from support.busy_fits import fits_of_recording, fits_of_world, with_vehicles
+from support.busy_fits import assigned_fits, fits_of_recording, fits_of_world
 from support.busy_worlds import busy
 from support.passes import ROAD
 from support.random_passes import SIMULATORS
@@ -28,7 +28,7 @@ def fit_pair(how, simulator):
 def test_two_vehicles_are_fitted_together(how, simulator):
     passes, a_world = fit_pair(how, simulator)
     assert [fit.label for fit in passes] == ['pass 1, vehicle 1', 'pass 1, vehicle 2']
-    right = with_vehicles(passes, [(a_world.t, position) for position in a_world.positions])
+    right = assigned_fits(passes, [(a_world.t, position) for position in a_world.positions])
     assert sorted(match.vehicle for match in right) == [0, 1]
     for match in right:
         assert '2 vehicles were fitted together' in match.one.notes[-1]

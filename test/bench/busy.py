@@ -25,7 +25,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
 from mag_tracking.stages.track.new_target_search import NewTargetSearch
 from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
-from support.busy_recordings import BUSY, rightly_counted, tracked_recording
+from support.busy_recordings import BUSY, correctly_counted, tracked_recording
 from support.busy_worlds import NETWORKS, busy, tracked
 from support.random_passes import KINDS, are_wrong, one_random_pass
 
@@ -84,14 +84,14 @@ def recordings(figures, folder):
         figures.add(f'{name}: found', float(got.is_found.mean()), '', found, True,
                     f' ({got.is_found.sum()} of {n})')
         figures.add(f'{name}: counted in the right direction', float(len(
-            rightly_counted(name, tracked.passages, folder))), '', None, True,
+            correctly_counted(name, tracked.passages, folder))), '', None, True,
             f' (of {len(tracked.passages)} counted)')
         figures.add(f'{name}: RMS', float(np.nanmedian(got.rms)), 'm', rms)
         figures.add(f'{name}: NEES', float(np.nanmedian(got.nees)), '', nees)
         figures.add(f'{name}: false tracks', got.n_extra, '', 0)
         figures.add(f'{name}: time of a search', float(np.median(seconds)), 's',
                     note=f' (longest {max(seconds):.2g} s, {len(seconds)} searches)')
-        counted.append((got.n_sure, got.n_wrong))
+        counted.append((got.n_unflagged, got.n_wrong))
     return counted
 
 
@@ -106,7 +106,7 @@ def simulated(figures, seeds):
         figures.add(f'boxes, {how}: RMS',
                     float(np.nanmedian(np.concatenate([s.rms for s in scores]))), 'm')
         figures.add(f'boxes, {how}: false tracks', sum(s.n_extra for s in scores), '')
-        counted += [(s.n_sure, s.n_wrong) for s in scores]
+        counted += [(s.n_unflagged, s.n_wrong) for s in scores]
     return counted
 
 
@@ -129,7 +129,7 @@ def single_vehicles(passes):
     for kind in KINDS:
         for seed in with_progress_bar(range(passes), kind):
             got = one_random_pass('boxes', kind, seed)
-            counted.append((int((~got.ambiguous).sum()), int(got.sure_and_wrong.sum())))
+            counted.append((int((~got.ambiguous).sum()), int(got.unflagged_and_wrong.sum())))
     return counted
 
 
@@ -174,9 +174,9 @@ def main():
     print('Several vehicles at once')
     counted = np.array([*recordings(figures, args.data), *simulated(figures, args.seeds),
                         *single_vehicles(args.passes)])
-    sure, wrong = counted.sum(axis=0)
-    figures.add('poses without a flag that are wrong', wrong / sure, '', MAX_WRONG,
-                note=f' ({wrong} of {sure})')
+    unflagged, wrong = counted.sum(axis=0)
+    figures.add('poses without a flag that are wrong', wrong / unflagged, '', MAX_WRONG,
+                note=f' ({wrong} of {unflagged})')
     figures.add('two vehicles together over one', cost(), 'times', MAX_COST)
     return figures.save()
 

@@ -32,7 +32,7 @@ class Figures:
     def __init__(self, benchmark):
         self._benchmark, self._figures, self.missed = benchmark, {}, 0
 
-    def keep(self, name, value, unit='', aim=None, more_is_better=False, note=''):
+    def record(self, name, value, unit='', aim=None, more_is_better=False, note=''):
         """Record a figure; return whether it misses `aim`, the worst acceptable value."""
         # NaN misses every aim.
         is_missed = aim is not None and not (value >= aim if more_is_better else value <= aim)
@@ -43,7 +43,7 @@ class Figures:
 
     def add(self, name, value, unit, aim=None, more_is_better=False, note=''):
         """Record a figure and print it."""
-        is_missed = self.keep(name, value, unit, aim, more_is_better, note)
+        is_missed = self.record(name, value, unit, aim, more_is_better, note)
         text = '' if aim is None else f'; aim {"at least" if more_is_better else "at most"} {aim:g}'
         print(f'  {name}: {value:.4g} {unit}'.rstrip() + note + text
               + (' (missed)' if is_missed else ''), flush=True)

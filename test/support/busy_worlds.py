@@ -31,7 +31,7 @@ TRUCKS = 0.1
 
 
 @dataclass(frozen=True)
-class OnWheels:
+class WheeledVehicle:
     """Body with a steel belt in each of four tyres, which rotates as the vehicle moves."""
 
     body: object
@@ -61,7 +61,7 @@ class OnWheels:
 def vehicle(rng, simulator, trucks=TRUCKS):
     """Random car, or truck with probability `trucks`; a vehicle of boxes has rotating wheels."""
     body = (truck if rng.random() < trucks else car)(rng, simulator)
-    return OnWheels(body, rng.normal(0.0, 2.0, (4, 2))) if simulator == 'boxes' else body
+    return WheeledVehicle(body, rng.normal(0.0, 2.0, (4, 2))) if simulator == 'boxes' else body
 
 
 def passing(rng, simulator, at_s, direction, speed, trucks=TRUCKS):
@@ -113,7 +113,7 @@ class Score:
     """Whether a vehicle has an accurate track in the right direction, (n_vehicles,)."""
     n_extra: int
     """Number of tracks that belong to no vehicle."""
-    n_sure: int
+    n_unflagged: int
     """Number of unflagged poses."""
     n_wrong: int
     """Number of unflagged poses that are wrong for every vehicle."""
@@ -121,7 +121,7 @@ class Score:
     def __str__(self):
         return (f'found {self.is_found.sum()} of {len(self.rms)}, RMS {np.nanmedian(self.rms):.2f} '
                 f'm, NEES {np.nanmedian(self.nees):.2f}, extra tracks {self.n_extra}, unflagged '
-                f'poses {self.n_sure}, of which wrong {self.n_wrong}')
+                f'poses {self.n_unflagged}, of which wrong {self.n_wrong}')
 
 
 FOUND_M = 5.0
@@ -131,10 +131,10 @@ FOUND_M = 5.0
 def score(poses, vehicles):
     """Compute the `Score` of `Track` records for vehicles [(t (n,) [s], position (n, 2) [m])]."""
     of_track = {i: [p for p in poses if p.id == i] for i in sorted({p.id for p in poses})}
-    candidates, sure = [], [p for p in poses if not p.ambiguous]
-    wrong = np.ones(len(sure), dtype=bool)
+    candidates, unflagged = [], [p for p in poses if not p.ambiguous]
+    wrong = np.ones(len(unflagged), dtype=bool)
     for k, (t, position) in enumerate(vehicles):
-        wrong &= are_wrong(*errors_of(sure, t, position)[:2]) | _outside(sure, t)
+        wrong &= are_wrong(*errors_of(unflagged, t, position)[:2]) | _outside(unflagged, t)
         for i, own in of_track.items():
             error, _, nees, true = errors_of(own, t, position)
             near = (np.hypot(*true.T) < NEAR_M) & ~_outside(own, t)
@@ -152,7 +152,7 @@ def score(poses, vehicles):
         if i not in used and np.isnan(rms[k]):
             used.add(i)
             rms[k], nees[k], found[k] = error, of_k, goes_right and error < FOUND_M
-    return Score(rms, nees, found, len(set(of_track) - used), len(sure), int(wrong.sum()))
+    return Score(rms, nees, found, len(set(of_track) - used), len(unflagged), int(wrong.sum()))
 
 
 def _outside(poses, t):

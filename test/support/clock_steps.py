@@ -16,12 +16,12 @@ def stream(n, begin, end, step=10, skip=()):
     return [(j, t + j) for t in range(begin, end, step) for j in range(n) if j not in skip]
 
 
-def stepped(arrivals, which, begin, end, by):
+def with_clock_step(arrivals, which, begin, end, by):
     """Copy arrivals; from `begin` to `end`, the clocks of the sensors `which` are ahead by `by`."""
     return [(j, t + by if j in which and begin <= t < end else t) for j, t in arrivals]
 
 
-def wild(rng, n, length):
+def random_arrivals(rng, n, length):
     """Generate (sensor, timestamp) with clock steps, dead sensors, time jumps and gaps."""
     offset, t, dead = [0] * n, 0, set()
     for _ in range(length):

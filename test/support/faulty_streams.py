@@ -10,7 +10,7 @@ from support.samples import simulate
 
 START_S = 1000.0
 SPEED = 10.0
-FIRST = np.array([-60.0, -1.5])
+INITIAL_POSITION = np.array([-60.0, -1.5])
 FULL_SCALE = 8e-4
 """[T] Full scale of a sensor; a spike of 2000 times full scale is 1.6 T."""
 NS = 1_000_000_000
@@ -69,7 +69,7 @@ def stream(n_sensors, seed, fault=None, lasting_s=1.5, sensor='mag_2'):
     farthest = float(network.positions[:, 0].max())
     body = point_body(rng.normal(0.0, 250.0, 3), 5.0, 0.5)
     duration = (60.0 + farthest + 60.0) / SPEED
-    samples, *_ = simulate(network, body, Path(FIRST, 0.0, SPEED), 100.0, duration, rng,
+    samples, *_ = simulate(network, body, Path(INITIAL_POSITION, 0.0, SPEED), 100.0, duration, rng,
                            start_s=START_S)
     begin = START_S + 6.0 + max(0.0, farthest / 2.0 - 5.0) / SPEED - 0.4
     end = begin + lasting_s
@@ -79,5 +79,5 @@ def stream(n_sensors, seed, fault=None, lasting_s=1.5, sensor='mag_2'):
         out += modify(sample, rng) if is_faulty else [sample]
 
     def truth(t):
-        return FIRST + [SPEED * (t - START_S), 0.0]
+        return INITIAL_POSITION + [SPEED * (t - START_S), 0.0]
     return network, out, truth, (begin, end)

@@ -72,7 +72,7 @@ def straight(rng, simulator, body, speed, network=ROAD, **of_lane):
     return world(network, [(body, path)], 2.0 * away / speed + 4.0, rng, FLAWS[simulator])
 
 
-def stop_and(rng, stop_s, then):
+def stopping_ride(rng, stop_s, then):
     """Random `Ride` that stops near the sensors, then continues at `then` times its speed.
 
     Returns (ride, duration [s]).
@@ -89,8 +89,8 @@ def stop_and(rng, stop_s, then):
     return Ride(path, tuple(times), (speed, speed, 0.0, 0.0, then * speed)), duration
 
 
-def stopping(rng, simulator, stop_s, then=1.0):
-    ride, duration = stop_and(rng, stop_s, then)
+def stopping_car(rng, simulator, stop_s, then=1.0):
+    ride, duration = stopping_ride(rng, stop_s, then)
     return world(ROAD, [(car(rng, simulator), ride)], duration, rng, FLAWS[simulator])
 
 
@@ -104,7 +104,7 @@ def u_turn(rng, simulator):
                  FLAWS[simulator])
 
 
-def leaves(rng, simulator, cars=0):
+def departing_car(rng, simulator, cars=0):
     """A car is parked near the sensors from the beginning and leaves; other cars may then pass."""
     x, y = rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 2.0)
     parked_s = rng.uniform(10.0, 20.0)
@@ -122,17 +122,17 @@ def leaves(rng, simulator, cars=0):
     return world(ROAD, movers, duration, rng, FLAWS[simulator])
 
 
-def parked(rng, simulator):
+def parked_and_passing_car(rng, simulator):
     """A car is parked permanently, 7 to 9 m from the middle of the road; another car passes."""
-    place = np.array([rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(7.0, 9.0)])
-    stop = Ride(Path(place, 0.0, 1.0), (0.0, 1.0), (0.0, 0.0))
+    position = np.array([rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(7.0, 9.0)])
+    stop = Ride(Path(position, 0.0, 1.0), (0.0, 1.0), (0.0, 0.0))
     speed = rng.uniform(7.0, 15.0)
     path, away = lane(rng, speed)
     return world(ROAD, [(car(rng, simulator), stop), (car(rng, simulator), path)],
                  2.0 * away / speed, rng, FLAWS[simulator])
 
 
-def two(rng, simulator, how, network=ROAD):
+def two_cars(rng, simulator, how, network=ROAD):
     """Two cars that 'meet', 'overtake' or 'follow' each other at the sensors."""
     speed = rng.uniform(7.0, 14.0)
     y = rng.uniform(1.0, 1.6)
@@ -150,13 +150,13 @@ def two(rng, simulator, how, network=ROAD):
     return world(network, movers, 2.0 * away / speed + 4.0, rng, FLAWS[simulator])
 
 
-def spoilt_car(rng, simulator, *faults):
+def faulty_pass(rng, simulator, *faults):
     """A car passes sensors with faults of `support.spoiler`."""
     clean = straight(rng, simulator, car(rng, simulator), rng.uniform(7.0, 20.0))
     return replace(clean, readings=spoiler.apply(clean.readings, *faults))
 
 
-def usual(rng, simulator, kind):
+def random_pass_world(rng, simulator, kind):
     """Random pass of `support.random_passes`."""
     seed = int(rng.integers(1 << 30))
     body, course, duration, flaws = random_pass(simulator, kind, seed)
@@ -224,7 +224,7 @@ def pulsations(rng, simulator):
         2e-8 * direction(rng), lambda t: np.sin(2.0 * np.pi * t / p)), 120.0)
 
 
-def knocked(rng, simulator):
+def knocked_sensor(rng, simulator):
     """A sensor is suddenly rotated by 1 to 5 degrees."""
     quiet = ambient_world(rng, simulator, None, 40.0)
     angles = np.deg2rad(rng.uniform(1.0, 5.0)) * direction(rng)
@@ -236,7 +236,7 @@ def knocked(rng, simulator):
     return replace(quiet, readings=replace(quiet.readings, field=field))
 
 
-def ramps(rng, simulator):
+def drifting_sensors(rng, simulator):
     """Each sensor drifts independently by up to 5 nT/s for 10 to 30 s, then back."""
     rates = rng.uniform(1e-9, 5e-9, (2, 1)) * np.array([direction(rng), direction(rng)])
     ramp_s = rng.uniform(10.0, 30.0)
@@ -245,7 +245,7 @@ def ramps(rng, simulator):
         90.0)
 
 
-def far(rng, simulator, body):
+def distant_body(rng, simulator, body):
     """A large object passes far away; its field is hardly measurable."""
     return straight(rng, simulator, body, rng.uniform(15.0, 25.0), away=200.0,
                     y=rng.choice([-1.0, 1.0]) * rng.uniform(30.0, 60.0))

@@ -7,7 +7,7 @@ import numpy as np
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings
 from mag_tracking.simulation.scenario import Path, SensorErrorModel
-from support.box_vehicles import BOUGHT, magnetised
+from support.box_vehicles import UNCALIBRATED, magnetised
 from support.samples import scenario
 
 GRID_S = 0.01
@@ -109,5 +109,5 @@ def _flawed(B, flaws, t, rng):
     return out + flaws.noise_std * rng.standard_normal(out.shape)
 
 
-FLAWS = {'clouds': SensorErrorModel(), 'boxes': BOUGHT}
+FLAWS = {'clouds': SensorErrorModel(), 'boxes': UNCALIBRATED}
 """{simulator: `SensorErrorModel` of its sensors}."""

@@ -13,7 +13,7 @@ from mag_tracking.drivers.reading import Reading
 LAYOUT = ('temp', 'acc', 'gyr', 'mag', 'counter')
 """Blocks of the MTData messages of `encode_random_frame`, in float precision."""
 FLOAT, FP1220, FP1632, DOUBLE = range(4)
-MARKS = (0xFA, 0xFA, 0xFF, 0xFF, 0x36, 0x32, 0x3E)
+FREQUENT_BYTES = (0xFA, 0xFA, 0xFF, 0xFF, 0x36, 0x32, 0x3E)
 """Bytes that are frequent in garbage."""
 
 
@@ -41,8 +41,8 @@ def reals(numbers, precision):
         return b''.join(int(x * 2**20).to_bytes(4, 'big', signed=True) for x in numbers)
     out = b''
     for x in numbers:
-        whole = int(x * 2**32).to_bytes(6, 'big', signed=True)
-        out += whole[2:] + whole[:2]
+        fixed_point = int(x * 2**32).to_bytes(6, 'big', signed=True)
+        out += fixed_point[2:] + fixed_point[:2]
     return out
 
 
@@ -118,7 +118,7 @@ def garbage(rng, n):
         elif kind < 0.35:
             out += b'\xfa\xff\x36\xff' + struct.pack('>H', rng.randrange(600))
         elif kind < 0.6:
-            out.append(rng.choice(MARKS))
+            out.append(rng.choice(FREQUENT_BYTES))
         else:
             out.append(rng.getrandbits(8))
     return bytes(out[:n])

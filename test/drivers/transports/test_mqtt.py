@@ -352,21 +352,21 @@ def test_a_silent_server_is_reported(topics, tls):
 def test_the_reason_of_a_refusal_is_reported_without_a_retry(topics, code, text):
     with ScriptedBroker(bytes([0x20, 2, 0, code])) as server:
         assert f'127.0.0.1:{server.port}: {text}' in open_error(topics(server.port))
-    assert len(server.heard) == 1
+    assert len(server.received) == 1
 
 
 @pytest.mark.parametrize('qos', [0, 1, 2])
 def test_the_configured_quality_of_service_is_requested(topics, qos):
     with ScriptedBroker(CONNECTED, granted) as server:
         topics(server.port, qos=qos).open()
-    assert server.heard[1].endswith(b'mag/#' + bytes([qos]))
+    assert server.received[1].endswith(b'mag/#' + bytes([qos]))
 
 
 def test_a_broker_that_does_not_answer_a_subscription_is_reported(topics):
     with ScriptedBroker(CONNECTED, b'') as server:
         message = open_error(topics(server.port, connect_timeout_s=0.3))
         assert 'no answer within 0.3 s' in message
-    assert b'mag/#' in server.heard[1]
+    assert b'mag/#' in server.received[1]
 
 
 @pytest.mark.parametrize('garbage', [
@@ -374,7 +374,7 @@ def test_a_broker_that_does_not_answer_a_subscription_is_reported(topics):
     bytes([0x20, 0]), bytes([0xF0, 0]), bytes([0x30, 1, 0]), bytes([0x32, 2, 0, 0]),
     bytes([0x00, 0]), b'\x30\xff\xff\xff\xff\xff'])
 def test_invalid_packets_end_the_connection_and_are_reported(topics, garbage):
-    with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + garbage) as server:
+    with ScriptedBroker(CONNECTED, lambda received: granted(received) + garbage) as server:
         mqtt = topics(server.port, connect_timeout_s=2.0)
         try:
             mqtt.open()
@@ -387,7 +387,7 @@ def test_invalid_packets_end_the_connection_and_are_reported(topics, garbage):
 
 def test_duplicates_are_counted_and_passed_on(topics):
     packets = publish_packet(b'mag/a', b'1') + publish_packet(b'mag/a', b'1', 0x08)
-    with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + packets) as server:
+    with ScriptedBroker(CONNECTED, lambda received: granted(received) + packets) as server:
         mqtt = topics(server.port)
         mqtt.open()
         assert [c.data for c in read_chunks(mqtt, 2)] == [b'1', b'1']
@@ -396,7 +396,7 @@ def test_duplicates_are_counted_and_passed_on(topics):
 
 def test_a_topic_that_is_not_utf_8_is_counted(topics):
     packets = publish_packet(b'mag/\xff', b'1') + publish_packet(b'mag/a', b'2')
-    with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + packets) as server:
+    with ScriptedBroker(CONNECTED, lambda received: granted(received) + packets) as server:
         mqtt = topics(server.port)
         mqtt.open()
         assert [c.data for c in read_chunks(mqtt, 1)] == [b'2']
@@ -405,7 +405,7 @@ def test_a_topic_that_is_not_utf_8_is_counted(topics):
 
 def test_counts_survive_a_lost_connection(topics):
     packets = publish_packet(b'mag/\xff', b'1')
-    with ScriptedBroker(CONNECTED, lambda heard: granted(heard) + packets) as server:
+    with ScriptedBroker(CONNECTED, lambda received: granted(received) + packets) as server:
         mqtt = topics(server.port)
         mqtt.open()
         server.hang_up()
@@ -466,7 +466,7 @@ def test_reopening_closes_the_previous_connection(topics):
         mqtt = topics(first.port)
         mqtt.open()
         assert 'connection refused; check that the broker is running' in open_error(mqtt)
-        wait_until(lambda: first.heard[-1] == b'\xe0\x00')
+        wait_until(lambda: first.received[-1] == b'\xe0\x00')
 
 
 def test_close_sends_a_disconnect_packet(topics):
@@ -474,9 +474,9 @@ def test_close_sends_a_disconnect_packet(topics):
         mqtt = topics(server.port)
         mqtt.open()
         mqtt.close()
-        wait_until(lambda: server.heard[-1] == b'\xe0\x00')
+        wait_until(lambda: server.received[-1] == b'\xe0\x00')
     # CONNECT, SUBSCRIBE and a single DISCONNECT.
-    assert [packet[0] >> 4 for packet in server.heard] == [1, 8, 14]
+    assert [packet[0] >> 4 for packet in server.received] == [1, 8, 14]
 
 
 def test_close_during_connecting_ends_open(topics, monkeypatch):
