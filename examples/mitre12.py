@@ -373,7 +373,7 @@ def main(argv=None):
     parser.add_argument('--out', type=Path, default=Path('out/mitre12'))
     out = parser.parse_args(argv).out
     out.mkdir(parents=True, exist_ok=True)
-    print('MITRE12 Table 1', *(f'  {what:25} {value}' for what, value in TABLE_1), sep='\n')
+    print('MITRE12 Table 1', *(f'  {variable:25} {value}' for variable, value in TABLE_1), sep='\n')
     for draw in (figure_2, figure_3, figure_4, figure_5, figure_6):
         draw().savefig(out / f'{draw.__name__}.png', dpi=110)
     print(detection_report(compare_detection()), bounds_report(compare_bounds()), sep='\n')

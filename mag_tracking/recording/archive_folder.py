@@ -149,13 +149,13 @@ class ArchiveFolder:
         if before.get('schema') != VERSION:
             raise OutputError(f'{self.path} has tables of version {before.get("schema")}; this '
                               f'program writes version {VERSION}. Choose another folder')
-        differs = sorted(key for key in {*head, *before}
-                         if json.dumps(head.get(key), sort_keys=True)
-                         != json.dumps(before.get(key), sort_keys=True))
-        if differs:
+        differing_keys = sorted(key for key in {*head, *before}
+                                if json.dumps(head.get(key), sort_keys=True)
+                                != json.dumps(before.get(key), sort_keys=True))
+        if differing_keys:
             raise OutputError(f'{self.path} was created with other values of '
-                              f'{", ".join(differs)}: the new rows would not be comparable with '
-                              'the existing rows. Choose another folder')
+                              f'{", ".join(differing_keys)}: the new rows would not be comparable '
+                              'with the existing rows. Choose another folder')
 
     def done(self, recording: Path) -> dict[str, Any] | None:
         """Return the summary of a recording that was processed and has not changed since then.

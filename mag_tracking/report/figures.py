@@ -59,8 +59,8 @@ def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray
     uncertainty = 3.0 * np.sqrt(np.trace(covariances, axis1=1, axis2=2))
     steps = np.hypot(*np.diff(points, axis=0).T)
     typical_step = 4.0 * np.median(steps) if len(steps) else 0.0
-    switch = np.flatnonzero(steps > np.maximum(typical_step, 0.5 * uncertainty[1:])) + 1
-    return np.insert(points, switch, np.nan, axis=0)
+    switches = np.flatnonzero(steps > np.maximum(typical_step, 0.5 * uncertainty[1:])) + 1
+    return np.insert(points, switches, np.nan, axis=0)
 
 
 def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None,
@@ -82,21 +82,22 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
     """
     figure = Figure(figsize=(8.5, 6.5), layout='constrained')
     axes = figure.add_subplot()
-    best = np.array(log.position)[:, :2]
+    positions = np.array(log.position)[:, :2]
     covariance = np.array(log.covariance)[:, :2, :2]
     ambiguous = np.array(log.ambiguous, dtype=bool)
-    reach = np.vstack([best, network.positions[:, :2]])
-    low, high = reach.min(axis=0), reach.max(axis=0)
+    map_points = np.vstack([positions, network.positions[:, :2]])
+    low, high = map_points.min(axis=0), map_points.max(axis=0)
     span = max((high - low).max(), 1e-6)
     f, unit = scale_of(span)
     _draw_arrivals(axes, log, f)
-    for k in range(0, len(best), max(1, len(best) // 14)):
-        axes.fill(*(f * _ellipse(best[k], covariance[k])).T, color='k', lw=0,
+    for k in range(0, len(positions), max(1, len(positions) // 14)):
+        axes.fill(*(f * _ellipse(positions[k], covariance[k])).T, color='k', lw=0,
                   alpha=0.04 if ambiguous[k] else 0.10)
-    axes.plot(*(f * _without_switches(best, covariance)).T, color='k', lw=1.8, label='track')
+    axes.plot(*(f * _without_switches(positions, covariance)).T, color='k', lw=1.8, label='track')
     if ambiguous.any():
-        axes.plot(*(f * best[ambiguous]).T, 'o', mfc='w', mec='k', ms=4, label='ambiguous pose')
-    axes.plot(*(f * best[0]), 's', mfc='w', mec='k', ms=7, label='first pose')
+        axes.plot(*(f * positions[ambiguous]).T, 'o', mfc='w', mec='k', ms=4,
+                  label='ambiguous pose')
+    axes.plot(*(f * positions[0]), 's', mfc='w', mec='k', ms=7, label='first pose')
     if truth is not None and np.isfinite(truth).any():
         axes.plot(f * truth[:, 0], f * truth[:, 1], '--', color='0.5', lw=1.4, label='truth')
     if smoothed is not None:

@@ -109,8 +109,9 @@ def pass_figure(fit: _Fit, title: str, max_sensors: int = 6) -> Figure:
     [TSP14]_ Fig. 6.
     """
     data = fit.data
-    level = fit.predicted - target_alone(fit)
-    strength = {j: np.nanmax(np.abs(data.field - level)[data.sensor == j]) for j in data.sensors}
+    background = fit.predicted - target_alone(fit)
+    strength = {j: np.nanmax(np.abs(data.field - background)[data.sensor == j])
+                for j in data.sensors}
     strongest = sorted(sorted(strength, key=lambda j: -strength[j])[:max_sensors])
     f, unit = field_unit(max(strength.values()))
     factor = max(1.0, fit.normalised_cost)
@@ -125,10 +126,10 @@ def pass_figure(fit: _Fit, title: str, max_sensors: int = 6) -> Figure:
         for a, colour in enumerate(AXIS_COLOURS):
             if np.isnan(data.field[rows, a]).all():
                 continue
-            middle = f * (fit.predicted - level)[rows, a]
+            middle = f * (fit.predicted - background)[rows, a]
             half = f * SCALE_1D * np.sqrt(fit.predicted_std[rows, a]**2 + factor * noise[a])
             axes.fill_between(t, middle - half, middle + half, color=colour, alpha=0.25, lw=0)
-            axes.plot(t, f * (data.field - level)[rows, a], '.', ms=2.5, color=colour,
+            axes.plot(t, f * (data.field - background)[rows, a], '.', ms=2.5, color=colour,
                       label=f'{"xyz"[a]}')
             axes.plot(t, middle, '-', lw=0.9, color='k')
         axes.set_title(literal(data.network.names[j]), fontsize=9)

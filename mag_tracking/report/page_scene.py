@@ -80,7 +80,7 @@ def _box(low: FloatArray, high: FloatArray) -> list[float]:
 
 
 def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
-                      most: int = MAX_SENSORS) -> IntArray:
+                      max_sensors: int = MAX_SENSORS) -> IntArray:
     """Return the sensors with the strongest fields during a track.
 
     Parameters
@@ -88,7 +88,7 @@ def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
     log : TrackLog
     rows : iterable of int, optional
         Indices of the poses that are evaluated; all by default.
-    most : int
+    max_sensors : int
         Maximum number of sensors.
 
     Returns
@@ -99,7 +99,7 @@ def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
     chosen = log.measured if rows is None else [log.measured[k] for k in rows]
     measured = np.abs(np.array(chosen).reshape(-1, len(log.measured[0]), 3))
     strength = np.nan_to_num(measured).max(axis=(0, 2), initial=0.0)
-    return np.sort(np.argsort(-strength, kind='stable')[:most])
+    return np.sort(np.argsort(-strength, kind='stable')[:max_sensors])
 
 
 def max_poses_of(logs: Sequence[TrackLog], max_bytes: int = MAX_BYTES) -> int:
@@ -136,7 +136,7 @@ def _pose_size(log: TrackLog) -> int:
     return (4 * (120 + 24 * n_sensors + 32 * n_arrivals)) // 3
 
 
-def thin_poses(log: TrackLog, most: int) -> list[int]:
+def thin_poses(log: TrackLog, max_poses: int) -> list[int]:
     """Return the indices of evenly spaced poses of a track.
 
     The first, the last and the most certain pose are included.
@@ -144,7 +144,7 @@ def thin_poses(log: TrackLog, most: int) -> list[int]:
     Parameters
     ----------
     log : TrackLog
-    most : int
+    max_poses : int
         Maximum number of poses.
 
     Returns
@@ -152,9 +152,9 @@ def thin_poses(log: TrackLog, most: int) -> list[int]:
     list of int
     """
     n = len(log.stamp_ns)
-    if n <= most:
+    if n <= max_poses:
         return list(range(n))
-    rows = np.linspace(0, n - 1, most - 1).round().astype(int)
+    rows = np.linspace(0, n - 1, max_poses - 1).round().astype(int)
     return sorted({*rows.tolist(), log.most_certain()})
 
 

@@ -15,7 +15,7 @@ from mag_tracking.recording.fit_folder import fit_row
 from mag_tracking.recording.reader import Recording
 from support.bundled import VEHICLES, vehicle_path
 from support.close_pairs import estimates_of, pass_of, readings_of
-from support.passes import NOISE, ROAD, measured, random_path, together
+from support.passes import NOISE, ROAD, measured, random_path, superposed
 
 PATH = np.array([0.0, -2.0, 0.5, 10.0, 0.0, 0.0, 3.0])
 
@@ -82,7 +82,7 @@ def test_a_single_fit_of_two_vehicles_is_not_trusted():
     other, m2 = random_path(rng, 3, True)
     one[:7] = 0.0, -1.75, 0.5, 9.0, 0.0, 0.0, 3.0
     other[:7] = 6.0, 1.75, 0.5, -11.0, 0.0, 0.0, 3.0
-    both = together(measured(ROAD, one, m1, rng), measured(ROAD, other, m2, rng, noise=1e-15))
+    both = superposed(measured(ROAD, one, m1, rng), measured(ROAD, other, m2, rng, noise=1e-15))
     fit = fit_pass(both, 3)
     assert 'not one target' in fit.reason and fit.trusted == ()
 

@@ -78,34 +78,34 @@ def recordings(figures, folder):
         name = path.name.removesuffix('.truth.json')
         with timed_searches() as seconds:
             tracked = tracked_recording(name, folder)
-            got = tracked.score
+            result = tracked.score
         rms, nees, found = aims_of(name)
-        n = len(got.rms)
-        figures.add(f'{name}: found', float(got.is_found.mean()), '', found, True,
-                    f' ({got.is_found.sum()} of {n})')
+        n = len(result.rms)
+        figures.add(f'{name}: found', float(result.is_found.mean()), '', found, True,
+                    f' ({result.is_found.sum()} of {n})')
         figures.add(f'{name}: counted in the right direction', float(len(
             correctly_counted(name, tracked.passages, folder))), '', None, True,
             f' (of {len(tracked.passages)} counted)')
-        figures.add(f'{name}: RMS', float(np.nanmedian(got.rms)), 'm', rms)
-        figures.add(f'{name}: NEES', float(np.nanmedian(got.nees)), '', nees)
-        figures.add(f'{name}: false tracks', got.n_extra, '', 0)
+        figures.add(f'{name}: RMS', float(np.nanmedian(result.rms)), 'm', rms)
+        figures.add(f'{name}: NEES', float(np.nanmedian(result.nees)), '', nees)
+        figures.add(f'{name}: false tracks', result.n_extra, '', 0)
         figures.add(f'{name}: time of a search', float(np.median(seconds)), 's',
                     note=f' (longest {max(seconds):.2g} s, {len(seconds)} searches)')
-        counted.append((got.n_unflagged, got.n_wrong))
+        counted.append((result.n_unflagged, result.n_wrong))
     return counted
 
 
 def simulated(figures, seeds):
     """Track worlds of the second simulator; return the same numbers as `recordings`."""
     counted = []
-    for how in ('meeting', 'following', 'traffic'):
-        scores = [tracked(busy(how, n, 'boxes', seed))[0]
-                  for n in (2, 4) for seed in with_progress_bar(range(seeds), how)]
+    for pattern in ('meeting', 'following', 'traffic'):
+        scores = [tracked(busy(pattern, n, 'boxes', seed))[0]
+                  for n in (2, 4) for seed in with_progress_bar(range(seeds), pattern)]
         found = np.concatenate([s.is_found for s in scores])
-        figures.add(f'boxes, {how}: found', float(found.mean()), '', note=f' (of {len(found)})')
-        figures.add(f'boxes, {how}: RMS',
+        figures.add(f'boxes, {pattern}: found', float(found.mean()), '', note=f' (of {len(found)})')
+        figures.add(f'boxes, {pattern}: RMS',
                     float(np.nanmedian(np.concatenate([s.rms for s in scores]))), 'm')
-        figures.add(f'boxes, {how}: false tracks', sum(s.n_extra for s in scores), '')
+        figures.add(f'boxes, {pattern}: false tracks', sum(s.n_extra for s in scores), '')
         counted += [(s.n_unflagged, s.n_wrong) for s in scores]
     return counted
 
@@ -128,8 +128,8 @@ def single_vehicles(passes):
             error_m, along / np.maximum(error_m, 1e-9)).sum())))
     for kind in KINDS:
         for seed in with_progress_bar(range(passes), kind):
-            got = one_random_pass('boxes', kind, seed)
-            counted.append((int((~got.ambiguous).sum()), int(got.unflagged_and_wrong.sum())))
+            result = one_random_pass('boxes', kind, seed)
+            counted.append((int((~result.ambiguous).sum()), int(result.unflagged_and_wrong.sum())))
     return counted
 
 

@@ -82,7 +82,7 @@ def machine():
     return ', '.join([platform.machine(), f'{os.cpu_count()} cores', *sorted(models)])
 
 
-def worse(run, before):
+def worse_figures(run, before):
     """List the figures that are worse or NaN, as (benchmark, name, figure, best earlier value).
 
     `before` contains the earlier runs on the same kind of machine.
@@ -121,7 +121,7 @@ def main():
         return 1
     figures = {name: run['figures'] for name, run in json.loads(LATEST.read_text()).items()}
     before = [run for run in read_history() if run['machine'] == machine()]
-    found = worse(figures, before)
+    found = worse_figures(figures, before)
     for benchmark, name, figure, best in found:
         print(f'{RED}worse: {benchmark}: {name}: {figure["value"]:.4g} {figure["unit"]}, the best '
               f'of the latest runs was {best:.4g}{PLAIN}')

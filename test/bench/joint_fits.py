@@ -76,12 +76,12 @@ def recordings(folder):
     return tally
 
 
-def worlds(how, simulator, seeds, trucks=TRUCKS):
+def worlds(pattern, simulator, seeds, trucks=TRUCKS):
     """Fit worlds with pairs of vehicles and a fraction `trucks` of trucks; return their `Tally`."""
     tally = Tally()
     for n_sensors in (2, 4):
         for seed in tqdm(range(seeds), disable=None, leave=False):
-            a_world = busy(how, n_sensors, simulator, seed, trucks=trucks)
+            a_world = busy(pattern, n_sensors, simulator, seed, trucks=trucks)
             begin = time.perf_counter()
             passes = fits_of_world(a_world)
             duration_s = time.perf_counter() - begin
@@ -117,9 +117,9 @@ def main():
     print('Fits of several vehicles at once')
     counted = [recordings(args.data).figures(figures, 'recordings', MIN_CORRECT)]
     for simulator in SIMULATORS:
-        for how in ('meeting', 'following'):
-            counted.append(worlds(how, simulator, args.seeds).figures(
-                figures, f'{simulator}, {how}'))
+        for pattern in ('meeting', 'following'):
+            counted.append(worlds(pattern, simulator, args.seeds).figures(
+                figures, f'{simulator}, {pattern}'))
         counted.append(worlds('meeting', simulator, args.seeds, 0.5).figures(
             figures, f'{simulator}, meeting, every other one a truck'))
         n_split, n = single_vehicles(simulator, args.passes)

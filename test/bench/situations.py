@@ -73,7 +73,7 @@ def event_counts(found):
 
 def cost():
     """Fraction of the processing time of a frame for the disturbance model and the tests."""
-    spent = {'_update_evidence': 0.0, '_doubts': 0.0, 'step': 0.0}
+    durations = {'_update_evidence': 0.0, '_doubts': 0.0, 'step': 0.0}
     owner = {'_update_evidence': RunningTrack, '_doubts': Member, 'step': RunningTrack}
 
     def timed(method):
@@ -84,22 +84,22 @@ def cost():
             try:
                 return original(*arguments, **named)
             finally:
-                spent[method] += time.perf_counter() - begin
+                durations[method] += time.perf_counter() - begin
         return original, call
 
-    originals = {method: timed(method) for method in spent}
+    originals = {method: timed(method) for method in durations}
     for method, (_, call) in originals.items():
         setattr(owner[method], method, call)
     try:
         a_world = simulated_world('a car', 'clouds', 0)
         for _ in range(2):
-            spent.update(dict.fromkeys(spent, 0.0))
+            durations.update(dict.fromkeys(durations, 0.0))
             pipeline = Pipeline(a_world.network, settings_for('vehicle'))
             pipeline.feed(a_world.readings)
     finally:
         for method, (original, _) in originals.items():
             setattr(owner[method], method, original)
-    return (spent['_update_evidence'] + spent['_doubts']) / spent['step']
+    return (durations['_update_evidence'] + durations['_doubts']) / durations['step']
 
 
 def main():

@@ -38,28 +38,33 @@ FAULTS = {
 """{fault: (function that returns the fault, its arguments)}."""
 
 
-def faults_of(what):
-    """Functions that apply the fault `what` of `FAULTS` to `Readings`; an empty list for 'none'."""
-    if not FAULTS[what]:
+def faults_of(stream_fault):
+    """Functions that apply the fault `stream_fault` of `FAULTS` to `Readings`.
+
+    The list is empty for 'none'.
+    """
+    if not FAULTS[stream_fault]:
         return []
-    fault, *arguments = FAULTS[what]
+    fault, *arguments = FAULTS[stream_fault]
     return [fault(*arguments)]
 
 
-def faulty_pass(what, simulator, kind, seed):
+def faulty_pass(stream_fault, simulator, kind, seed):
     """Track a random pass with a fault of `FAULTS`; return its `Tracked`."""
-    return one_random_pass(simulator, kind, seed, faults=faults_of(what))
+    return one_random_pass(simulator, kind, seed, faults=faults_of(stream_fault))
 
 
-def summary(figures, what, simulator, kind, found):
+def summary(figures, stream_fault, simulator, kind, found):
     """Record the figures of one combination; return a line and whether the aim is met."""
     n_unflagged, rate = fraction_of_wrong(found)
     n_tracked = sum(len(f.error) > 0 for f in found)
     n_tracked_right = sum(bool(f.heading > MIN_HEADING_COSINE) for f in found)
-    met = not figures.record(f'{what}; {simulator}, {kind}: unflagged and wrong', 100.0 * rate, '%',
-                             100.0 * MAX_WRONG, note=f'of {n_unflagged} poses')
-    figures.record(f'{what}; {simulator}, {kind}: tracked', n_tracked / len(found), '', None, True)
-    return (f'  {what:27s} {simulator}, {kind}: {sum(f.detected for f in found):2d} of '
+    met = not figures.record(f'{stream_fault}; {simulator}, {kind}: unflagged and wrong',
+                             100.0 * rate, '%', 100.0 * MAX_WRONG,
+                             note=f'of {n_unflagged} poses')
+    figures.record(f'{stream_fault}; {simulator}, {kind}: tracked',
+                   n_tracked / len(found), '', None, True)
+    return (f'  {stream_fault:27s} {simulator}, {kind}: {sum(f.detected for f in found):2d} of '
             f'{len(found)} detected, {n_tracked:2d} tracked, {n_tracked_right:2d} in the right '
             f'direction; {sum((~f.ambiguous).any() for f in found):2d} with unflagged poses, '
             f'unflagged and wrong {rate:5.1%} in '

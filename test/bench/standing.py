@@ -26,22 +26,22 @@ from support.standing import (
 RUNS = 20
 
 
-def run_case(what, run):
+def run_case(case, run):
     """Run one case; return the result of its function in `support.standing`."""
-    if what == 'stops':
+    if case == 'stops':
         return is_one_track(STOPS[run % len(STOPS)], run // len(STOPS))
-    return background_recovery_s(run) if what == 'leaves' else error_after_parked(run)
+    return background_recovery_s(run) if case == 'leaves' else error_after_parked(run)
 
 
-def summary(figures, what, found):
+def summary(figures, case, found):
     """Record the figures of one case; return a line and whether the aim is met."""
     n = len(found)
-    if what == 'stops':
+    if case == 'stops':
         figures.record('stopped for 5, 20 and 60 s: runs with one track', sum(found) / n, '', 0.9,
                        True, note=f'{n} runs')
         return (f'stopped for 5, 20 and 60 s: in {sum(found)} of {n} runs the same track continues '
                 'and departs (aim 90 %)', sum(found) >= 0.9 * n)
-    if what == 'leaves':
+    if case == 'leaves':
         n_in_time = sum(s <= MAX_RECOVERY_S for s in found)
         figures.record(f'present at the start: correct background within {MAX_RECOVERY_S:g} s',
                        n_in_time / n, '', 1.0, True, note=f'{n} runs')

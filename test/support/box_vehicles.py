@@ -70,9 +70,9 @@ def magnetised(rng, parts, length, moment):
     fraction /= fraction.sum()
     # Approximation: demagnetisation along a side is inversely proportional to the side length.
     N = (1.0 / sides) / (1.0 / sides).sum(axis=1, keepdims=True)
-    easy = 1.0 / (N + 1.0 / CHI)
-    easy *= fraction[:, None] / easy.mean(axis=1, keepdims=True)
-    induced = easy * moment / 1.4 * MU0 / 50e-6
+    susceptibility = 1.0 / (N + 1.0 / CHI)
+    susceptibility *= fraction[:, None] / susceptibility.mean(axis=1, keepdims=True)
+    induced = susceptibility * moment / 1.4 * MU0 / 50e-6
     while True:
         common = rng.standard_normal(3)
         along = common / np.linalg.norm(common) + 0.6 * rng.standard_normal((len(fraction), 3))

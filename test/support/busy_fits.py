@@ -54,10 +54,10 @@ def assigned_fits(passes, vehicles):
         for k, (t, position) in enumerate(vehicles):
             if not t[0] + 0.5 < time < t[-1] - 0.5:
                 continue
-            here, ahead, behind = (np.array([np.interp(time + s, t, position[:, a])
-                                             for a in (0, 1)]) for s in (0.0, 0.2, -0.2))
-            velocity = (ahead - behind) / 0.4
-            error = float(np.linalg.norm(fit.position[:2] - here))
+            current, later, earlier = (np.array([np.interp(time + s, t, position[:, a])
+                                                 for a in (0, 1)]) for s in (0.0, 0.2, -0.2))
+            velocity = (later - earlier) / 0.4
+            error = float(np.linalg.norm(fit.position[:2] - current))
             if error < MAX_ASSIGNMENT_M and velocity @ fit.velocity[:2] > 0.0:
                 candidates.append((error, i, k, float(np.linalg.norm(velocity))))
     out, used = [], set()

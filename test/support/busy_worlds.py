@@ -72,30 +72,30 @@ def passing(rng, simulator, at_s, direction, speed, trucks=TRUCKS):
     return body, random_drive(rng, path, at_s) if simulator == 'boxes' else path
 
 
-def pair(rng, how, at_s):
+def pair(rng, pattern, at_s):
     """[(time [s], direction, speed [m/s])] of two vehicles that meet or follow each other."""
     speed, direction = rng.uniform(8.0, 20.0), int(rng.choice([-1, 1]))
-    if how == 'meeting':
+    if pattern == 'meeting':
         return [(at_s, direction, speed),
                 (at_s + rng.uniform(0.1, 1.1), -direction, rng.uniform(8.0, 20.0))]
     return [(at_s, direction, speed),
             (at_s + rng.uniform(1.2, 2.5), direction, speed * rng.uniform(0.96, 1.04))]
 
 
-def busy(how, n_sensors, simulator, seed, n=4, trucks=TRUCKS):
+def busy(pattern, n_sensors, simulator, seed, n=4, trucks=TRUCKS):
     """Simulate a `World` with `n` pairs of vehicles, or with up to 3 `n` vehicles in free traffic.
 
-    `how` is 'meeting', 'following' or 'traffic'.
+    `pattern` is 'meeting', 'following' or 'traffic'.
     """
-    rng = np.random.default_rng([seed, n_sensors, len(how), len(simulator)])
-    if how == 'traffic':
+    rng = np.random.default_rng([seed, n_sensors, len(pattern), len(simulator)])
+    if pattern == 'traffic':
         times = LEAD_S + np.cumsum(rng.exponential(3.0, 3 * n))
         plan = [(t, int(rng.choice([-1, 1])), rng.uniform(8.0, 20.0)) for t in times]
         plan = [p for k, p in enumerate(plan) if not any(
             # Vehicles do not drive through other vehicles in the same lane.
             q[1] == p[1] and (p[0] - q[0]) * min(p[2], q[2]) < 14.0 for q in plan[:k])]
     else:
-        plan = [p for k in range(n) for p in pair(rng, how, LEAD_S + 14.0 * k)]
+        plan = [p for k in range(n) for p in pair(rng, pattern, LEAD_S + 14.0 * k)]
     movers = [passing(rng, simulator, *p, trucks) for p in plan]
     return world(NETWORKS[n_sensors], movers, max(p[0] for p in plan) + 7.0, rng,
                  FLAWS[simulator], RATE)

@@ -16,12 +16,12 @@ FULL_SCALE = 8e-4
 NS = 1_000_000_000
 
 
-def swapped(sample, rng):
+def swap_axes(sample, rng):
     """Swap two axes."""
     return [replace(sample, field=sample.field[[1, 0, 2]])]
 
 
-def spiky(size):
+def with_spikes(size):
     """Add a spike of +/- `size` [T] on every axis to one of twenty readings."""
     def modify(sample, rng):
         spike = size * rng.choice([-1.0, 1.0], 3) if rng.random() < 0.05 else 0.0
@@ -29,7 +29,7 @@ def spiky(size):
     return modify
 
 
-def late_by(seconds):
+def shift_clock(seconds):
     """Set the clock back by `seconds`, or ahead if negative."""
     return lambda sample, rng: [replace(sample, stamp_ns=sample.stamp_ns - round(seconds * NS))]
 
@@ -48,12 +48,12 @@ class Frozen:
 FAULTS = {
     'dies': lambda: lambda sample, rng: [],
     'freezes': Frozen,
-    'spikes of 2000 times full scale': lambda: spiky(2000.0 * FULL_SCALE),
-    'spikes within full scale': lambda: spiky(0.6 * FULL_SCALE),
-    'small spikes': lambda: spiky(2e-6),
-    'swaps axes': lambda: swapped,
-    'jumps 1 s ahead': lambda: late_by(-1.0),
-    'jumps 1 s back': lambda: late_by(1.0),
+    'spikes of 2000 times full scale': lambda: with_spikes(2000.0 * FULL_SCALE),
+    'spikes within full scale': lambda: with_spikes(0.6 * FULL_SCALE),
+    'small spikes': lambda: with_spikes(2e-6),
+    'swaps axes': lambda: swap_axes,
+    'jumps 1 s ahead': lambda: shift_clock(-1.0),
+    'jumps 1 s back': lambda: shift_clock(1.0),
     'sends duplicates': lambda: lambda sample, rng: [sample, sample],
     'sends gauss': lambda: lambda sample, rng: [replace(sample, field=1e4 * sample.field)],
 }

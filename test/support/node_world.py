@@ -239,15 +239,15 @@ def world(folder):
             own, *password_lines(own, 'somebody', 'secret')) as guarded, Roadside(
             read_network(network_file(folder)), BODY, broker.port, line) as roadside:
         begin()
-        here = World(folder, broker, guarded, roadside, line)
+        running_world = World(folder, broker, guarded, roadside, line)
         try:
-            here.use('mqtt')
+            running_world.use('mqtt')
             for name in list(TOPICS)[1:]:
-                here.start(name)
-            assert here.wait(lambda: here.received['detection_node'])
-            yield here
+                running_world.start(name)
+            assert running_world.wait(lambda: running_world.received['detection_node'])
+            yield running_world
         finally:
-            codes, outputs = here.close()
+            codes, outputs = running_world.close()
             rclpy.try_shutdown()
         assert not any(codes), outputs
         assert not any('Traceback' in text for text in outputs), outputs

@@ -26,8 +26,8 @@ async def main(url, n):
     tasks = [asyncio.create_task(receive_all(url, one)) for one in sizes]
     asyncio.get_running_loop().add_signal_handler(
         signal.SIGTERM, lambda: [task.cancel() for task in tasks])
-    ended = await asyncio.gather(*tasks, return_exceptions=True)
-    lost = sum(not isinstance(e, asyncio.CancelledError) for e in ended)
+    results = await asyncio.gather(*tasks, return_exceptions=True)
+    lost = sum(not isinstance(e, asyncio.CancelledError) for e in results)
     counts = [len(one) for one in sizes]
     print(f'{n}, each {min(counts)} to {max(counts)} messages, {sum(sizes[0]) / 1e6:.1f} MB; '
           f'{lost} disconnected')

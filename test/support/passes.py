@@ -57,7 +57,7 @@ def measured(network, path, moments, rng, rate=100.0, seconds=4.0, noise=NOISE):
                     np.tile(noise**2 * np.eye(3), (len(t), 1, 1)))
 
 
-def together(first, second):
+def superposed(first, second):
     """`PassData` of two targets at once: the sum of their fields, with the noise of the first."""
     return replace(first, field=first.field + second.field)
 

@@ -33,8 +33,8 @@ def errors(geometry, field, positions, axes, poses):
     return np.linalg.norm([p.position for p in estimates] - r, axis=1), np.array(angle)
 
 
-def print_errors(what, position_error, axis_error, is_low):
-    print(f'{what}: {1e3 * np.median(position_error):.3f} mm, '
+def print_errors(title, position_error, axis_error, is_low):
+    print(f'{title}: {1e3 * np.median(position_error):.3f} mm, '
           f'{1e3 * np.median(position_error[is_low]):.3f} mm below 100 mm, '
           f'{np.median(axis_error):.2f} deg; 90 % within '
           f'{1e3 * np.quantile(position_error, 0.9):.2f} mm')

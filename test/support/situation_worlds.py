@@ -58,18 +58,19 @@ def wagon(rng, simulator):
 
 # Courses.
 
-def lane(rng, speed, away=None, y=None):
-    """Straight `Path` along the road, and the distance `away` of its start from the sensors [m]."""
-    away = QUIET_S * speed + 25.0 if away is None else away
+def lane(rng, speed, start_m=None, y=None):
+    """Straight `Path` along the road, and the distance [m] of its start from the sensors."""
+    start_m = QUIET_S * speed + 25.0 if start_m is None else start_m
     y = rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.6) if y is None else y
     forward = rng.random() < 0.5
-    return Path(np.array([-away if forward else away, y]), 0.0 if forward else np.pi, speed), away
+    return Path(np.array([-start_m if forward else start_m, y]), 0.0 if forward else np.pi,
+                speed), start_m
 
 
 def straight(rng, simulator, body, speed, network=ROAD, **of_lane):
     """Body on a straight path past the sensors."""
-    path, away = lane(rng, speed, **of_lane)
-    return world(network, [(body, path)], 2.0 * away / speed + 4.0, rng, FLAWS[simulator])
+    path, start_m = lane(rng, speed, **of_lane)
+    return world(network, [(body, path)], 2.0 * start_m / speed + 4.0, rng, FLAWS[simulator])
 
 
 def stopping_ride(rng, stop_s, then):
@@ -78,10 +79,10 @@ def stopping_ride(rng, stop_s, then):
     Returns (ride, duration [s]).
     """
     speed = rng.uniform(6.0, 12.0)
-    brake = rng.uniform(1.5, 3.0)
-    path, away = lane(rng, speed, y=rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.6))
-    stop_m = away + rng.uniform(-5.0, 3.0)
-    braking_s = speed / brake
+    deceleration = rng.uniform(1.5, 3.0)
+    path, start_m = lane(rng, speed, y=rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.6))
+    stop_m = start_m + rng.uniform(-5.0, 3.0)
+    braking_s = speed / deceleration
     begin = (stop_m - 0.5 * speed * braking_s) / speed
     times = [0.0, begin, begin + braking_s, begin + braking_s + stop_s]
     times += [times[-1] + max(abs(then), 0.1) * speed / 2.0]
@@ -108,15 +109,15 @@ def departing_car(rng, simulator, cars=0):
     """A car is parked near the sensors from the beginning and leaves; other cars may then pass."""
     x, y = rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 2.0)
     parked_s = rng.uniform(10.0, 20.0)
-    top = rng.uniform(6.0, 12.0)
+    final_speed = rng.uniform(6.0, 12.0)
     forward = rng.random() < 0.5
-    path = Path(np.array([x, y]), 0.0 if forward else np.pi, top)
-    ride = Ride(path, (0.0, parked_s, parked_s + top / 2.0), (0.0, 0.0, top))
-    duration = parked_s + top / 2.0 + 60.0 / top + 6.0
+    path = Path(np.array([x, y]), 0.0 if forward else np.pi, final_speed)
+    ride = Ride(path, (0.0, parked_s, parked_s + final_speed / 2.0), (0.0, 0.0, final_speed))
+    duration = parked_s + final_speed / 2.0 + 60.0 / final_speed + 6.0
     movers = [(car(rng, simulator), ride)]
     for _ in range(cars):
         speed = rng.uniform(7.0, 15.0)
-        other, _ = lane(rng, speed, away=speed * duration)
+        other, _ = lane(rng, speed, start_m=speed * duration)
         movers.append((car(rng, simulator), other))
         duration += 12.0
     return world(ROAD, movers, duration, rng, FLAWS[simulator])
@@ -127,27 +128,27 @@ def parked_and_passing_car(rng, simulator):
     position = np.array([rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(7.0, 9.0)])
     stop = Ride(Path(position, 0.0, 1.0), (0.0, 1.0), (0.0, 0.0))
     speed = rng.uniform(7.0, 15.0)
-    path, away = lane(rng, speed)
+    path, start_m = lane(rng, speed)
     return world(ROAD, [(car(rng, simulator), stop), (car(rng, simulator), path)],
-                 2.0 * away / speed, rng, FLAWS[simulator])
+                 2.0 * start_m / speed, rng, FLAWS[simulator])
 
 
-def two_cars(rng, simulator, how, network=ROAD):
+def two_cars(rng, simulator, pattern, network=ROAD):
     """Two cars that 'meet', 'overtake' or 'follow' each other at the sensors."""
     speed = rng.uniform(7.0, 14.0)
     y = rng.uniform(1.0, 1.6)
-    away = QUIET_S * speed + 30.0
-    first = Path(np.array([-away, -y]), 0.0, speed)
-    if how == 'meet':
+    start_m = QUIET_S * speed + 30.0
+    first = Path(np.array([-start_m, -y]), 0.0, speed)
+    if pattern == 'meet':
         other = speed * rng.uniform(0.8, 1.2)
-        second = Path(np.array([away / speed * other + rng.uniform(-5.0, 5.0), y]), np.pi, other)
-    elif how == 'overtake':
+        second = Path(np.array([start_m / speed * other + rng.uniform(-5.0, 5.0), y]), np.pi, other)
+    elif pattern == 'overtake':
         other = speed * rng.uniform(1.3, 1.7)
-        second = Path(np.array([-away / speed * other + rng.uniform(-5.0, 5.0), y]), 0.0, other)
+        second = Path(np.array([-start_m / speed * other + rng.uniform(-5.0, 5.0), y]), 0.0, other)
     else:
-        second = Path(np.array([-away - speed * rng.uniform(1.0, 2.0), -y]), 0.0, speed)
+        second = Path(np.array([-start_m - speed * rng.uniform(1.0, 2.0), -y]), 0.0, speed)
     movers = [(car(rng, simulator), first), (car(rng, simulator), second)]
-    return world(network, movers, 2.0 * away / speed + 4.0, rng, FLAWS[simulator])
+    return world(network, movers, 2.0 * start_m / speed + 4.0, rng, FLAWS[simulator])
 
 
 def faulty_pass(rng, simulator, *faults):
@@ -170,7 +171,7 @@ def ambient_world(rng, simulator, ambient, duration, rate=100.0, cars=0):
     movers = []
     for k in range(cars):
         speed = rng.uniform(7.0, 15.0)
-        path, _ = lane(rng, speed, away=speed * (duration / cars * (k + 0.6)))
+        path, _ = lane(rng, speed, start_m=speed * (duration / cars * (k + 0.6)))
         movers.append((car(rng, simulator), path))
     return world(ROAD, movers, duration, rng, FLAWS[simulator], rate, ambient)
 
@@ -197,11 +198,11 @@ def hum(rng, simulator, frequency, rate):
 def tram(rng, simulator):
     """A current of 100 to 500 A in a line 30 to 60 m away is switched on and off with ramps."""
     times = np.sort(rng.uniform(12.0, 55.0, 4))
-    away, current = rng.uniform(30.0, 60.0), rng.uniform(100.0, 500.0)
+    distance, current = rng.uniform(30.0, 60.0), rng.uniform(100.0, 500.0)
     y = ROAD.positions[:, 1]
     # Field of an infinite wire along x, 5 m above the ground.
-    r2 = (away - y)**2 + 25.0
-    B = 2e-7 * current * np.stack([0.0 * y, 5.0 / r2, (away - y) / r2], axis=1)
+    r2 = (distance - y)**2 + 25.0
+    B = 2e-7 * current * np.stack([0.0 * y, 5.0 / r2, (distance - y) / r2], axis=1)
     ramp = rng.uniform(0.2, 2.0)
     return ambient_world(rng, simulator, lambda t: np.interp(
         t, np.concatenate([[s, s + ramp] for s in times]), [0, 1, 1, 0, 0, 1, 1, 0]
@@ -247,15 +248,15 @@ def drifting_sensors(rng, simulator):
 
 def distant_body(rng, simulator, body):
     """A large object passes far away; its field is hardly measurable."""
-    return straight(rng, simulator, body, rng.uniform(15.0, 25.0), away=200.0,
+    return straight(rng, simulator, body, rng.uniform(15.0, 25.0), start_m=200.0,
                     y=rng.choice([-1.0, 1.0]) * rng.uniform(30.0, 60.0))
 
 
 def train(rng, simulator, y):
     """A train of five wagons of 18 m passes; a pose at any wagon is correct."""
     speed = rng.uniform(10.0, 20.0)
-    path, away = lane(rng, speed, away=250.0, y=rng.choice([-1.0, 1.0]) * y)
+    path, start_m = lane(rng, speed, start_m=250.0, y=rng.choice([-1.0, 1.0]) * y)
     along = np.array([np.cos(path.heading), np.sin(path.heading)])
     movers = [(wagon(rng, simulator), replace(path, start=path.start + 20.0 * k * along))
               for k in range(-2, 3)]
-    return world(ROAD, movers, 2.0 * away / speed, rng, FLAWS[simulator])
+    return world(ROAD, movers, 2.0 * start_m / speed, rng, FLAWS[simulator])

@@ -66,9 +66,9 @@ SITUATIONS = {
     'stops for 60 s': Situation(lambda r, s: stopping_car(r, s, 60.0)),
     'parks': Situation(lambda r, s: stopping_car(r, s, 60.0, 0.0)),
     'reverses': Situation(lambda r, s: stopping_car(r, s, 2.0, -0.5)),
-    'crawls at 0.3 m/s': Situation(lambda r, s: straight(r, s, car(r, s), 0.3, away=15.0)),
+    'crawls at 0.3 m/s': Situation(lambda r, s: straight(r, s, car(r, s), 0.3, start_m=15.0)),
     'a trolley at 1.3 m/s': Situation(lambda r, s: straight(
-        r, s, small(r, s, 1.0, r.uniform(8.0, 15.0), 0.1), 1.3, away=20.0,
+        r, s, small(r, s, 1.0, r.uniform(8.0, 15.0), 0.1), 1.3, start_m=20.0,
         y=r.choice([-1.0, 1.0]) * r.uniform(2.0, 3.5))),
     'a bicycle': Situation(lambda r, s: straight(
         r, s, small(r, s, 1.7, r.uniform(4.0, 8.0), 0.1), r.uniform(4.0, 7.0),

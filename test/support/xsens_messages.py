@@ -162,8 +162,8 @@ def main():
     parser.add_argument('--seed', type=int, default=0)
     arguments = parser.parse_args()
     rng, framing = random.Random(arguments.seed), XsensFraming(XsensSettings(mtdata=LAYOUT))
-    sent = lost = false = fed = 0
-    spent = 0.0
+    sent = lost = false = n_bytes = 0
+    parse_s = 0.0
     for _ in range(0, arguments.frames, 10_000):
         data, readings, _ = stream(rng, min(10_000, arguments.frames))
         found, rest, position = [], b'', 0
@@ -174,11 +174,12 @@ def main():
             parsed = framing.parse(piece, final=position >= len(data))
             rest = piece[parsed.consumed:]
             found += parsed.readings
-        spent += time.perf_counter() - begin
-        fewer, more = lost_and_false(readings, found)
-        sent, lost, false, fed = sent + len(readings), lost + fewer, false + more, fed + len(data)
-    print(f'{arguments.frames} frames with {sent} readings in {fed} bytes: {lost} lost, {false} '
-          f'false, {1e6 * spent / arguments.frames:.1f} us a frame')
+        parse_s += time.perf_counter() - begin
+        n_lost, n_false = lost_and_false(readings, found)
+        sent, lost, false, n_bytes = (sent + len(readings), lost + n_lost, false + n_false,
+                                      n_bytes + len(data))
+    print(f'{arguments.frames} frames with {sent} readings in {n_bytes} bytes: {lost} lost, '
+          f'{false} false, {1e6 * parse_s / arguments.frames:.1f} us a frame')
 
 
 if __name__ == '__main__':
