@@ -100,7 +100,7 @@ def best_sensor_position(numbers, same_side=False):
 
 
 def figure_5_2():
-    """Eigenvalues of the information matrix for one and two sensors."""
+    """Plot the eigenvalues of the information matrix for one and two sensors."""
     figure = Figure(figsize=(7.5, 4.6), layout='constrained')
     axes, number = figure.add_subplot(), np.arange(1, 10)
     for sensors, style, label in ((ONE_SENSOR, 'o', 'one sensor, at [0, 0, 0]'),
@@ -121,8 +121,7 @@ def figure_5_2():
 
 
 def figure_5_3(numbers):
-    """Map of the condition number (n_y, n_x) against the position of the second sensor.
-    """
+    """Plot a map of the condition numbers (n_y, n_x) by position of the second sensor."""
     figure = Figure(figsize=(7.5, 6.0), layout='constrained')
     axes = figure.add_subplot()
     clipped = np.clip(numbers, None, 1e300)  # LogNorm does not draw infinite values.
@@ -145,7 +144,7 @@ def figure_5_3(numbers):
 
 
 def figure_5_4():
-    """Distributions of the test statistic without and with a target."""
+    """Plot the distributions of the test statistic without and with a target."""
     figure = Figure(figsize=(7.5, 4.6), layout='constrained')
     axes, x, h = figure.add_subplot(), np.linspace(0.0, 35.0, 701), energy_threshold(P_FA, 3)
     for density, colour, name, tail in (

@@ -70,7 +70,7 @@ class Page:
         self.wait(f'magTracking.drawn > {drawn}')
 
     def pose_on_map(self):
-        """(x, y) of the pose on the map, in map units; None if no pose is shown."""
+        """Position (x, y) of the pose on the map, in map units; None if no pose is shown."""
         return self.value('''(() => {
             const pose = document.getElementById('map').data.find(d => d.meta === 'pose');
             return pose ? [pose.x[0], pose.y[0]] : null; })()''')

@@ -73,7 +73,7 @@ def passing(rng, simulator, at_s, direction, speed, trucks=TRUCKS):
 
 
 def pair(rng, pattern, at_s):
-    """[(time [s], direction, speed [m/s])] of two vehicles that meet or follow each other."""
+    """Draw two vehicles that meet or follow: [(time [s], direction, speed [m/s])]."""
     speed, direction = rng.uniform(8.0, 20.0), int(rng.choice([-1, 1]))
     if pattern == 'meeting':
         return [(at_s, direction, speed),

@@ -77,7 +77,7 @@ def estimated(geometry, network):
 
 
 def _rotation_vector(R):
-    """(3,) rotation vector of a rotation by less than 90 degrees."""
+    """Rotation vector (3,) of a rotation matrix; the angle must be below 90 degrees."""
     v = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     s = np.linalg.norm(v)
     return v if s == 0.0 else v * np.arcsin(s) / s

@@ -23,7 +23,10 @@ def board_of_41():
 
 
 def errors(geometry, field, positions, axes, poses):
-    """Errors of the estimated positions [m] and axes [deg]; `poses` maps from tracker to world."""
+    """Errors of the estimated positions [m] and axes [deg] of a magnet.
+
+    `poses` transforms positions and axes from the tracker frame to the world frame.
+    """
     r, u = poses(positions, axes)
     estimates = [locate_magnet(geometry.network, B, geometry.moment[0], *BOX, PoseSettings())
                  for B in geometry.signal(field)]

@@ -40,7 +40,7 @@ def truck(rng, simulator, length=None, moment=None):
 
 
 def small(rng, simulator, length, moment, iron=1.0):
-    """Random motorcycle, bicycle or trolley."""
+    """Body of a random motorcycle, bicycle or trolley."""
     if simulator == 'boxes':
         return box_two_wheeler(rng, length, moment, iron)
     return random_vehicle(rng, length, 0.5, 1.0, n_parts=20, moment=moment)
@@ -68,7 +68,7 @@ def lane(rng, speed, start_m=None, y=None):
 
 
 def straight(rng, simulator, body, speed, network=ROAD, **of_lane):
-    """Body on a straight path past the sensors."""
+    """World with a body on a straight path past the sensors."""
     path, start_m = lane(rng, speed, **of_lane)
     return world(network, [(body, path)], 2.0 * start_m / speed + 4.0, rng, FLAWS[simulator])
 
@@ -106,7 +106,7 @@ def u_turn(rng, simulator):
 
 
 def departing_car(rng, simulator, cars=0):
-    """A car is parked near the sensors from the beginning and leaves; other cars may then pass."""
+    """World with a car that is parked at the start and leaves; then `cars` other cars pass."""
     x, y = rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 2.0)
     parked_s = rng.uniform(10.0, 20.0)
     final_speed = rng.uniform(6.0, 12.0)
@@ -124,7 +124,7 @@ def departing_car(rng, simulator, cars=0):
 
 
 def parked_and_passing_car(rng, simulator):
-    """A car is parked permanently, 7 to 9 m from the middle of the road; another car passes."""
+    """World with a car parked 7 to 9 m from the middle of the road, and a passing car."""
     position = np.array([rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(7.0, 9.0)])
     stop = Ride(Path(position, 0.0, 1.0), (0.0, 1.0), (0.0, 0.0))
     speed = rng.uniform(7.0, 15.0)
@@ -134,7 +134,7 @@ def parked_and_passing_car(rng, simulator):
 
 
 def two_cars(rng, simulator, pattern, network=ROAD):
-    """Two cars that 'meet', 'overtake' or 'follow' each other at the sensors."""
+    """World with two cars that 'meet', 'overtake' or 'follow' each other at the sensors."""
     speed = rng.uniform(7.0, 14.0)
     y = rng.uniform(1.0, 1.6)
     start_m = QUIET_S * speed + 30.0
@@ -152,13 +152,13 @@ def two_cars(rng, simulator, pattern, network=ROAD):
 
 
 def faulty_pass(rng, simulator, *faults):
-    """A car passes sensors with faults of `support.spoiler`."""
+    """World with a car that passes sensors with faults of `support.spoiler`."""
     clean = straight(rng, simulator, car(rng, simulator), rng.uniform(7.0, 20.0))
     return replace(clean, readings=spoiler.apply(clean.readings, *faults))
 
 
 def random_pass_world(rng, simulator, kind):
-    """Random pass of `support.random_passes`."""
+    """World with a random pass of `support.random_passes`."""
     seed = int(rng.integers(1 << 30))
     body, course, duration, flaws = random_pass(simulator, kind, seed)
     return world(ROAD, [(body, course)], duration, rng, flaws)
@@ -187,7 +187,7 @@ def direction(rng):
 
 
 def hum(rng, simulator, frequency, rate):
-    """A power line beside the road adds a field, which is larger at the nearer sensor."""
+    """World with the field of a power line, which is larger at the nearer sensor."""
     near = rng.uniform(0.5, 1.0, 2)
     v = rng.uniform(1e-7, 3e-7) * direction(rng)
     omega = 2.0 * np.pi * frequency * rng.uniform(0.9995, 1.0005)
@@ -196,7 +196,7 @@ def hum(rng, simulator, frequency, rate):
 
 
 def tram(rng, simulator):
-    """A current of 100 to 500 A in a line 30 to 60 m away is switched on and off with ramps."""
+    """World with a tram line 30 to 60 m away, whose current of 100 to 500 A is switched."""
     times = np.sort(rng.uniform(12.0, 55.0, 4))
     distance, current = rng.uniform(30.0, 60.0), rng.uniform(100.0, 500.0)
     y = ROAD.positions[:, 1]
@@ -210,7 +210,7 @@ def tram(rng, simulator):
 
 
 def storm(rng, simulator, cars=0):
-    """Two minutes of a geomagnetic storm: slow waves and a drift of 500 nT per ten minutes."""
+    """World with two minutes of a geomagnetic storm: slow waves, and a drift of 50 nT/min."""
     v = 5e-7 * direction(rng)
     periods, phases = rng.uniform(60.0, 400.0, 6), rng.uniform(0.0, 2.0 * np.pi, 6)
     return ambient_world(rng, simulator, uniform(v, lambda t: sum(
@@ -219,14 +219,14 @@ def storm(rng, simulator, cars=0):
 
 
 def pulsations(rng, simulator):
-    """Geomagnetic pulsations of 20 nT with a period of 20 to 60 s."""
+    """World with geomagnetic pulsations of 20 nT and a period of 20 to 60 s."""
     p = rng.uniform(20.0, 60.0)
     return ambient_world(rng, simulator, uniform(
         2e-8 * direction(rng), lambda t: np.sin(2.0 * np.pi * t / p)), 120.0)
 
 
 def knocked_sensor(rng, simulator):
-    """A sensor is suddenly rotated by 1 to 5 degrees."""
+    """World in which a sensor is suddenly rotated by 1 to 5 degrees."""
     quiet = ambient_world(rng, simulator, None, 40.0)
     angles = np.deg2rad(rng.uniform(1.0, 5.0)) * direction(rng)
     n = int(15.0 * 100.0) * 2
@@ -238,7 +238,7 @@ def knocked_sensor(rng, simulator):
 
 
 def drifting_sensors(rng, simulator):
-    """Each sensor drifts independently by up to 5 nT/s for 10 to 30 s, then back."""
+    """World in which each sensor drifts by up to 5 nT/s for 10 to 30 s, then back."""
     rates = rng.uniform(1e-9, 5e-9, (2, 1)) * np.array([direction(rng), direction(rng)])
     ramp_s = rng.uniform(10.0, 30.0)
     return ambient_world(rng, simulator, lambda t: np.interp(
@@ -247,13 +247,13 @@ def drifting_sensors(rng, simulator):
 
 
 def distant_body(rng, simulator, body):
-    """A large object passes far away; its field is hardly measurable."""
+    """World with a large body that passes far away, with a hardly measurable field."""
     return straight(rng, simulator, body, rng.uniform(15.0, 25.0), start_m=200.0,
                     y=rng.choice([-1.0, 1.0]) * rng.uniform(30.0, 60.0))
 
 
 def train(rng, simulator, y):
-    """A train of five wagons of 18 m passes; a pose at any wagon is correct."""
+    """World with a train of five wagons of 18 m; a pose at any wagon is correct."""
     speed = rng.uniform(10.0, 20.0)
     path, start_m = lane(rng, speed, start_m=250.0, y=rng.choice([-1.0, 1.0]) * y)
     along = np.array([np.cos(path.heading), np.sin(path.heading)])

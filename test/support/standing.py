@@ -26,7 +26,7 @@ def poses_of(records):
 
 
 def stop_interval(a_world, body=0):
-    """(begin, end) [s] of the stop of a body in a `World`."""
+    """Stop of a body in a `World`: (begin, end) [s]."""
     velocity = np.gradient(a_world.positions[body], a_world.t, axis=0)
     still = a_world.t[np.linalg.norm(velocity, axis=1) < MAX_STOPPED_SPEED]
     return still.min(), still.max()
