@@ -21,7 +21,7 @@ def with_clock_step(arrivals, which, begin, end, by):
     return [(j, t + by if j in which and begin <= t < end else t) for j, t in arrivals]
 
 
-def random_arrivals(rng, n, length):
+def wild(rng, n, length):
     """Generate (sensor, timestamp) with clock steps, dead sensors, time jumps and gaps."""
     offset, t, dead = [0] * n, 0, set()
     for _ in range(length):

@@ -7,7 +7,7 @@ from support.samples import MagSample
 C = 1.44e-16 * np.eye(3)
 
 
-def random_samples(rng, n):
+def disorder(rng, n):
     """Generate samples of `n` sensors with losses, delays, reordering and invalid axes.
 
     A yielded None requests a flush.

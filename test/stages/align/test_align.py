@@ -12,7 +12,7 @@ from mag_tracking.settings import replace
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.stage import rejected
-from support.disordered_samples import C, random_samples
+from support.disordered_samples import C, disorder
 from support.networks import line_network
 from support.samples import MagSample, one
 
@@ -298,7 +298,7 @@ def test_frames_and_counts_match_the_reference_at_every_sample(seed):
         'max_buffered': int(rng.choice([2, 5, 20, 10000]))})
     align, reference = Align(line_network(n), chosen), PlainAlign(n, chosen)
     frames, rows = [], []
-    for s in random_samples(rng, n):
+    for s in disorder(rng, n):
         found = align.flush() if s is None else align.feed(one(s))
         expected = reference.flush() if s is None else reference.feed(s)
         assert [f.stamp_ns for f in found] == [stamp for stamp, _ in expected]

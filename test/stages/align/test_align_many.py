@@ -11,7 +11,7 @@ from mag_tracking.settings import replace
 from mag_tracking.stages.align import core
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
-from support.disordered_samples import random_samples
+from support.disordered_samples import disorder
 from support.networks import line_network
 from support.samples import batch, one
 
@@ -27,7 +27,7 @@ def test_batches_give_the_same_frames_as_single_samples(seed):
         'max_buffered': int(rng.choice([2, 5, 33, 10000]))})
     single, many = Align(line_network(n), chosen), Align(line_network(n), chosen)
     frames, held = ([], []), []
-    for s in random_samples(rng, n):
+    for s in disorder(rng, n):
         frames[0].extend(single.flush() if s is None else single.feed(one(s)))
         if s is not None:
             held.append(s)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mag_tracking.stages.align.clock_step import ClockStepFilter
-from support.clock_steps import random_arrivals, sample, stream, with_clock_step
+from support.clock_steps import sample, stream, wild, with_clock_step
 
 LIMIT = 500
 """Maximum jump. Timestamps in these tests are in milliseconds, although the filter documents
@@ -221,7 +221,7 @@ def test_every_sample_passes_or_is_rejected_once_and_in_order(seed):
     n, max_held = int(rng.integers(1, 7)), int(rng.choice([2, 10_000]))
     clock_filter = ClockStepFilter(n, LIMIT, max_held)
     arrived, passed, rejected = [], [], []
-    for j, t in random_arrivals(rng, n, 600):
+    for j, t in wild(rng, n, 600):
         arrived.append((j, sample(t, j)))
         accepted, wrong = clock_filter.feed(*arrived[-1])
         passed, rejected = passed + accepted, rejected + wrong

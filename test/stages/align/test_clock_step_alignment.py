@@ -10,7 +10,7 @@ from mag_tracking.settings import replace
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import MAX_HELD, Align
 from mag_tracking.stages.stage import rejected
-from support.clock_steps import random_arrivals, sample, stream, with_clock_step
+from support.clock_steps import sample, stream, wild, with_clock_step
 from support.networks import line_network
 from support.samples import one
 
@@ -40,7 +40,7 @@ def test_every_sample_is_used_rejected_or_held(seed):
                   max_backward_jump_s=float(rng.choice([0.1, 1])),
                   max_buffered=int(rng.choice([2, 10_000])))
     n_used, n_fed = 0, 0
-    for j, t in random_arrivals(rng, n, 500):
+    for j, t in wild(rng, n, 500):
         n_used += sum(int(f.n_samples.sum()) for f in frames_of(stage, [(j, t)]))
         n_fed += 1
         if rng.random() < 0.005:
