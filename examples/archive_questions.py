@@ -47,7 +47,7 @@ QUESTIONS = {
 """{title: SQL query over the tables of an archive}."""
 
 
-def tables_of(folder):
+def open_archive(folder):
     """Open a DuckDB connection with the tables of an archive as views."""
     connection = duckdb.connect()
     for table in ('tracks', 'poses', 'smoothed', 'passes', 'health'):
@@ -76,7 +76,7 @@ def main():
                       folder, workers=2, report=print)
         print(f'{len(run.done)} recordings archived in {folder}, {len(run.tracked_earlier)} '
               'were archived earlier')
-    connection = tables_of(folder)
+    connection = open_archive(folder)
     for question, sql in QUESTIONS.items():
         print(f'\n{question}\n{connection.sql(sql)}')
 

@@ -41,7 +41,7 @@ RECORDING = ROOT / 'test' / 'data' / 'vehicles' / 'junction_left_turns_to_rear.m
 
 
 class Spectator(Node):
-    """Node that records the published topics, as any other ROS program could."""
+    """ROS node that subscribes to the topics of the other nodes, and stores their messages."""
 
     def __init__(self, network):
         super().__init__('spectator')
@@ -95,7 +95,7 @@ class Spectator(Node):
 
 
 def draw(spectator, out):
-    """Write the figures and errors of all tracks, print a summary; return the figure paths."""
+    """Write figures and a summary of each track, print the summaries; return the figure paths."""
     truth = spectator.truth_arrays()
     paths, network = [], spectator.network
     for log in spectator.logs.values():
@@ -154,8 +154,8 @@ def main(argv=None):
         return spectators[-1]
 
     print(f'Replaying {RECORDING.name} at {args.rate:g} times real time through the calibration, '
-          'detection and tracker nodes.\nNo vehicle is near in the first seconds, in which the '
-          'background is estimated.\n', flush=True)
+          'detection and tracker nodes.\nIn the first seconds, no vehicle is near the sensors '
+          'and the background is estimated.\n', flush=True)
     status = run(network_file, settings_for('vehicle'), RECORDING, args.rate,
                  observers=[spectator])
     paths = draw(spectators[0], args.out)

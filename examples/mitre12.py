@@ -55,7 +55,7 @@ TABLE_1 = (
     ('high-pass, bandwidth', f'{BAND[0]:.0f} Hz, {BAND[1]:.0f} Hz'),
     ('sensitivity (step)', f'{RESOLUTION * 1e9:.1f} nT'), ('P_FA', f'{P_FA:.0e}'),
 )
-ONE, FIVE = np.zeros(1), 20.0 * np.arange(-2.0, 3.0)
+ONE_SENSOR, FIVE_SENSORS = np.zeros(1), 20.0 * np.arange(-2.0, 3.0)
 """Positions of the sensors along the road [m]."""
 CPAS = {'car': (10, 15, 20, 25, 30, 35), 'ATV': (5, 8, 10, 12, 15, 20)}
 # Name, unit in the figures, and factor from the SI unit to it.
@@ -65,27 +65,29 @@ PRIOR_STD = np.array([30.0, 5.0, 10.0 * MPH, np.radians(15.0), 100.0, 100.0])
 """Prior standard deviations of the states, Table 2."""
 PRIOR = np.diag(PRIOR_STD**-2)
 Y0_KNOWN = np.diag([0.0, np.inf, 0.0, 0.0, 0.0, 0.0])
-FIRST_FOUR = np.diag(np.where(np.arange(6) < 4, PRIOR_STD**-2, 0.0))
-"""Prior if the product in (26) ends at four, as printed: without M1 and M2."""
+PRIOR_WITHOUT_MOMENT = np.diag(np.where(np.arange(6) < 4, PRIOR_STD**-2, 0.0))
+"""Prior information if the product in eq. (26) ends at four, as printed: without M1 and M2."""
 BOUND_CPA = 25.0
-ALONG = -np.pi / 2
-AS_PUBLISHED = SAMPLING_RATE / N_SAMPLES
+ROAD_HEADING = -np.pi / 2
+PUBLISHED_SCALE = SAMPLING_RATE / N_SAMPLES
 """Deflection with the DFT divided by N, relative to the physical deflection."""
-FROM_WHERE = 'position along the road at the start of the period [m]'
-CHOSEN = 'road to the north, DFT divided by N'
+START_LABEL = 'position along the road at the start of the period [m]'
+ASSUMPTIONS = 'road to the north, DFT divided by N'
 
 
 def moment(vehicle, azimuth=0.0):
-    """Induced moment (3,) [A m²]: along the road, left, up; `azimuth` of the road [rad]."""
+    """Induced moment (3,) [A m²], with components along the road, to the left and upwards.
+
+    `azimuth` is the azimuth of the road [rad].
+    """
     dip, declination = np.radians(59.0), np.radians(-11.0)
     field = 57e-6 * np.array([np.cos(declination - azimuth) * np.cos(dip),
                               -np.sin(declination - azimuth) * np.cos(dip), -np.sin(dip)])
     return ellipsoid_moment(SEMI_AXES[vehicle], 11.0, 0.0, field)
 
 
-def places(x0, y0, v, theta):
-    """Positions of the source relative to the sensor during a period, (..., 11, 3) m; (7), (8).
-    """
+def source_positions(x0, y0, v, theta):
+    """Source positions relative to the sensor during a period, (..., 11, 3) [m]; eqs. (7), (8)."""
     t = np.arange(N_SAMPLES) / SAMPLING_RATE
     x, y = (np.asarray(start)[..., None] + v * t * direction for start, direction in
             ((x0, -np.sin(theta)), (y0, np.cos(theta))))
@@ -93,47 +95,53 @@ def places(x0, y0, v, theta):
     return np.stack([x, y, np.zeros_like(x)], axis=-1)
 
 
-def detection(m, cpa, starts, sensors, scale=AS_PUBLISHED):
-    """Detection probability (n_starts, n_sensors) of periods that start at `starts` [m] along the
-    road.
+def detection(m, cpa, starts, sensors, scale=PUBLISHED_SCALE):
+    """Detection probability (n_starts, n_sensors) of one period, by start position and sensor.
+
+    `starts` and `sensors` are positions along the road [m].
 
     `scale` multiplies the physical deflection.
     """
-    B = dipole_field(-places(np.subtract.outer(starts, sensors), cpa, SPEED, ALONG), m)[..., :2]
+    B = dipole_field(-source_positions(
+        np.subtract.outer(starts, sensors), cpa, SPEED, ROAD_HEADING), m)[..., :2]
     d = deflection(B, SAMPLING_RATE, lambda f: noise_spectrum(f, BACKGROUND, RESOLUTION, BAND[1]),
                    BAND)
     return detection_probability(scale * d, P_FA)
 
 
-def at_least_once(m, cpa, sensors=ONE, phase=0.0, scale=AS_PUBLISHED):
-    """Probability (6) of at least one detection in a drive; `phase` shifts the start [periods]."""
+def drive_detection(m, cpa, sensors=ONE_SENSOR, phase=0.0, scale=PUBLISHED_SCALE):
+    """Probability of at least one detection in a drive, eq. (6).
+
+    `phase` shifts the start of the first period, in units of a period.
+    """
     starts = SPEED * PERIOD * (np.arange(-20, 20) + phase)
     return any_detection_probability(detection(m, cpa, starts, sensors, scale))
 
 
-def most_in_a_period(m, cpa, sensors=ONE, scale=AS_PUBLISHED):
-    """Maximum detection probability (5) of one period over all start positions."""
+def max_period_detection(m, cpa, sensors=ONE_SENSOR, scale=PUBLISHED_SCALE):
+    """Maximum over all start positions of the detection probability of one period, eq. (5)."""
     starts = np.linspace(-60.0, 60.0, 961)
     return any_detection_probability(detection(m, cpa, starts, sensors, scale), axis=-1).max()
 
 
-def cpa_where(probability, target):
+def cpa_at_probability(probability, target):
     """CPA [m] at which a decreasing function `probability(cpa)` equals `target`."""
     return brentq(lambda cpa: probability(cpa) - target, 2.0, 90.0, xtol=1e-6)
 
 
 def noise_std():
-    """Noise standard deviation of a sample [T], from S_n + S_s over the two-sided band.
-    """
+    """Noise standard deviation of a sample [T], from S_n + S_s over the two-sided band."""
     return np.sqrt(2.0 * quad(lambda f: noise_spectrum(f, BACKGROUND, RESOLUTION, BAND[1]),
                               *BAND, epsabs=0.0)[0])
 
 
 def jacobian(z):
-    """Jacobian (11, 2, 6) of the field with respect to z = (x0, y0, v, theta, M1, M2), by (7), (8).
+    """Jacobian (11, 2, 6) of the field with respect to z = (x0, y0, v, theta, M1, M2).
+
+    The positions follow eqs. (7) and (8).
     """
     x0, y0, v, theta, m1, m2 = z
-    dB_dr, dB_dm = dipole_jacobians(-places(x0, y0, v, theta), np.array([m1, m2, 0.0]))
+    dB_dr, dB_dm = dipole_jacobians(-source_positions(x0, y0, v, theta), np.array([m1, m2, 0.0]))
     t = np.arange(N_SAMPLES) / SAMPLING_RATE
     path = np.zeros((N_SAMPLES, 2, 4))
     path[:, 0, 0] = path[:, 1, 1] = 1.0
@@ -142,14 +150,17 @@ def jacobian(z):
     return np.concatenate([-dB_dr[:, :2, :2] @ path, dB_dm[:, :2, :2]], axis=-1)
 
 
-def measured(x0, v=SPEED, vehicle='car'):
-    """Information matrix (6, 6) about z from the samples of one period; (18)."""
-    z = [x0, BOUND_CPA, v, ALONG, *moment(vehicle)[:2]]
+def period_information(x0, v=SPEED, vehicle='car'):
+    """Fisher information matrix (6, 6) of z from the samples of one period, eq. (18)."""
+    z = [x0, BOUND_CPA, v, ROAD_HEADING, *moment(vehicle)[:2]]
     return information(jacobian(z), noise_std()**2 * np.eye(2))
 
 
 def std_bounds(information_matrix, prior=None):
-    """Bounds on the standard deviations (6,) in the units of `STATES`; (18), (28)."""
+    """Cramér-Rao bounds (6,) on the standard deviations, in the units of `STATES`.
+
+    The bounds follow eq. (18) without a prior, and eq. (28) with a prior.
+    """
     return np.sqrt(np.diag(bound(information_matrix, prior))) * [scale for *_, scale in STATES]
 
 
@@ -163,22 +174,23 @@ def pass_figure(sensors, title):
             p = any_detection_probability(detection(moment(vehicle), cpa, starts, sensors), axis=-1)
             axes.plot(starts, p, label=f'{cpa} m')
         axes.plot(sensors, np.full(len(sensors), -0.045), 'k^', ms=7, label='sensor')
-        axes.set(title=vehicle, xlabel=FROM_WHERE, ylim=(-0.08, 1.03), xlim=(-80.0, 80.0))
+        axes.set(title=vehicle, xlabel=START_LABEL, ylim=(-0.08, 1.03), xlim=(-80.0, 80.0))
         axes.grid(alpha=0.3)
         axes.legend(title='CPA', fontsize=8, loc='center left', bbox_to_anchor=(1.0, 0.5))
     figure.axes[0].set_ylabel('detection probability of the period')
-    figure.suptitle(f'{title}\n{CHOSEN}')
+    figure.suptitle(f'{title}\n{ASSUMPTIONS}')
     return figure
 
 
 def figure_2():
     """Figure 2: detection probability of one sensor."""
-    return pass_figure(ONE, 'MITRE12 Figure 2: one sensor, 25 mph, periods of 0.5 s')
+    return pass_figure(ONE_SENSOR, 'MITRE12 Figure 2: one sensor, 25 mph, periods of 0.5 s')
 
 
 def figure_3():
     """Figure 3: probability that at least one of five sensors detects the vehicle."""
-    return pass_figure(FIVE, 'MITRE12 Figure 3: at least one of five sensors, 20 m apart, 25 mph')
+    return pass_figure(FIVE_SENSORS,
+                       'MITRE12 Figure 3: at least one of five sensors, 20 m apart, 25 mph')
 
 
 def figure_4():
@@ -187,27 +199,35 @@ def figure_4():
     axes = figure.add_subplot()
     cpas = np.linspace(2.0, 45.0, 173)
     for vehicle, colour in (('car', 'tab:blue'), ('ATV', 'tab:orange')):
-        for sensors, line, name in ((ONE, '-', 'one sensor'), (FIVE, '--', 'five sensors')):
+        for sensors, line, name in ((ONE_SENSOR, '-', 'one sensor'),
+                                    (FIVE_SENSORS, '--', 'five sensors')):
             m = moment(vehicle)
-            axes.plot(cpas, [at_least_once(m, c, sensors) for c in cpas], line, color=colour,
+            axes.plot(cpas, [drive_detection(m, c, sensors) for c in cpas], line, color=colour,
                       label=f'{vehicle}, {name}')
-            axes.plot(CPAS[vehicle], [at_least_once(m, c, sensors) for c in CPAS[vehicle]], 'o',
+            axes.plot(CPAS[vehicle], [drive_detection(m, c, sensors) for c in CPAS[vehicle]], 'o',
                       color=colour, ms=4)
     axes.set(xlabel='closest point of approach [m]', ylabel='probability of at least one detection',
-             title=f'MITRE12 Figure 4: a whole drive at 25 mph\n{CHOSEN}; dots: Figures 2 and 3')
+             title='MITRE12 Figure 4: a whole drive at 25 mph\n'
+                   f'{ASSUMPTIONS}; dots: Figures 2 and 3')
     axes.grid(alpha=0.3)
     axes.legend(loc='upper right')
     return figure
 
 
 def phi_std_bound(C, x0, sign):
-    """Bound on phi [deg] by (19) from the bound `C` on z; (20) has x/r^2 with the `sign` -1."""
+    """Bound on the standard deviation of phi [deg], eq. (19), from the covariance bound `C` of z.
+
+    `sign` is the sign of x/r^2, which is -1 in eq. (20) as printed.
+    """
     row = np.array([-BOUND_CPA, sign * x0]) / (x0**2 + BOUND_CPA**2)
     return np.degrees(np.sqrt(row @ C[:2, :2] @ row))
 
 
 def draw_bounds(axes, at, matrices, prior):
-    """Draw the six bounds against `at`; dashed for known y0 where a bound is infinite."""
+    """Plot the six bounds against `at`.
+
+    If most values of a bound are infinite, the bound for known y0 is plotted as a dashed line.
+    """
     bounds = np.array([std_bounds(J, prior) for J in matrices])
     bounds_known_y0 = np.array([std_bounds(J, Y0_KNOWN) for J in matrices])
     for i, (name, unit, scale) in enumerate(STATES):
@@ -224,7 +244,10 @@ def draw_bounds(axes, at, matrices, prior):
 
 
 def bounds_figure(rows, xlabel, title):
-    """Panels without and with prior, one row of panels for each (name, at, matrices)."""
+    """Plot the bounds without prior (left) and with prior (right).
+
+    Each entry (name, at, matrices) of `rows` has one row of panels.
+    """
     figure = Figure(figsize=(10.5, 0.8 + 4.2 * len(rows)), layout='constrained')
     grid = figure.subplots(len(rows), 2, squeeze=False)
     for (left, right), (name, at, matrices) in zip(grid, rows, strict=True):
@@ -240,14 +263,14 @@ def bounds_figure(rows, xlabel, title):
 def figure_5():
     """Figure 5: bounds against the position at the start of the period."""
     starts = np.linspace(-80.0, 80.0, 321)
-    return bounds_figure([('car', starts, [measured(x) for x in starts])], FROM_WHERE,
+    return bounds_figure([('car', starts, [period_information(x) for x in starts])], START_LABEL,
                          'MITRE12 Figure 5: bounds of one period, one sensor, CPA 25 m, 25 mph')
 
 
 def figure_6():
     """Figure 6: bounds against the speed, for a period that starts at the CPA."""
     mph = np.linspace(-80.0, 80.0, 160)  # An even number excludes zero speed.
-    return bounds_figure([(name, mph, [measured(0.0, v * MPH, name) for v in mph])
+    return bounds_figure([(name, mph, [period_information(0.0, v * MPH, name) for v in mph])
                           for name in SEMI_AXES], 'speed [mph], negative = backwards',
                          'MITRE12 Figure 6: bounds of one period starting at (x0, y0) = (0, 25 m)')
 
@@ -256,30 +279,31 @@ def compare_detection():
     """Compute the values that are compared with Figures 2 to 4, by name."""
     n = {}
     car, east = moment('car'), moment('car', np.pi / 2)
-    for name, m, scale in (('', car, AS_PUBLISHED), (' physical', car, 1.0),
-                           (' east', east, AS_PUBLISHED)):
-        n[f'most{name}'] = most_in_a_period(m, 30.0, scale=scale)
-        n[f'once{name}'] = at_least_once(m, 30.0, scale=scale)
-        n[f'range{name}'] = cpa_where(lambda c, m=m, scale=scale:
-                                      at_least_once(m, c, scale=scale), 0.5)
-    n['five'] = at_least_once(car, 30.0, FIVE)
-    n['at 25'], n['at 35'] = (at_least_once(car, cpa) for cpa in (25.0, 35.0))
-    return {**n, 'ATV at 10': at_least_once(moment('ATV'), 10.0),
-            'ATV five most': most_in_a_period(moment('ATV'), 20.0, FIVE)}
+    for name, m, scale in (('', car, PUBLISHED_SCALE), (' physical', car, 1.0),
+                           (' east', east, PUBLISHED_SCALE)):
+        n[f'most{name}'] = max_period_detection(m, 30.0, scale=scale)
+        n[f'once{name}'] = drive_detection(m, 30.0, scale=scale)
+        n[f'range{name}'] = cpa_at_probability(lambda c, m=m, scale=scale:
+                                               drive_detection(m, c, scale=scale), 0.5)
+    n['five'] = drive_detection(car, 30.0, FIVE_SENSORS)
+    n['at 25'], n['at 35'] = (drive_detection(car, cpa) for cpa in (25.0, 35.0))
+    return {**n, 'ATV at 10': drive_detection(moment('ATV'), 10.0),
+            'ATV five most': max_period_detection(moment('ATV'), 20.0, FIVE_SENSORS)}
 
 
 def compare_bounds():
     """Compute the values that are compared with Figures 5 and 6, by name."""
     starts = np.linspace(-80.0, 80.0, 161)
-    alone, prior, four = (np.array([std_bounds(measured(x), p) for x in starts])
-                          for p in (None, PRIOR, FIRST_FOUR))
-    seen = observability(measured(-20.0), [name for name, *_ in STATES], PRIOR_STD)
-    n = {'lost': seen.unobservable, 'kernel': seen.kernel[:, 0] / seen.kernel[1, 0],
-         'theta alone': alone[:, 3], 'with prior': prior, 'prior on four': four, 'starts': starts}
+    alone, prior, prior_on_four = (np.array([std_bounds(period_information(x), p) for x in starts])
+                                   for p in (None, PRIOR, PRIOR_WITHOUT_MOMENT))
+    observed = observability(period_information(-20.0), [name for name, *_ in STATES], PRIOR_STD)
+    n = {'lost': observed.unobservable, 'kernel': observed.kernel[:, 0] / observed.kernel[1, 0],
+         'theta alone': alone[:, 3], 'with prior': prior, 'prior on four': prior_on_four,
+         'starts': starts}
     for v in (0.0, 10.0, 25.0, 80.0):
-        J = measured(0.0, v * MPH)
-        n[f'at {v:.0f} mph'] = tuple(std_bounds(J, p) for p in (None, PRIOR, FIRST_FOUR))
-    C = bound(measured(-20.0), PRIOR)
+        J = period_information(0.0, v * MPH)
+        n[f'at {v:.0f} mph'] = tuple(std_bounds(J, p) for p in (None, PRIOR, PRIOR_WITHOUT_MOMENT))
+    C = bound(period_information(-20.0), PRIOR)
     return {**n, 'phi at -20 m': [phi_std_bound(C, -20.0, sign) for sign in (-1.0, 1.0)]}
 
 
@@ -310,7 +334,7 @@ def bounds_report(n):
     starts, alone = n['starts'], n['theta alone']
     best = alone.argmin()
     before, after = n['with prior'][starts == -20.0][0], n['with prior'][starts == 20.0][0]
-    most, still = n['prior on four'][:, 4:].max(axis=0), n['at 0 mph']
+    maxima, stationary = n['prior on four'][:, 4:].max(axis=0), n['at 0 mph']
     kernel = ', '.join(f'{x:.3g}' for x in n['kernel'].round(9) + 0.0)
     thetas = ', '.join(f'{n[f"at {v} mph"][0][3]:.0f} deg at {v} mph' for v in (10, 25, 80))
     phi, right = n['phi at -20 m']
@@ -329,17 +353,18 @@ Figure 5, bounds along the road
            Published: low on the left.
 Figure 6, bounds against speed
   agrees   Without a prior, theta has no bound at speed zero. With the prior, the bound on v grows
-           with speed, from {still[1][2]:.1f} to {n['at 80 mph'][1][2]:.1f} mph at 80 mph.
+           with speed, from {stationary[1][2]:.1f} to {n['at 80 mph'][1][2]:.1f} mph at 80 mph.
   differs  With the prior, the bound on theta at speed zero is the prior itself, \
-{still[1][3]:.0f} deg;
+{stationary[1][3]:.0f} deg;
            published is a singularity. Without a prior, the bound on theta decreases with speed,
            because the sensor measures more of the signature:
            {thetas}. Published: it grows.
 Misprints that were tested, and excluded, as the cause of these differences
   (20)     The sign of x/r^2 only changes the bound on phi: {phi:.1f} instead of {right:.1f} deg at
            -20 m, with the prior. The six parameters in the figures do not depend on (20).
-  (26)     A product up to four leaves M1 and M2 without a prior: bounds up to {most[0]:.0f} and
-           {most[1]:.0f} A m^2. At speed zero all bounds are finite, theta {still[2][3]:.0f} deg."""
+  (26)     A product up to four leaves M1 and M2 without a prior: bounds up to {maxima[0]:.0f} and
+           {maxima[1]:.0f} A m^2. At speed zero all bounds are finite, theta \
+{stationary[2][3]:.0f} deg."""
 
 
 def main(argv=None):
@@ -348,7 +373,7 @@ def main(argv=None):
     parser.add_argument('--out', type=Path, default=Path('out/mitre12'))
     out = parser.parse_args(argv).out
     out.mkdir(parents=True, exist_ok=True)
-    print('MITRE12 Table 1', *(f'  {what:25} {value}' for what, value in TABLE_1), sep='\n')
+    print('MITRE12 Table 1', *(f'  {variable:25} {value}' for variable, value in TABLE_1), sep='\n')
     for draw in (figure_2, figure_3, figure_4, figure_5, figure_6):
         draw().savefig(out / f'{draw.__name__}.png', dpi=110)
     print(detection_report(compare_detection()), bounds_report(compare_bounds()), sep='\n')

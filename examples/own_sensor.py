@@ -22,8 +22,8 @@ from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.settings import param
 
 END, ESCAPE = b'\xc0', b'\xdb'
-LONGEST = 2 * 16
-"""Length of a packet in which every byte is escaped."""
+MAX_PACKET_BYTES = 2 * 16
+"""Maximum length of a packet, in which every byte is escaped [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class SlipFraming:
         for packet in packets:
             self._read(packet, readings, rejected)
         # The remaining bytes cannot become a packet if they are too long, or if no bytes follow.
-        if rest and (final or len(rest) > LONGEST):
+        if rest and (final or len(rest) > MAX_PACKET_BYTES):
             rejected['bytes between frames'] += len(rest)
             rest = b''
         return Parsed(tuple(readings), len(data) - len(rest), rejected)

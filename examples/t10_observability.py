@@ -30,7 +30,7 @@ R0, V0, M = np.array([-3.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0]), np.ones(3)
 """Table 5.1: position [m], velocity [m/s], moment (relative)."""
 N_SAMPLES, SAMPLE_TIME = 60, 0.1
 NAMES = [f'{state}_{axis}' for state in ('r0', 'v0', 'm') for axis in 'xyz']
-ONE, TWO = np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
+ONE_SENSOR, TWO_SENSORS = np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
 SCALE = np.repeat([1.0, 1.0 / (N_SAMPLES * SAMPLE_TIME), 1.0], 3)
 """Typical magnitudes of r0, v0 and m by eq. (5.11), for r = 1 m and T = 6 s."""
 P_FA, P_D, SNR = 0.01, 0.5, 9.2
@@ -43,21 +43,22 @@ GRID = np.arange(-30, 31) / 5.0
 
 
 def sensor_information(sensor, m=M):
-    """Information (9, 9) about [r0, v0, m] from one sensor at (3,) [m]; eq. (5.2)."""
+    """Information matrix (9, 9) of [r0, v0, m] from one sensor at `sensor` (3,) [m], eq. (5.2)."""
     t = SAMPLE_TIME * np.arange(N_SAMPLES)[:, None]
     dB_dd, dB_dm = dipole_jacobians(sensor - (R0 + t * V0), m)
     return information(np.concatenate([-dB_dd, -t[:, :, None] * dB_dd, dB_dm], axis=-1) / K_DIPOLE)
 
 
-def seen_by(sensors, m=M):
+def observability_of(sensors, m=M):
     """Observability of the nine states with sensors at (n, 3) [m]; eq. (5.7)."""
     return observability(sum(sensor_information(s, m) for s in sensors), NAMES)
 
 
 def information_map():
-    """Information (n_y, n_x, 9, 9) of the first sensor and a second sensor at each grid point."""
-    places = np.stack(np.broadcast_arrays(GRID, GRID[:, None], 0.0), axis=-1)
-    return sensor_information(ONE[0]) + np.apply_along_axis(sensor_information, -1, places)
+    """Information matrices (n_y, n_x, 9, 9) with a second sensor at each point of the grid."""
+    grid_points = np.stack(np.broadcast_arrays(GRID, GRID[:, None], 0.0), axis=-1)
+    return sensor_information(ONE_SENSOR[0]) \
+        + np.apply_along_axis(sensor_information, -1, grid_points)
 
 
 def condition_map(J, scale=None):
@@ -68,26 +69,29 @@ def condition_map(J, scale=None):
     return numbers
 
 
-def about_cpa(J):
-    """Information about [r at the CPA, v0, m] instead of [r0, v0, m]."""
+def information_at_cpa(J):
+    """Transform an information matrix of [r0, v0, m] to [r at the CPA, v0, m]."""
     t_cpa = -(R0 @ V0) / (V0 @ V0)
     T = np.eye(9) - t_cpa * np.eye(9, k=3) * (np.arange(9) < 3)[:, None]
     return T.T @ J @ T
 
 
 def condition_maps():
-    """Condition numbers for three state vectors: of eq. (5.1), with the position at the CPA, and
-    scaled by eq. (5.11).
+    """Maps of the condition number for three state vectors.
+
+    The state vectors are that of eq. (5.1), the same with the position at the CPA, and that of
+    eq. (5.1) scaled by eq. (5.11).
     """
     J = information_map()
-    return {'plain': condition_map(J), 'cpa': condition_map(about_cpa(J)),
+    return {'plain': condition_map(J), 'cpa': condition_map(information_at_cpa(J)),
             'scaled': condition_map(J, SCALE)}
 
 
-def best_place(numbers, same_side=False):
-    """Position (x, y) and value of the minimum, at least 1 m from the line of the path.
+def best_sensor_position(numbers, same_side=False):
+    """Position (x, y) [m] of the second sensor with the smallest condition number, and this number.
 
-    `same_side` excludes positions across the path from the first sensor.
+    Only positions at least 1 m from the line of the path are considered. `same_side` excludes
+    positions across the path from the first sensor.
     """
     y = GRID[:, None]
     masked = np.where((np.abs(y - 1.0) > 0.999) & ((y < 1.0) | (not same_side)), numbers, np.inf)
@@ -96,14 +100,14 @@ def best_place(numbers, same_side=False):
 
 
 def figure_5_2():
-    """Eigenvalues of the information matrix for one and two sensors."""
+    """Plot the eigenvalues of the information matrix for one and two sensors."""
     figure = Figure(figsize=(7.5, 4.6), layout='constrained')
     axes, number = figure.add_subplot(), np.arange(1, 10)
-    for sensors, style, label in ((ONE, 'o', 'one sensor, at [0, 0, 0]'),
-                                  (TWO, 's', 'two sensors, at [0, 0, 0] and [0, 2, 0]')):
-        seen = seen_by(sensors)
-        zero = seen.kernel_dimension
-        points, = axes.semilogy(number[zero:], seen.eigenvalues[zero:], style, label=label)
+    for sensors, style, label in ((ONE_SENSOR, 'o', 'one sensor, at [0, 0, 0]'),
+                                  (TWO_SENSORS, 's', 'two sensors, at [0, 0, 0] and [0, 2, 0]')):
+        observed = observability_of(sensors)
+        zero = observed.kernel_dimension
+        points, = axes.semilogy(number[zero:], observed.eigenvalues[zero:], style, label=label)
         axes.plot(number[:zero], np.full(zero, 2e-2), 'v', mfc='w', ms=9,
                   mec=points.get_color())
         for k in range(zero):
@@ -117,12 +121,11 @@ def figure_5_2():
 
 
 def figure_5_3(numbers):
-    """Map of the condition number (n_y, n_x) against the position of the second sensor.
-    """
+    """Plot a map of the condition numbers (n_y, n_x) by position of the second sensor."""
     figure = Figure(figsize=(7.5, 6.0), layout='constrained')
     axes = figure.add_subplot()
-    shown = np.clip(numbers, None, 1e300)  # LogNorm does not draw infinite values.
-    image = axes.pcolormesh(GRID, GRID, shown, cmap='viridis_r', norm=LogNorm(1e3, 1e6),
+    clipped = np.clip(numbers, None, 1e300)  # LogNorm does not draw infinite values.
+    image = axes.pcolormesh(GRID, GRID, clipped, cmap='viridis_r', norm=LogNorm(1e3, 1e6),
                             shading='nearest', rasterized=True)
     path = R0 + SAMPLE_TIME * np.arange(N_SAMPLES)[:, None] * V0
     axes.plot(path[:, 0], path[:, 1], 'r-', lw=2.0, label='path')
@@ -130,7 +133,7 @@ def figure_5_3(numbers):
                   arrowprops={'arrowstyle': '->', 'color': 'r', 'lw': 2.0})
     axes.plot(0.0, 0.0, 'r^', ms=9, mec='w', label='first sensor')
     axes.plot(0.0, 2.0, 'wD', ms=7, mec='k', label='opposite the first, [0, 2]')
-    axes.plot(*best_place(numbers)[0], 'w*', ms=13, mec='k',
+    axes.plot(*best_sensor_position(numbers)[0], 'w*', ms=13, mec='k',
               label='best, at least 1 m from the line')
     figure.colorbar(image, extend='both', label='condition number')
     axes.set(aspect='equal', xlabel='x of the second sensor [m]',
@@ -141,7 +144,7 @@ def figure_5_3(numbers):
 
 
 def figure_5_4():
-    """Distributions of the test statistic without and with a target."""
+    """Plot the distributions of the test statistic without and with a target."""
     figure = Figure(figsize=(7.5, 4.6), layout='constrained')
     axes, x, h = figure.add_subplot(), np.linspace(0.0, 35.0, 701), energy_threshold(P_FA, 3)
     for density, colour, name, tail in (
@@ -159,15 +162,19 @@ def figure_5_4():
 
 
 def comparison(maps):
-    """Compute the values that are compared with T10, by name; `maps` is from `condition_maps`."""
-    up, h = np.array([0.0, 0.0, 1.0]), energy_threshold(P_FA, 3)
-    one, two = seen_by(ONE), seen_by(TWO)
+    """Compute the values that are compared with T10, by name.
+
+    `maps` is the result of `condition_maps`.
+    """
+    vertical_moment, h = np.array([0.0, 0.0, 1.0]), energy_threshold(P_FA, 3)
+    one, two = observability_of(ONE_SENSOR), observability_of(TWO_SENSORS)
     d = -(R0 + SAMPLE_TIME * np.arange(N_SAMPLES)[:, None] * V0)
-    B, thrice = dipole_field(d, M), dipole_field(3.0 * d, 27.0 * M)
+    B, scaled_field = dipole_field(d, M), dipole_field(3.0 * d, 27.0 * M)
     at = np.argmin(np.abs(GRID)), np.argmin(np.abs(GRID - 2.0))
-    n = {'one': one.eigenvalues, 'up': seen_by(ONE, up).eigenvalues, 'two': two.eigenvalues,
+    n = {'one': one.eigenvalues, 'up': observability_of(ONE_SENSOR, vertical_moment).eigenvalues,
+         'two': two.eigenvalues,
          'condition': two.condition_number, 'kernel': one.kernel[:, 0] / one.kernel[1, 0],
-         'thrice': np.abs(thrice - B).max() / np.abs(B).max(), 'threshold': h,
+         'thrice': np.abs(scaled_field - B).max() / np.abs(B).max(), 'threshold': h,
          'snr': brentq(lambda s: detection_probability(s, h, 3) - P_D, 1.0, 30.0),
          'p_fa at 11.2': false_alarm_probability(11.2, 3),
          'snr at 11.2': brentq(lambda s: detection_probability(s, 11.2, 3) - P_D, 1.0, 30.0),
@@ -175,14 +182,14 @@ def comparison(maps):
          'ranges': {name: snr_range(m, NOISE_STD, SNR) for name, m in MOMENTS.items()}}
     for name, numbers in maps.items():
         n[f'{name} opposite'] = numbers[at[1], at[0]]
-        n[f'{name} best'] = best_place(numbers)
-        n[f'{name} best same side'] = best_place(numbers, same_side=True)
+        n[f'{name} best'] = best_sensor_position(numbers)
+        n[f'{name} best same side'] = best_sensor_position(numbers, same_side=True)
     return n
 
 
 def report(n):
-    """Report of the agreements with T10 and the differences from T10."""
-    def place(name):
+    """Report that compares the values of `comparison` with T10."""
+    def optimum_of(name):
         (x, y), number = n[name]
         return f'{number:.0f} at [{x:.1f}, {y:.1f}]'
 
@@ -202,14 +209,15 @@ Figure 5.2, eigenvalues
 Figure 5.3, second sensor
   agrees   The condition number at [0, 2] is {n['plain opposite']:.0f}. On the side of the first
            sensor, the second should be far from the first: the best is
-           {place('plain best same side')} (all optima are at least 1 m from the line of the path).
+           {optimum_of('plain best same side')} (all optima are at least 1 m from the line of the \
+path).
   differs  The position opposite the first sensor is not optimal: the best is
-           {place('plain best')}, because the states refer to the start, left of both.
+           {optimum_of('plain best')}, because the states refer to the start, left of both.
            For the position at the closest point of approach, T10 is nearly right: [0, 2] has
-           {n['cpa opposite']:.0f}, the best is {place('cpa best')}, on the side of the first
-           sensor {place('cpa best same side')}. With the scale of (5.11), which measures v0 in
+           {n['cpa opposite']:.0f}, the best is {optimum_of('cpa best')}, on the side of the first
+           sensor {optimum_of('cpa best same side')}. With the scale of (5.11), which measures v0 in
            r/T, [0, 2] has {n['scaled opposite']:.0f}, and the best is on the same side:
-           {place('scaled best')}.
+           {optimum_of('scaled best')}.
 Figure 5.4, test statistic
   differs  The threshold for P_FA 0.01 is {n['threshold']:.3f}, not 11.2 (which has P_FA \
 {n['p_fa at 11.2']:.4f}).

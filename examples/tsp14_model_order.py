@@ -27,8 +27,8 @@ PUBLISHED = {'cars': ((10.0, 51.0), (1.3, 1.6)), 'large': ((142.0, 360.0), (76.7
 """TSP14 Tables I and II: (lowest, highest) normalised cost for one and for three dipoles."""
 
 
-def passes(rate, orders=(1, 2, 3, 4, 5)):
-    """Fit the pass of each recording at one of `RATES`; return one `FittedPass` per recording."""
+def fit_passes(rate, orders=(1, 2, 3, 4, 5)):
+    """Fit the pass in each recording, at a rate of `RATES`; return one `FittedPass` per pass."""
     network, settings = read_network(ROOT / 'config/network.yaml'), settings_for('vehicle')
     settings = dataclasses.replace(settings, calibrate=replace(
         settings.calibrate, {'decimate_to_hz': RATES[rate]}))
@@ -55,8 +55,9 @@ def report(found):
         lines.append(f'{n_dipoles} dipole{"s" if n_dipoles > 1 else ""}; TSP14: cars {cars[0]:g} '
                      f'to {cars[1]:g}, large vehicles {large[0]:g} to {large[1]:g}')
         for rate, fitted in found.items():
-            ours, truck = costs_of(fitted, n_dipoles)
-            lines.append(f'  {rate:8} cars {min(ours):.2f} to {max(ours):.2f}, truck {truck:.1f}')
+            car_costs, truck = costs_of(fitted, n_dipoles)
+            lines.append(f'  {rate:8} cars {min(car_costs):.2f} to {max(car_costs):.2f}, '
+                         f'truck {truck:.1f}')
     return '\n'.join([*lines, """\
 agrees   Every dipole lowers the cost. With three dipoles, the cars come close to one; the truck
          does not.
@@ -72,7 +73,7 @@ def main(argv=None):
     parser.add_argument('--out', type=Path, default=Path('out/tsp14'))
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
-    found = {rate: passes(rate) for rate in RATES}
+    found = {rate: fit_passes(rate) for rate in RATES}
     for rate, fitted in found.items():
         figure, path = order_figure(fitted), args.out / f'figure_7_{rate.replace(" ", "_")}.png'
         figure.axes[0].set_title(f'TSP14 Figure 7 with simulated passes at {rate} '

@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def generated():
-    """{path: content} of all generated files."""
+    """Contents of all generated files: {path: content}."""
     assert set(TARGET_DEFAULTS) == {'vehicle', 'magnet'}
     return {ROOT / 'config' / 'default.yaml': to_yaml(Settings()),
             ROOT / 'config' / 'magnet.yaml': to_yaml(settings_for('magnet'))}

@@ -40,7 +40,7 @@ def nodes(folder, namespace):
             network, *(Parameter(name, value=value) for name, value in more.items())])
 
 
-def expression(name):
+def policy_expression(name):
     """Absolute name in a policy, with a wildcard instead of the sensor."""
     for sensor in SENSORS:
         name = name.replace(f'/{sensor}/', '/*/')
@@ -52,7 +52,7 @@ def add_rules(profile, kind, access, names):
     if not names:
         return
     group = ElementTree.SubElement(profile, kind, {access: 'ALLOW'})
-    for name in sorted(set(map(expression, names))):
+    for name in sorted(set(map(policy_expression, names))):
         ElementTree.SubElement(group, kind.removesuffix('s')).text = name
 
 

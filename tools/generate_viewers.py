@@ -109,7 +109,7 @@ def plotjuggler(fields):
 
 
 def layouts(network):
-    """{file name: content} of all layouts."""
+    """Contents of all layouts: {file name: content}."""
     fields = [f'{absolute(topic)}_calibrated' for topic in network.topics]
     return {'mag_tracking.rviz': rviz(network), 'foxglove.json': foxglove(network, fields),
             'plotjuggler.xml': plotjuggler(fields)}

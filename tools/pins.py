@@ -27,10 +27,10 @@ def freeze():
     projects.
     """
     return sorted(
-        f'{each.metadata["Name"].lower()}=={each.version}'
-        for each in distributions()
-        if (each.read_text('INSTALLER') or '').strip() == 'pip'
-        and each.read_text('direct_url.json') is None
+        f'{distribution.metadata["Name"].lower()}=={distribution.version}'
+        for distribution in distributions()
+        if (distribution.read_text('INSTALLER') or '').strip() == 'pip'
+        and distribution.read_text('direct_url.json') is None
     )
 
 

@@ -51,12 +51,12 @@ def main():
         page.move_slider(SHOWN_S)
         page.page.wait_for_timeout(500)
         page.page.screenshot(path=IMAGES / 'report.png')
-        telephone = Page(chromium, (Path(folder) / 'report.html').as_uri(),
-                         viewport={'width': 390, 'height': 844}, device_scale_factor=2)
-        telephone.wait('magTracking.drawn > 0')
-        telephone.move_slider(0.5)
-        telephone.page.wait_for_timeout(500)
-        telephone.page.screenshot(path=IMAGES / 'report_telephone.png')
+        phone_page = Page(chromium, (Path(folder) / 'report.html').as_uri(),
+                          viewport={'width': 390, 'height': 844}, device_scale_factor=2)
+        phone_page.wait('magTracking.drawn > 0')
+        phone_page.move_slider(0.5)
+        phone_page.page.wait_for_timeout(500)
+        phone_page.page.screenshot(path=IMAGES / 'report_telephone.png')
     return status
 
 

@@ -33,8 +33,9 @@ figure = result.weights_figure()
 figure = result.field_figure()
 
 # %%
-# The recording contains the true poses. ``closest`` is the error at the closest point of approach,
-# ``anees`` the average normalised squared error, which is near one if the covariance is consistent.
+# The recording contains the true poses. ``closest`` is the error at the closest point of approach.
+# ``anees`` is the average normalised estimation error squared per axis, which is near one if the
+# covariance is consistent.
 result.errors()
 
 # %%

@@ -12,6 +12,6 @@ import tsp14_model_order as tsp14
 from mag_tracking.report.fit_figures import order_figure
 
 rate = next(iter(tsp14.RATES))
-found = tsp14.passes(rate)
+found = tsp14.fit_passes(rate)
 figure = order_figure(found)
 title = figure.axes[0].set_title(f'simulated passes at {rate} (filled: selected order)')

@@ -140,7 +140,7 @@ class ArchiveFolder:
         self.close()
 
     def _check_head(self, head: dict[str, Any]) -> None:
-        """Write `head` in the first run, later compare it with the file; raises OutputError."""
+        """Write `head`, or compare it with the head of an earlier run; raises OutputError."""
         path = self.path / _HEAD
         if not path.exists():
             replace_text(path, json.dumps(head, indent=1, sort_keys=True) + '\n')
@@ -149,13 +149,13 @@ class ArchiveFolder:
         if before.get('schema') != VERSION:
             raise OutputError(f'{self.path} has tables of version {before.get("schema")}; this '
                               f'program writes version {VERSION}. Choose another folder')
-        differs = sorted(key for key in {*head, *before}
-                         if json.dumps(head.get(key), sort_keys=True)
-                         != json.dumps(before.get(key), sort_keys=True))
-        if differs:
+        differing_keys = sorted(key for key in {*head, *before}
+                                if json.dumps(head.get(key), sort_keys=True)
+                                != json.dumps(before.get(key), sort_keys=True))
+        if differing_keys:
             raise OutputError(f'{self.path} was created with other values of '
-                              f'{", ".join(differs)}: the new rows would not be comparable with '
-                              'the existing rows. Choose another folder')
+                              f'{", ".join(differing_keys)}: the new rows would not be comparable '
+                              'with the existing rows. Choose another folder')
 
     def done(self, recording: Path) -> dict[str, Any] | None:
         """Return the summary of a recording that was processed and has not changed since then.
@@ -176,7 +176,7 @@ class ArchiveFolder:
         return known if known.get('state') == recording_state(recording) else None
 
     def begin(self, recording: Path, state: list[list[Any]]) -> Path:
-        """Create the folder for a recording's partial results, and remove its outdated results.
+        """Remove outdated results of a recording, and create the folder for its partial results.
 
         Parameters
         ----------
@@ -264,7 +264,7 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
     parts : iterable of Path
         Files of the same table, in chronological order.
     shifts : iterable of int
-        Offset for each part, which is added to its column `track_id`.
+        Offset for each part, to be added to the column `track_id`.
     table : str
         Name of the table.
     folder : Path

@@ -32,7 +32,8 @@ TABLES: dict[str, tuple[Column, ...]] = {
         *columns_of('i', '', poses='number of published poses'),
         *columns_of('s', '', arrival='most probable arrival direction',
                     kind='most probable kind of vehicle',
-                    verdict='ambiguous if the last or the most certain pose is, otherwise unique',
+                    verdict='ambiguous if the last or the most certain pose is ambiguous, '
+                            'otherwise unique',
                     doubts='reasons why poses of the track are ambiguous'),
         *columns_of('f', '', arrival_weight='probability of the arrival direction',
                     kind_weight='probability of the kind',

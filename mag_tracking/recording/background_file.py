@@ -54,6 +54,11 @@ def is_background_file(path: Path) -> bool:
     Returns
     -------
     bool
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
     """
     with open(path, 'rb') as stream:
         return stream.read(len(_HEAD)) == _HEAD.encode()

@@ -64,10 +64,10 @@ class BagFile:
             for connection in reader.connections:
                 self.types[connection.topic] = connection.msgtype
                 self.message_counts[connection.topic] += connection.msgcount
-            times = reader if self._is_ros1 else reader.metadata
+            time_range = reader if self._is_ros1 else reader.metadata
             if self.message_counts.total():
                 # The end time of the library is one nanosecond after the last message.
-                self.start_ns, self.end_ns = times.start_time, times.end_time - 1
+                self.start_ns, self.end_ns = time_range.start_time, time_range.end_time - 1
 
     def _open_reader(self) -> AbstractContextManager[Any]:
         """Open the bag with the reader of the library; raises RecordingError."""
@@ -117,7 +117,7 @@ class BagFile:
                 reported = position
 
     def _raw(self, start_ns: int | None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Iterate over (topic, type, log time, bytes); stop at damage, and count it as a loss."""
+        """Iterate over (topic, type, log time [ns], bytes); at damage, count a loss and stop."""
         n = 0
         with self._open_reader() as reader:
             try:

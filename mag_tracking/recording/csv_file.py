@@ -89,12 +89,13 @@ def number(path: CsvPath, line: int, column: str, text: str, finite: bool) -> fl
     Returns
     -------
     float
-        NaN for an empty cell.
+        NaN for an empty or NaN cell.
 
     Raises
     ------
     RecordingError
-        If the cell is not a number or is not finite. The message names file, row and column.
+        If the cell is not a number, is infinite, or is empty or NaN although `finite` is true. The
+        message names file, row and column.
     """
     try:
         value = float(text) if text.strip() else np.nan

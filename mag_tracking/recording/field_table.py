@@ -185,8 +185,8 @@ def _number(text: str, where: str) -> float:
 def _stamp(text: str, scale: int, where: str) -> int:
     """Convert a cell to a time [ns]; integers are not rounded; raises RecordingError."""
     text = text.strip()
-    is_whole = re.fullmatch(r'[+-]?[0-9]{1,20}', text)
-    value = int(text) * scale if is_whole else _number(text, where) * scale
+    is_integer = re.fullmatch(r'[+-]?[0-9]{1,20}', text)
+    value = int(text) * scale if is_integer else _number(text, where) * scale
     if not 0 <= value <= LATEST_NS:
         raise RecordingError(f'{where}: {text[:30] or "an empty cell"} is not a valid time since '
                              '1970')

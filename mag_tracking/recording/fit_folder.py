@@ -105,7 +105,7 @@ def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
 
 
 def _trusted_quantities(fit: PassFit, centre: FloatArray) -> dict[str, float]:
-    """Trusted quantities of a fit by column."""
+    """Values of the trusted quantities of a fit, by column; others are omitted."""
     quantities: dict[str, Iterable[float]] = {}
     if 'speed' in fit.trusted:
         quantities['speed sd_speed'] = fit.speed
@@ -117,25 +117,26 @@ def _trusted_quantities(fit: PassFit, centre: FloatArray) -> dict[str, float]:
             for name, value in zip(names.split(), values, strict=True)}
 
 
-def pass_rows(one: _FittedPass) -> list[dict[str, Any]]:
+def pass_rows(fitted_pass: _FittedPass) -> list[dict[str, Any]]:
     """Rows of a fitted pass, one per fit.
 
     Parameters
     ----------
-    one : FittedPass
+    fitted_pass : FittedPass
 
     Returns
     -------
     list of dict
         Values by `FIT_COLUMNS`.
     """
-    chosen, known, c = one.chosen, one.known, one.correlated
+    chosen, known, c = fitted_pass.chosen, fitted_pass.known, fitted_pass.correlated
     delay = {'delay_speed': c.speed, 'sd_delay_speed': c.speed_std,
              'delay_heading_deg': math.degrees(c.heading),
              'sd_delay_heading_deg': math.degrees(c.heading_std), 'no_delay': c.reason}
-    return [{'recording': one.recording, 'pass': one.number, 'vehicle': one.vehicle,
-             'n_vehicles': one.n_vehicles, **fit_row(fit, fit is known),
-             'chosen': int(fit is chosen), **delay} for fit in one.fits]
+    return [{'recording': fitted_pass.recording, 'pass': fitted_pass.number,
+             'vehicle': fitted_pass.vehicle, 'n_vehicles': fitted_pass.n_vehicles,
+             **fit_row(fit, fit is known),
+             'chosen': int(fit is chosen), **delay} for fit in fitted_pass.fits]
 
 
 class FitFolder:
@@ -183,15 +184,16 @@ class FitFolder:
                       allow_nan=False)
             stream.write('\n')
 
-    def add(self, one: _FittedPass) -> None:
+    def add(self, fitted_pass: _FittedPass) -> None:
         """Write the rows of a fitted pass.
 
         Parameters
         ----------
-        one : FittedPass
+        fitted_pass : FittedPass
         """
-        for fit, row in zip(one.fits, pass_rows(one), strict=True):
-            self.rows.append(row | {'notes': list(one.notes), 'bearing': _bearing(fit.bearing)})
+        for fit, row in zip(fitted_pass.fits, pass_rows(fitted_pass), strict=True):
+            self.rows.append(row | {'notes': list(fitted_pass.notes),
+                                    'bearing': _bearing(fit.bearing)})
             self._writer.writerow([repr(v) if isinstance(v, float) else v
                                    for v in (row[c] for c in FIT_COLUMNS)])
         self._stream.flush()

@@ -18,8 +18,7 @@ def until_stopped(read: Callable[[Progress], Iterator[_Item]], progress: Progres
     Parameters
     ----------
     read : callable
-        Returns an iterator. Its argument is a function that it calls with the number of bytes read
-        since the last call.
+        Takes a `Progress` function and returns an iterator that calls this function while reading.
     progress : callable, optional
         Called with the number of bytes read since the last call.
     stopped : callable, optional

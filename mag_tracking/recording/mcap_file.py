@@ -154,13 +154,13 @@ class McapFile:
     def _streamed_blocks(self, stream: BinaryIO, progress: Progress | None
                          ) -> Iterator[MessageBlock]:
         """Iterate over the messages in file order, up to the first damage outside of a chunk."""
-        channels, loose = _Channels(), _LooseMessages()
+        channels, unchunked = _Channels(), _UnchunkedMessages()
         end = 0
         try:
             for record in StreamReader(stream, emit_chunks=True).records:
                 record_end = stream.tell()
                 if isinstance(record, Chunk):
-                    yield from loose.flush(channels)
+                    yield from unchunked.flush(channels)
                     try:
                         yield channels.block_of(record)
                     except DECODE_ERRORS:
@@ -168,15 +168,15 @@ class McapFile:
                 elif isinstance(record, Schema | Channel):
                     channels.add(record)
                 elif isinstance(record, Message) and channels.has_schema(record.channel_id):
-                    loose.add(record)
-                    if len(loose) >= BATCH_SIZE:
-                        yield from loose.flush(channels)
+                    unchunked.add(record)
+                    if len(unchunked) >= BATCH_SIZE:
+                        yield from unchunked.flush(channels)
                 if progress:
                     progress(record_end - end)
                 end = record_end
-            yield from loose.flush(channels)
+            yield from unchunked.flush(channels)
         except DECODE_ERRORS:
-            yield from loose.flush(channels)
+            yield from unchunked.flush(channels)
             size = os.fstat(stream.fileno()).st_size
             # A file that ends after a complete record only lacks its index.
             if end < size:
@@ -184,7 +184,7 @@ class McapFile:
                                       f'of {size})')
 
 
-class _LooseMessages:
+class _UnchunkedMessages:
     """Buffer that collects messages outside of chunks into blocks, which are faster to process."""
 
     def __init__(self) -> None:

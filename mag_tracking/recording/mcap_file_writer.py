@@ -53,7 +53,7 @@ class McapFileWriter:
 
     @property
     def size(self) -> int:
-        """Upper bound of the file size after a flush, bytes."""
+        """Upper bound of the file size after the next flush, bytes."""
         return self._stream.offset + self._buffered_size
 
     def add(self, name: str, topic: Topic, sequence: int, data: bytes, log_ns: int,

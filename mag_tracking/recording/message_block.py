@@ -129,20 +129,20 @@ class MessageBlock:
             data, schema = cdr_of(schema, data), schema_of(kind)
         return RawMessage(topic, kind, int(self.log_time_ns[k]), data, schema)
 
-    def part(self, which: IntArray | slice) -> 'MessageBlock':
+    def part(self, selection: IntArray | slice) -> 'MessageBlock':
         """Select messages.
 
         Parameters
         ----------
-        which : int array or slice
-            Indices of the messages, in any order.
+        selection : int array or slice
+            Indices of the messages. The order of the indices is kept.
 
         Returns
         -------
         MessageBlock
         """
-        return MessageBlock(self.data, self.kinds, self.channel[which], self.log_time_ns[which],
-                            self.begin[which], self.end[which])
+        return MessageBlock(self.data, self.kinds, self.channel[selection],
+                            self.log_time_ns[selection], self.begin[selection], self.end[selection])
 
     def merged(self, other: 'MessageBlock') -> 'MessageBlock':
         """Merge this block with another block of the same file, in order of log time.

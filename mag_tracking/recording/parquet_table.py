@@ -100,9 +100,10 @@ def schema_of(columns: Iterable[Column]) -> 'pa.Schema':
 
 
 class TableWriter:
-    """Writer of a Parquet file in parts, which replaces an existing file only on success.
+    """Writer of a Parquet file; a context manager.
 
-    It is a context manager. After an error, no file is created or replaced.
+    Rows are written in batches. An existing file is replaced only on success. After an error, no
+    file is created or replaced.
 
     Parameters
     ----------

@@ -88,7 +88,7 @@ def read_sensor_positions(path: CsvPath) -> FloatArray:
 
 
 def _values(path: CsvPath, pose: tuple[str, ...]) -> tuple[Lines, FloatArray]:
-    """Read a table; return [(line, cells)], and the readings and `pose` columns as an array."""
+    """Read a table; return [(line, cells)], and an array of the field and `pose` columns."""
     header, rows = read_csv(path)
     n = sum(name[:1] == 'x' and name[1:].isdigit() for name in header)
     fields = [f'{a}{j}' for j in range(n) for a in 'xyz']

@@ -114,7 +114,7 @@ class Recorder:
 
     @property
     def size(self) -> int:
-        """Number of bytes written to all files."""
+        """Upper bound of the total size of all files after the next flush, bytes."""
         return self._finished_bytes + (self._file.size if self._file else 0)
 
     def add_topic(self, name: str, type_name: str, definition: str = '', qos: str | None = None,
@@ -167,7 +167,9 @@ class Recorder:
             self._latched[name].append(message)
 
     def tick(self, now_ns: int) -> None:
-        """Flush, split and retry when due; to be called several times per second.
+        """Flush or split the file, and retry failed metadata, when due.
+
+        To be called several times per second.
 
         Parameters
         ----------

@@ -218,7 +218,7 @@ def finish_file(path: str | PathLike[str]) -> list[str]:
 
 
 def _replace_end(raw: io.FileIO, end: int, index: bytes) -> None:
-    """Write the index after the intact records, or write nothing if the space is insufficient."""
+    """Write the index after the intact records; on OSError, remove the incomplete index."""
     raw.truncate(end)
     raw.seek(end)
     try:
@@ -259,7 +259,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     # A crash at a split leaves an empty file.
     empty = [file for file in files if file.stat().st_size < len(_MAGIC)]
     if len(empty) == len(files):
-        raise RecordingError(f'{path}: there is nothing to repair, all .mcap files are empty')
+        raise RecordingError(f'{path} cannot be repaired: all .mcap files are empty')
     for file in empty:
         report(f'{file} is empty and was skipped')
     for file in [file for file in files if file not in empty]:

@@ -113,7 +113,7 @@ class ResultFolder:
         return bool(earlier)
 
     def _stream(self, name: str, columns: tuple[str, ...]) -> TextIO:
-        """Open a CSV file and write its header."""
+        """Create a CSV file and write its header; return the open file."""
         stream = self._files.enter_context(new_text_file(self.folder / name, newline=''))
         csv.writer(stream).writerow(columns)
         return stream

@@ -191,10 +191,10 @@ class SampleReader:
         """Decode messages to (record, log time); collect true poses, count unusable messages."""
         for message in messages:
             sensor = self._sensors.get(message.topic)
-            truth = self._truth.accepts(message.topic, message.type)
+            is_truth = self._truth.accepts(message.topic, message.type)
             is_batch = message.topic == self._batch_topic and message.type == FIELD_READINGS
             imu_sensors = imus.get(message.topic) if message.type == IMU else None
-            if sensor is None and imu_sensors is None and not truth and not is_batch:
+            if sensor is None and imu_sensors is None and not is_truth and not is_batch:
                 continue
             try:
                 content = decode(message)
@@ -202,7 +202,7 @@ class SampleReader:
             except RecordingError:
                 self.rejected[f'undecodable message on {message.topic}'] += 1
                 continue
-            if truth:
+            if is_truth:
                 self._truth.add(message.topic, content)
             elif readings is not None:
                 yield self._network_readings(readings), message.log_time_ns

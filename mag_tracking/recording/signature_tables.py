@@ -74,14 +74,15 @@ def read_signatures(path: str | PathLike[str], is_labelled: bool = True) -> list
     """
     header, lines = read_csv(path)
     if LABEL not in header and is_labelled:
-        other = next((c for c in ';\t' if c in header[0]), None)
-        hint = f'; the delimiter is {other!r}, expected a comma' if other else ''
+        delimiter = next((c for c in ';\t' if c in header[0]), None)
+        hint = f'; the delimiter is {delimiter!r}, expected a comma' if delimiter else ''
         raise LabelsError(f'{path}: column {LABEL!r} is missing; the columns are '
                           f'{", ".join(header)}{hint}')
-    return _by_sample(path, header, lines) if TIME in header else _by_row(path, header, lines)
+    return _read_by_sample(path, header, lines) if TIME in header \
+        else _read_by_row(path, header, lines)
 
 
-def _by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
+def _read_by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
     """Read signatures with one row per sample; other columns identify the signature of a row."""
     axes = {name: match for name in header if (match := _AXIS_COLUMN.fullmatch(name.lower()))}
     names = [name for name in header if name not in (*axes, LABEL, TIME, PASS)]
@@ -116,7 +117,7 @@ def _unique_value(source: str, column: str, rows: list[tuple[int, dict[str, str]
     return values[0]
 
 
-def _by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
+def _read_by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
     """Read signatures with one row per signature, with columns x0, x1, ... (and y0, ...)."""
     axes: dict[tuple[str, str], list[tuple[int, str]]] = {}
     for name in header:

@@ -122,7 +122,7 @@ def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[s
 
 
 def summary_rows(recording: str, summary: TrafficSummary) -> list[dict[str, Any]]:
-    """Rows of `intervals`: one per direction and class, or one row with count 0 for no passages.
+    """Rows of `intervals`: one per direction and class, or a single row with count 0.
 
     Parameters
     ----------

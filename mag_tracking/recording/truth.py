@@ -84,7 +84,7 @@ class TruthTopics:
              np.array([[p.x, p.y, p.z, q.x, q.y, q.z, q.w]])))
 
     def add_block(self, block: MessageBlock) -> IntArray:
-        """Add the poses in a block that can be decoded directly from its bytes.
+        """Add the true poses of a block; only CDR messages of type PoseStamped are decoded.
 
         Parameters
         ----------
@@ -160,13 +160,13 @@ def read_truth_table(path: str | PathLike[str]) -> dict[str, Truth]:
 
 
 def _stamp(path: str | PathLike[str], line: int, column: str, text: str) -> int:
-    """Convert a cell to a time [ns]; `stamp_ns` is not converted to a float, which would round."""
+    """Convert a cell to a time [ns]; integers in `stamp_ns` stay exact; raises RecordingError."""
     try:
         stamp = int(text) if column == 'stamp_ns' else None
     except ValueError:
         stamp = None
-    exact = stamp if stamp is not None else \
+    time_ns = stamp if stamp is not None else \
         number(path, line, column, text, True) * _NS_PER_UNIT[column]
-    if abs(exact) > LATEST_NS:
+    if abs(time_ns) > LATEST_NS:
         raise RecordingError(f'{path}: row {line}: {column} is {text.strip()}, not a valid time')
-    return round(exact)
+    return round(time_ns)

@@ -65,15 +65,16 @@ class _EllipsoidFit(Protocol):
     def correct(self, readings: FloatArray) -> FloatArray: ...
 
 
-def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> Figure:
+def calibration_figure(calibration: _Calibration, nominal: _Network,
+                       max_sensors: int = 8) -> Figure:
     """Plot the knocks before and after clock calibration, and the rotations of the sensors.
 
     Parameters
     ----------
-    found : Calibration
-    stated : SensorNetwork
+    calibration : Calibration
+    nominal : SensorNetwork
         Network with the nominal orientations from the network file.
-    most : int
+    max_sensors : int
         Maximum number of sensors in the plot of the knocks.
 
     Returns
@@ -82,13 +83,13 @@ def calibration_figure(found: _Calibration, stated: _Network, most: int = 8) -> 
     """
     figure = Figure(figsize=(11.0, 4.6), layout='constrained')
     left, middle, right = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
-    _plot_knocks(left, middle, found, most)
-    _plot_headings(right, found, stated)
+    _plot_knocks(left, middle, calibration, max_sensors)
+    _plot_headings(right, calibration, nominal)
     return figure
 
 
 def first_knock(shocks: Mapping[str, tuple[FloatArray, FloatArray]]) -> float:
-    """Time of the first acceleration above 30 % of the maximum of its sensor.
+    """Time of the first acceleration that exceeds 30 % of the maximum of the same sensor.
 
     Parameters
     ----------
@@ -104,12 +105,13 @@ def first_knock(shocks: Mapping[str, tuple[FloatArray, FloatArray]]) -> float:
                 if len(s) and s.max() > 0.0), default=0.0)
 
 
-def _plot_knocks(before: Axes, after: Axes, found: _Calibration, most: int) -> None:
+def _plot_knocks(before: Axes, after: Axes, calibration: _Calibration, max_sensors: int) -> None:
     """Plot the acceleration around the first knock, before and after the clock correction."""
-    shocks = {name: found.survey.shocks[name] for name in list(found.survey.shocks)[:most]}
+    shocks = {name: calibration.survey.shocks[name]
+              for name in list(calibration.survey.shocks)[:max_sensors]}
     first = first_knock(shocks)
     for k, (name, (t, s)) in enumerate(shocks.items()):
-        offset = found.network.clock_offset[found.network.index(name)]
+        offset = calibration.network.clock_offset[calibration.network.index(name)]
         for axes, shift in ((before, 0.0), (after, offset)):
             near = np.abs(t - shift - first) < 0.25
             axes.plot(t[near] - shift - first, s[near], '.-', ms=4, lw=0.8, color=f'C{k}',
@@ -123,22 +125,22 @@ def _plot_knocks(before: Axes, after: Axes, found: _Calibration, most: int) -> N
         after.legend(fontsize=8)
 
 
-def _plot_headings(axes: Axes, found: _Calibration, stated: _Network) -> None:
+def _plot_headings(axes: Axes, calibration: _Calibration, nominal: _Network) -> None:
     """Plot the yaw of each sensor relative to its nominal orientation, by calibration step."""
-    n = len(stated)
-    steps = [('compass', found.survey.network, 'tab:orange', 0.12)]
-    if found.evidence is not None:
-        steps.append(('compass and passes', found.network, 'tab:blue', -0.12))
+    n = len(nominal)
+    steps = [('compass', calibration.survey.network, 'tab:orange', 0.12)]
+    if calibration.evidence is not None:
+        steps.append(('compass and passes', calibration.network, 'tab:blue', -0.12))
     for label, network, colour, shift in steps:
-        yaw = [np.degrees(yaw_between(stated.R_ws[j], network.R_ws[j])) for j in range(n)]
+        yaw = [np.degrees(yaw_between(nominal.R_ws[j], network.R_ws[j])) for j in range(n)]
         std = [0.0 if s is None else SCALE_1D * np.degrees(s[2]) for s in network.orientation_std]
         axes.errorbar(yaw, np.arange(n) + shift, xerr=std, fmt='o', ms=4, capsize=3, color=colour,
                       label=label)
     axes.axvline(0.0, color='k', lw=0.8, ls=':', label='network file')
-    axes.set_yticks(range(n), [literal(name) for name in stated.names])
+    axes.set_yticks(range(n), [literal(name) for name in nominal.names])
     axes.invert_yaxis()
     axes.set_title('rotation about the vertical (90 %)', fontsize=10)
-    axes.set_xlabel('[degrees]')
+    axes.set_xlabel('rotation [degrees]')
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
 

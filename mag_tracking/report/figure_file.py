@@ -17,7 +17,7 @@ def save_figure(figure: Figure, path: str | PathLike[str]) -> None:
     Parameters
     ----------
     figure : Figure
-    path : str or path
+    path : path_like
 
     Raises
     ------

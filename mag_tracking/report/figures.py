@@ -23,7 +23,7 @@ SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
 SCALE_1D = 1.645
 """Half width of a 90 % interval, in standard deviations."""
 
-MIN_DRAWN = 0.01
+MIN_WEIGHT = 0.01
 """Minimum weight of a plotted hypothesis. Less probable hypotheses are omitted for clarity."""
 
 
@@ -59,8 +59,8 @@ def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray
     uncertainty = 3.0 * np.sqrt(np.trace(covariances, axis1=1, axis2=2))
     steps = np.hypot(*np.diff(points, axis=0).T)
     typical_step = 4.0 * np.median(steps) if len(steps) else 0.0
-    switch = np.flatnonzero(steps > np.maximum(typical_step, 0.5 * uncertainty[1:])) + 1
-    return np.insert(points, switch, np.nan, axis=0)
+    switches = np.flatnonzero(steps > np.maximum(typical_step, 0.5 * uncertainty[1:])) + 1
+    return np.insert(points, switches, np.nan, axis=0)
 
 
 def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None,
@@ -82,21 +82,22 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
     """
     figure = Figure(figsize=(8.5, 6.5), layout='constrained')
     axes = figure.add_subplot()
-    best = np.array(log.position)[:, :2]
+    positions = np.array(log.position)[:, :2]
     covariance = np.array(log.covariance)[:, :2, :2]
     ambiguous = np.array(log.ambiguous, dtype=bool)
-    reach = np.vstack([best, network.positions[:, :2]])
-    low, high = reach.min(axis=0), reach.max(axis=0)
+    map_points = np.vstack([positions, network.positions[:, :2]])
+    low, high = map_points.min(axis=0), map_points.max(axis=0)
     span = max((high - low).max(), 1e-6)
     f, unit = scale_of(span)
     _draw_arrivals(axes, log, f)
-    for k in range(0, len(best), max(1, len(best) // 14)):
-        axes.fill(*(f * _ellipse(best[k], covariance[k])).T, color='k', lw=0,
+    for k in range(0, len(positions), max(1, len(positions) // 14)):
+        axes.fill(*(f * _ellipse(positions[k], covariance[k])).T, color='k', lw=0,
                   alpha=0.04 if ambiguous[k] else 0.10)
-    axes.plot(*(f * _without_switches(best, covariance)).T, color='k', lw=1.8, label='track')
+    axes.plot(*(f * _without_switches(positions, covariance)).T, color='k', lw=1.8, label='track')
     if ambiguous.any():
-        axes.plot(*(f * best[ambiguous]).T, 'o', mfc='w', mec='k', ms=4, label='ambiguous pose')
-    axes.plot(*(f * best[0]), 's', mfc='w', mec='k', ms=7, label='first pose')
+        axes.plot(*(f * positions[ambiguous]).T, 'o', mfc='w', mec='k', ms=4,
+                  label='ambiguous pose')
+    axes.plot(*(f * positions[0]), 's', mfc='w', mec='k', ms=7, label='first pose')
     if truth is not None and np.isfinite(truth).any():
         axes.plot(f * truth[:, 0], f * truth[:, 1], '--', color='0.5', lw=1.4, label='truth')
     if smoothed is not None:
@@ -117,15 +118,15 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
 
 
 def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
-    """Plot the best hypothesis of each arrival direction where its weight exceeds `MIN_DRAWN`.
+    """Plot the best hypothesis of each arrival direction where its weight exceeds `MIN_WEIGHT`.
 
-    A track with a single direction has no such curves.
+    Nothing is plotted for a track with a single direction.
     """
     colours = _colours(log)
     if len(colours) < 2:
         return
     for name, colour in colours.items():
-        rows = [row[name] for row in log.arrivals if name in row and row[name][0] > MIN_DRAWN]
+        rows = [row[name] for row in log.arrivals if name in row and row[name][0] > MIN_WEIGHT]
         if not rows:
             continue
         points = _without_switches(np.array([position[:2] for _, position, _ in rows]),
@@ -167,14 +168,14 @@ def weights_figure(log: TrackLog) -> Figure:
     return figure
 
 
-def field_figure(log: TrackLog, network: _Network, most: int = 8) -> Figure:
+def field_figure(log: TrackLog, network: _Network, max_sensors: int = 8) -> Figure:
     """Plot the measured field and the field of the best hypothesis, per sensor and axis.
 
     Parameters
     ----------
     log : TrackLog
     network : SensorNetwork
-    most : int
+    max_sensors : int
         Maximum number of sensors. In a larger network, only the sensors with the strongest fields
         are plotted, and the title states how many.
 
@@ -185,7 +186,7 @@ def field_figure(log: TrackLog, network: _Network, most: int = 8) -> Figure:
     measured, predicted = np.array(log.measured), np.array(log.predicted)
     strength = np.nan_to_num(np.nanmax(np.abs(np.where(np.isnan(measured), 0.0, measured)),
                                        axis=(0, 2)))
-    rows = np.sort(np.argsort(-strength, kind='stable')[:most])
+    rows = np.sort(np.argsort(-strength, kind='stable')[:max_sensors])
     columns = 2 if len(rows) > 1 else 1
     lines = -(-len(rows) // columns)
     figure = Figure(figsize=(9.5, 1.2 + 2.4 * lines), layout='constrained')

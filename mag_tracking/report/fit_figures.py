@@ -86,7 +86,7 @@ class _FittedPass(Protocol):
     def chosen(self) -> _Fit | None: ...
 
 
-def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
+def pass_figure(fit: _Fit, title: str, max_sensors: int = 6) -> Figure:
     """Plot the measured and the fitted field, with bands that should contain 90 % of the readings.
 
     The bands include noise and `PassFit.robust_covariance`. If the normalised cost exceeds 1,
@@ -96,7 +96,7 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
     ----------
     fit : PassFit
     title : str
-    most : int
+    max_sensors : int
         Maximum number of sensors. In a larger network, only the sensors with the strongest fields
         are plotted.
 
@@ -109,9 +109,10 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
     [TSP14]_ Fig. 6.
     """
     data = fit.data
-    level = fit.predicted - target_alone(fit)
-    strength = {j: np.nanmax(np.abs(data.field - level)[data.sensor == j]) for j in data.sensors}
-    strongest = sorted(sorted(strength, key=lambda j: -strength[j])[:most])
+    background = fit.predicted - target_alone(fit)
+    strength = {j: np.nanmax(np.abs(data.field - background)[data.sensor == j])
+                for j in data.sensors}
+    strongest = sorted(sorted(strength, key=lambda j: -strength[j])[:max_sensors])
     f, unit = field_unit(max(strength.values()))
     factor = max(1.0, fit.normalised_cost)
     figure = Figure(figsize=(10.0, 1.0 + 2.6 * len(strongest)), layout='constrained')
@@ -125,17 +126,17 @@ def pass_figure(fit: _Fit, title: str, most: int = 6) -> Figure:
         for a, colour in enumerate(AXIS_COLOURS):
             if np.isnan(data.field[rows, a]).all():
                 continue
-            middle = f * (fit.predicted - level)[rows, a]
+            middle = f * (fit.predicted - background)[rows, a]
             half = f * SCALE_1D * np.sqrt(fit.predicted_std[rows, a]**2 + factor * noise[a])
             axes.fill_between(t, middle - half, middle + half, color=colour, alpha=0.25, lw=0)
-            axes.plot(t, f * (data.field - level)[rows, a], '.', ms=2.5, color=colour,
+            axes.plot(t, f * (data.field - background)[rows, a], '.', ms=2.5, color=colour,
                       label=f'{"xyz"[a]}')
             axes.plot(t, middle, '-', lw=0.9, color='k')
         axes.set_title(literal(data.network.names[j]), fontsize=9)
         axes.set_ylabel(f'field [{unit}]')
         axes.grid(alpha=0.3)
         legend_beside(axes)
-    axes.set_xlabel('time from the strongest field [s]')
+    axes.set_xlabel('time relative to the strongest field [s]')
     figure.suptitle(f'{literal(title)}: measured (dots), fitted (lines), 90 % bands', fontsize=11)
     return figure
 

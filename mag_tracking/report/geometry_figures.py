@@ -76,68 +76,68 @@ class _Survey(Protocol):
     def rotation_angle(self) -> FloatArray: ...
 
 
-def geometry_figure(found: _Survey) -> Figure:
+def geometry_figure(survey: _Survey) -> Figure:
     """Plot the corrections of the sensor positions, orientations and gains, and the residuals.
 
     Parameters
     ----------
-    found : GeometrySurvey
+    survey : GeometrySurvey
 
     Returns
     -------
     Figure
     """
-    g, names = found.geometry, found.network.names
+    g, names = survey.geometry, survey.network.names
     n = len(names)
     suspect = np.isin(names, g.suspect_sensors)
     figure = Figure(figsize=(15.0, 9.5), layout='constrained')
     left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.15))
     board, poses = left.subplots(2, 1, height_ratios=(2.4, 1.0))
-    _plot_displacements(left, board, found, suspect)
-    _plot_pose_residuals(poses, found)
+    _plot_displacements(left, board, survey, suspect)
+    _plot_pose_residuals(poses, survey)
     rows = right.subplots(4, 1, sharex=True)
-    along = np.arange(n)
-    moved = found.network.positions - found.stated.positions
-    _plot_corrections(rows[0], along, 1e3 * np.linalg.norm(moved, axis=1), 1e3 * g.position_std,
-                      'displacement [mm]')
-    _plot_corrections(rows[1], along, np.rad2deg(found.rotation_angle), np.rad2deg(g.rotation_std),
-                      'rotation [deg]')
-    rows[2].errorbar(along, g.gain, yerr=SCALE_1D * g.gain_std, fmt='o', ms=4, capsize=2,
+    indices = np.arange(n)
+    displacement = survey.network.positions - survey.stated.positions
+    _plot_corrections(rows[0], indices, 1e3 * np.linalg.norm(displacement, axis=1),
+                      1e3 * g.position_std, 'displacement [mm]')
+    _plot_corrections(rows[1], indices, np.rad2deg(survey.rotation_angle),
+                      np.rad2deg(g.rotation_std), 'rotation [deg]')
+    rows[2].errorbar(indices, g.gain, yerr=SCALE_1D * g.gain_std, fmt='o', ms=4, capsize=2,
                      color='tab:blue')
     rows[2].axhline(1.0, color='k', lw=0.8, ls=':')
     rows[2].set_title('gain (90 %)', fontsize=10, loc='left')
-    _plot_residuals(rows[3], along, g.sensor_residual, suspect,
+    _plot_residuals(rows[3], indices, g.sensor_residual, suspect,
                     'residual in standard deviations (RMS; 1 for correct noise and field error)')
     step = -(-n // _MAX_NAMES)
-    rows[3].set_xticks(along[::step], [literal(name) for name in names[::step]], rotation=90,
+    rows[3].set_xticks(indices[::step], [literal(name) for name in names[::step]], rotation=90,
                        fontsize=7)
     rows[3].set_xlim(-0.7, n - 0.3)
     return figure
 
 
-def _plot_displacements(figure: SubFigure, axes: Axes, found: _Survey, suspect: BoolArray) -> None:
+def _plot_displacements(figure: SubFigure, axes: Axes, survey: _Survey, suspect: BoolArray) -> None:
     """Plot the board, viewed along its thinnest axis, with magnified arrows for displacements."""
-    positions = found.stated.positions
+    positions = survey.stated.positions
     a, b = _widest_axes(positions)
     c = 3 - a - b
-    shift = 1e3 * (found.network.positions - positions)
+    shift = 1e3 * (survey.network.positions - positions)
     extent = np.ptp(positions, axis=0).max() or 1.0
     longest = np.linalg.norm(shift[:, [a, b]], axis=1).max()
     key = _round_down(longest) or 1.0
-    r, _ = found.geometry.poses
+    r, _ = survey.geometry.poses
     axes.plot(r[:, a], r[:, b], '.', ms=3, color='0.85', zorder=0, label='poses of the magnet')
-    most = np.abs(shift[:, c]).max() or 1.0
+    max_shift = np.abs(shift[:, c]).max() or 1.0
     arrows = axes.quiver(
         positions[:, a], positions[:, b], shift[:, a], shift[:, b], shift[:, c], cmap='coolwarm',
-        clim=(-most, most), angles='xy', scale_units='xy', width=0.006, edgecolor='k',
+        clim=(-max_shift, max_shift), angles='xy', scale_units='xy', width=0.006, edgecolor='k',
         linewidth=0.4, scale=8.0 * (longest or 1.0) / extent, zorder=2)
     axes.quiverkey(arrows, 0.86, 1.03, key, f'{key:g} mm', labelpos='E')
     axes.plot(positions[:, a], positions[:, b], 'k.', ms=3, zorder=3, label='nominal positions')
     if suspect.any():
         axes.plot(positions[suspect, a], positions[suspect, b], 'o', ms=12, mfc='none', mew=1.5,
-                  color=_SUSPECT_COLOUR, label='does not fit')
+                  color=_SUSPECT_COLOUR, label='suspect sensor')
     if len(positions) <= _MAX_NAMES:
-        for name, position in zip(found.network.names, positions, strict=True):
+        for name, position in zip(survey.network.names, positions, strict=True):
             axes.annotate(literal(name), position[[a, b]], xytext=(3, -8),
                           textcoords='offset points', fontsize=6, color='0.35')
     # A few distant poses must not extend the axes.
@@ -167,37 +167,37 @@ def _round_down(value: float) -> float:
     return float(power * max(m for m in (1.0, 2.0, 5.0) if m * power <= value * (1.0 + 1e-9)))
 
 
-def _plot_corrections(axes: Axes, along: IntArray, magnitude: FloatArray, std: FloatArray,
+def _plot_corrections(axes: Axes, indices: IntArray, magnitude: FloatArray, std: FloatArray,
                       title: str) -> None:
     """Plot the magnitudes of the corrections, and their uncertainty per axis."""
-    axes.bar(along, SCALE_1D * np.sqrt(np.square(std).mean(axis=1)), color='0.85', width=0.8,
+    axes.bar(indices, SCALE_1D * np.sqrt(np.square(std).mean(axis=1)), color='0.85', width=0.8,
              label='uncertainty (90 %, per axis)')
-    axes.plot(along, magnitude, 'o', ms=4, color='tab:blue', label='correction')
+    axes.plot(indices, magnitude, 'o', ms=4, color='tab:blue', label='correction')
     axes.set_title(title, fontsize=10, loc='left')
     axes.legend(fontsize=7, ncols=2, loc='lower right', bbox_to_anchor=(1.0, 1.0), frameon=False)
     axes.grid(alpha=0.3)
 
 
-def _plot_residuals(axes: Axes, along: IntArray, residual: FloatArray, suspect: BoolArray,
+def _plot_residuals(axes: Axes, indices: IntArray, residual: FloatArray, suspect: BoolArray,
                     title: str) -> None:
     """Plot the residuals of the sensors as bars; bars of suspect sensors are red."""
-    axes.bar(along, np.nan_to_num(residual), width=0.8,
+    axes.bar(indices, np.nan_to_num(residual), width=0.8,
              color=np.where(suspect, _SUSPECT_COLOUR, 'tab:blue').tolist())
     axes.axhline(1.0, color='k', lw=0.8, ls=':')
     axes.set_title(title, fontsize=10, loc='left')
     axes.grid(alpha=0.3)
 
 
-def _plot_pose_residuals(axes: Axes, found: _Survey) -> None:
+def _plot_pose_residuals(axes: Axes, survey: _Survey) -> None:
     """Plot the residual of each pose against its row in the table."""
-    suspect = np.isin(found.rows, found.suspect_rows)
-    residual = found.geometry.pose_residual
-    axes.plot(found.rows[~suspect], residual[~suspect], '.', ms=4, color='tab:blue')
-    axes.plot(found.rows[suspect], residual[suspect], 'o', ms=5, color=_SUSPECT_COLOUR)
+    suspect = np.isin(survey.rows, survey.suspect_rows)
+    residual = survey.geometry.pose_residual
+    axes.plot(survey.rows[~suspect], residual[~suspect], '.', ms=4, color='tab:blue')
+    axes.plot(survey.rows[suspect], residual[suspect], 'o', ms=5, color=_SUSPECT_COLOUR)
     axes.set_ylim(0.0)
     axes.axhline(1.0, color='k', lw=0.8, ls=':')
     axes.set_title('residual of the poses, relative to the noise'
-                   + (f'; do not fit: {suspect.sum()} (red)' if suspect.any() else ''),
+                   + (f'; suspect: {suspect.sum()} (red)' if suspect.any() else ''),
                    fontsize=10, loc='left')
     axes.grid(alpha=0.3)
     axes.set_xlabel('row of the table')

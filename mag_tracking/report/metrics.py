@@ -24,7 +24,7 @@ class PassErrors(TypedDict):
     closest_distance: float
     """Horizontal distance of this true position from the centre [m]."""
     anees: float
-    """Mean NEES per axis of the poses within the radius, or of the closest pose."""
+    """Mean NEES per axis of the poses within the radius, or NEES of the closest pose if none is."""
     n: int
     """Number of poses whose true position is within the radius."""
 

@@ -1,4 +1,4 @@
-"""Binary arrays as base64 in JSON, about a third of the size of decimal numbers."""
+"""Binary arrays as base64 in JSON, which take a third of the space of decimal numbers."""
 
 import base64
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 Packed = dict[str, str]
-"""Maps the number type to little-endian numbers in base64, which `scene.js` decodes."""
+"""Maps the type of the numbers to little-endian base64, which `scene.js` decodes."""
 
 
 def packed(values: ArrayLike, kind: str = 'f8') -> Packed:

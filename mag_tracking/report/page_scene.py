@@ -22,8 +22,8 @@ MIN_POSES, TRACK_SIZE = 4, 2_500
 """Minimum number of poses per track, and approximate size of a track without poses [bytes]."""
 MAX_EXTENT = 6.0
 """Maximum margin of the map around the network, as a multiple of the span of the network."""
-MIN_REACH_M = 10.0
-"""Maximum margin of the map around a single sensor [m]."""
+SINGLE_SENSOR_MARGIN_M = 10.0
+"""Maximum margin of the map around a network without extent, such as a single sensor [m]."""
 
 
 class Sensors(Protocol):
@@ -63,13 +63,14 @@ def scene_of(network: Sensors, begin_ns: int, end_ns: int,
     xy = network.positions[:, :2]
     low, high = xy.min(axis=0), xy.max(axis=0)
     span = float((high - low).max())
-    far = MAX_EXTENT * span if span > 0.0 else MIN_REACH_M
-    spare = 0.15 * span if span > 0.0 else 1.0
-    factor, unit = scale_of(span if span > 0.0 else MIN_REACH_M)
+    max_margin = MAX_EXTENT * span if span > 0.0 else SINGLE_SENSOR_MARGIN_M
+    margin = 0.15 * span if span > 0.0 else 1.0
+    factor, unit = scale_of(span if span > 0.0 else SINGLE_SENSOR_MARGIN_M)
     return {'frame': network.frame, 'begin_ns': str(begin_ns), 'begin': 0.0,
             'end': (end_ns - begin_ns) / NS, 'scale': {'factor': factor, 'unit': unit},
             'sensors': {'names': list(network.names), 'x': packed(xy[:, 0]), 'y': packed(xy[:, 1])},
-            'reach': _box(low - spare, high + spare), 'most_reach': _box(low - far, high + far),
+            'reach': _box(low - margin, high + margin),
+            'most_reach': _box(low - max_margin, high + max_margin),
             'tracks': list(tracks)}
 
 
@@ -79,7 +80,7 @@ def _box(low: FloatArray, high: FloatArray) -> list[float]:
 
 
 def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
-                      most: int = MAX_SENSORS) -> IntArray:
+                      max_sensors: int = MAX_SENSORS) -> IntArray:
     """Return the sensors with the strongest fields during a track.
 
     Parameters
@@ -87,7 +88,7 @@ def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
     log : TrackLog
     rows : iterable of int, optional
         Indices of the poses that are evaluated; all by default.
-    most : int
+    max_sensors : int
         Maximum number of sensors.
 
     Returns
@@ -98,16 +99,16 @@ def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
     chosen = log.measured if rows is None else [log.measured[k] for k in rows]
     measured = np.abs(np.array(chosen).reshape(-1, len(log.measured[0]), 3))
     strength = np.nan_to_num(measured).max(axis=(0, 2), initial=0.0)
-    return np.sort(np.argsort(-strength, kind='stable')[:most])
+    return np.sort(np.argsort(-strength, kind='stable')[:max_sensors])
 
 
-def max_poses_of(logs: Sequence[TrackLog], most_bytes: int = MAX_BYTES) -> int:
+def max_poses_of(logs: Sequence[TrackLog], max_bytes: int = MAX_BYTES) -> int:
     """Return the maximum number of poses per track that keeps a report below a size limit.
 
     Parameters
     ----------
     logs : sequence of TrackLog
-    most_bytes : int
+    max_bytes : int
         Approximate size limit of the track data [bytes].
 
     Returns
@@ -120,7 +121,7 @@ def max_poses_of(logs: Sequence[TrackLog], most_bytes: int = MAX_BYTES) -> int:
     low, high = MIN_POSES, max(int(lengths.max()), MIN_POSES)
     while low < high:
         middle = (low + high + 1) // 2
-        if TRACK_SIZE * len(logs) + (np.minimum(lengths, middle) * sizes).sum() > most_bytes:
+        if TRACK_SIZE * len(logs) + (np.minimum(lengths, middle) * sizes).sum() > max_bytes:
             high = middle - 1
         else:
             low = middle
@@ -135,7 +136,7 @@ def _pose_size(log: TrackLog) -> int:
     return (4 * (120 + 24 * n_sensors + 32 * n_arrivals)) // 3
 
 
-def thin_poses(log: TrackLog, most: int) -> list[int]:
+def thin_poses(log: TrackLog, max_poses: int) -> list[int]:
     """Return the indices of evenly spaced poses of a track.
 
     The first, the last and the most certain pose are included.
@@ -143,7 +144,7 @@ def thin_poses(log: TrackLog, most: int) -> list[int]:
     Parameters
     ----------
     log : TrackLog
-    most : int
+    max_poses : int
         Maximum number of poses.
 
     Returns
@@ -151,9 +152,9 @@ def thin_poses(log: TrackLog, most: int) -> list[int]:
     list of int
     """
     n = len(log.stamp_ns)
-    if n <= most:
+    if n <= max_poses:
         return list(range(n))
-    rows = np.linspace(0, n - 1, most - 1).round().astype(int)
+    rows = np.linspace(0, n - 1, max_poses - 1).round().astype(int)
     return sorted({*rows.tolist(), log.most_certain()})
 
 

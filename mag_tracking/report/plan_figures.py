@@ -106,15 +106,17 @@ def _draw_map(plan: _Plan, title: str) -> tuple[Figure, Axes, float, str]:
 def _levels(values: FloatArray, factor: float) -> FloatArray:
     """Contour levels of 1, 2 or 5 times a power of ten within the range of the values; one
     intermediate level if there are none."""
-    tens = 10.0 ** np.arange(-6, 7)
-    levels = np.sort(np.concatenate([tens, 2.0 * tens, 5.0 * tens]))
+    powers_of_ten = 10.0 ** np.arange(-6, 7)
+    levels = np.sort(np.concatenate([powers_of_ten, 2.0 * powers_of_ten, 5.0 * powers_of_ten]))
     low, high = factor * np.nanmin(values), factor * np.nanmax(values)
     inside = levels[(levels > low) & (levels < high)]
     return inside if len(inside) else np.array([np.sqrt(low * high)])
 
 
 def position_figure(plan: _Plan) -> Figure:
-    """Plot a map of the position's Cramér-Rao bound (std) for a whole pass through each point.
+    """Plot a map of the Cramér-Rao bound on the position, for a whole pass through each point.
+
+    The bound is a standard deviation.
 
     Parameters
     ----------
@@ -260,8 +262,8 @@ def lane_figure(plan: _Plan) -> Figure:
     middle.set_ylabel('P(detection by one frame)')
     middle.set_xlabel(f'distance along the lane [{unit}]')
     legend_beside(middle)
-    known = plan.missed[plan.missed[:, 1] >= MIN_MISSED]
-    bottom.semilogy(f * known[:, 0], known[:, 1], '.-', color='k')
+    drawn_rows = plan.missed[plan.missed[:, 1] >= MIN_MISSED]
+    bottom.semilogy(f * drawn_rows[:, 0], drawn_rows[:, 1], '.-', color='k')
     bottom.set_xlim(f * plan.missed[0, 0], 1.02 * f * plan.missed[-1, 0])
     bottom.set_ylim(0.5 * MIN_MISSED, 2.0)
     bottom.set_xlabel(f'lateral distance of a pass from the centre of the sensors [{unit}]')

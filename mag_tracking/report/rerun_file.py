@@ -45,7 +45,7 @@ def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, 
 
     Parameters
     ----------
-    path : str or path
+    path : path_like
     network : SensorNetwork
     logs : dict of int to TrackLog
         Tracks by identifier.

@@ -85,7 +85,7 @@ class TrafficIntervals:
         return stamp_ns // self._length * self._length
 
     def _observe(self, now_ns: int) -> None:
-        """Add the time since the previous frame to the observed times, divided by interval."""
+        """Add the time since the previous frame to the observed times, split at interval limits."""
         self._observed.setdefault(self._begin_of(now_ns), 0)
         last_ns, self._last_ns = self._last_ns, now_ns
         if last_ns is None or now_ns - last_ns > MAX_GAP_S * NS:

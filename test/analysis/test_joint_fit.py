@@ -20,7 +20,7 @@ from mag_tracking.analysis.pass_targets import fit_targets
 from mag_tracking.analysis.pass_trust import FittedRow, residual_elsewhere
 from mag_tracking.inference.separable_fit import Minimum
 from mag_tracking.physics.passes import RowPass, SuperposedPasses
-from support.passes import ROAD, measured, network_of, random_moments, together
+from support.passes import ROAD, measured, network_of, random_moments, superposed
 
 GROUND, ORDERS = GroundPrior((0.7, 0.4), 0.1), (1, 2)
 FOUR = network_of([[-3.0, -4.5, 0.0], [-3.0, 4.5, 0.0], [3.0, -4.5, 0.0], [3.0, 4.5, 0.0]])
@@ -42,7 +42,7 @@ def simulated_pass(rng, plan, n_dipoles, network=ROAD):
               for k, (path, moments) in enumerate(targets)]
     data = fields[0]
     for other in fields[1:]:
-        data = together(data, other)
+        data = superposed(data, other)
     return data, [path for path, _ in targets]
 
 
@@ -105,8 +105,8 @@ def test_order_of_each_vehicle_is_chosen_separately():
     rng = np.random.default_rng(9)
     point, m = one_path(rng, -0.3, 1, 1)
     row, moments = one_path(rng, 0.3, -1, 3)
-    data = together(measured(ROAD, point, m, rng, seconds=6.0),
-                    measured(ROAD, row, moments, rng, seconds=6.0, noise=1e-15))
+    data = superposed(measured(ROAD, point, m, rng, seconds=6.0),
+                      measured(ROAD, row, moments, rng, seconds=6.0, noise=1e-15))
     found = fit_joint(data, tracked_paths(rng, (point, row)), GROUND, (1, 2, 3))
     orders = [choose_order(fits).n_dipoles for fits in found]
     assert orders[0] == 1 and orders[1] >= 2
@@ -123,8 +123,8 @@ def test_two_following_vehicles_are_not_fitted_as_one_long_row():
     one, moments = one_path(rng, -0.5, 1, 2)
     other = one.copy()
     other[0] -= 18.0
-    data = together(measured(ROAD, one, moments, rng, seconds=6.0),
-                    measured(ROAD, other, 0.8 * moments, rng, seconds=6.0, noise=1e-15))
+    data = superposed(measured(ROAD, one, moments, rng, seconds=6.0),
+                      measured(ROAD, other, 0.8 * moments, rng, seconds=6.0, noise=1e-15))
     alone = [fit_pass(data, n) for n in (1, 2)]
     wrong = choose_order(alone)
     assert wrong is not None and wrong.length[0] > 12.0
@@ -153,8 +153,8 @@ def test_fits_of_overlapping_vehicles_are_rejected():
     slow, slow_moments = one_path(rng, 0.0, 1, 1)
     fast, fast_moments = one_path(rng, 0.3, 1, 1)
     fast[1], fast[3] = slow[1], 2.0 * slow[3]
-    data = together(measured(ROAD, slow, slow_moments, rng, seconds=6.0),
-                    measured(ROAD, fast, fast_moments, rng, seconds=6.0, noise=1e-15))
+    data = superposed(measured(ROAD, slow, slow_moments, rng, seconds=6.0),
+                      measured(ROAD, fast, fast_moments, rng, seconds=6.0, noise=1e-15))
     alone = [fit_pass(data, n) for n in (1, 2)]
     fits, = fit_targets(data, alone, np.array([slow, fast]), GROUND, ORDERS)
     assert all('overlap' in fit.reason for fit in fits) and choose_order(alone) is not None
@@ -170,7 +170,7 @@ def test_a_rejected_joint_fit_has_a_reason():
                  data, t=data.t[::200], sensor=data.sensor[::200], field=data.field[::200],
                  covariance=data.covariance[::200]), two),
              # A third vehicle is not tracked.
-             ('of the field unexplained', together(data, measured(
+             ('of the field unexplained', superposed(data, measured(
                  ROAD, *one_path(rng, 1.5, 1, 1), rng, seconds=6.0, noise=1e-15)), two)]
     for reason, of, tracks in cases:
         fits, = fit_targets(of, alone, tracks, GROUND, (1,))

@@ -28,7 +28,7 @@ from support.passes import (
     measured,
     network_of,
     random_path,
-    together,
+    superposed,
     unknowns_at,
 )
 
@@ -324,7 +324,7 @@ def test_two_vehicles_in_one_window_are_rejected():
         other, m2 = random_path(rng, 3, True)
         one[:7] = 0.0, -1.75, 0.5, 9.0, 0.0, 0.0, 3.0
         other[:7] = 6.0, 1.75, 0.5, 11.0 * np.cos(heading), 0.0, 0.0, 3.0
-        both = together(measured(ROAD, one, m1, rng), measured(ROAD, other, m2, rng, noise=1e-15))
+        both = superposed(measured(ROAD, one, m1, rng), measured(ROAD, other, m2, rng, noise=1e-15))
         assert choose_order([fit_pass(both, d) for d in (1, 2, 3)]) is None
 
 

@@ -14,8 +14,8 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.fit_folder import fit_row
 from mag_tracking.recording.reader import Recording
 from support.bundled import VEHICLES, vehicle_path
-from support.close_pairs import answers, pass_of, readings_of
-from support.passes import NOISE, ROAD, measured, random_path, together
+from support.close_pairs import estimates_of, pass_of, readings_of
+from support.passes import NOISE, ROAD, measured, random_path, superposed
 
 PATH = np.array([0.0, -2.0, 0.5, 10.0, 0.0, 0.0, 3.0])
 
@@ -82,7 +82,7 @@ def test_a_single_fit_of_two_vehicles_is_not_trusted():
     other, m2 = random_path(rng, 3, True)
     one[:7] = 0.0, -1.75, 0.5, 9.0, 0.0, 0.0, 3.0
     other[:7] = 6.0, 1.75, 0.5, -11.0, 0.0, 0.0, 3.0
-    both = together(measured(ROAD, one, m1, rng), measured(ROAD, other, m2, rng, noise=1e-15))
+    both = superposed(measured(ROAD, one, m1, rng), measured(ROAD, other, m2, rng, noise=1e-15))
     fit = fit_pass(both, 3)
     assert 'not one target' in fit.reason and fit.trusted == ()
 
@@ -90,8 +90,8 @@ def test_a_single_fit_of_two_vehicles_is_not_trusted():
 def test_a_near_vehicle_is_not_rejected_for_its_residuals():
     """At a distance of 0.8 m, correct fits leave 2.4 to 11.9 % of the energy unexplained."""
     for seed in (2, 9, 20):
-        velocity, std = answers(seed).fit
-        assert abs(velocity / answers(seed).truth - 1.0) < 0.1 and std < 0.25 * abs(velocity)
+        velocity, std = estimates_of(seed).fit
+        assert abs(velocity / estimates_of(seed).truth - 1.0) < 0.1 and std < 0.25 * abs(velocity)
 
 
 @pytest.mark.parametrize('errors', [SensorErrors(), SensorErrors(np.deg2rad(4.0), 0.03)])

@@ -8,7 +8,7 @@ from mag_tracking.analysis.network_blind import calibrate_geometry_blind
 from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
 from mag_tracking.analysis.network_readings import rotation, tool_rotations
 from support.marks import studied
-from support.real_board import BOX, MOMENT, board_of_41, errors, print_errors, within_limits
+from support.real_board import BOX, MOMENT, assert_within_limits, board_of_41, errors, print_errors
 
 
 @pytest.fixture(scope='module')
@@ -32,7 +32,7 @@ def test_calibration_with_half_of_the_readings_is_accurate_for_the_other_half(re
                                         axes[test_rows], g.magnet_poses)
     low = positions[test_rows, 2] < 0.1
     print_errors(f'known poses, rows {first}::2', position_error, axis_error, low)
-    within_limits(position_error, axis_error, low)
+    assert_within_limits(position_error, axis_error, low)
     if first == 0:
         # If only the biases are calibrated, the errors are at least three times as large.
         bias_only = GeometrySettings(
@@ -75,4 +75,4 @@ def test_blind_calibration_is_accurate_for_the_other_readings(recorded):
     place, turn = errors(g, field[1::2], positions[1::2], axes[1::2], poses)
     low = positions[1::2, 2] < 0.1
     print_errors('unknown poses, rows 0::2', place, turn, low)
-    within_limits(place, turn, low)
+    assert_within_limits(place, turn, low)

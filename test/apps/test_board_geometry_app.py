@@ -10,7 +10,7 @@ from mag_tracking.analysis.network_readings import TrackedMagnet, rotation, tool
 from mag_tracking.apps.board_geometry import survey_geometry
 from mag_tracking.network import CalibrationRecord
 from mag_tracking.network.file import read_network, write_network
-from support.geometry_command import command, through_calibrate, write_table
+from support.geometry_command import calibrated_readings, command, write_table
 from support.magnet_boards import HIGH, LOW, MOMENT, simulated
 
 
@@ -39,7 +39,7 @@ def test_an_earlier_calibration_is_preserved(tmp_path):
     table = write_table(tmp_path / 'poses.csv', raw_readings(calibrated, field), positions, axes)
     assert command(table, '--network', tmp_path / 'stated.yaml', out=tmp_path / 'out.yaml') == 0
     network = read_network(tmp_path / 'out.yaml')
-    B = through_calibrate(network, raw_readings(calibrated, field))
+    B = calibrated_readings(network, raw_readings(calibrated, field))
     np.testing.assert_allclose(B, geometry.signal(field), rtol=0, atol=1e-11)
     np.testing.assert_allclose(network.positions, geometry.network.positions, atol=1e-8)
     np.testing.assert_allclose(network.R_ws, geometry.network.R_ws, atol=1e-6)

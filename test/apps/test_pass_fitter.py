@@ -9,7 +9,7 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.pass_fitter import PassFitter
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.pipeline import settings_for
-from support.busy_fits import fits_of_recording, fits_of_world, with_vehicles
+from support.busy_fits import assigned_fits, fits_of_recording, fits_of_world
 from support.busy_worlds import busy
 from support.passes import ROAD
 from support.random_passes import SIMULATORS
@@ -28,7 +28,7 @@ def fit_pair(scenario, simulator):
 def test_two_vehicles_are_fitted_together(scenario, simulator):
     passes, world = fit_pair(scenario, simulator)
     assert [fit.label for fit in passes] == ['pass 1, vehicle 1', 'pass 1, vehicle 2']
-    matches = with_vehicles(passes, [(world.t, position) for position in world.positions])
+    matches = assigned_fits(passes, [(world.t, position) for position in world.positions])
     assert sorted(match.vehicle for match in matches) == [0, 1]
     for match in matches:
         assert '2 vehicles were fitted together' in match.one.notes[-1]

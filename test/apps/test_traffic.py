@@ -17,7 +17,7 @@ from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.recording.traffic_tables import tables_of
 from mag_tracking.recording.writer import RecordingWriter
 from support.bundled import DATA, NETWORK_FILE, QUICK, vehicle_path
-from support.busy_recordings import network_of_recording, rightly_counted
+from support.busy_recordings import correctly_counted, network_of_recording
 from support.samples import field_dict
 
 ROAD = DATA / 'two_way_road'
@@ -32,7 +32,7 @@ def road():
 
 def test_thirty_vehicles_are_counted_with_direction_class_and_speed():
     passages = [v.passage for v in road().vehicles]
-    matches = rightly_counted('two_way_road', passages, ROAD)
+    matches = correctly_counted('two_way_road', passages, ROAD)
     assert len(passages) == len(matches) == 30
     kinds = [(p.vehicle_class == 'truck') == (v['length_m'] > 6.0) for p, v in matches]
     cars = [p.vehicle_class == 'car' for p, v in matches if v['length_m'] < 6.0]

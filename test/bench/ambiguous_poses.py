@@ -38,14 +38,14 @@ def summary(figures, policy, found):
     error = np.concatenate([f.error for f in found])
     on_topic = ambiguous & np.isfinite(nees)
     if policy == HOLD:
-        figures.keep(f'{policy}: ambiguous poses on the topics', on_topic.sum(), '', 0)
+        figures.record(f'{policy}: ambiguous poses on the topics', on_topic.sum(), '', 0)
         return (f'  {policy}: {on_topic.sum()} of {ambiguous.sum()} ambiguous poses on the topics, '
                 f'{np.isfinite(nees[~ambiguous]).sum()} of {(~ambiguous).sum()} other poses',
                 not on_topic.any())
-    met = not figures.keep(f'{policy}: ANEES of ambiguous poses', nees[on_topic].mean(), '',
-                           MAX_ANEES if policy == MIXTURE else None,
-                           note=f'{on_topic.sum()} poses of {len(found)} passes')
-    figures.keep(f'{policy}: ANEES of the other poses', nees[~ambiguous].mean(), '')
+    met = not figures.record(f'{policy}: ANEES of ambiguous poses', nees[on_topic].mean(), '',
+                             MAX_ANEES if policy == MIXTURE else None,
+                             note=f'{on_topic.sum()} poses of {len(found)} passes')
+    figures.record(f'{policy}: ANEES of the other poses', nees[~ambiguous].mean(), '')
     return (f'  {policy}: {len(found)} passes, {on_topic.sum()} ambiguous poses, ANEES '
             f'{nees[on_topic].mean():.2f}{f" (aim {MAX_ANEES:g})" if policy == MIXTURE else ""}, '
             f'99 % below {np.quantile(nees[on_topic], 0.99):.1f}, largest error '

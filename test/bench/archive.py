@@ -30,7 +30,7 @@ from mag_tracking.simulation import scenario
 from support.bundled import NETWORK_FILE
 from support.random_passes import KINDS, SIMULATORS, random_pass
 
-N_STATIONS, VEHICLES_A_DAY = 100, 5000
+N_STATIONS, VEHICLES_PER_DAY = 100, 5000
 """Number of stations, and number of vehicles per station and day, in the projection."""
 
 
@@ -88,12 +88,12 @@ def main():
     ratio = first['speed'] / [speeds[Path(source)] for source in first['source']]
     figures.add('passes tracked', len(first) / args.passes, '', more_is_better=True)
     figures.add('speed error, median', 100.0 * float((ratio - 1.0).abs().median()), '%')
-    passes_a_year = N_STATIONS * VEHICLES_A_DAY * 365.25
-    cores = passes_a_year * hours[0] / args.passes / (24 * 365.25)
-    print(f'  projection: {N_STATIONS} stations with {VEHICLES_A_DAY} vehicles per day have '
-          f'{passes_a_year:.3g} passes per year, which occupy {cores:.1f} such cores; one core '
+    passes_per_year = N_STATIONS * VEHICLES_PER_DAY * 365.25
+    cores = passes_per_year * hours[0] / args.passes / (24 * 365.25)
+    print(f'  projection: {N_STATIONS} stations with {VEHICLES_PER_DAY} vehicles per day have '
+          f'{passes_per_year:.3g} passes per year, which occupy {cores:.1f} such cores; one core '
           'processes a year of one station in '
-          f'{passes_a_year / N_STATIONS * hours[0] / args.passes / 24:.0f} days')
+          f'{passes_per_year / N_STATIONS * hours[0] / args.passes / 24:.0f} days')
     return figures.save()
 
 

@@ -1,10 +1,10 @@
 """Update of the filter bank, compared with loops of filterpy filters.
 
-A bank of hypotheses of a point vehicle is updated with one frame of 2 to 100 sensors. The peers
-compute the same update with a loop of filterpy EKFs, with a model that loops over the sensors or
-with a vectorised model. Each figure is the ratio of the peer's time to the bank's time, as the
-median over rounds. Both times are measured alternately on one thread. The aims are ratios of 350,
-120, 40 and 25 for 2, 8, 32 and 100 sensors, against the model that loops over the sensors.
+A bank of hypotheses of a point vehicle is updated with one frame of 2 to 100 sensors. Two
+peers compute the same update with a loop of filterpy EKFs. The model of the first peer loops over
+the sensors; the model of the second peer is vectorised. Each figure is the ratio of the peer's time
+to the bank's time, as the median over rounds. Both times are measured alternately on one thread.
+The aims are ratios of 350, 120, 40 and 25 for 2, 8, 32 and 100 sensors, against the first peer.
 """
 
 import os
@@ -42,7 +42,7 @@ N_TARGET = 12
 
 
 def moment(x):
-    """Moment (3,) of a vehicle's state and its Jacobian (3, 12).
+    """Magnetic moment (3,) [A m²] of a vehicle with the state `x` (12,), and its Jacobian (3, 12).
 
     ICASSP11 eq. (8), with a tensor that is diagonal in the axes of the vehicle.
     """
@@ -63,7 +63,7 @@ def moment(x):
 
 
 def dipole(d, m):
-    """Field of a dipole at one point and its Jacobians, in textbook form."""
+    """Field (3,) [T] of a dipole at the position `d` from it; its Jacobians about `d` and `m`."""
     n2 = d @ d
     k3 = 1e-7 / n2**1.5
     dm = d @ m
@@ -84,7 +84,7 @@ class Peer:
     def __init__(self, positions, R_sw, x, P):
         self.positions, self.R_sw = positions, R_sw
         self.n = 3 * len(positions)
-        self.turned = x.shape[1] > N_TARGET + self.n
+        self.has_mounting = x.shape[1] > N_TARGET + self.n
         self.filters = []
         for xi, Pi in zip(x, P, strict=True):
             f = ExtendedKalmanFilter(x.shape[1], self.n)
@@ -110,7 +110,7 @@ class Peer:
     def h(self, x):
         """Predicted measurement, divided by the standard deviation of the noise."""
         B = self.fields(x)
-        if self.turned:
+        if self.has_mounting:
             B = B + np.cross(x[N_TARGET:N_TARGET + self.n].reshape(-1, 3), B)
         return (B.ravel() + x[-self.n:]) / SIGMA
 
@@ -118,7 +118,7 @@ class Peer:
         """Jacobian of `h`."""
         out = np.zeros((self.n, len(x)))
         J = self.jacobians(x)
-        if self.turned:
+        if self.has_mounting:
             J = J + cross_matrix(x[N_TARGET:N_TARGET + self.n].reshape(-1, 3)) @ J
             by_angle = -cross_matrix(self.fields(x))
             for j in range(len(J)):
@@ -163,10 +163,10 @@ class VectorPeer(Peer):
         return out
 
 
-def bank_case(n_sensors, n_hyp, rng, turned):
+def bank_case(n_sensors, n_hyp, rng, has_mounting):
     """Create a filter, the sensor poses, a bank of hypotheses near the truth and a frame.
 
-    With `turned`, the state includes the mounting angles of the sensors.
+    With `has_mounting`, the state includes the mounting angles of the sensors.
     """
     positions = np.zeros((n_sensors, 3))
     positions[:, 0] = 9.0 * (np.arange(n_sensors) // 2)
@@ -179,8 +179,9 @@ def bank_case(n_sensors, n_hyp, rng, turned):
                             names, earth_field=EARTH)
     settings = settings_for('vehicle', {
         **POINT, 'track.vehicle.near_field_lengths': [0.0], 'track.field_error': 0.0,
-        'track.model_error_time_s': 0.0, 'track.mounting_std_deg': 5.0 if turned else 0.0}).track
-    n_mounting = 3 * n_sensors if turned else 0
+        'track.model_error_time_s': 0.0,
+        'track.mounting_std_deg': 5.0 if has_mounting else 0.0}).track
+    n_mounting = 3 * n_sensors if has_mounting else 0
     x = np.zeros((n_hyp, N_TARGET + n_mounting + 3 * n_sensors))
     x[:, :3] = [-6.0, -1.0, 0.5] + 0.3 * rng.standard_normal((n_hyp, 3))
     x[:, 3:6] = [10.0, 0.0, 0.0] + 0.3 * rng.standard_normal((n_hyp, 3))
@@ -198,10 +199,10 @@ def bank_case(n_sensors, n_hyp, rng, turned):
     return BankFilter(network, model, settings), positions, R_sw, bank, frame
 
 
-def bank_ratio(peer_class, n_sensors, turned, n_hyp=64, rounds=12, repeats=100):
-    """Time an update; return (median, minimum and maximum ratio, times [us] of bank and peer)."""
+def bank_ratio(peer_class, n_sensors, has_mounting, n_hyp=64, rounds=12, repeats=100):
+    """Time updates; return (median, minimum, maximum ratio, time [us] of bank, time of peer)."""
     rng = np.random.default_rng(n_sensors)
-    bank_filter, positions, R_sw, bank, frame = bank_case(n_sensors, n_hyp, rng, turned)
+    bank_filter, positions, R_sw, bank, frame = bank_case(n_sensors, n_hyp, rng, has_mounting)
     x, P = bank.x, bank.P
     bank_times, peer_times = [], []
     for k in range(rounds + 1):
@@ -232,14 +233,14 @@ def main():
     """Print the figures; return 1 if an aim is missed."""
     figures = Figures('bank')
     print('bank update against a loop of filterpy EKFs, one thread')
-    for n_sensors, n_hyp, turned, aim in (
+    for n_sensors, n_hyp, has_mounting, aim in (
             (2, 64, False, 350.0), (8, 64, False, 120.0), (32, 64, False, 40.0),
             (100, 16, False, 25.0), (2, 64, True, None), (8, 64, True, None)):
         for peer, peer_aim in ((Peer, aim), (VectorPeer, None)):
             rounds, repeats = (12, 100) if n_sensors <= 8 else (4, 3)
-            ratio, low, high, bank_us, peer_us = bank_ratio(peer, n_sensors, turned, n_hyp, rounds,
-                                                            repeats)
-            state = 'target, backgrounds' + (', mounting' if turned else '')
+            ratio, low, high, bank_us, peer_us = bank_ratio(
+                peer, n_sensors, has_mounting, n_hyp, rounds, repeats)
+            state = 'target, backgrounds' + (', mounting' if has_mounting else '')
             kind = 'a model from sensor to sensor' if peer is Peer else 'a vectorised model'
             figures.add(f'{n_sensors} sensors x {n_hyp} hypotheses; {state}; {kind}', ratio,
                         'times', peer_aim, True,

@@ -25,7 +25,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
 from mag_tracking.stages.track.new_target_search import NewTargetSearch
 from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
-from support.busy_recordings import BUSY, rightly_counted, tracked_recording
+from support.busy_recordings import BUSY, correctly_counted, tracked_recording
 from support.busy_worlds import NETWORKS, busy, tracked
 from support.random_passes import KINDS, are_wrong, one_random_pass
 
@@ -72,46 +72,46 @@ def timed_searches():
 
 
 def recordings(figures, folder):
-    """Track the recordings; return their numbers of [(unflagged, wrong unflagged)] poses."""
+    """Track the recordings; return [(number of unflagged poses, number of wrong ones of these)]."""
     counted = []
     for path in with_progress_bar(sorted(folder.glob('*.truth.json')), 'recordings'):
         name = path.name.removesuffix('.truth.json')
         with timed_searches() as seconds:
             tracked = tracked_recording(name, folder)
-            got = tracked.score
+            result = tracked.score
         rms, nees, found = aims_of(name)
-        n = len(got.rms)
-        figures.add(f'{name}: found', float(got.is_found.mean()), '', found, True,
-                    f' ({got.is_found.sum()} of {n})')
+        n = len(result.rms)
+        figures.add(f'{name}: found', float(result.is_found.mean()), '', found, True,
+                    f' ({result.is_found.sum()} of {n})')
         figures.add(f'{name}: counted in the right direction', float(len(
-            rightly_counted(name, tracked.passages, folder))), '', None, True,
+            correctly_counted(name, tracked.passages, folder))), '', None, True,
             f' (of {len(tracked.passages)} counted)')
-        figures.add(f'{name}: RMS', float(np.nanmedian(got.rms)), 'm', rms)
-        figures.add(f'{name}: NEES', float(np.nanmedian(got.nees)), '', nees)
-        figures.add(f'{name}: false tracks', got.n_extra, '', 0)
+        figures.add(f'{name}: RMS', float(np.nanmedian(result.rms)), 'm', rms)
+        figures.add(f'{name}: NEES', float(np.nanmedian(result.nees)), '', nees)
+        figures.add(f'{name}: false tracks', result.n_extra, '', 0)
         figures.add(f'{name}: time of a search', float(np.median(seconds)), 's',
                     note=f' (longest {max(seconds):.2g} s, {len(seconds)} searches)')
-        counted.append((got.n_sure, got.n_wrong))
+        counted.append((result.n_unflagged, result.n_wrong))
     return counted
 
 
 def simulated(figures, seeds):
-    """Track the worlds of the second simulator; return [(unflagged, unflagged and wrong)] poses."""
+    """Track worlds of the second simulator; return the same numbers as `recordings`."""
     counted = []
-    for how in ('meeting', 'following', 'traffic'):
-        scores = [tracked(busy(how, n, 'boxes', seed))[0]
-                  for n in (2, 4) for seed in with_progress_bar(range(seeds), how)]
+    for pattern in ('meeting', 'following', 'traffic'):
+        scores = [tracked(busy(pattern, n, 'boxes', seed))[0]
+                  for n in (2, 4) for seed in with_progress_bar(range(seeds), pattern)]
         found = np.concatenate([s.is_found for s in scores])
-        figures.add(f'boxes, {how}: found', float(found.mean()), '', note=f' (of {len(found)})')
-        figures.add(f'boxes, {how}: RMS',
+        figures.add(f'boxes, {pattern}: found', float(found.mean()), '', note=f' (of {len(found)})')
+        figures.add(f'boxes, {pattern}: RMS',
                     float(np.nanmedian(np.concatenate([s.rms for s in scores]))), 'm')
-        figures.add(f'boxes, {how}: false tracks', sum(s.n_extra for s in scores), '')
-        counted += [(s.n_sure, s.n_wrong) for s in scores]
+        figures.add(f'boxes, {pattern}: false tracks', sum(s.n_extra for s in scores), '')
+        counted += [(s.n_unflagged, s.n_wrong) for s in scores]
     return counted
 
 
 def single_vehicles(passes):
-    """Track single vehicles; return the numbers of [(unflagged, wrong unflagged)] poses.
+    """Track single vehicles; return the same numbers as `recordings`.
 
     The vehicles are in the bundled recordings, and in passes of each kind of the second simulator.
     """
@@ -128,8 +128,8 @@ def single_vehicles(passes):
             error_m, along / np.maximum(error_m, 1e-9)).sum())))
     for kind in KINDS:
         for seed in with_progress_bar(range(passes), kind):
-            got = one_random_pass('boxes', kind, seed)
-            counted.append((int((~got.ambiguous).sum()), int(got.sure_and_wrong.sum())))
+            result = one_random_pass('boxes', kind, seed)
+            counted.append((int((~result.ambiguous).sum()), int(result.unflagged_and_wrong.sum())))
     return counted
 
 
@@ -174,9 +174,9 @@ def main():
     print('Several vehicles at once')
     counted = np.array([*recordings(figures, args.data), *simulated(figures, args.seeds),
                         *single_vehicles(args.passes)])
-    sure, wrong = counted.sum(axis=0)
-    figures.add('poses without a flag that are wrong', wrong / sure, '', MAX_WRONG,
-                note=f' ({wrong} of {sure})')
+    unflagged, wrong = counted.sum(axis=0)
+    figures.add('poses without a flag that are wrong', wrong / unflagged, '', MAX_WRONG,
+                note=f' ({wrong} of {unflagged})')
     figures.add('two vehicles together over one', cost(), 'times', MAX_COST)
     return figures.save()
 

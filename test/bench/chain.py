@@ -19,7 +19,7 @@ import numpy as np
 
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 os.environ.setdefault('ROS_DOMAIN_ID', str(101 + os.getpid() % 100))
-N_SENSORS, RATE, EVERY = 100, 100.0, 8
+N_SENSORS, RATE, DECIMATION = 100, 100.0, 8
 ROLES = ('last', 'second', 'first', 'source')
 
 
@@ -55,7 +55,7 @@ def run_node(role):
         count[0] += 1
         if role != 'last':
             publisher.publish(message)
-        elif count[0] % EVERY == 0:
+        elif count[0] % DECIMATION == 0:
             publisher.publish(PoseWithCovarianceStamped(header=message.header))
 
     if role == 'source':
@@ -98,8 +98,9 @@ def main():
     delays = 1e3 * np.array(delays[60:])
     from bench.figures import Figures
     figures = Figures('chain')
-    figures.keep('four bare nodes: pose after its readings, median', np.median(delays), 'ms')
-    figures.keep('four bare nodes: pose after its readings, 99 %', np.quantile(delays, 0.99), 'ms')
+    figures.record('four bare nodes: pose after its readings, median', np.median(delays), 'ms')
+    figures.record('four bare nodes: pose after its readings, 99 %', np.quantile(delays, 0.99),
+                   'ms')
     figures.save()
     print(f'{len(delays)} poses of four bare nodes, delay after their readings were sent: median '
           f'{np.median(delays):.1f} ms, p99 {np.quantile(delays, 0.99):.1f} ms, worst '

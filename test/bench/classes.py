@@ -20,7 +20,7 @@ from mag_tracking.event_records import VehiclePassage
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.simulation.scenario import SensorErrorModel
-from support.box_vehicles import BOUGHT, random_drive
+from support.box_vehicles import UNCALIBRATED, random_drive
 from support.bundled import NETWORK_FILE
 from support.labelled_passes import signatures
 from support.random_passes import SIMULATORS, random_course
@@ -29,7 +29,7 @@ from support.situation_worlds import car, small, truck
 
 FRACTIONS = {'motorcycle': 0.05, 'car': 0.8, 'truck': 0.15}
 """Fractions of the classes, as in `traffic.class_shares`."""
-N = 120
+N_PASSES = 120
 """Number of passes per simulator."""
 EXAMPLE_COUNTS = {'motorcycle': 30, 'car': 160, 'truck': 30}
 """Number of signatures of each class."""
@@ -37,7 +37,7 @@ MIN_CORRECT, MAX_CALIBRATION_ERROR = 0.95, 0.05
 
 
 def body_of(rng, name, simulator):
-    """Random body of a vehicle of a class; motorcycles are heavy touring motorcycles."""
+    """Create a random body of the class `name`; motorcycles are heavy touring motorcycles."""
     if name == 'motorcycle':
         return small(rng, simulator, rng.uniform(1.9, 2.3), rng.uniform(40.0, 120.0))
     return (car if name == 'car' else truck)(rng, simulator)
@@ -49,7 +49,7 @@ def classified_pass(simulator, seed):
     name = str(rng.choice(list(FRACTIONS), p=list(FRACTIONS.values())))
     path, duration, closest_s = random_course(rng, False)
     course, flaws = (path, SensorErrorModel()) if simulator == 'clouds' else \
-        (random_drive(rng, path, closest_s), BOUGHT)
+        (random_drive(rng, path, closest_s), UNCALIBRATED)
     network = read_network(NETWORK_FILE)
     readings, *_ = scenario.simulate(network, body_of(rng, name, simulator), course, 100.0,
                                      duration + 3.0, rng, flaws)
@@ -66,10 +66,10 @@ def main():
     classes = settings_for('vehicle').traffic.class_names
     for simulator in SIMULATORS:
         found = [classified_pass(simulator, seed) for seed in tqdm(
-            range(N), desc=simulator, disable=None, leave=False)]
+            range(N_PASSES), desc=simulator, disable=None, leave=False)]
         counted = [(name, p) for name, p in found if p is not None]
         is_correct = np.array([p.vehicle_class == name for name, p in counted])
-        figures.add(f'{simulator}: counted', len(counted) / N, '', None, True)
+        figures.add(f'{simulator}: counted', len(counted) / N_PASSES, '', None, True)
         figures.add(f'{simulator}: correct classes', float(is_correct.mean()), '', MIN_CORRECT,
                     True)
         for kind in classes:

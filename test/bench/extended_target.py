@@ -32,11 +32,11 @@ POINT = {f'track.vehicle.{name}': [value] for name, value in {
     'kinds': 'car', 'lengths': 0.0, 'length_stds': 0.0, 'moments': 400.0, 'moment_stds': 150.0,
     'difference_stds': 0.0, 'heights': 0.5, 'height_stds': 0.2,
     'near_field_lengths': 1.0}.items()}
-BOUGHT = SensorErrorModel(1.2e-8, 1e-6, 4e-9, np.deg2rad(5), 0.015)
+UNCALIBRATED = SensorErrorModel(1.2e-8, 1e-6, 4e-9, np.deg2rad(5), 0.015)
 STUDIES = (
     ('cars, as points, 12.5 Hz, perfect sensors', 'car', POINT, SensorErrorModel()),
     ('cars, 12.5 Hz, perfect sensors', 'car', {}, SensorErrorModel()),
-    ('cars, 12.5 Hz, sensors turned 5 degrees, clocks 15 ms apart', 'car', {}, BOUGHT),
+    ('cars, 12.5 Hz, sensors turned 5 degrees, clocks 15 ms apart', 'car', {}, UNCALIBRATED),
     ('cars, 100 Hz, perfect sensors', 'car', {'align.period_s': 0.01}, SensorErrorModel()),
     ('trucks, as points, 12.5 Hz, perfect sensors', 'truck', POINT, SensorErrorModel()),
     ('trucks, 12.5 Hz, perfect sensors', 'truck', {}, SensorErrorModel()))
@@ -79,7 +79,10 @@ def vehicle(seed, kind):
 
 
 def one_pass(seed, kind, changes, flaws):
-    """Track a pass; return (filtered errors, smoothed errors, is ambiguous at CPA) or None."""
+    """Track a pass; return (filtered errors, smoothed errors, is ambiguous at the CPA).
+
+    Returns None without a track.
+    """
     network = read_network(NETWORK)
     body, path, duration = vehicle(seed, kind)
     samples, t, position, _ = simulate(network, body, path, 100.0, duration,
@@ -100,8 +103,8 @@ def simulated(figures, pool, name, kind, changes, flaws, n=40):
     """Track `n` passes of one kind, record the figures and print a line."""
     jobs = [pool.submit(one_pass, seed, kind, changes, flaws) for seed in range(n)]
     found = [job.result() for job in tqdm(jobs, desc=name, disable=None, leave=False)]
-    sure = [f for f in found if f is not None and not f[2]]
-    filtered, smoothed = [f[0] for f in sure], [f[1] for f in sure]
+    unflagged = [f for f in found if f is not None and not f[2]]
+    filtered, smoothed = [f[0] for f in unflagged], [f[1] for f in unflagged]
     closest = np.array([e['closest'] for e in filtered])
     anees, anees_smoothed = (np.array([e['anees'] for e in errors])
                              for errors in (filtered, smoothed))
@@ -111,8 +114,8 @@ def simulated(figures, pool, name, kind, changes, flaws, n=40):
                                ('RMS within 5 m, smoothed', np.median(rms[:, 1]), 'm'),
                                ('error at the closest point', np.median(closest), 'm'),
                                ('ANEES', anees.mean(), '')):
-        figures.keep(f'{name}: {label}', value, unit, note=f'{len(sure)} of {n} passes')
-    print(f'  {name}: {len(sure)} of {n} tracked and unambiguous; RMS error within 5 m '
+        figures.record(f'{name}: {label}', value, unit, note=f'{len(unflagged)} of {n} passes')
+    print(f'  {name}: {len(unflagged)} of {n} tracked and unambiguous; RMS error within 5 m '
           f'{np.median(rms[:, 0]):.2f} m, smoothed {np.median(rms[:, 1]):.2f} m (ratio '
           f'{np.median(rms[:, 1] / rms[:, 0]):.2f}); at the closest point '
           f'{np.median(closest):.2f} m, 90 % below {np.quantile(closest, 0.9):.2f} m; '
@@ -120,7 +123,7 @@ def simulated(figures, pool, name, kind, changes, flaws, n=40):
           f'{anees_smoothed.mean():.1f}, {np.median(anees_smoothed):.1f}', flush=True)
 
 
-def grids(figures, n=8, period=0.08):
+def frame_grid_study(figures, n=8, period=0.08):
     """Track the bundled recordings for `n` starts of the frame grid, and print the errors."""
     network = read_network(NETWORK)
     print(f'error at the closest point for {n} starts of the frame grid')
@@ -136,8 +139,8 @@ def grids(figures, n=8, period=0.08):
                 closest.append([pass_errors(log, truth, network.centre)['closest']
                                 for log in found])
         filtered, smoothed = np.array(closest).T
-        figures.keep(f'{path.stem}: error at the closest point, mean of {n} frame grids',
-                     filtered.mean(), 'm', note=f'{filtered.min():.2f} to {filtered.max():.2f} m')
+        figures.record(f'{path.stem}: error at the closest point, mean of {n} frame grids',
+                       filtered.mean(), 'm', note=f'{filtered.min():.2f} to {filtered.max():.2f} m')
         print(f'  {path.stem}: {len(closest)} of {n} tracked; mean {filtered.mean():.2f} m, '
               f'{filtered.min():.2f} .. {filtered.max():.2f} m; smoothed {smoothed.mean():.2f} m, '
               f'{smoothed.min():.2f} .. {smoothed.max():.2f} m', flush=True)
@@ -150,7 +153,7 @@ def main():
     with ProcessPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
         for study in STUDIES:
             simulated(figures, pool, *study)
-    grids(figures)
+    frame_grid_study(figures)
     figures.save()
     return 0
 

@@ -21,7 +21,7 @@ from support.bundled import ROOT
 FOLDER = ROOT / 'benchmarks'
 LATEST, HISTORY = FOLDER / 'latest.json', FOLDER / 'history.jsonl'
 MAX_RATIO = 1.15
-"""Factor by which a reported figure is worse than the best earlier figure."""
+"""A figure is reported if it is worse than the best earlier figure by more than this factor."""
 RUNS = 5
 RED, PLAIN = '\033[31m', '\033[0m'
 
@@ -32,7 +32,7 @@ class Figures:
     def __init__(self, benchmark):
         self._benchmark, self._figures, self.missed = benchmark, {}, 0
 
-    def keep(self, name, value, unit='', aim=None, more_is_better=False, note=''):
+    def record(self, name, value, unit='', aim=None, more_is_better=False, note=''):
         """Record a figure; return whether it misses `aim`, the worst acceptable value."""
         # NaN misses every aim.
         is_missed = aim is not None and not (value >= aim if more_is_better else value <= aim)
@@ -43,7 +43,7 @@ class Figures:
 
     def add(self, name, value, unit, aim=None, more_is_better=False, note=''):
         """Record a figure and print it."""
-        is_missed = self.keep(name, value, unit, aim, more_is_better, note)
+        is_missed = self.record(name, value, unit, aim, more_is_better, note)
         text = '' if aim is None else f'; aim {"at least" if more_is_better else "at most"} {aim:g}'
         print(f'  {name}: {value:.4g} {unit}'.rstrip() + note + text
               + (' (missed)' if is_missed else ''), flush=True)
@@ -82,8 +82,8 @@ def machine():
     return ', '.join([platform.machine(), f'{os.cpu_count()} cores', *sorted(models)])
 
 
-def worse(run, before):
-    """List (benchmark, name, figure, best earlier value) of figures that got worse or are NaN.
+def worse_figures(run, before):
+    """List the figures that are worse or NaN, as (benchmark, name, figure, best earlier value).
 
     `before` contains the earlier runs on the same kind of machine.
     """
@@ -121,7 +121,7 @@ def main():
         return 1
     figures = {name: run['figures'] for name, run in json.loads(LATEST.read_text()).items()}
     before = [run for run in read_history() if run['machine'] == machine()]
-    found = worse(figures, before)
+    found = worse_figures(figures, before)
     for benchmark, name, figure, best in found:
         print(f'{RED}worse: {benchmark}: {name}: {figure["value"]:.4g} {figure["unit"]}, the best '
               f'of the latest runs was {best:.4g}{PLAIN}')

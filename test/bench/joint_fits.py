@@ -19,7 +19,7 @@ from tqdm import tqdm
 from bench.figures import Figures
 from mag_tracking.network.file import read_network
 from support.bundled import NETWORK_FILE
-from support.busy_fits import fits_of_recording, fits_of_world, with_vehicles
+from support.busy_fits import assigned_fits, fits_of_recording, fits_of_world
 from support.busy_recordings import BUSY
 from support.busy_worlds import TRUCKS, busy
 from support.random_passes import KINDS, SIMULATORS, random_pass
@@ -50,8 +50,8 @@ class Tally:
         """Print the figures; return (number of unflagged fits, number of wrong unflagged fits)."""
         error = np.array([of.one.chosen.speed[0] / of.speed - 1.0 for of in self.found])
         sd = np.array([of.one.chosen.speed[1] / of.speed for of in self.found])
-        sure = np.array([not of.one.chosen.ambiguous for of in self.found], dtype=bool)
-        wrong = sure & (np.abs(error) > MAX_ERROR) & (np.abs(error) > MAX_ERROR_STD * sd)
+        unflagged = np.array([not of.one.chosen.ambiguous for of in self.found], dtype=bool)
+        wrong = unflagged & (np.abs(error) > MAX_ERROR) & (np.abs(error) > MAX_ERROR_STD * sd)
         n = max(self.n_vehicles, 1)
         figures.add(f'{label}: fitted in the right direction', len(error) / n, '', aim, True,
                     f' (of {self.n_vehicles})')
@@ -59,10 +59,10 @@ class Tally:
                     MIN_CORRECT if aim else None, True)
         figures.add(f'{label}: median error of the position',
                     float(np.median([of.error for of in self.found])), 'm')
-        figures.add(f'{label}: without a flag', float(sure.mean()), '',
+        figures.add(f'{label}: without a flag', float(unflagged.mean()), '',
                     note=f' ({wrong.sum()} of them wrong)')
         figures.add(f'{label}: time of a fit', self.seconds / max(self.n_passes, 1), 's')
-        return int(sure.sum()), int(wrong.sum())
+        return int(unflagged.sum()), int(wrong.sum())
 
 
 def recordings(folder):
@@ -76,17 +76,17 @@ def recordings(folder):
     return tally
 
 
-def worlds(how, simulator, seeds, trucks=TRUCKS):
+def worlds(pattern, simulator, seeds, trucks=TRUCKS):
     """Fit worlds with pairs of vehicles and a fraction `trucks` of trucks; return their `Tally`."""
     tally = Tally()
     for n_sensors in (2, 4):
         for seed in tqdm(range(seeds), disable=None, leave=False):
-            a_world = busy(how, n_sensors, simulator, seed, trucks=trucks)
+            a_world = busy(pattern, n_sensors, simulator, seed, trucks=trucks)
             begin = time.perf_counter()
             passes = fits_of_world(a_world)
             duration_s = time.perf_counter() - begin
             vehicles = [(a_world.t, position) for position in a_world.positions]
-            tally.add(passes, with_vehicles(passes, vehicles), len(vehicles), duration_s)
+            tally.add(passes, assigned_fits(passes, vehicles), len(vehicles), duration_s)
     return tally
 
 
@@ -117,17 +117,17 @@ def main():
     print('Fits of several vehicles at once')
     counted = [recordings(args.data).figures(figures, 'recordings', MIN_CORRECT)]
     for simulator in SIMULATORS:
-        for how in ('meeting', 'following'):
-            counted.append(worlds(how, simulator, args.seeds).figures(
-                figures, f'{simulator}, {how}'))
+        for pattern in ('meeting', 'following'):
+            counted.append(worlds(pattern, simulator, args.seeds).figures(
+                figures, f'{simulator}, {pattern}'))
         counted.append(worlds('meeting', simulator, args.seeds, 0.5).figures(
             figures, f'{simulator}, meeting, every other one a truck'))
         n_split, n = single_vehicles(simulator, args.passes)
         figures.add(f'{simulator}: single vehicles taken for several', n_split / n, '', MAX_WRONG,
                     note=f' ({n_split} of {n})')
-    sure, wrong = np.sum(counted, axis=0)
-    figures.add('answers without a flag that are wrong', wrong / sure, '', MAX_WRONG,
-                note=f' ({wrong} of {sure})')
+    unflagged, wrong = np.sum(counted, axis=0)
+    figures.add('answers without a flag that are wrong', wrong / unflagged, '', MAX_WRONG,
+                note=f' ({wrong} of {unflagged})')
     return figures.save()
 
 

@@ -56,8 +56,8 @@ def errors(network, changes, figures=None, name=''):
     track, = replay_recording(network, changes).summary['tracks']
     truth, smoothed = track['truth'], track['smoothed']['truth']
     if figures is not None:
-        figures.keep(f'{name}: error at the closest point', truth['closest'], 'm')
-        figures.keep(f'{name}: error at the closest point, smoothed', smoothed['closest'], 'm')
+        figures.record(f'{name}: error at the closest point', truth['closest'], 'm')
+        figures.record(f'{name}: error at the closest point, smoothed', smoothed['closest'], 'm')
     return (f'closest {truth["closest"]:.2f} m, ANEES {truth["anees"]:.1f}; '
             f'smoothed {smoothed["closest"]:.2f} m')
 
@@ -66,22 +66,25 @@ def true_motion(data, truth):
     """Position (n, 3) and rotation (n, 3, 3) of the body at the samples of a `PassData`."""
     stamps, position, _ = truth
     t = (stamps - data.stamp_ns) / 1e9
-    place, v = (np.stack([np.interp(data.t, t, column) for column in table.T], axis=1)
-                for table in (position, np.gradient(position, t, axis=0)))
+    body_position, v = (np.stack([np.interp(data.t, t, column) for column in table.T], axis=1)
+                        for table in (position, np.gradient(position, t, axis=0)))
     direction = v / np.linalg.norm(v, axis=1, keepdims=True)
     R = np.zeros((len(data.t), 3, 3))
     R[:, :2, 0], R[:, 2, 2] = direction[:, :2], 1.0
     R[:, 0, 1], R[:, 1, 1] = -direction[:, 1], direction[:, 0]
-    return place, R
+    return body_position, R
 
 
 def magnetic_centre(network, row):
-    """Fit dipoles; return centre (3,) [m] in the body frame, half length [m], moments and cost."""
+    """Fit dipoles that move along the true path.
+
+    Returns (centre (3,) [m] in the body frame, half length [m], moments [A m²], normalised cost).
+    """
     reader = SampleReader(Recording(vehicle_path(NAME)), network)
     collector = PassCollector(network, settings_for('vehicle'))
     passes = [p for s in recorded(reader) for p in collector.feed(one(s))] + collector.flush()
     (data, _), = passes
-    place, R = true_motion(data, next(iter(replay_recording(network, {}).truth.values())))
+    body_position, R = true_motion(data, next(iter(replay_recording(network, {}).truth.values())))
     y = np.einsum('nij,nj->ni', network.R_ws[data.sensor], data.field).ravel() / NOISE
     induction = network.earth_field / MU0
     backgrounds = np.kron(np.eye(len(network))[data.sensor], np.eye(3))
@@ -89,7 +92,7 @@ def magnetic_centre(network, row):
     def linear(p):
         columns = []
         for offset in row:
-            r = data.positions - place - R @ (p[:3] + [offset * p[3], 0.0, 0.0])
+            r = data.positions - body_position - R @ (p[:3] + [offset * p[3], 0.0, 0.0])
             columns += [dipole_field(r, m).ravel() / NOISE for m in (
                 *np.moveaxis(R, 2, 0), np.broadcast_to(induction, r.shape))]
         A = np.column_stack([*columns, backgrounds])

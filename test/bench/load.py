@@ -37,7 +37,7 @@ RATE, PERIOD_S = 100.0, 0.08
 WARM_UP_S = 20.0
 BEGINS_AFTER_S = 0.5
 """Interval [s] after which a pose counts as the first pose of a new track."""
-MANY, GATHER_S = 16, 0.002
+MAX_UNBATCHED_SENSORS, BATCH_S = 16, 0.002
 """Maximum number of sensors without batches; duration of a batch [s] if sensors take turns."""
 LEAN = {'arrival_names': "['left']", 'arrival_headings_deg': '[0.0]'}
 """Settings with one kind of vehicle and one arrival direction, for which all 126 hypotheses
@@ -54,8 +54,8 @@ def network_yaml(n):
 
 def drivers_yaml(n, network, sequential):
     """Content of a driver file that simulates a car at 20 m/s whenever the road is free."""
-    gather = f'  batch_s: {GATHER_S}\n' if sequential and n > MANY else ''
-    return (f'road:\n  device: simulator\n{gather}  simulator: {{network: {network}, '
+    batch_line = f'  batch_s: {BATCH_S}\n' if sequential and n > MAX_UNBATCHED_SENSORS else ''
+    return (f'road:\n  device: simulator\n{batch_line}  simulator: {{network: {network}, '
             f'rate_hz: {RATE}, speed: 20.0, period_s: 5.0, offset: 1.0, '
             f'sequential: {str(sequential).lower()}}}\n  sensors: {{'
             + ', '.join(f'mag_{i + 1}: mag_{i + 1}' for i in range(n)) + '}\n')
@@ -134,12 +134,12 @@ def start(folder, n, parameters, sequential, batches, is_one_process):
         return {'all_in_one': subprocess.Popen(
             [Path(sys.executable).with_name('mag-tracking'), 'run', '--network', network,
              '--drivers', drivers, '--params', parameters,
-             *(['--batches'] if batches or n > MANY else [])],
+             *(['--batches'] if batches or n > MAX_UNBATCHED_SENSORS else [])],
             stdout=subprocess.DEVNULL, stderr=sys.stderr)}
     processes = {}
     for node in NODES:
         options = ['-p', f'drivers:={drivers}',
-                   '-p', f'batches:={str(batches or n > MANY).lower()}'] \
+                   '-p', f'batches:={str(batches or n > MAX_UNBATCHED_SENSORS).lower()}'] \
             if node == 'driver_node' else ['--params-file', str(parameters)]
         processes[node] = subprocess.Popen(
             [sys.executable, '-m', f'mag_tracking.nodes.{node}', '--ros-args', '-p',
@@ -149,7 +149,10 @@ def start(folder, n, parameters, sequential, batches, is_one_process):
 
 
 def open_pages(n):
-    """Start the server of the live page and `n` viewers that read all its data."""
+    """Start the server of the live page, and a process of `n` viewers that read all its data.
+
+    Returns ({name: server process}, viewer process).
+    """
     server = subprocess.Popen(
         [Path(sys.executable).with_name('mag-tracking'), 'watch', '--port', '0'],
         stdout=subprocess.PIPE, text=True)
@@ -193,10 +196,10 @@ def report(monitor, rows, figures, aim):
     if not len(delays):
         print('no pose was received')
     else:
-        figures.keep('pose after the last sample of its frame, median', np.median(delays), 'ms',
-                     aim)
-        figures.keep('pose after the last sample of its frame, 99 %', np.quantile(delays, 0.99),
-                     'ms')
+        figures.record('pose after the last sample of its frame, median', np.median(delays), 'ms',
+                       aim)
+        figures.record('pose after the last sample of its frame, 99 %', np.quantile(delays, 0.99),
+                       'ms')
         print(f'{len(delays)} poses, delay after the sample that completed the frame: median '
               f'{np.median(delays):.1f} ms, p99 {np.quantile(delays, 0.99):.1f} ms, '
               f'worst {delays.max():.1f} ms')
@@ -215,11 +218,11 @@ def report(monitor, rows, figures, aim):
         print(f'{node}: {100.0 * cpu_fraction:.1f} % of a core, {last[1][node][1]:.1f} MB, '
               f'{last[1][node][1] - minute[1][node][1]:+.1f} MB since the first minute')
     print(f'all nodes: {100.0 * total:.1f} % of a core')
-    figures.keep('all nodes', 100.0 * total, '% of a core')
-    figures.keep('growth of the largest process after the first minute',
-                 max(last[1][node][1] - minute[1][node][1] for node in last[1]), 'MB')
+    figures.record('all nodes', 100.0 * total, '% of a core')
+    figures.record('growth of the largest process after the first minute',
+                   max(last[1][node][1] - minute[1][node][1] for node in last[1]), 'MB')
     losses = monitor.losses()
-    figures.keep('kinds of losses', len(losses), '', 0)
+    figures.record('kinds of losses', len(losses), '', 0)
     figures.save()
     print(f'lost: {losses or "nothing"}')
     for text, n in Counter(monitor.warnings.values()).most_common(5):

@@ -120,13 +120,13 @@ def main(n=200):
             for fraction in (0.05, 0.1):
                 selected = np.argsort(rms)[:round(n * (1.0 - fraction))]
                 ratio = np.sqrt((error[selected]**2).mean() / (bound[selected]**2).mean())
-                figures.keep(
+                figures.record(
                     f'{target}: error over the path bound, without the worst {fraction:.0%}', ratio)
                 ratios.append(f'{ratio:.2f} without the worst {fraction:.0%}')
             median = np.median(rms / np.sqrt((bound**2).mean(axis=1)))
-            figures.keep(f'{target}: error over the path bound, median of the runs', median)
-            figures.keep(f'{target}: failures (> 2 m at the end)',
-                         100.0 * np.mean(error[:, -1] > 2.0), '%')
+            figures.record(f'{target}: error over the path bound, median of the runs', median)
+            figures.record(f'{target}: failures (> 2 m at the end)',
+                           100.0 * np.mean(error[:, -1] > 2.0), '%')
             print(f'  {target}: error over path bound {", ".join(ratios)}, median of the runs '
                   f'{median:.2f}; failures (> 2 m at the end) {np.mean(error[:, -1] > 2.0):.1%}',
                   flush=True)

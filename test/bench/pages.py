@@ -40,8 +40,8 @@ def main():
           f'{with_pages:.1f} ms: ratio {with_pages / without:.2f} (aim {MAX_WORSE}); '
           f'{"with" if has_losses else "without"} losses')
     figures = Figures('pages')
-    figures.keep(f'99 % latency with {PAGES} pages over that without', with_pages / without,
-                 'times', MAX_WORSE)
+    figures.record(f'99 % latency with {PAGES} pages over that without', with_pages / without,
+                   'times', MAX_WORSE)
     figures.save()
     return int(has_losses or not with_pages <= MAX_WORSE * without)
 

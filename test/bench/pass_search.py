@@ -29,7 +29,7 @@ def timed(function, *args, **kwargs):
     return function(*args, **kwargs), time.perf_counter() - start
 
 
-def one(seed, n_dipoles, road, compared=True):
+def fit_one_pass(seed, n_dipoles, road, compared=True):
     """Fit one pass; return (is optimal, duration [s] of the fit, durations [s] of scipy).
 
     scipy starts from a plausible guess and from the best start of the search. Its durations are NaN
@@ -71,19 +71,19 @@ def main(n=200, n_compared=40):
     print(f'{n} random passes each: global optimum found; time of the whole fit, compared with '
           f'scipy for {n_compared} of them')
     figures = Figures('pass_search')
-    one(0, 1, True)
+    fit_one_pass(0, 1, True)
     for road in (True, False):
         for n_dipoles in (1, 2, 3):
-            rows = np.array([one(seed, n_dipoles, road, seed < n_compared)
+            rows = np.array([fit_one_pass(seed, n_dipoles, road, seed < n_compared)
                              for seed in tqdm(range(n), disable=None, leave=False)], dtype=float)
             ours, guess, best = rows[:n_compared, 1:].mean(axis=0)
             m_ours, m_guess, m_best = np.median(rows[:n_compared, 1:], axis=0)
             name = f'{"road" if road else "any heading"}, {n_dipoles} dipoles'
-            figures.keep(f'{name}: global optimum found', 100.0 * rows[:, 0].mean(), '%', 99.0,
-                         True)
-            figures.keep(f'{name}: time of a fit', 1e3 * ours, 'ms')
-            figures.keep(f'{name}: time over scipy from a guess', ours / guess, 'times')
-            figures.keep(f'{name}: time over scipy from the best start', ours / best, 'times')
+            figures.record(f'{name}: global optimum found', 100.0 * rows[:, 0].mean(), '%', 99.0,
+                           True)
+            figures.record(f'{name}: time of a fit', 1e3 * ours, 'ms')
+            figures.record(f'{name}: time over scipy from a guess', ours / guess, 'times')
+            figures.record(f'{name}: time over scipy from the best start', ours / best, 'times')
             print(f'  {name}: '
                   f'{rows[:, 0].mean():.1%}; {1e3 * ours:.0f} ms, {ours / guess:.2f} of scipy '
                   f'from a guess (median {m_ours / m_guess:.2f}), {ours / best:.2f} of scipy from '

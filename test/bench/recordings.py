@@ -29,16 +29,16 @@ from mag_tracking.records import Track
 from mag_tracking.report.metrics import interpolate_truth
 from support.bundled import DATA, NETWORK_FILE, ROOT, VEHICLES, vehicle_path
 from support.random_passes import KINDS, SIMULATORS, WRONG_M, errors_of
-from support.situation_worlds import FOUR, car, straight, usual
+from support.situation_worlds import FOUR, car, random_pass_world, straight
 
 RUNS = 5
 """Number of simulated passes of each control and simulator."""
 MIN_UNFLAGGED_RATIO = 0.95
-"""Minimum ratio of the number of unflagged poses to the number with the other checkout, for correct
-poses in each row and for all poses in the total."""
+"""Minimum ratio of the number of unflagged poses to this number with the other checkout. It applies
+to the correct poses of each recording or control, and to all poses of the total."""
 MAX_ERROR = 1.03
 """Maximum ratio of an error to the error with the other checkout."""
-SURE, RIGHT = 'unflagged', f'unflagged, within {WRONG_M:g} m'
+UNFLAGGED, CORRECT = 'unflagged', f'unflagged, within {WRONG_M:g} m'
 ERRORS = {'rms': 'RMS [m]', 'closest': 'closest [m]', 'anees': 'ANEES', 'position_mean': 'mean [m]',
           'axis_median_deg': 'axis [deg]'}
 
@@ -59,10 +59,10 @@ def recordings(folder):
 def counts_of_table(table, truth):
     """Numbers of unflagged poses and of correct unflagged poses in a table of results."""
     with open(table, newline='', encoding='utf-8') as stream:
-        sure = [row for row in csv.DictReader(stream) if row['ambiguous'] == '0']
-    found = np.array([[float(row['x']), float(row['y'])] for row in sure]).reshape(-1, 2)
-    true = interpolate_truth(truth, [int(row['stamp_ns']) for row in sure])[:, :2]
-    return len(sure), int((np.linalg.norm(found - true, axis=1) <= WRONG_M).sum())
+        unflagged = [row for row in csv.DictReader(stream) if row['ambiguous'] == '0']
+    found = np.array([[float(row['x']), float(row['y'])] for row in unflagged]).reshape(-1, 2)
+    true = interpolate_truth(truth, [int(row['stamp_ns']) for row in unflagged])[:, :2]
+    return len(unflagged), int((np.linalg.norm(found - true, axis=1) <= WRONG_M).sum())
 
 
 def figures_of_recording(recording, network, preset, folder):
@@ -71,7 +71,7 @@ def figures_of_recording(recording, network, preset, folder):
     truth = next(iter(run.truth.values()))
     found = {}
     for prefix, table in (('', 'poses.csv'), ('smoothed: ', 'poses_smoothed.csv')):
-        found[prefix + SURE], found[prefix + RIGHT] = counts_of_table(folder / table, truth)
+        found[prefix + UNFLAGGED], found[prefix + CORRECT] = counts_of_table(folder / table, truth)
     for track in run.summary['tracks'][:1]:
         for prefix, of in (('', track), ('smoothed: ', track.get('smoothed') or {})):
             found |= {prefix + text: of['truth'][error] for error, text in ERRORS.items()
@@ -80,19 +80,19 @@ def figures_of_recording(recording, network, preset, folder):
 
 
 def figures_of_control(name):
-    """Track `RUNS` passes by each simulator live; return the numbers of poses."""
-    total = {SURE: 0, RIGHT: 0}
+    """Track `RUNS` passes of a control by each simulator live; return the numbers of poses."""
+    total = {UNFLAGGED: 0, CORRECT: 0}
     for s, simulator in enumerate(SIMULATORS):
         for seed in range(RUNS):
             rng = np.random.default_rng([seed, s])
             a_world = (straight(rng, simulator, car(rng, simulator), rng.uniform(7.0, 20.0), FOUR)
-                       if name == 'car, four sensors' else usual(rng, simulator, name))
+                       if name == 'car, four sensors' else random_pass_world(rng, simulator, name))
             pipeline = Pipeline(a_world.network, settings_for('vehicle'))
-            sure = [r for r in pipeline.feed(a_world.readings) + pipeline.flush()
-                    if isinstance(r, Track) and not r.ended and not r.ambiguous]
-            total[SURE] += len(sure)
-            error = errors_of(sure, a_world.t, a_world.positions[0])[0]
-            total[RIGHT] += int((error <= WRONG_M).sum())
+            unflagged = [r for r in pipeline.feed(a_world.readings) + pipeline.flush()
+                         if isinstance(r, Track) and not r.ended and not r.ambiguous]
+            total[UNFLAGGED] += len(unflagged)
+            error = errors_of(unflagged, a_world.t, a_world.positions[0])[0]
+            total[CORRECT] += int((error <= WRONG_M).sum())
     return total
 
 
@@ -109,7 +109,8 @@ def measure():
                  for name, source in with_progress_bar(recordings(folder).items(), 'recordings')}
     found |= {f'simulated {name}': figures_of_control(name)
               for name in with_progress_bar((*KINDS, 'car, four sensors'), 'controls')}
-    return found | {'all': {f: sum(x.get(f, 0) for x in found.values()) for f in (SURE, RIGHT)}}
+    return found | {'all': {f: sum(x.get(f, 0) for x in found.values())
+                             for f in (UNFLAGGED, CORRECT)}}
 
 
 def measure_checkout(checkout):
@@ -123,9 +124,9 @@ def measure_checkout(checkout):
 
 def is_worse(name, figure, now, before):
     """Whether a figure is worse than before by more than its tolerance."""
-    if RIGHT in figure or (name, figure) == ('all', SURE):
+    if CORRECT in figure or (name, figure) == ('all', UNFLAGGED):
         return now < MIN_UNFLAGGED_RATIO * before
-    if SURE in figure:
+    if UNFLAGGED in figure:
         return False  # A decrease is an improvement if the poses were wrong.
     return now > max(MAX_ERROR * before, 1.0 if 'ANEES' in figure else 0.0)
 
@@ -154,7 +155,7 @@ def main():
     results = Figures('recordings')
     for name, figures in found.items():
         for figure, value in figures.items():
-            results.keep(f'{name}: {figure}', value)
+            results.record(f'{name}: {figure}', value)
     results.save()
     before = measure_checkout(args.against) if args.against else {}
     n_worse = 0

@@ -24,9 +24,9 @@ from support.situations import SITUATIONS, simulated_world, verdict
 MIN_EVENTS = 0.9
 """Minimum fraction of runs with a disturbance among runs with a detection but no vehicle."""
 MAX_COST = 0.1
-"""Maximum fraction of the time of a tracked frame for the disturbance model and the tests."""
+"""Maximum fraction of the processing time of a frame for the disturbance model and the tests."""
 
-HEAD = """# Situations
+TABLE_HEADER = """# Situations
 
 Simulated situations that the tracker's model does not assume are tracked live (no prescan), by
 default with two sensors at a distance of 9 m, in {n} runs of each of two simulators: clouds of
@@ -39,30 +39,31 @@ Without a vehicle, every such pose is wrong.
 """
 
 
-def percentage(part, whole):
+def percentage(part, total):
     """Format a fraction as a percentage."""
-    return f'{part / whole:.1%}' if whole else '-'
+    return f'{part / total:.1%}' if total else '-'
 
 
 def row(name, found):
     """Format the table row of a situation from its `Verdict`s."""
-    sure, wrong = sum(v.n_sure for v in found), sum(v.n_wrong for v in found)
+    unflagged, wrong = sum(v.n_unflagged for v in found), sum(v.n_wrong for v in found)
     smoothed, smoothed_wrong = (sum(getattr(v, f'smoothed_{k}') for v in found)
-                                for k in ('sure', 'wrong'))
+                                for k in ('unflagged', 'wrong'))
     with_events, detected = event_counts(found)
     aim = SITUATIONS[name].aim
-    missed = ' **missed**' if sure and wrong > aim * sure else ''
-    return (f'| {name} | {sum(len(v.wrong) for v in found)} | {sure} | '
-            f'{percentage(wrong, sure)} | {percentage(smoothed_wrong, smoothed)} | '
+    missed = ' **missed**' if unflagged and wrong > aim * unflagged else ''
+    return (f'| {name} | {sum(len(v.wrong) for v in found)} | {unflagged} | '
+            f'{percentage(wrong, unflagged)} | {percentage(smoothed_wrong, smoothed)} | '
             f'{with_events} of {detected} detected | {aim:.0%}{missed} |')
 
 
-def keep(figures, name, found):
+def record(figures, name, found):
     """Record the fraction of wrong poses of a situation; return whether its aim is missed."""
-    sure, wrong = sum(v.n_sure for v in found), sum(v.n_wrong for v in found)
+    unflagged, wrong = sum(v.n_unflagged for v in found), sum(v.n_wrong for v in found)
     n = sum(len(v.wrong) for v in found)
-    return figures.keep(f'{name}: wrong', 100.0 * wrong / max(sure, 1), '%',
-                        100.0 * SITUATIONS[name].aim, note=f'{wrong} of {sure}; {n} poses in all')
+    return figures.record(f'{name}: wrong', 100.0 * wrong / max(unflagged, 1), '%',
+                          100.0 * SITUATIONS[name].aim,
+                          note=f'{wrong} of {unflagged}; {n} poses in all')
 
 
 def event_counts(found):
@@ -71,8 +72,8 @@ def event_counts(found):
 
 
 def cost():
-    """Fraction of the time of a tracked frame for the disturbance model and the tests."""
-    spent = {'_update_evidence': 0.0, '_doubts': 0.0, 'step': 0.0}
+    """Fraction of the processing time of a frame for the disturbance model and the tests."""
+    durations = {'_update_evidence': 0.0, '_doubts': 0.0, 'step': 0.0}
     owner = {'_update_evidence': RunningTrack, '_doubts': Member, 'step': RunningTrack}
 
     def timed(method):
@@ -83,22 +84,22 @@ def cost():
             try:
                 return original(*arguments, **named)
             finally:
-                spent[method] += time.perf_counter() - begin
+                durations[method] += time.perf_counter() - begin
         return original, call
 
-    originals = {method: timed(method) for method in spent}
+    originals = {method: timed(method) for method in durations}
     for method, (_, call) in originals.items():
         setattr(owner[method], method, call)
     try:
         a_world = simulated_world('a car', 'clouds', 0)
         for _ in range(2):
-            spent.update(dict.fromkeys(spent, 0.0))
+            durations.update(dict.fromkeys(durations, 0.0))
             pipeline = Pipeline(a_world.network, settings_for('vehicle'))
             pipeline.feed(a_world.readings)
     finally:
         for method, (original, _) in originals.items():
             setattr(owner[method], method, original)
-    return (spent['_update_evidence'] + spent['_doubts']) / spent['step']
+    return (durations['_update_evidence'] + durations['_doubts']) / durations['step']
 
 
 def main():
@@ -112,10 +113,10 @@ def main():
 
     def summary(name, found):
         verdicts.extend(found)
-        missed.append(keep(figures, name, found))
+        missed.append(record(figures, name, found))
         return row(name, found), not missed[-1]
 
-    print(HEAD.format(n=args.runs), end='')
+    print(TABLE_HEADER.format(n=args.runs), end='')
     status = count_over([(name,) for name in args.only], both_simulators, 2 * args.runs, summary)
     print(summary_of(figures,
                      list(zip(np.repeat(args.only, 2 * args.runs), verdicts, strict=True))))
@@ -128,18 +129,19 @@ def summary_of(figures, found):
     """Record the totals of [(situation, `Verdict`)]; return the paragraph below the table."""
     one = [v for name, v in found if SITUATIONS[name].group != 'several']
     nothing = [v for name, v in found if SITUATIONS[name].group == 'nothing']
-    sure, wrong = sum(v.n_sure for v in one), sum(v.n_wrong for v in one)
+    unflagged, wrong = sum(v.n_unflagged for v in one), sum(v.n_wrong for v in one)
     events, detected = event_counts(nothing)
-    figures.keep('all with one vehicle or none: wrong', 100.0 * wrong / max(sure, 1), '%', 0.5,
-                 note=f'{wrong} of {sure}')
-    figures.keep('without a vehicle: runs with a disturbance', events / max(detected, 1), '',
-                 MIN_EVENTS, True, note=f'{events} of {detected}')
+    figures.record('all with one vehicle or none: wrong', 100.0 * wrong / max(unflagged, 1),
+                   '%', 0.5, note=f'{wrong} of {unflagged}')
+    figures.record('without a vehicle: runs with a disturbance', events / max(detected, 1), '',
+                   MIN_EVENTS, True, note=f'{events} of {detected}')
     frame_fraction = cost()
-    figures.keep('disturbance model and tests, share of a frame', 100.0 * frame_fraction, '%',
-                 100.0 * MAX_COST)
+    figures.record('disturbance model and tests, share of a frame', 100.0 * frame_fraction, '%',
+                   100.0 * MAX_COST)
     return (f'\nWithout a vehicle, {events} of {detected} runs with a detection yield a '
             f'disturbance (aim {MIN_EVENTS:.0%}). All situations with at most one vehicle: '
-            f'{percentage(wrong, sure)} of {sure} poses without a flag are wrong (aim 0.5 %). '
+            f'{percentage(wrong, unflagged)} of {unflagged} poses without a flag are wrong '
+            '(aim 0.5 %). '
             f'The disturbance model and the tests use {frame_fraction:.1%} of a tracked frame '
             f'(aim at most {MAX_COST:.0%}).\n')
 

@@ -15,7 +15,7 @@ from bench.two_simulators import MAX_WRONG, count_over, fraction_of_wrong
 from support import spoiler
 from support.dense_traffic import dense_traffic
 from support.random_passes import KINDS, SIMULATORS, one_random_pass
-from support.spoilt_runs import HEADING
+from support.spoilt_runs import MIN_HEADING_COSINE
 
 FAULTS = {
     'none': (),
@@ -38,32 +38,37 @@ FAULTS = {
 """{fault: (function that returns the fault, its arguments)}."""
 
 
-def faults_of(what):
-    """List of functions that apply a fault of `FAULTS` to `Readings`; empty for `none`."""
-    if not FAULTS[what]:
+def faults_of(stream_fault):
+    """Functions that apply the fault `stream_fault` of `FAULTS` to `Readings`.
+
+    The list is empty for 'none'.
+    """
+    if not FAULTS[stream_fault]:
         return []
-    fault, *arguments = FAULTS[what]
+    fault, *arguments = FAULTS[stream_fault]
     return [fault(*arguments)]
 
 
-def faulty_pass(what, simulator, kind, seed):
+def faulty_pass(stream_fault, simulator, kind, seed):
     """Track a random pass with a fault of `FAULTS`; return its `Tracked`."""
-    return one_random_pass(simulator, kind, seed, faults=faults_of(what))
+    return one_random_pass(simulator, kind, seed, faults=faults_of(stream_fault))
 
 
-def summary(figures, what, simulator, kind, found):
+def summary(figures, stream_fault, simulator, kind, found):
     """Record the figures of one combination; return a line and whether the aim is met."""
-    n_sure, rate = fraction_of_wrong(found)
+    n_unflagged, rate = fraction_of_wrong(found)
     n_tracked = sum(len(f.error) > 0 for f in found)
-    n_tracked_right = sum(bool(f.heading > HEADING) for f in found)
-    met = not figures.keep(f'{what}; {simulator}, {kind}: unflagged and wrong', 100.0 * rate, '%',
-                           100.0 * MAX_WRONG, note=f'of {n_sure} poses')
-    figures.keep(f'{what}; {simulator}, {kind}: tracked', n_tracked / len(found), '', None, True)
-    return (f'  {what:27s} {simulator}, {kind}: {sum(f.detected for f in found):2d} of '
+    n_tracked_right = sum(bool(f.heading > MIN_HEADING_COSINE) for f in found)
+    met = not figures.record(f'{stream_fault}; {simulator}, {kind}: unflagged and wrong',
+                             100.0 * rate, '%', 100.0 * MAX_WRONG,
+                             note=f'of {n_unflagged} poses')
+    figures.record(f'{stream_fault}; {simulator}, {kind}: tracked',
+                   n_tracked / len(found), '', None, True)
+    return (f'  {stream_fault:27s} {simulator}, {kind}: {sum(f.detected for f in found):2d} of '
             f'{len(found)} detected, {n_tracked:2d} tracked, {n_tracked_right:2d} in the right '
             f'direction; {sum((~f.ambiguous).any() for f in found):2d} with unflagged poses, '
             f'unflagged and wrong {rate:5.1%} in '
-            f'{sum(f.sure_and_wrong.any() for f in found)} passes'
+            f'{sum(f.unflagged_and_wrong.any() for f in found)} passes'
             f'{"" if met else "  MISSED"}', met)
 
 

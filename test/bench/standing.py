@@ -15,7 +15,7 @@ import numpy as np
 from bench.figures import Figures
 from bench.two_simulators import count_over
 from support.standing import (
-    SOON_S,
+    MAX_RECOVERY_S,
     STOPS,
     TRACKED_M,
     background_recovery_s,
@@ -26,36 +26,36 @@ from support.standing import (
 RUNS = 20
 
 
-def one(what, run):
+def run_case(case, run):
     """Run one case; return the result of its function in `support.standing`."""
-    if what == 'stops':
+    if case == 'stops':
         return is_one_track(STOPS[run % len(STOPS)], run // len(STOPS))
-    return background_recovery_s(run) if what == 'leaves' else error_after_parked(run)
+    return background_recovery_s(run) if case == 'leaves' else error_after_parked(run)
 
 
-def summary(figures, what, found):
+def summary(figures, case, found):
     """Record the figures of one case; return a line and whether the aim is met."""
     n = len(found)
-    if what == 'stops':
-        figures.keep('stopped for 5, 20 and 60 s: runs with one track', sum(found) / n, '', 0.9,
-                     True, note=f'{n} runs')
+    if case == 'stops':
+        figures.record('stopped for 5, 20 and 60 s: runs with one track', sum(found) / n, '', 0.9,
+                       True, note=f'{n} runs')
         return (f'stopped for 5, 20 and 60 s: in {sum(found)} of {n} runs the same track continues '
                 'and departs (aim 90 %)', sum(found) >= 0.9 * n)
-    if what == 'leaves':
-        n_soon = sum(s <= SOON_S for s in found)
-        figures.keep(f'present at the start: correct background within {SOON_S:g} s', n_soon / n,
-                     '', 1.0, True, note=f'{n} runs')
-        return (f'present at the start: in {n_soon} of {n} runs the background is correct within '
-                f'{SOON_S:g} s after the departure, median {np.median(found):.1f} s '
-                '(aim all)', n_soon == n)
+    if case == 'leaves':
+        n_in_time = sum(s <= MAX_RECOVERY_S for s in found)
+        figures.record(f'present at the start: correct background within {MAX_RECOVERY_S:g} s',
+                       n_in_time / n, '', 1.0, True, note=f'{n} runs')
+        return (f'present at the start: in {n_in_time} of {n} runs the background is correct '
+                f'within {MAX_RECOVERY_S:g} s after the departure, median {np.median(found):.1f} s '
+                '(aim all)', n_in_time == n)
     tracked = sum(error < TRACKED_M for error, *_ in found)
-    sure, wrong = (sum(f[k] for f in found) for k in (1, 2))
-    figures.keep('first vehicle afterwards, offline: tracked', tracked / n, '', 1.0, True,
-                 note=f'{n} runs')
-    figures.keep('first vehicle afterwards, offline: wrong poses without a flag', wrong, '', 0,
-                 note=f'of {sure}')
+    unflagged, wrong = (sum(f[k] for f in found) for k in (1, 2))
+    figures.record('first vehicle afterwards, offline: tracked', tracked / n, '', 1.0, True,
+                   note=f'{n} runs')
+    figures.record('first vehicle afterwards, offline: wrong poses without a flag', wrong, '', 0,
+                   note=f'of {unflagged}')
     return (f'first vehicle afterwards, offline: tracked in {tracked} of {n} runs (aim all), '
-            f'{wrong} of {sure} poses without a flag are wrong (aim none)',
+            f'{wrong} of {unflagged} poses without a flag are wrong (aim none)',
             tracked == n and not wrong)
 
 
@@ -65,7 +65,7 @@ def main():
     parser.add_argument('--runs', type=int, default=RUNS)
     args = parser.parse_args()
     figures = Figures('standing')
-    status = count_over([('stops',), ('leaves',), ('first',)], one, args.runs,
+    status = count_over([('stops',), ('leaves',), ('first',)], run_case, args.runs,
                         partial(summary, figures))
     figures.save()
     return status

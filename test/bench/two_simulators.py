@@ -24,8 +24,8 @@ MAX_WRONG, MIN_SPEED = 0.01, 0.9
 
 def fraction_of_wrong(found):
     """Count the unflagged poses of [`Tracked`]; return (number, fraction of wrong poses)."""
-    n_sure = sum(int((~f.ambiguous).sum()) for f in found)
-    return n_sure, sum(int(f.sure_and_wrong.sum()) for f in found) / max(n_sure, 1)
+    n_unflagged = sum(int((~f.ambiguous).sum()) for f in found)
+    return n_unflagged, sum(int(f.unflagged_and_wrong.sum()) for f in found) / max(n_unflagged, 1)
 
 
 def count_over(products, one_pass, n, summary):
@@ -44,30 +44,31 @@ def count_over(products, one_pass, n, summary):
 
 def summary(figures, simulator, kind, found):
     """Record the figures of one kind and simulator; return a line and whether the aims are met."""
-    sure = [f for f in found if (~f.ambiguous).any()]
-    near = [~f.ambiguous & (f.distance < 5.0) for f in sure]
-    nees = np.array([f.nees[rows].mean() for f, rows in zip(sure, near, strict=True)
+    unflagged = [f for f in found if (~f.ambiguous).any()]
+    near = [~f.ambiguous & (f.distance < 5.0) for f in unflagged]
+    nees = np.array([f.nees[rows].mean() for f, rows in zip(unflagged, near, strict=True)
                      if rows.any()])
-    closest = [f.error[np.argmin(f.distance)] for f in sure]
+    closest = [f.error[np.argmin(f.distance)] for f in unflagged]
     speed_ratio = np.array([f.speed_ratio for f in found])
     within = np.mean(np.abs(speed_ratio - 1.0) < 0.1)
-    n_sure, rate = fraction_of_wrong(sure)
-    n_smoothed = sum(f.smoothed_sure for f in found)
+    n_unflagged, rate = fraction_of_wrong(unflagged)
+    n_smoothed = sum(f.smoothed_unflagged for f in found)
     smoothed = sum(f.smoothed_wrong for f in found) / max(n_smoothed, 1)
     name = f'{simulator}, {kind}'
     missed = [
-        figures.keep(f'{name}: unflagged and wrong', 100.0 * rate, '%', 100.0 * MAX_WRONG,
-                     note=f'of {n_sure} poses'),
-        figures.keep(f'{name}: NEES per axis within 5 m, mean', nees.mean(), '', MAX_NEES[kind]),
-        figures.keep(f'{name}: speed within 10 %', 100.0 * within, '%', 100.0 * MIN_SPEED, True)]
-    figures.keep(f'{name}: median error at the closest point', np.median(closest), 'm')
-    figures.keep(f'{name}: smoothed, unflagged and wrong', 100.0 * smoothed, '%',
-                 note=f'of {n_smoothed} poses')
+        figures.record(f'{name}: unflagged and wrong', 100.0 * rate, '%', 100.0 * MAX_WRONG,
+                       note=f'of {n_unflagged} poses'),
+        figures.record(f'{name}: NEES per axis within 5 m, mean', nees.mean(), '', MAX_NEES[kind]),
+        figures.record(f'{name}: speed within 10 %', 100.0 * within, '%', 100.0 * MIN_SPEED, True)]
+    figures.record(f'{name}: median error at the closest point', np.median(closest), 'm')
+    figures.record(f'{name}: smoothed, unflagged and wrong', 100.0 * smoothed, '%',
+                   note=f'of {n_smoothed} poses')
     met = not any(missed)
-    return (f'  {simulator}, {kind}: {len(sure)} of {len(found)} with unflagged '
-            f'poses; {n_sure} such poses, unflagged and wrong {rate:.1%} (aim 1 %), in '
-            f'{sum(f.sure_and_wrong.any() for f in sure)} passes; within 5 m NEES per axis mean '
-            f'{nees.mean():.1f} (aim {MAX_NEES[kind]:.1f}), median {np.median(nees):.1f}; speed '
+    return (f'  {simulator}, {kind}: {len(unflagged)} of {len(found)} with unflagged '
+            f'poses; {n_unflagged} such poses, unflagged and wrong {rate:.1%} (aim 1 %), in '
+            f'{sum(f.unflagged_and_wrong.any() for f in unflagged)} passes; within 5 m NEES per '
+            f'axis mean {nees.mean():.1f} (aim {MAX_NEES[kind]:.1f}), median '
+            f'{np.median(nees):.1f}; speed '
             f'within 10 % in {within:.0%} (aim 90 %); at the closest point median '
             f'{np.median(closest):.2f} m; of {n_smoothed} unflagged smoothed poses '
             f'{smoothed:.1%} unflagged and wrong{"" if met else "  MISSED"}', met)

@@ -13,7 +13,7 @@ from mag_tracking.recording.fit_folder import FIT_COLUMNS
 from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
 from support.bundled import DATA, NETWORK_FILE, QUICK, parameter_file, vehicle_path
 from support.cli_runs import NAME, quick_file, replay_one
-from support.permissions import as_files_say
+from support.permissions import enforced_permissions
 
 
 def test_replay_writes_all_documented_files(tmp_path, capsys):
@@ -132,7 +132,7 @@ def test_an_argument_with_a_nul_character_is_named(capsys, command):
 def test_a_read_only_folder_is_named(tmp_path, capsys):
     folder = tmp_path / 'theirs'
     folder.mkdir(mode=0o500)
-    with as_files_say():
+    with enforced_permissions():
         error = fail(capsys, 'replay', vehicle_path(NAME), '--network', NETWORK_FILE,
                      '--out', folder / 'out')
     assert f'cannot write to {folder / "out"}' in error and 'Permission denied' in error

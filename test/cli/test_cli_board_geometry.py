@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from mag_tracking.analysis.magnet_pose import PoseSettings, locate_magnet
 from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
 from mag_tracking.network.file import read_network, write_network
-from support.geometry_command import command, through_calibrate, write_table
+from support.geometry_command import calibrated_readings, command, write_table
 from support.magnet_boards import MOMENT, board, simulated
-from support.real_board import BOX, FOLDER, board_of_41, print_errors, within_limits
+from support.real_board import BOX, FOLDER, assert_within_limits, board_of_41, print_errors
 
 POSITIONS_FILE = FOLDER / 'sensor_positions_m.csv'
 
@@ -38,7 +38,7 @@ def test_the_written_network_locates_the_magnet(calibrated):
     nominal, field, positions, axes = board_of_41()
     g = calibrate_geometry(nominal, field[::2], positions[::2], axes[::2], MOMENT,
                            GeometrySettings())
-    B = through_calibrate(network, field[1::2])
+    B = calibrated_readings(network, field[1::2])
     # The fields are equal within the digits of the file, because the background does not drift.
     np.testing.assert_allclose(B, g.signal(field[1::2]), rtol=0, atol=1e-12)
     poses = [locate_magnet(network, b, MOMENT, *BOX, PoseSettings()) for b in B]
@@ -49,7 +49,7 @@ def test_the_written_network_locates_the_magnet(calibrated):
                               for p, a in zip(poses, u, strict=True)])
     is_low = positions[1::2, 2] < 0.1
     print_errors('by the written file', position_error, angle_error, is_low)
-    within_limits(position_error, angle_error, is_low)
+    assert_within_limits(position_error, angle_error, is_low)
 
 
 def test_the_printed_table_and_figure_match_the_network(calibrated):
@@ -113,9 +113,9 @@ def test_inconsistent_sensors_and_poses_are_named(tmp_path, capsys, monkeypatch)
     assert lines[8].endswith(','.join(map(str, [*positions[7].tolist(), *axes[7].tolist()])))
     labels = [t.get_text() for f in figures[0].subfigs for a in f.axes for t in
               (a.get_legend().get_texts() if a.get_legend() else [])]
-    assert 'does not fit' in labels
+    assert 'suspect sensor' in labels
     titles = [a.get_title(loc='left') for f in figures[0].subfigs for a in f.axes]
-    assert any('do not fit: 1' in title for title in titles)
+    assert any('suspect: 1' in title for title in titles)
 
 
 # Rejected calibrations, settings and invalid input.
@@ -214,7 +214,7 @@ def test_unknown_poses_are_estimated(tmp_path, capsys):
     assert 36 <= n < 40 and f'outside the box): {40 - n}' in text and '; tilt ' not in text
     network = read_network(tmp_path / 'out.yaml')
     assert network.calibrated[0].by == f'magnet, {n} unknown poses'
-    B = through_calibrate(network, field)
+    B = calibrated_readings(network, field)
     pose = locate_magnet(network, B[0], MOMENT, [-0.08, -0.08, 0.03], [0.2, 0.2, 0.25],
                          PoseSettings())
     assert pose.converged and pose.normalised_cost < 3.0

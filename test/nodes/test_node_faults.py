@@ -19,7 +19,7 @@ from mag_tracking.stages.track.manager import TrackManager
 from support.bundled import POINT
 from support.node_processes import scaled
 from support.node_world import BODY, NS, STEADY, TOPICS, is_wrong, network_file, world
-from support.roadside import FIRST, RATE_HZ
+from support.roadside import INITIAL_POSITION, RATE_HZ
 from support.samples import one, simulate
 
 pytestmark = pytest.mark.timeout(600)
@@ -233,7 +233,7 @@ def test_no_pose_is_wrong_after_a_gap_during_a_pass(tmp_path, name, x, gap_s):
     network, speed = read_network(network_file(tmp_path)), 10.0
     settings = settings_for('vehicle', {**POINT, **STEADY['calibration_node'],
                                         **STEADY['detection_node']})
-    pipeline, first = Pipeline(network, settings), np.array([-40.0, FIRST[1]])
+    pipeline, first = Pipeline(network, settings), np.array([-40.0, INITIAL_POSITION[1]])
     samples, *_ = simulate(network, BODY, Path(first, 0.0, speed), RATE_HZ, 6.5,
                            np.random.default_rng(0), start_s=1000.0)
     begin = 1000.0 + (x - first[0]) / speed

@@ -47,7 +47,7 @@ from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
 from support.busy_recordings import BUSY, network_of_recording
 from support.marks import studied
 from support.node_processes import MAX_S, call, start, stop, without_states
-from support.shared_memory import left_behind, segments_of
+from support.shared_memory import orphaned_segments, segments_of
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -366,4 +366,4 @@ def test_ended_nodes_leave_no_shared_memory(ros, signum):
         process.send_signal(signum)
         output, _ = process.communicate(timeout=MAX_S)
     assert (process.returncode, without_states(output)) == (0, '')
-    assert segments and not left_behind(segments)
+    assert segments and not orphaned_segments(segments)

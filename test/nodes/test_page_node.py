@@ -81,7 +81,7 @@ def test_the_page_of_running_nodes_shows_the_values_of_the_topic(ros):
             assert min(measured) > 0.9 * n
             page.wait('magTracking.scene?.tracks[0]?.smoothed')
             page.wait('document.getElementById("tables").textContent.includes("tracker_node")')
-            assert page.complaints == []
+            assert page.page_errors == []
             run.communicate(timeout=MAX_S)
     finally:
         assert terminate(watch) == 0

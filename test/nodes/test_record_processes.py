@@ -28,7 +28,7 @@ from mag_tracking.recording.repair import repair
 from support.bundled import NETWORK_FILE, vehicle_path
 from support.node_processes import MAX_S, call, start, stop
 from support.recorded_topics import FIELDS, IMUS
-from support.shared_memory import left_behind, segments_of
+from support.shared_memory import orphaned_segments, segments_of
 
 pytestmark = pytest.mark.timeout(600)
 NS = 10**9
@@ -114,7 +114,7 @@ def test_a_recorded_replay_equals_the_original(ros, tmp_path, road_network):
         replay(Recording(path), road_network, long_wait, tmp_path / f'of_{path.stem}')
     np.testing.assert_allclose(*(poses(tmp_path / f'of_{path.stem}') for path in (original, out)),
                                rtol=1e-9, atol=1e-12)
-    assert segments and not left_behind(segments)
+    assert segments and not orphaned_segments(segments)
 
 
 def test_a_kill_of_the_command_loses_less_than_a_second(ros, tmp_path):

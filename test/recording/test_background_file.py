@@ -125,8 +125,8 @@ def test_a_changed_calibration_discards_stored_backgrounds(tmp_path, change):
     assert not [c for s in readings(1011.0, 2.0, 1) for c in fed(stage, s)]
 
 
-def test_a_sensor_moved_before_the_restart_is_relearnt_soon(tmp_path):
-    """The background is relearnt even with `relearn_s` = 0, which disables usual relearning."""
+def test_a_sensor_moved_before_the_restart_is_relearnt(tmp_path):
+    """The background is relearnt even with `relearn_s` = 0, which disables relearning otherwise."""
     network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
     stage.resume(stored)
@@ -139,8 +139,8 @@ def test_a_sensor_moved_before_the_restart_is_relearnt_soon(tmp_path):
     np.testing.assert_allclose(np.mean([c.field for c in out], axis=0), STEP, atol=1e-8)
 
 
-def test_a_confirmed_background_is_not_relearnt_sooner(tmp_path):
-    """A target that arrives later and stays must not become the background sooner than usual."""
+def test_a_confirmed_background_is_not_relearnt(tmp_path):
+    """A target that arrives later and stays must not become part of the background."""
     network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
     stage.resume(stored)

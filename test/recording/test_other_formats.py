@@ -188,10 +188,10 @@ def test_invalid_json_messages_are_rejected(change, cause, tmp_path):
 
 def protobuf_class():
     """Create a message class with timestamp and magnetic_field; return class and descriptors."""
-    double, whole, message = (FieldDescriptorProto.TYPE_DOUBLE, FieldDescriptorProto.TYPE_INT64,
-                              FieldDescriptorProto.TYPE_MESSAGE)
+    double, integer, message = (FieldDescriptorProto.TYPE_DOUBLE, FieldDescriptorProto.TYPE_INT64,
+                                FieldDescriptorProto.TYPE_MESSAGE)
     file = FileDescriptorProto(name='m.proto', package='lab', syntax='proto3')
-    for name, fields in (('Time', (('seconds', whole, ''), ('nanos', whole, ''))),
+    for name, fields in (('Time', (('seconds', integer, ''), ('nanos', integer, ''))),
                          ('Vector', tuple((a, double, '') for a in 'xyz')),
                          ('Magnetic', (('timestamp', message, '.lab.Time'),
                                        ('magnetic_field', message, '.lab.Vector')))):

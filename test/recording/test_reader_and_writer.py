@@ -139,8 +139,8 @@ def test_a_file_of_a_few_bytes_is_reported_as_truncated(n_bytes, tmp_path):
 def test_a_truncated_file_is_read_up_to_its_end(tmp_path):
     path = tmp_path / 'cut.mcap'
     write(tmp_path / 'a.mcap', 15_000)
-    whole = (tmp_path / 'a.mcap').read_bytes()
-    path.write_bytes(whole[:int(0.6 * len(whole))])
+    complete_data = (tmp_path / 'a.mcap').read_bytes()
+    path.write_bytes(complete_data[:int(0.6 * len(complete_data))])
     messages, recording = read(path)
     assert 0.3 * 30_000 < len(messages) < 0.65 * 30_000
     no_index, partially_read = sorted(recording.losses)
@@ -152,7 +152,7 @@ def test_a_truncated_file_is_read_up_to_its_end(tmp_path):
     assert [m.log_time_ns for m in messages] == sorted(m.log_time_ns for m in messages)
 
 
-def test_flipped_bytes_cost_only_their_chunk_and_are_reported(tmp_path):
+def test_flipped_bytes_lose_only_their_chunk_and_are_reported(tmp_path):
     path = tmp_path / 'a.mcap'
     write(path, 15_000)
     data = bytearray(path.read_bytes())

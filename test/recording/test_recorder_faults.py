@@ -26,25 +26,25 @@ TEST_FOLDER = str(ROOT / 'test')
 
 
 class SmallDisk:
-    """File opener that simulates a disk with `room` free bytes."""
+    """File opener that simulates a disk with `free_bytes` free bytes."""
 
-    def __init__(self, room):
-        self.room = room
+    def __init__(self, free_bytes):
+        self.free_bytes = free_bytes
 
     def __call__(self, path):
         disk = self
 
         class File(io.FileIO):
             def write(self, data):
-                if len(data) and disk.room <= 0:
+                if len(data) and disk.free_bytes <= 0:
                     raise OSError(errno.ENOSPC, 'No space left on device')
-                n = super().write(bytes(data[:disk.room]))
-                disk.room -= n
+                n = super().write(bytes(data[:disk.free_bytes]))
+                disk.free_bytes -= n
                 return n
 
             def truncate(self, size=None):
                 before = os.fstat(self.fileno()).st_size
-                disk.room += before - super().truncate(size)
+                disk.free_bytes += before - super().truncate(size)
 
         return File(path, 'xb')
 
@@ -115,7 +115,7 @@ def test_a_full_disk_is_reported_and_the_recording_continues(tmp_path):
     for k in range(2000):
         if k == 1000:
             before = recorder.dropped[TOPIC]
-            disk.room += 10**6
+            disk.free_bytes += 10**6
         recorder.write(TOPIC, field(k), k)
         recorder.tick(S + k * S // 100)
     recorder.close()

@@ -84,14 +84,14 @@ def test_repair_keeps_the_order_of_many_files(tmp_path):
     recorder.close()
     assert (tmp_path / 'a' / 'a_11.mcap').exists()
     metadata = tmp_path / 'a' / 'metadata.yaml'
-    whole = yaml.safe_load(metadata.read_text())
+    original = yaml.safe_load(metadata.read_text())
     metadata.unlink()
     assert repair(tmp_path / 'a') == 0 and numbers(tmp_path / 'a')[0] == list(range(24))
-    assert yaml.safe_load(metadata.read_text()) == whole
+    assert yaml.safe_load(metadata.read_text()) == original
 
 
 @pytest.mark.parametrize('name', ['a_0.mcap', 'a_12.mcap'])
-def test_an_empty_file_after_a_crash_costs_no_other_file(tmp_path, name):
+def test_an_empty_file_after_a_crash_affects_no_other_file(tmp_path, name):
     """The empty file is the first file, or a later file that had just been created."""
     recorder, _ = started(tmp_path / 'a', split_ns=S)
     for k in range(24):

@@ -98,7 +98,7 @@ def test_every_figure_draws_names_literally(draw, label):
 
 
 def test_equal_lanes_share_a_curve_and_a_label():
-    """Otherwise one of two equal curves would hide the other curve."""
+    """If both of two equal curves were drawn, one would hide the other."""
     lanes = plan()
     lanes.lanes[2].filter_std = lanes.lanes[0].filter_std
     texts = texts_of(lane_figure(lanes))
@@ -106,7 +106,7 @@ def test_equal_lanes_share_a_curve_and_a_label():
 
 
 def test_the_first_pose_is_on_the_line_of_the_track():
-    """The best hypothesis of an arrival may be at another position."""
+    """The marker is at the published pose, not at the best hypothesis of an arrival direction."""
     log = log_of_track()
     (axes,) = map_figure(log, NETWORK).axes
     lines = {line.get_label(): line.get_xydata() for line in axes.get_lines()}

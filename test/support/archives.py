@@ -13,7 +13,10 @@ NAMES = ('straight_car_right', 'straight_small_left', 'junction_left_to_right')
 
 
 def archive_recordings(folder):
-    """Fill a folder with three recordings, one in a subfolder, and two other files; return it."""
+    """Fill a folder with three recordings, one in a subfolder, and two other files.
+
+    Returns the folder.
+    """
     (folder / 'below').mkdir()
     for name in NAMES:
         shutil.copy(vehicle_path(name), folder / ('below' if 'junction' in name else '.'))

@@ -16,7 +16,7 @@ from mag_tracking.physics.dipole import MU0
 from mag_tracking.simulation.scenario import Path, SensorErrorModel, body_poses
 from support.passes import EARTH
 
-BOUGHT = SensorErrorModel(noise_std=1.2e-8, tilt_std=np.deg2rad(1.0), gain_std=0.01)
+UNCALIBRATED = SensorErrorModel(noise_std=1.2e-8, tilt_std=np.deg2rad(1.0), gain_std=0.01)
 """Errors of uncalibrated sensors that are mounted carefully."""
 
 SHEET = 0.01
@@ -70,9 +70,9 @@ def magnetised(rng, parts, length, moment):
     fraction /= fraction.sum()
     # Approximation: demagnetisation along a side is inversely proportional to the side length.
     N = (1.0 / sides) / (1.0 / sides).sum(axis=1, keepdims=True)
-    easy = 1.0 / (N + 1.0 / CHI)
-    easy *= fraction[:, None] / easy.mean(axis=1, keepdims=True)
-    induced = easy * moment / 1.4 * MU0 / 50e-6
+    susceptibility = 1.0 / (N + 1.0 / CHI)
+    susceptibility *= fraction[:, None] / susceptibility.mean(axis=1, keepdims=True)
+    induced = susceptibility * moment / 1.4 * MU0 / 50e-6
     while True:
         common = rng.standard_normal(3)
         along = common / np.linalg.norm(common) + 0.6 * rng.standard_normal((len(fraction), 3))
@@ -128,44 +128,45 @@ class Drive:
     """Course along a `Path` on which the speed changes once and the vehicle swerves once."""
 
     path: Path
-    change: float = 0.0
+    speed_change: float = 0.0
     """Relative change of the speed, negative for braking."""
-    change_at: float = 0.0
+    speed_change_at_s: float = 0.0
     """[s] Middle of the speed change."""
-    change_s: float = 2.0
+    speed_change_s: float = 2.0
     """[s] Approximate duration of the speed change."""
-    aside: float = 0.0
+    swerve_m: float = 0.0
     """[m] Lateral displacement of the swerve, positive to the left."""
-    aside_at: float = 0.0
+    swerve_at_s: float = 0.0
     """[s] Middle of the swerve."""
-    aside_s: float = 2.0
+    swerve_s: float = 2.0
     """[s] Approximate duration of the swerve."""
 
     def _on_path(self, t):
-        """Time (n,) at which the `Path` reaches the travelled distance, at its initial speed."""
-        width = self.change_s / 4.0
-        z, z0 = (t - self.change_at) / width, -self.change_at / width
+        """Times (n,) [s] at which `path` reaches the distances travelled at the times `t`."""
+        width = self.speed_change_s / 4.0
+        z, z0 = (t - self.speed_change_at_s) / width, -self.speed_change_at_s / width
         # This is the integral of a logistic step.
-        return t + self.change * width * (np.logaddexp(0.0, z) - np.logaddexp(0.0, z0))
+        return t + self.speed_change * width * (np.logaddexp(0.0, z) - np.logaddexp(0.0, z0))
 
     def speed(self, t):
         """Speed along the path [m/s] at times (n,)."""
-        z = (np.asarray(t, dtype=float) - self.change_at) / (self.change_s / 4.0)
-        return self.path.speed * (1.0 + self.change / (1.0 + np.exp(-z)))
+        z = (np.asarray(t, dtype=float) - self.speed_change_at_s) / (self.speed_change_s / 4.0)
+        return self.path.speed * (1.0 + self.speed_change / (1.0 + np.exp(-z)))
 
     def at(self, t):
         """Position and heading at times `t`; implements `scenario.Trajectory`."""
         t = np.asarray(t, dtype=float)
         position, heading = self.path.at(self._on_path(t))
-        z = (t - self.aside_at) / (self.aside_s / 2.0)
-        offset = self.aside * np.exp(-0.5 * z * z)
-        slope = -offset * z / (self.aside_s / 2.0) / self.speed(t)
+        z = (t - self.swerve_at_s) / (self.swerve_s / 2.0)
+        offset = self.swerve_m * np.exp(-0.5 * z * z)
+        slope = -offset * z / (self.swerve_s / 2.0) / self.speed(t)
         left = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
         return position + offset[:, None] * left, heading + np.arctan(slope)
 
 
 def random_drive(rng, path, at):
     """Random `Drive` that changes speed by -20 to 10 % and swerves by up to 0.4 m near `at` [s]."""
-    return Drive(path, change=rng.uniform(-0.2, 0.1), change_at=at + rng.uniform(-2.0, 2.0),
-                 change_s=rng.uniform(1.5, 4.0), aside=rng.uniform(-0.4, 0.4),
-                 aside_at=at + rng.uniform(-2.0, 2.0), aside_s=rng.uniform(1.5, 4.0))
+    return Drive(path, speed_change=rng.uniform(-0.2, 0.1),
+                 speed_change_at_s=at + rng.uniform(-2.0, 2.0),
+                 speed_change_s=rng.uniform(1.5, 4.0), swerve_m=rng.uniform(-0.4, 0.4),
+                 swerve_at_s=at + rng.uniform(-2.0, 2.0), swerve_s=rng.uniform(1.5, 4.0))

@@ -38,16 +38,16 @@ class Page:
 
     def __init__(self, browser, url, **options):
         self.page = browser.new_page(**options)
-        self.complaints = []
+        self.page_errors = []
         self.page.on('console', self._record_message)
-        self.page.on('pageerror', lambda error: self.complaints.append(str(error)))
+        self.page.on('pageerror', lambda error: self.page_errors.append(str(error)))
         self.requests = []
         self.page.on('request', lambda request: self.requests.append(request.url))
         self.page.goto(url)
 
     def _record_message(self, message):
         if message.type in ('error', 'warning'):
-            self.complaints.append(message.text)
+            self.page_errors.append(message.text)
 
     def value(self, expression):
         """Evaluate a JavaScript expression in the page, and return its value."""
@@ -70,13 +70,13 @@ class Page:
         self.wait(f'magTracking.drawn > {drawn}')
 
     def pose_on_map(self):
-        """(x, y) of the pose on the map, in map units; None if no pose is shown."""
+        """Position (x, y) of the pose on the map, in map units; None if no pose is shown."""
         return self.value('''(() => {
             const pose = document.getElementById('map').data.find(d => d.meta === 'pose');
             return pose ? [pose.x[0], pose.y[0]] : null; })()''')
 
-    def lines(self):
-        """Time at which the vertical line of each plot is drawn."""
+    def line_times(self):
+        """Current time [s] at which each plot has its vertical line."""
         return self.value('''[...document.querySelectorAll('#field .plot'),
             ...['weights', 'innovation', 'speed'].map(id => document.getElementById(id))]
             .map(plot => plot.layout.shapes[0].x0)''')

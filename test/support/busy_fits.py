@@ -12,11 +12,11 @@ from mag_tracking.recording.reader import Recording
 from support.busy_recordings import BUSY, network_of_recording
 
 ORDERS = (1, 2, 3, 4)
-FAR_M = 8.0
+MAX_ASSIGNMENT_M = 8.0
 """[m] Maximum distance of a fit from the vehicle that it is assigned to."""
 
 
-class OfVehicle(NamedTuple):
+class AssignedFit(NamedTuple):
     """A fit, and the true vehicle that it is assigned to."""
 
     one: FittedPass
@@ -39,11 +39,11 @@ def fits_of_recording(name, folder=BUSY, orders=ORDERS):
     recording = Recording(folder / f'{name}.mcap')
     passes = list(RecordingFit(recording, network, settings_for('vehicle'), orders).passes())
     truth = read_recording(folder / f'{name}.mcap', network).truth
-    return passes, with_vehicles(passes, [
+    return passes, assigned_fits(passes, [
         (stamps / 1e9, position[:, :2]) for stamps, position, _ in truth.values()])
 
 
-def with_vehicles(passes, vehicles):
+def assigned_fits(passes, vehicles):
     """Assign fits to vehicles [(t (n,) [s], positions (n, 2) [m])]; return [OfVehicle]."""
     candidates = []
     for i, one in enumerate(passes):
@@ -54,15 +54,15 @@ def with_vehicles(passes, vehicles):
         for k, (t, position) in enumerate(vehicles):
             if not t[0] + 0.5 < time < t[-1] - 0.5:
                 continue
-            here, ahead, behind = (np.array([np.interp(time + s, t, position[:, a])
-                                             for a in (0, 1)]) for s in (0.0, 0.2, -0.2))
-            velocity = (ahead - behind) / 0.4
-            error = float(np.linalg.norm(fit.position[:2] - here))
-            if error < FAR_M and velocity @ fit.velocity[:2] > 0.0:
+            current, later, earlier = (np.array([np.interp(time + s, t, position[:, a])
+                                                 for a in (0, 1)]) for s in (0.0, 0.2, -0.2))
+            velocity = (later - earlier) / 0.4
+            error = float(np.linalg.norm(fit.position[:2] - current))
+            if error < MAX_ASSIGNMENT_M and velocity @ fit.velocity[:2] > 0.0:
                 candidates.append((error, i, k, float(np.linalg.norm(velocity))))
     out, used = [], set()
     for error, i, k, speed in sorted(candidates):
         if ('fit', i) not in used and ('vehicle', k) not in used:
             used |= {('fit', i), ('vehicle', k)}
-            out.append(OfVehicle(passes[i], k, speed, error))
+            out.append(AssignedFit(passes[i], k, speed, error))
     return out

@@ -60,7 +60,7 @@ def tracked_recording(name, folder=BUSY, changes=None):
                             [r for r in records if isinstance(r, VehiclePassage)])
 
 
-def rightly_counted(name, passages, folder=BUSY):
+def correctly_counted(name, passages, folder=BUSY):
     """Match passages and vehicles within 1 s and in the same direction: [(passage, vehicle)]."""
     truth, out = json.loads((folder / f'{name}.truth.json').read_text()), []
     unmatched = list(truth['vehicles'])

@@ -31,7 +31,7 @@ TRUCKS = 0.1
 
 
 @dataclass(frozen=True)
-class OnWheels:
+class WheeledVehicle:
     """Body with a steel belt in each of four tyres, which rotates as the vehicle moves."""
 
     body: object
@@ -61,7 +61,7 @@ class OnWheels:
 def vehicle(rng, simulator, trucks=TRUCKS):
     """Random car, or truck with probability `trucks`; a vehicle of boxes has rotating wheels."""
     body = (truck if rng.random() < trucks else car)(rng, simulator)
-    return OnWheels(body, rng.normal(0.0, 2.0, (4, 2))) if simulator == 'boxes' else body
+    return WheeledVehicle(body, rng.normal(0.0, 2.0, (4, 2))) if simulator == 'boxes' else body
 
 
 def passing(rng, simulator, at_s, direction, speed, trucks=TRUCKS):
@@ -72,30 +72,30 @@ def passing(rng, simulator, at_s, direction, speed, trucks=TRUCKS):
     return body, random_drive(rng, path, at_s) if simulator == 'boxes' else path
 
 
-def pair(rng, how, at_s):
-    """[(time [s], direction, speed [m/s])] of two vehicles that meet or follow each other."""
+def pair(rng, pattern, at_s):
+    """Draw two vehicles that meet or follow: [(time [s], direction, speed [m/s])]."""
     speed, direction = rng.uniform(8.0, 20.0), int(rng.choice([-1, 1]))
-    if how == 'meeting':
+    if pattern == 'meeting':
         return [(at_s, direction, speed),
                 (at_s + rng.uniform(0.1, 1.1), -direction, rng.uniform(8.0, 20.0))]
     return [(at_s, direction, speed),
             (at_s + rng.uniform(1.2, 2.5), direction, speed * rng.uniform(0.96, 1.04))]
 
 
-def busy(how, n_sensors, simulator, seed, n=4, trucks=TRUCKS):
-    """Simulate `n` pairs that meet or follow, or up to 3 `n` vehicles in traffic; a `World`.
+def busy(pattern, n_sensors, simulator, seed, n=4, trucks=TRUCKS):
+    """Simulate a `World` with `n` pairs of vehicles, or with up to 3 `n` vehicles in free traffic.
 
-    `how` is 'meeting', 'following' or 'traffic'.
+    `pattern` is 'meeting', 'following' or 'traffic'.
     """
-    rng = np.random.default_rng([seed, n_sensors, len(how), len(simulator)])
-    if how == 'traffic':
+    rng = np.random.default_rng([seed, n_sensors, len(pattern), len(simulator)])
+    if pattern == 'traffic':
         times = LEAD_S + np.cumsum(rng.exponential(3.0, 3 * n))
         plan = [(t, int(rng.choice([-1, 1])), rng.uniform(8.0, 20.0)) for t in times]
         plan = [p for k, p in enumerate(plan) if not any(
             # Vehicles do not drive through other vehicles in the same lane.
             q[1] == p[1] and (p[0] - q[0]) * min(p[2], q[2]) < 14.0 for q in plan[:k])]
     else:
-        plan = [p for k in range(n) for p in pair(rng, how, LEAD_S + 14.0 * k)]
+        plan = [p for k in range(n) for p in pair(rng, pattern, LEAD_S + 14.0 * k)]
     movers = [passing(rng, simulator, *p, trucks) for p in plan]
     return world(NETWORKS[n_sensors], movers, max(p[0] for p in plan) + 7.0, rng,
                  FLAWS[simulator], RATE)
@@ -113,7 +113,7 @@ class Score:
     """Whether a vehicle has an accurate track in the right direction, (n_vehicles,)."""
     n_extra: int
     """Number of tracks that belong to no vehicle."""
-    n_sure: int
+    n_unflagged: int
     """Number of unflagged poses."""
     n_wrong: int
     """Number of unflagged poses that are wrong for every vehicle."""
@@ -121,7 +121,7 @@ class Score:
     def __str__(self):
         return (f'found {self.is_found.sum()} of {len(self.rms)}, RMS {np.nanmedian(self.rms):.2f} '
                 f'm, NEES {np.nanmedian(self.nees):.2f}, extra tracks {self.n_extra}, unflagged '
-                f'poses {self.n_sure}, of which wrong {self.n_wrong}')
+                f'poses {self.n_unflagged}, of which wrong {self.n_wrong}')
 
 
 FOUND_M = 5.0
@@ -131,10 +131,10 @@ FOUND_M = 5.0
 def score(poses, vehicles):
     """Compute the `Score` of `Track` records for vehicles [(t (n,) [s], position (n, 2) [m])]."""
     of_track = {i: [p for p in poses if p.id == i] for i in sorted({p.id for p in poses})}
-    candidates, sure = [], [p for p in poses if not p.ambiguous]
-    wrong = np.ones(len(sure), dtype=bool)
+    candidates, unflagged = [], [p for p in poses if not p.ambiguous]
+    wrong = np.ones(len(unflagged), dtype=bool)
     for k, (t, position) in enumerate(vehicles):
-        wrong &= are_wrong(*errors_of(sure, t, position)[:2]) | _outside(sure, t)
+        wrong &= are_wrong(*errors_of(unflagged, t, position)[:2]) | _outside(unflagged, t)
         for i, own in of_track.items():
             error, _, nees, true = errors_of(own, t, position)
             near = (np.hypot(*true.T) < NEAR_M) & ~_outside(own, t)
@@ -152,7 +152,7 @@ def score(poses, vehicles):
         if i not in used and np.isnan(rms[k]):
             used.add(i)
             rms[k], nees[k], found[k] = error, of_k, goes_right and error < FOUND_M
-    return Score(rms, nees, found, len(set(of_track) - used), len(sure), int(wrong.sum()))
+    return Score(rms, nees, found, len(set(of_track) - used), len(unflagged), int(wrong.sum()))
 
 
 def _outside(poses, t):

@@ -16,8 +16,8 @@ def stream(n, begin, end, step=10, skip=()):
     return [(j, t + j) for t in range(begin, end, step) for j in range(n) if j not in skip]
 
 
-def stepped(arrivals, which, begin, end, by):
-    """Copy arrivals with the clocks of the sensors `which` ahead by `by` from `begin` to `end`."""
+def with_clock_step(arrivals, which, begin, end, by):
+    """Copy arrivals; from `begin` to `end`, the clocks of the sensors `which` are ahead by `by`."""
     return [(j, t + by if j in which and begin <= t < end else t) for j, t in arrivals]
 
 

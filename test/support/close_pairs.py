@@ -17,7 +17,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.simulation.scenario import Path
 from support import spoiler
-from support.box_vehicles import BOUGHT, box_car
+from support.box_vehicles import UNCALIBRATED, box_car
 from support.passes import network_of
 from support.samples import scenario
 
@@ -34,13 +34,13 @@ def readings_of(seed):
     lateral = rng.choice([-1.0, 1.0]) * (SIDE + half)
     lead = 8.0 * speed + 10.0
     path = Path(np.array([-lead * np.cos(heading), lateral]), heading, speed)
-    readings, *_ = scenario.simulate(PAIR, body, path, RATE, 2.0 * lead / speed, rng, BOUGHT)
+    readings, *_ = scenario.simulate(PAIR, body, path, RATE, 2.0 * lead / speed, rng, UNCALIBRATED)
     faulty = spoiler.apply(readings, spoiler.steps(STEP), spoiler.glitches(0.001, 1e-4, seed))
     return faulty, speed * np.cos(heading), lead / speed
 
 
 @dataclass(frozen=True)
-class Answers:
+class VelocityEstimates:
     """Estimates for a pass. A pair is (velocity along x, standard deviation) [m/s]."""
 
     truth: float
@@ -65,8 +65,8 @@ def pass_of(seed):
 
 
 @cache
-def answers(seed):
-    """Estimate the velocity of a random pass by all methods; return `Answers`."""
+def estimates_of(seed):
+    """Estimate the velocity of a random pass by all methods; return `VelocityEstimates`."""
     readings, truth, closest_s = readings_of(seed)
     pipeline = Pipeline(PAIR, settings_for('vehicle'))
     records = pipeline.feed(readings) + pipeline.flush()
@@ -78,7 +78,7 @@ def answers(seed):
     data = pass_of(seed)
     fits = [fit_pass(data, n) for n in (1, 2, 3)]
     best = choose_order(fits)
-    return Answers(
+    return VelocityEstimates(
         truth, None if best is None else (float(best.velocity[0]), float(
             np.sqrt(best.robust_covariance[3, 3]))),
         None if track is None else _velocity_along_x(track),

@@ -10,18 +10,18 @@ from support.samples import simulate
 
 START_S = 1000.0
 SPEED = 10.0
-FIRST = np.array([-60.0, -1.5])
+INITIAL_POSITION = np.array([-60.0, -1.5])
 FULL_SCALE = 8e-4
 """[T] Full scale of a sensor; a spike of 2000 times full scale is 1.6 T."""
 NS = 1_000_000_000
 
 
-def swapped(sample, rng):
+def swap_axes(sample, rng):
     """Swap two axes."""
     return [replace(sample, field=sample.field[[1, 0, 2]])]
 
 
-def spiky(size):
+def with_spikes(size):
     """Add a spike of +/- `size` [T] on every axis to one of twenty readings."""
     def modify(sample, rng):
         spike = size * rng.choice([-1.0, 1.0], 3) if rng.random() < 0.05 else 0.0
@@ -29,7 +29,7 @@ def spiky(size):
     return modify
 
 
-def late_by(seconds):
+def shift_clock(seconds):
     """Set the clock back by `seconds`, or ahead if negative."""
     return lambda sample, rng: [replace(sample, stamp_ns=sample.stamp_ns - round(seconds * NS))]
 
@@ -48,12 +48,12 @@ class Frozen:
 FAULTS = {
     'dies': lambda: lambda sample, rng: [],
     'freezes': Frozen,
-    'spikes of 2000 times full scale': lambda: spiky(2000.0 * FULL_SCALE),
-    'spikes within full scale': lambda: spiky(0.6 * FULL_SCALE),
-    'small spikes': lambda: spiky(2e-6),
-    'swaps axes': lambda: swapped,
-    'jumps 1 s ahead': lambda: late_by(-1.0),
-    'jumps 1 s back': lambda: late_by(1.0),
+    'spikes of 2000 times full scale': lambda: with_spikes(2000.0 * FULL_SCALE),
+    'spikes within full scale': lambda: with_spikes(0.6 * FULL_SCALE),
+    'small spikes': lambda: with_spikes(2e-6),
+    'swaps axes': lambda: swap_axes,
+    'jumps 1 s ahead': lambda: shift_clock(-1.0),
+    'jumps 1 s back': lambda: shift_clock(1.0),
     'sends duplicates': lambda: lambda sample, rng: [sample, sample],
     'sends gauss': lambda: lambda sample, rng: [replace(sample, field=1e4 * sample.field)],
 }
@@ -69,7 +69,7 @@ def stream(n_sensors, seed, fault=None, lasting_s=1.5, sensor='mag_2'):
     farthest = float(network.positions[:, 0].max())
     body = point_body(rng.normal(0.0, 250.0, 3), 5.0, 0.5)
     duration = (60.0 + farthest + 60.0) / SPEED
-    samples, *_ = simulate(network, body, Path(FIRST, 0.0, SPEED), 100.0, duration, rng,
+    samples, *_ = simulate(network, body, Path(INITIAL_POSITION, 0.0, SPEED), 100.0, duration, rng,
                            start_s=START_S)
     begin = START_S + 6.0 + max(0.0, farthest / 2.0 - 5.0) / SPEED - 0.4
     end = begin + lasting_s
@@ -79,5 +79,5 @@ def stream(n_sensors, seed, fault=None, lasting_s=1.5, sensor='mag_2'):
         out += modify(sample, rng) if is_faulty else [sample]
 
     def truth(t):
-        return FIRST + [SPEED * (t - START_S), 0.0]
+        return INITIAL_POSITION + [SPEED * (t - START_S), 0.0]
     return network, out, truth, (begin, end)

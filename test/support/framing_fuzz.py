@@ -35,7 +35,7 @@ class Case(NamedTuple):
     encode_random_frame: Callable
     """Function from a `random.Random` to (bytes, [Reading, ...])."""
     end_of_garbage: bytes = b''
-    """Bytes after garbage that would otherwise merge with the next frame."""
+    """Bytes appended to garbage, so that it does not merge with the next frame."""
     garbage: tuple = GARBAGE
     """Kinds of garbage that cannot be valid frames."""
     chance: float = 0.0
@@ -70,7 +70,7 @@ class Result(NamedTuple):
         return max(self.invented, self.lost) > limit * self.readings / self.sent
 
 
-def some_garbage(rng, case, frame):
+def random_garbage(rng, case, frame):
     """Generate random garbage, partly derived from `frame` (bytes)."""
     out = b''
     for _ in range(rng.randint(1, 3)):
@@ -100,7 +100,7 @@ def fuzz(case, n_frames, seed=0, share=0.4):
         for _ in range(batch):
             frame, readings = case.encode_random_frame(rng)
             if rng.random() < share:
-                garbage = some_garbage(rng, case, frame)
+                garbage = random_garbage(rng, case, frame)
                 n_garbage += len(garbage)
                 pieces.append(garbage)
             pieces.append(frame)

@@ -28,7 +28,7 @@ def command(table, *options, out):
                  *map(str, options)])
 
 
-def through_calibrate(network, readings):
+def calibrated_readings(network, readings):
     """Calibrate raw readings (K, n, 3) with a `Calibrate` stage; NaN where it returns none."""
     stage = Calibrate(network, settings_for('magnet').calibrate)
     out = np.full(readings.shape, np.nan)

@@ -185,7 +185,7 @@ class FakeHmc5883l(FakeChip):
         self.end_ns = None
 
 
-class Continuous(FakeChip):
+class ContinuousChip(FakeChip):
     """Chip that measures continuously from `start_ns` on, every `period_ns`."""
 
     start_ns = None
@@ -213,7 +213,7 @@ class Continuous(FakeChip):
         return self.field(self.start_ns + round((self.complete - 0.5) * self.period_ns))
 
 
-class FakeRm3100(Continuous):
+class FakeRm3100(ContinuousChip):
     """RM3100; results are latched when their first byte is read."""
 
     GAIN = {50: (20.0, 534.0), 100: (38.0, 283.0), 200: (75.0, 147.0)}
@@ -255,7 +255,7 @@ class FakeRm3100(Continuous):
         return self.memory[register]
 
 
-class FakeLis3mdl(Continuous):
+class FakeLis3mdl(ContinuousChip):
     """LIS3MDL; if `strict`, bit 7 of the register number enables auto-increment."""
 
     GAIN = (6842, 3421, 2281, 1711)

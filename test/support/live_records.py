@@ -31,6 +31,6 @@ def poses(records):
     return [r for r in records if isinstance(r, Track) and not r.ended]
 
 
-def later(records, seconds):
+def delayed_records(records, seconds):
     """Copy records with timestamps later by `seconds`."""
     return [replace(r, stamp_ns=r.stamp_ns + round(seconds * NS)) for r in records]

@@ -20,10 +20,10 @@ LOW, HIGH = np.array([-0.08, -0.08, 0.03]), np.array([0.2, 0.2, 0.25])
 
 def board(n_side=3, spacing=0.06, noise=1e-7, seed=3):
     """Network of sensors on a square grid, each with a random orientation."""
-    places = np.array([(x, y, 0.0) for y in range(n_side) for x in range(n_side)]) * spacing
+    positions = np.array([(x, y, 0.0) for y in range(n_side) for x in range(n_side)]) * spacing
     R = rotation(np.random.default_rng(seed).standard_normal((n_side**2, 3)))
-    names = tuple(f'mag_{j}' for j in range(len(places)))
-    return SensorNetwork(names, places, R, tuple(f'/{name}' for name in names),
+    names = tuple(f'mag_{j}' for j in range(len(positions)))
+    return SensorNetwork(names, positions, R, tuple(f'/{name}' for name in names),
                          noise_std=(np.full(3, noise),) * len(names))
 
 
@@ -77,7 +77,7 @@ def estimated(geometry, network):
 
 
 def _rotation_vector(R):
-    """(3,) rotation vector of a rotation by less than 90 degrees."""
+    """Rotation vector (3,) of a rotation matrix; the angle must be below 90 degrees."""
     v = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     s = np.linalg.norm(v)
     return v if s == 0.0 else v * np.arcsin(s) / s

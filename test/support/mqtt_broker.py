@@ -122,13 +122,13 @@ def certificate(folder):
 
 
 class ScriptedBroker:
-    """Accepts one connection, answers each message with the next response, then stays silent."""
+    """Accepts one connection, and answers each message with the next of the given responses."""
 
     def __init__(self, *responses):
         self._responses = responses
         self._server = socket.create_server(('127.0.0.1', 0))
         self.port = self._server.getsockname()[1]
-        self.heard = []
+        self.received = []
         self._connection = None
         self._thread = threading.Thread(target=self._serve, daemon=True)
 
@@ -153,11 +153,11 @@ class ScriptedBroker:
         self._server.close()
         with suppress(OSError), closing(self._connection):
             for response in self._responses:
-                self.heard.append(self._connection.recv(65536))
+                self.received.append(self._connection.recv(65536))
                 self._connection.sendall(
-                    response(self.heard[-1]) if callable(response) else response)
+                    response(self.received[-1]) if callable(response) else response)
             while message := self._connection.recv(65536):
-                self.heard.append(message)
+                self.received.append(message)
 
 
 def granted(subscribe, *codes):

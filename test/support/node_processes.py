@@ -54,7 +54,7 @@ def without_states(output):
 
 
 def call(ros, kind, name, request):
-    """Call a service, repeat the request if no response arrives, and return the response."""
+    """Call a service and return the response; repeat the request if no response arrives."""
     node, spin_until = ros
     client = node.create_client(kind, name)
     assert spin_until(client.service_is_ready), f'there is no {name}'

@@ -87,11 +87,12 @@ class World:
         self.drivers = drivers_files(folder, broker, guarded, line)
         self.node, self._executor = Node('tester'), make_executor()
         self._executor.add_node(self.node)
-        # `heard`: {node: [(arrival [ns], message)]}; `statuses`: [(arrival [ns], DiagnosticStatus)]
-        self._processes, self.heard, self.statuses = {}, {name: [] for name in TOPICS}, []
+        # `received`: {node: [(arrival [ns], message)]};
+        # `statuses`: [(arrival [ns], DiagnosticStatus)].
+        self._processes, self.received, self.statuses = {}, {name: [] for name in TOPICS}, []
         self.link = None
         for name, (kind, topic) in TOPICS.items():
-            self._subscribe(kind, topic, STREAM_QOS, self.heard[name].append)
+            self._subscribe(kind, topic, STREAM_QOS, self.received[name].append)
         self._subscribe(DiagnosticArray, '/diagnostics', RESULT_QOS, lambda e: self.statuses.extend(
             (e[0], status) for status in e[1].status))
 
@@ -110,7 +111,7 @@ class World:
             self._executor.shutdown()
 
     def wait(self, condition, seconds=MAX_S):
-        """Spin at 100 Hz until `condition()` is true or `seconds` have passed; return its value."""
+        """Spin at 100 Hz until `condition()` is true or `seconds` have passed; return the value."""
         end = time.monotonic() + seconds
         while not (value := condition()) and time.monotonic() < end:
             self._executor.spin_until_future_complete(Future(), 0.01)
@@ -184,7 +185,7 @@ class World:
 
     def since(self, since_ns, name):
         """Messages of a node that arrived after `since_ns`, as [(arrival [ns], message)]."""
-        return [entry for entry in self.heard[name] if entry[0] > since_ns]
+        return [entry for entry in self.received[name] if entry[0] > since_ns]
 
     def statuses_since(self, since_ns, name, *words):
         """Select the received statuses `name` after `since_ns` that contain all `words`.
@@ -203,7 +204,7 @@ class World:
 
     def is_quiet(self):
         """Whether the previous vehicle has left and its detection has ended."""
-        frames = self.heard['detection_node']
+        frames = self.received['detection_node']
         return frames and not frames[-1][1].target_present and self.roadside.is_gone()
 
     def call(self):
@@ -238,15 +239,15 @@ def world(folder):
             own, *password_lines(own, 'somebody', 'secret')) as guarded, Roadside(
             read_network(network_file(folder)), BODY, broker.port, line) as roadside:
         begin()
-        here = World(folder, broker, guarded, roadside, line)
+        running_world = World(folder, broker, guarded, roadside, line)
         try:
-            here.use('mqtt')
+            running_world.use('mqtt')
             for name in list(TOPICS)[1:]:
-                here.start(name)
-            assert here.wait(lambda: here.heard['detection_node'])
-            yield here
+                running_world.start(name)
+            assert running_world.wait(lambda: running_world.received['detection_node'])
+            yield running_world
         finally:
-            codes, outputs = here.close()
+            codes, outputs = running_world.close()
             rclpy.try_shutdown()
         assert not any(codes), outputs
         assert not any('Traceback' in text for text in outputs), outputs

@@ -12,7 +12,7 @@ import sys
 from websockets.asyncio.client import connect
 
 
-async def look(url, sizes):
+async def receive_all(url, sizes):
     """Read all messages of one viewer, and append their sizes [bytes] to `sizes`."""
     async with connect(url.replace('http', 'ws') + 'stream', max_size=None,
                        compression=None) as viewer:
@@ -23,11 +23,11 @@ async def look(url, sizes):
 async def main(url, n):
     """Run `n` viewers until SIGTERM."""
     sizes = [[] for _ in range(n)]
-    tasks = [asyncio.create_task(look(url, one)) for one in sizes]
+    tasks = [asyncio.create_task(receive_all(url, one)) for one in sizes]
     asyncio.get_running_loop().add_signal_handler(
         signal.SIGTERM, lambda: [task.cancel() for task in tasks])
-    ended = await asyncio.gather(*tasks, return_exceptions=True)
-    lost = sum(not isinstance(e, asyncio.CancelledError) for e in ended)
+    results = await asyncio.gather(*tasks, return_exceptions=True)
+    lost = sum(not isinstance(e, asyncio.CancelledError) for e in results)
     counts = [len(one) for one in sizes]
     print(f'{n}, each {min(counts)} to {max(counts)} messages, {sum(sizes[0]) / 1e6:.1f} MB; '
           f'{lost} disconnected')

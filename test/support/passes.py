@@ -57,13 +57,13 @@ def measured(network, path, moments, rng, rate=100.0, seconds=4.0, noise=NOISE):
                     np.tile(noise**2 * np.eye(3), (len(t), 1, 1)))
 
 
-def together(first, second):
+def superposed(first, second):
     """`PassData` of two targets at once: the sum of their fields, with the noise of the first."""
     return replace(first, field=first.field + second.field)
 
 
 def unknowns_at(path, moments, seconds):
-    """Shift time zero of `path` later by `seconds`; return path and moments as fit unknowns."""
+    """Move the reference time of `path` later by `seconds`; return the unknowns of a fit."""
     moved = path.copy()
     moved[:3] += seconds * path[3:6]
     return np.concatenate([moved, moments.ravel()])

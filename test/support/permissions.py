@@ -10,7 +10,7 @@ OVERRIDE_BITS = 1 << 1 | 1 << 2
 
 
 @contextmanager
-def as_files_say():
+def enforced_permissions():
     """Drop the capabilities by which root overrides file permissions; restore them afterwards.
 
     Only the current thread is affected.

@@ -41,7 +41,7 @@ class Repetition:
 
 
 class Spikes:
-    """Holds up to three readings whose steps far exceed the eight previous steps."""
+    """Spike detector, which holds up to three samples with steps far above the eight previous."""
 
     def __init__(self, threshold):
         self.threshold = threshold
@@ -51,7 +51,7 @@ class Spikes:
         self.held, self.before, self.steps = [], None, []
 
     def feed(self, sample, noise_std, step):
-        """Add a sample; return [(sample, whether it is a spike)] of the samples now classified."""
+        """Add a sample; return [(sample, is a spike)] of all samples that are now classified."""
         if self.before is None:
             return self.step(sample)
         steps = np.abs(sample.field - self.before.field)

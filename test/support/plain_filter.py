@@ -70,7 +70,10 @@ class PlainFilter(StepByStep, BankFilter):
         return moved, F, Q
 
     def predict(self, bank, dt, x_lin=None):
-        """Time update in place, linearised at `x_lin` or the bank; return (Jacobian, decay)."""
+        """Time update in place; return (Jacobian, decay).
+
+        The update is linearised at `x_lin`, or at the states of the bank if `x_lin` is None.
+        """
         n_t = self.observation.n_target
         x_start = (bank.x if x_lin is None else x_lin)[:, :n_t]
         x_target, F, Q = self._propagate(x_start, dt, bank.P[:, :n_t, :n_t])
@@ -83,7 +86,10 @@ class PlainFilter(StepByStep, BankFilter):
         return F, decay
 
     def update(self, bank, frame, dt, x_lin=None):
-        """Measurement update in place at `x_lin`, or iterated; return (log-likelihood, `Gains`)."""
+        """Measurement update in place; return (log-likelihood, `Gains`).
+
+        The update is linearised at `x_lin`, or iterated if `x_lin` is None.
+        """
         iterations = self._settings.iterations if x_lin is None else 1
         covariance = np.where(np.isnan(frame.covariance), np.eye(3), frame.covariance)
         x_prior, P_prior = bank.x, bank.P

@@ -42,7 +42,7 @@ def predict(x, P, x_target, F, Q, variance, decay=1.0):
     P[:] = 0.5 * (P + np.swapaxes(P, 1, 2))
 
 
-def whole_derivative(H, n_own):
+def full_jacobian(H, n_own):
     """Expand `H` (n_hyp, n_sensors, 3, n_t + n_own) to all states, (n_hyp, n_sensors, 3, n_x)."""
     n_hyp, n_sensors, _, n_seen = H.shape
     n_t = n_seen - n_own
@@ -67,7 +67,7 @@ def update(x, P, y, h, H, C, inflation, x_lin=None, n_own=0):
     """
     x_lin = x.copy() if x_lin is None else x_lin
     n_hyp, n_sensors, n_x = len(x), len(y), x.shape[1]
-    A = whole_derivative(H, n_own)
+    A = full_jacobian(H, n_own)
     A[:, np.isnan(y)] = 0.0
     log_likelihood, nis = np.zeros(n_hyp), np.zeros((n_hyp, n_sensors))
     gains = Gains(A, np.zeros((n_hyp, n_sensors, 3, n_x)), np.zeros((n_hyp, n_sensors, 3)),

@@ -8,7 +8,7 @@ from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.simulation.scenario import Path, SensorErrorModel, random_vehicle
-from support.box_vehicles import BOUGHT, box_car, box_truck, random_drive
+from support.box_vehicles import UNCALIBRATED, box_car, box_truck, random_drive
 from support.bundled import NETWORK_FILE
 from support.samples import scenario
 from support.spoiler import apply
@@ -43,7 +43,7 @@ def random_pass(simulator, kind, seed):
                 random_vehicle(rng, rng.uniform(3.6, 4.8), moment=rng.uniform(300.0, 600.0)))
         return body, path, duration, SensorErrorModel()
     body = (box_truck if kind == 'truck' else box_car)(rng)
-    return body, random_drive(rng, path, closest_s), duration + 3.0, BOUGHT
+    return body, random_drive(rng, path, closest_s), duration + 3.0, UNCALIBRATED
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Tracked:
 
     error: np.ndarray
     """Horizontal error, (n,) m."""
-    deviation: np.ndarray
+    error_std: np.ndarray
     """Published standard deviation in the direction of the error, (n,) m."""
     nees: np.ndarray
     """NEES per axis, (n,)."""
@@ -67,24 +67,24 @@ class Tracked:
     heading: float
     """Cosine of the angle between tracked and true velocity at the CPA; NaN without a pose."""
     detected: bool
-    smoothed_sure: int
+    smoothed_unflagged: int
     """Number of unflagged smoothed poses."""
     smoothed_wrong: int
     """Number of unflagged smoothed poses that are wrong."""
 
     @property
-    def sure_and_wrong(self):
+    def unflagged_and_wrong(self):
         """Whether each pose is wrong and not flagged, (n,)."""
-        return ~self.ambiguous & are_wrong(self.error, self.deviation)
+        return ~self.ambiguous & are_wrong(self.error, self.error_std)
 
 
-def are_wrong(error, deviation):
+def are_wrong(error, error_std):
     """Whether each error [m] exceeds `WRONG_M` and `WRONG_SD` published standard deviations [m]."""
-    return (error > WRONG_M) & (error > WRONG_SD * deviation)
+    return (error > WRONG_M) & (error > WRONG_SD * error_std)
 
 
 def errors_of(poses, t, position):
-    """Horizontal (error [m], its std [m], NEES per axis, true position (n, 2) [m]) of poses."""
+    """Horizontal errors of poses: (error [m], its std [m], NEES per axis, true position [m])."""
     stamps = np.array([r.stamp_ns for r in poses]) / 1e9
     true = np.stack([np.interp(stamps, t, position[:, k]) for k in (0, 1)], axis=1)
     error = np.array([r.position[:2] for r in poses]).reshape(-1, 2) - true
@@ -117,12 +117,12 @@ def tracked(network, body, course, duration, flaws, seed, changes=None, faults=(
         w = tracks[k].velocity[:2]
         ratio = np.hypot(*w) / np.hypot(*v)
         heading = w @ v / np.hypot(*w) / np.hypot(*v)
-    sure = [r for r in records if isinstance(r, SmoothedPose) and not r.ambiguous]
-    smoothed_error, smoothed_std, *_ = errors_of(sure, t, position)
+    unflagged = [r for r in records if isinstance(r, SmoothedPose) and not r.ambiguous]
+    smoothed_error, smoothed_std, *_ = errors_of(unflagged, t, position)
     ambiguous = np.array([r.ambiguous for r in tracks], dtype=bool)
     return Tracked(error, std, nees, topic_nees, distance, ambiguous,
-                   float(ratio), float(heading), pipeline.detect.counts['onsets'] > 0, len(sure),
-                   int(are_wrong(smoothed_error, smoothed_std).sum()))
+                   float(ratio), float(heading), pipeline.detect.counts['onsets'] > 0,
+                   len(unflagged), int(are_wrong(smoothed_error, smoothed_std).sum()))
 
 
 def one_random_pass(simulator, kind, seed, changes=None, faults=()):

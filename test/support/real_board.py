@@ -14,16 +14,19 @@ BOX = np.array([-0.05, -0.05, 0.03]), np.array([0.2, 0.22, 0.3])
 
 def board_of_41():
     """Read the bundled data of the board: (network, field, positions, axes)."""
-    places = read_sensor_positions(FOLDER / 'sensor_positions_m.csv')
-    names = tuple(f'mag_{j}' for j in range(len(places)))
+    sensor_positions = read_sensor_positions(FOLDER / 'sensor_positions_m.csv')
+    names = tuple(f'mag_{j}' for j in range(len(sensor_positions)))
     noise = (np.full(3, 4e-8),) * 25 + (np.array([3.2e-7, 3.2e-7, 4.1e-7]),) * 16
-    network = SensorNetwork(names, places, np.tile(np.eye(3), (41, 1, 1)),
+    network = SensorNetwork(names, sensor_positions, np.tile(np.eye(3), (41, 1, 1)),
                             tuple(f'/{name}' for name in names), noise_std=noise)
     return network, *read_pose_table(FOLDER / 'poses.csv')
 
 
 def errors(geometry, field, positions, axes, poses):
-    """Errors of the estimated positions [m] and axes [deg]; `poses` maps from tracker to world."""
+    """Errors of the estimated positions [m] and axes [deg] of a magnet.
+
+    `poses` transforms positions and axes from the tracker frame to the world frame.
+    """
     r, u = poses(positions, axes)
     estimates = [locate_magnet(geometry.network, B, geometry.moment[0], *BOX, PoseSettings())
                  for B in geometry.signal(field)]
@@ -33,14 +36,16 @@ def errors(geometry, field, positions, axes, poses):
     return np.linalg.norm([p.position for p in estimates] - r, axis=1), np.array(angle)
 
 
-def print_errors(what, place, turn, low):
-    print(f'{what}: {1e3 * np.median(place):.3f} mm, {1e3 * np.median(place[low]):.3f} mm below '
-          f'100 mm, {np.median(turn):.2f} deg; 90 % within {1e3 * np.quantile(place, 0.9):.2f} mm')
+def print_errors(title, position_error, axis_error, is_low):
+    print(f'{title}: {1e3 * np.median(position_error):.3f} mm, '
+          f'{1e3 * np.median(position_error[is_low]):.3f} mm below 100 mm, '
+          f'{np.median(axis_error):.2f} deg; 90 % within '
+          f'{1e3 * np.quantile(position_error, 0.9):.2f} mm')
 
 
-def within_limits(place, turn, low):
+def assert_within_limits(position_error, axis_error, is_low):
     """Assert the specified limits, and the tighter limits that have been reached."""
-    assert np.median(place) <= 2.0e-3 and np.median(place[low]) <= 0.8e-3
-    assert np.median(turn) <= 2.5
-    assert np.median(place) <= 1.0e-3 and np.median(place[low]) <= 0.55e-3
-    assert np.median(turn) <= 1.1
+    assert np.median(position_error) <= 2.0e-3 and np.median(position_error[is_low]) <= 0.8e-3
+    assert np.median(axis_error) <= 2.5
+    assert np.median(position_error) <= 1.0e-3 and np.median(position_error[is_low]) <= 0.55e-3
+    assert np.median(axis_error) <= 1.1

@@ -20,7 +20,7 @@ from support.mqtt_broker import publish_packet
 RATE_HZ = 100.0
 NOISE = 1.2e-8
 """[T] Noise of a reading."""
-FIRST = np.array([-20.0, -1.5])
+INITIAL_POSITION = np.array([-20.0, -1.5])
 """[m] Initial position of a vehicle, some metres before it can be detected."""
 SPEED = 6.0
 PASSING_S = 8.0
@@ -73,7 +73,7 @@ class Roadside:
     def __init__(self, network, body, port, line):
         assert len(network) == 2
         self._mqtt, self._line = MqttSender(port), line
-        self._path = Path(FIRST, 0.0, SPEED)
+        self._path = Path(INITIAL_POSITION, 0.0, SPEED)
         self._still = np.einsum('w,jws->js', network.earth_field, network.R_ws)
         position, heading = self._path.at(np.arange(0.0, PASSING_S, 1.0 / RATE_HZ))
         self._table = self._still + np.einsum('njw,jws->njs', body.field(
@@ -125,7 +125,7 @@ class Roadside:
         """Position (2,) [m] of the latest vehicle, even after its pass; NaN before the first."""
         if self._called is None:
             return np.full(2, np.nan)
-        return FIRST + [SPEED * self._elapsed(stamp_ns), 0.0]
+        return INITIAL_POSITION + [SPEED * self._elapsed(stamp_ns), 0.0]
 
     def _elapsed(self, stamp_ns):
         """Time since the start of the vehicle [s]."""

@@ -12,7 +12,7 @@ def segments_of(pid):
     return {f.removeprefix('/dev/shm/') for f in files if f.startswith('/dev/shm/')}
 
 
-def left_behind(names):
+def orphaned_segments(names):
     """Select the segments of `names` that still exist although no running process has them open."""
     # A process also opens segments of other processes, such as those of another test.
     orphans = {n for n in names & set(os.listdir('/dev/shm')) if not n.startswith('sem.')}

@@ -40,7 +40,7 @@ def truck(rng, simulator, length=None, moment=None):
 
 
 def small(rng, simulator, length, moment, iron=1.0):
-    """Random motorcycle, bicycle or trolley."""
+    """Body of a random motorcycle, bicycle or trolley."""
     if simulator == 'boxes':
         return box_two_wheeler(rng, length, moment, iron)
     return random_vehicle(rng, length, 0.5, 1.0, n_parts=20, moment=moment)
@@ -58,30 +58,31 @@ def wagon(rng, simulator):
 
 # Courses.
 
-def lane(rng, speed, away=None, y=None):
-    """Straight `Path` along the road, and the distance `away` of its start from the sensors [m]."""
-    away = QUIET_S * speed + 25.0 if away is None else away
+def lane(rng, speed, start_m=None, y=None):
+    """Straight `Path` along the road, and the distance [m] of its start from the sensors."""
+    start_m = QUIET_S * speed + 25.0 if start_m is None else start_m
     y = rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.6) if y is None else y
     forward = rng.random() < 0.5
-    return Path(np.array([-away if forward else away, y]), 0.0 if forward else np.pi, speed), away
+    return Path(np.array([-start_m if forward else start_m, y]), 0.0 if forward else np.pi,
+                speed), start_m
 
 
 def straight(rng, simulator, body, speed, network=ROAD, **of_lane):
-    """Body on a straight path past the sensors."""
-    path, away = lane(rng, speed, **of_lane)
-    return world(network, [(body, path)], 2.0 * away / speed + 4.0, rng, FLAWS[simulator])
+    """World with a body on a straight path past the sensors."""
+    path, start_m = lane(rng, speed, **of_lane)
+    return world(network, [(body, path)], 2.0 * start_m / speed + 4.0, rng, FLAWS[simulator])
 
 
-def stop_and(rng, stop_s, then):
+def stopping_ride(rng, stop_s, then):
     """Random `Ride` that stops near the sensors, then continues at `then` times its speed.
 
     Returns (ride, duration [s]).
     """
     speed = rng.uniform(6.0, 12.0)
-    brake = rng.uniform(1.5, 3.0)
-    path, away = lane(rng, speed, y=rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.6))
-    stop_m = away + rng.uniform(-5.0, 3.0)
-    braking_s = speed / brake
+    deceleration = rng.uniform(1.5, 3.0)
+    path, start_m = lane(rng, speed, y=rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.6))
+    stop_m = start_m + rng.uniform(-5.0, 3.0)
+    braking_s = speed / deceleration
     begin = (stop_m - 0.5 * speed * braking_s) / speed
     times = [0.0, begin, begin + braking_s, begin + braking_s + stop_s]
     times += [times[-1] + max(abs(then), 0.1) * speed / 2.0]
@@ -89,8 +90,8 @@ def stop_and(rng, stop_s, then):
     return Ride(path, tuple(times), (speed, speed, 0.0, 0.0, then * speed)), duration
 
 
-def stopping(rng, simulator, stop_s, then=1.0):
-    ride, duration = stop_and(rng, stop_s, then)
+def stopping_car(rng, simulator, stop_s, then=1.0):
+    ride, duration = stopping_ride(rng, stop_s, then)
     return world(ROAD, [(car(rng, simulator), ride)], duration, rng, FLAWS[simulator])
 
 
@@ -104,60 +105,60 @@ def u_turn(rng, simulator):
                  FLAWS[simulator])
 
 
-def leaves(rng, simulator, cars=0):
-    """A car is parked near the sensors from the beginning and leaves; other cars may then pass."""
+def departing_car(rng, simulator, cars=0):
+    """World with a car that is parked at the start and leaves; then `cars` other cars pass."""
     x, y = rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 2.0)
     parked_s = rng.uniform(10.0, 20.0)
-    top = rng.uniform(6.0, 12.0)
+    final_speed = rng.uniform(6.0, 12.0)
     forward = rng.random() < 0.5
-    path = Path(np.array([x, y]), 0.0 if forward else np.pi, top)
-    ride = Ride(path, (0.0, parked_s, parked_s + top / 2.0), (0.0, 0.0, top))
-    duration = parked_s + top / 2.0 + 60.0 / top + 6.0
+    path = Path(np.array([x, y]), 0.0 if forward else np.pi, final_speed)
+    ride = Ride(path, (0.0, parked_s, parked_s + final_speed / 2.0), (0.0, 0.0, final_speed))
+    duration = parked_s + final_speed / 2.0 + 60.0 / final_speed + 6.0
     movers = [(car(rng, simulator), ride)]
     for _ in range(cars):
         speed = rng.uniform(7.0, 15.0)
-        other, _ = lane(rng, speed, away=speed * duration)
+        other, _ = lane(rng, speed, start_m=speed * duration)
         movers.append((car(rng, simulator), other))
         duration += 12.0
     return world(ROAD, movers, duration, rng, FLAWS[simulator])
 
 
-def parked(rng, simulator):
-    """A car is parked permanently, 7 to 9 m from the middle of the road; another car passes."""
-    place = np.array([rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(7.0, 9.0)])
-    stop = Ride(Path(place, 0.0, 1.0), (0.0, 1.0), (0.0, 0.0))
+def parked_and_passing_car(rng, simulator):
+    """World with a car parked 7 to 9 m from the middle of the road, and a passing car."""
+    position = np.array([rng.uniform(-4.0, 4.0), rng.choice([-1.0, 1.0]) * rng.uniform(7.0, 9.0)])
+    stop = Ride(Path(position, 0.0, 1.0), (0.0, 1.0), (0.0, 0.0))
     speed = rng.uniform(7.0, 15.0)
-    path, away = lane(rng, speed)
+    path, start_m = lane(rng, speed)
     return world(ROAD, [(car(rng, simulator), stop), (car(rng, simulator), path)],
-                 2.0 * away / speed, rng, FLAWS[simulator])
+                 2.0 * start_m / speed, rng, FLAWS[simulator])
 
 
-def two(rng, simulator, how, network=ROAD):
-    """Two cars that 'meet', 'overtake' or 'follow' each other at the sensors."""
+def two_cars(rng, simulator, pattern, network=ROAD):
+    """World with two cars that 'meet', 'overtake' or 'follow' each other at the sensors."""
     speed = rng.uniform(7.0, 14.0)
     y = rng.uniform(1.0, 1.6)
-    away = QUIET_S * speed + 30.0
-    first = Path(np.array([-away, -y]), 0.0, speed)
-    if how == 'meet':
+    start_m = QUIET_S * speed + 30.0
+    first = Path(np.array([-start_m, -y]), 0.0, speed)
+    if pattern == 'meet':
         other = speed * rng.uniform(0.8, 1.2)
-        second = Path(np.array([away / speed * other + rng.uniform(-5.0, 5.0), y]), np.pi, other)
-    elif how == 'overtake':
+        second = Path(np.array([start_m / speed * other + rng.uniform(-5.0, 5.0), y]), np.pi, other)
+    elif pattern == 'overtake':
         other = speed * rng.uniform(1.3, 1.7)
-        second = Path(np.array([-away / speed * other + rng.uniform(-5.0, 5.0), y]), 0.0, other)
+        second = Path(np.array([-start_m / speed * other + rng.uniform(-5.0, 5.0), y]), 0.0, other)
     else:
-        second = Path(np.array([-away - speed * rng.uniform(1.0, 2.0), -y]), 0.0, speed)
+        second = Path(np.array([-start_m - speed * rng.uniform(1.0, 2.0), -y]), 0.0, speed)
     movers = [(car(rng, simulator), first), (car(rng, simulator), second)]
-    return world(network, movers, 2.0 * away / speed + 4.0, rng, FLAWS[simulator])
+    return world(network, movers, 2.0 * start_m / speed + 4.0, rng, FLAWS[simulator])
 
 
-def spoilt_car(rng, simulator, *faults):
-    """A car passes sensors with faults of `support.spoiler`."""
+def faulty_pass(rng, simulator, *faults):
+    """World with a car that passes sensors with faults of `support.spoiler`."""
     clean = straight(rng, simulator, car(rng, simulator), rng.uniform(7.0, 20.0))
     return replace(clean, readings=spoiler.apply(clean.readings, *faults))
 
 
-def usual(rng, simulator, kind):
-    """Random pass of `support.random_passes`."""
+def random_pass_world(rng, simulator, kind):
+    """World with a random pass of `support.random_passes`."""
     seed = int(rng.integers(1 << 30))
     body, course, duration, flaws = random_pass(simulator, kind, seed)
     return world(ROAD, [(body, course)], duration, rng, flaws)
@@ -170,7 +171,7 @@ def ambient_world(rng, simulator, ambient, duration, rate=100.0, cars=0):
     movers = []
     for k in range(cars):
         speed = rng.uniform(7.0, 15.0)
-        path, _ = lane(rng, speed, away=speed * (duration / cars * (k + 0.6)))
+        path, _ = lane(rng, speed, start_m=speed * (duration / cars * (k + 0.6)))
         movers.append((car(rng, simulator), path))
     return world(ROAD, movers, duration, rng, FLAWS[simulator], rate, ambient)
 
@@ -186,7 +187,7 @@ def direction(rng):
 
 
 def hum(rng, simulator, frequency, rate):
-    """A power line to one side, whose field is larger at the nearer sensor."""
+    """World with the field of a power line, which is larger at the nearer sensor."""
     near = rng.uniform(0.5, 1.0, 2)
     v = rng.uniform(1e-7, 3e-7) * direction(rng)
     omega = 2.0 * np.pi * frequency * rng.uniform(0.9995, 1.0005)
@@ -195,13 +196,13 @@ def hum(rng, simulator, frequency, rate):
 
 
 def tram(rng, simulator):
-    """A current of 100 to 500 A in a line 30 to 60 m away is switched on and off with ramps."""
+    """World with a tram line 30 to 60 m away, whose current of 100 to 500 A is switched."""
     times = np.sort(rng.uniform(12.0, 55.0, 4))
-    away, current = rng.uniform(30.0, 60.0), rng.uniform(100.0, 500.0)
+    distance, current = rng.uniform(30.0, 60.0), rng.uniform(100.0, 500.0)
     y = ROAD.positions[:, 1]
     # Field of an infinite wire along x, 5 m above the ground.
-    r2 = (away - y)**2 + 25.0
-    B = 2e-7 * current * np.stack([0.0 * y, 5.0 / r2, (away - y) / r2], axis=1)
+    r2 = (distance - y)**2 + 25.0
+    B = 2e-7 * current * np.stack([0.0 * y, 5.0 / r2, (distance - y) / r2], axis=1)
     ramp = rng.uniform(0.2, 2.0)
     return ambient_world(rng, simulator, lambda t: np.interp(
         t, np.concatenate([[s, s + ramp] for s in times]), [0, 1, 1, 0, 0, 1, 1, 0]
@@ -209,7 +210,7 @@ def tram(rng, simulator):
 
 
 def storm(rng, simulator, cars=0):
-    """Two minutes of a geomagnetic storm: slow waves and a drift of 500 nT per ten minutes."""
+    """World with two minutes of a geomagnetic storm: slow waves, and a drift of 50 nT/min."""
     v = 5e-7 * direction(rng)
     periods, phases = rng.uniform(60.0, 400.0, 6), rng.uniform(0.0, 2.0 * np.pi, 6)
     return ambient_world(rng, simulator, uniform(v, lambda t: sum(
@@ -218,14 +219,14 @@ def storm(rng, simulator, cars=0):
 
 
 def pulsations(rng, simulator):
-    """Geomagnetic pulsations of 20 nT with a period of 20 to 60 s."""
+    """World with geomagnetic pulsations of 20 nT and a period of 20 to 60 s."""
     p = rng.uniform(20.0, 60.0)
     return ambient_world(rng, simulator, uniform(
         2e-8 * direction(rng), lambda t: np.sin(2.0 * np.pi * t / p)), 120.0)
 
 
-def knocked(rng, simulator):
-    """A sensor is suddenly rotated by 1 to 5 degrees."""
+def knocked_sensor(rng, simulator):
+    """World in which a sensor is suddenly rotated by 1 to 5 degrees."""
     quiet = ambient_world(rng, simulator, None, 40.0)
     angles = np.deg2rad(rng.uniform(1.0, 5.0)) * direction(rng)
     n = int(15.0 * 100.0) * 2
@@ -236,8 +237,8 @@ def knocked(rng, simulator):
     return replace(quiet, readings=replace(quiet.readings, field=field))
 
 
-def ramps(rng, simulator):
-    """Each sensor drifts independently by up to 5 nT/s for 10 to 30 s, then back."""
+def drifting_sensors(rng, simulator):
+    """World in which each sensor drifts by up to 5 nT/s for 10 to 30 s, then back."""
     rates = rng.uniform(1e-9, 5e-9, (2, 1)) * np.array([direction(rng), direction(rng)])
     ramp_s = rng.uniform(10.0, 30.0)
     return ambient_world(rng, simulator, lambda t: np.interp(
@@ -245,17 +246,17 @@ def ramps(rng, simulator):
         90.0)
 
 
-def far(rng, simulator, body):
-    """A large object passes far away; its field is hardly measurable."""
-    return straight(rng, simulator, body, rng.uniform(15.0, 25.0), away=200.0,
+def distant_body(rng, simulator, body):
+    """World with a large body that passes far away, with a hardly measurable field."""
+    return straight(rng, simulator, body, rng.uniform(15.0, 25.0), start_m=200.0,
                     y=rng.choice([-1.0, 1.0]) * rng.uniform(30.0, 60.0))
 
 
 def train(rng, simulator, y):
-    """A train of five wagons of 18 m passes; a pose at any wagon is correct."""
+    """World with a train of five wagons of 18 m; a pose at any wagon is correct."""
     speed = rng.uniform(10.0, 20.0)
-    path, away = lane(rng, speed, away=250.0, y=rng.choice([-1.0, 1.0]) * y)
+    path, start_m = lane(rng, speed, start_m=250.0, y=rng.choice([-1.0, 1.0]) * y)
     along = np.array([np.cos(path.heading), np.sin(path.heading)])
     movers = [(wagon(rng, simulator), replace(path, start=path.start + 20.0 * k * along))
               for k in range(-2, 3)]
-    return world(ROAD, movers, 2.0 * away / speed, rng, FLAWS[simulator])
+    return world(ROAD, movers, 2.0 * start_m / speed, rng, FLAWS[simulator])

@@ -13,24 +13,24 @@ from support.situation_worlds import (
     FOUR,
     car,
     car_with_trailer,
-    far,
+    departing_car,
+    distant_body,
+    drifting_sensors,
+    faulty_pass,
     hum,
-    knocked,
-    leaves,
-    parked,
+    knocked_sensor,
+    parked_and_passing_car,
     pulsations,
-    ramps,
+    random_pass_world,
     small,
-    spoilt_car,
-    stopping,
+    stopping_car,
     storm,
     straight,
     train,
     tram,
     truck,
-    two,
+    two_cars,
     u_turn,
-    usual,
 )
 
 
@@ -47,28 +47,28 @@ class Situation:
 
 
 SITUATIONS = {
-    'a car': Situation(lambda r, s: usual(r, s, 'car'), group='control'),
-    'a truck': Situation(lambda r, s: usual(r, s, 'truck'), group='control'),
-    'a car that turns': Situation(lambda r, s: usual(r, s, 'turning'), group='control'),
+    'a car': Situation(lambda r, s: random_pass_world(r, s, 'car'), group='control'),
+    'a truck': Situation(lambda r, s: random_pass_world(r, s, 'truck'), group='control'),
+    'a car that turns': Situation(lambda r, s: random_pass_world(r, s, 'turning'), group='control'),
     'a car of 25 to 40 m/s': Situation(
         lambda r, s: straight(r, s, car(r, s), r.uniform(25.0, 40.0)), group='control'),
     'a U-turn': Situation(u_turn, group='control'),
     'a car, four sensors': Situation(
         lambda r, s: straight(r, s, car(r, s), r.uniform(7.0, 20.0), FOUR), group='control'),
     'a car of 60 m/s': Situation(lambda r, s: straight(r, s, car(r, s), 60.0)),
-    'clocks 50 ms apart': Situation(lambda r, s: spoilt_car(r, s, spoiler.delayed('mag_2', 0.05))),
-    'clocks 100 ms apart': Situation(lambda r, s: spoilt_car(r, s, spoiler.delayed('mag_2', 0.1))),
-    'clocks 200 ms apart': Situation(lambda r, s: spoilt_car(r, s, spoiler.delayed('mag_2', 0.2))),
+    'clocks 50 ms apart': Situation(lambda r, s: faulty_pass(r, s, spoiler.delayed('mag_2', 0.05))),
+    'clocks 100 ms apart': Situation(lambda r, s: faulty_pass(r, s, spoiler.delayed('mag_2', 0.1))),
+    'clocks 200 ms apart': Situation(lambda r, s: faulty_pass(r, s, spoiler.delayed('mag_2', 0.2))),
     'over a sensor': Situation(lambda r, s: straight(
         r, s, car(r, s), r.uniform(7.0, 20.0), y=r.choice([-4.5, 4.5]) + r.uniform(-0.4, 0.4))),
-    'stops for 5 s': Situation(lambda r, s: stopping(r, s, 5.0)),
-    'stops for 20 s': Situation(lambda r, s: stopping(r, s, 20.0)),
-    'stops for 60 s': Situation(lambda r, s: stopping(r, s, 60.0)),
-    'parks': Situation(lambda r, s: stopping(r, s, 60.0, 0.0)),
-    'reverses': Situation(lambda r, s: stopping(r, s, 2.0, -0.5)),
-    'crawls at 0.3 m/s': Situation(lambda r, s: straight(r, s, car(r, s), 0.3, away=15.0)),
+    'stops for 5 s': Situation(lambda r, s: stopping_car(r, s, 5.0)),
+    'stops for 20 s': Situation(lambda r, s: stopping_car(r, s, 20.0)),
+    'stops for 60 s': Situation(lambda r, s: stopping_car(r, s, 60.0)),
+    'parks': Situation(lambda r, s: stopping_car(r, s, 60.0, 0.0)),
+    'reverses': Situation(lambda r, s: stopping_car(r, s, 2.0, -0.5)),
+    'crawls at 0.3 m/s': Situation(lambda r, s: straight(r, s, car(r, s), 0.3, start_m=15.0)),
     'a trolley at 1.3 m/s': Situation(lambda r, s: straight(
-        r, s, small(r, s, 1.0, r.uniform(8.0, 15.0), 0.1), 1.3, away=20.0,
+        r, s, small(r, s, 1.0, r.uniform(8.0, 15.0), 0.1), 1.3, start_m=20.0,
         y=r.choice([-1.0, 1.0]) * r.uniform(2.0, 3.5))),
     'a bicycle': Situation(lambda r, s: straight(
         r, s, small(r, s, 1.7, r.uniform(4.0, 8.0), 0.1), r.uniform(4.0, 7.0),
@@ -79,23 +79,23 @@ SITUATIONS = {
         r, s, car_with_trailer(r, s), r.uniform(7.0, 15.0))),
     # The distance is from the nearer sensor.
     'a train at 9 m': Situation(lambda r, s: train(r, s, 13.5)),
-    'there at the start, leaves': Situation(leaves),
-    'there at the start, then cars': Situation(lambda r, s: leaves(r, s, cars=2)),
+    'there at the start, leaves': Situation(departing_car),
+    'there at the start, then cars': Situation(lambda r, s: departing_car(r, s, cars=2)),
     # The stop is longer than `relearn_s`, so the vehicle has become part of the background.
-    'was parked for minutes, leaves': Situation(lambda r, s: stopping(r, s, 150.0)),
-    'parked beside a passing car': Situation(parked),
-    'one sensor alone': Situation(lambda r, s: spoilt_car(r, s, spoiler.only_sensor('mag_1'))),
-    'one axis flipped': Situation(lambda r, s: spoilt_car(r, s, spoiler.wrong_sign('mag_2', 'y'))),
-    'clipped at half its peak': Situation(lambda r, s: spoilt_car(r, s, spoiler.clipped(0.5))),
-    'warming by 10 nT/s': Situation(lambda r, s: spoilt_car(r, s, spoiler.drift(1e-8))),
-    'a temperature step': Situation(lambda r, s: spoilt_car(
+    'was parked for minutes, leaves': Situation(lambda r, s: stopping_car(r, s, 150.0)),
+    'parked beside a passing car': Situation(parked_and_passing_car),
+    'one sensor alone': Situation(lambda r, s: faulty_pass(r, s, spoiler.only_sensor('mag_1'))),
+    'one axis flipped': Situation(lambda r, s: faulty_pass(r, s, spoiler.wrong_sign('mag_2', 'y'))),
+    'clipped at half its peak': Situation(lambda r, s: faulty_pass(r, s, spoiler.clipped(0.5))),
+    'warming by 10 nT/s': Situation(lambda r, s: faulty_pass(r, s, spoiler.drift(1e-8))),
+    'a temperature step': Situation(lambda r, s: faulty_pass(
         r, s, spoiler.temperature_step(3e-7, 4.0))),
-    'two that meet': Situation(lambda r, s: two(r, s, 'meet'), aim=0.05, group='several'),
-    'one overtakes': Situation(lambda r, s: two(r, s, 'overtake'), aim=0.05, group='several'),
-    'one follows': Situation(lambda r, s: two(r, s, 'follow'), aim=0.05, group='several'),
-    'two that meet, four sensors': Situation(lambda r, s: two(r, s, 'meet', FOUR), aim=0.05,
+    'two that meet': Situation(lambda r, s: two_cars(r, s, 'meet'), aim=0.05, group='several'),
+    'one overtakes': Situation(lambda r, s: two_cars(r, s, 'overtake'), aim=0.05, group='several'),
+    'one follows': Situation(lambda r, s: two_cars(r, s, 'follow'), aim=0.05, group='several'),
+    'two that meet, four sensors': Situation(lambda r, s: two_cars(r, s, 'meet', FOUR), aim=0.05,
                                              group='several'),
-    'one follows, four sensors': Situation(lambda r, s: two(r, s, 'follow', FOUR), aim=0.05,
+    'one follows, four sensors': Situation(lambda r, s: two_cars(r, s, 'follow', FOUR), aim=0.05,
                                            group='several'),
     'hum of 50 Hz at 50 Hz': Situation(lambda r, s: hum(r, s, 50.0, 50.0), group='nothing'),
     'hum of 16.7 Hz at 100 Hz': Situation(lambda r, s: hum(r, s, 16.7, 100.0), group='nothing'),
@@ -103,9 +103,9 @@ SITUATIONS = {
     'a storm': Situation(storm, group='nothing'),
     'pulsations of 20 nT': Situation(pulsations, group='nothing'),
     'cars in a storm': Situation(lambda r, s: storm(r, s, cars=4)),
-    'a sensor knocked': Situation(knocked, group='nothing'),
-    'slow ramps': Situation(ramps, group='nothing'),
-    'a truck far away': Situation(lambda r, s: far(r, s, truck(r, s))),
+    'a sensor knocked': Situation(knocked_sensor, group='nothing'),
+    'slow ramps': Situation(drifting_sensors, group='nothing'),
+    'a truck far away': Situation(lambda r, s: distant_body(r, s, truck(r, s))),
     'a train far away': Situation(lambda r, s: train(r, s, r.uniform(40.0, 60.0))),
 }
 """{name: situation}."""
@@ -128,17 +128,17 @@ class Verdict:
     ambiguous: np.ndarray
     wrong: np.ndarray
     """Whether the error exceeds 2 m and 3 standard deviations for every body, (n,)."""
-    smoothed_sure: int
+    smoothed_unflagged: int
     smoothed_wrong: int
     n_tracks: int
     n_disturbances: int
-    n_mistaken: int
+    n_false_disturbances: int
     """Number of disturbances that were reported although their tracks follow a body."""
     doubts: tuple
     """Doubts of each pose."""
 
     @property
-    def n_sure(self):
+    def n_unflagged(self):
         return int((~self.ambiguous).sum())
 
     @property
@@ -155,7 +155,7 @@ def wrong_of(poses, a_world):
     return wrong
 
 
-def mistaken(disturbances, tracks, a_world):
+def false_disturbances(disturbances, tracks, a_world):
     """Select the disturbances whose tracks follow a body of a `World` within 5 m."""
     out = []
     for d in disturbances:
@@ -178,5 +178,5 @@ def verdict(name, simulator, seed, changes=None):
         np.array([r.stamp_ns for r in tracks]) / 1e9, np.array([r.id for r in tracks]),
         np.array([r.ambiguous for r in tracks], dtype=bool), wrong_of(tracks, a_world),
         len(smoothed), int(wrong_of(smoothed, a_world).sum()), pipeline.track.counts['tracks'],
-        len(disturbances), len(mistaken(disturbances, tracks, a_world)),
+        len(disturbances), len(false_disturbances(disturbances, tracks, a_world)),
         tuple(r.doubts for r in tracks))

@@ -1,4 +1,4 @@
-"""Faults and poor sensors for any recording: each function returns a fault, which `apply` applies.
+"""Faults of sensors and streams for any recording. Each function returns a fault for `apply`.
 
     readings = apply(readings, steps(1e-7), covariance(1e-2), beginning_cut(5.0))
 """

@@ -13,7 +13,7 @@ from mag_tracking.report.metrics import interpolate_truth
 from support.bundled import DATA, NETWORK_FILE, vehicle_path
 from support.spoiler import apply
 
-HEADING = np.cos(np.deg2rad(45.0))
+MIN_HEADING_COSINE = np.cos(np.deg2rad(45.0))
 """Cosine of the largest permitted angle between tracked and true velocity at the CPA."""
 
 
@@ -48,7 +48,7 @@ class Outcome:
 
     @property
     def direction_is_right(self):
-        return self.tracked and self.heading > HEADING
+        return self.tracked and self.heading > MIN_HEADING_COSINE
 
 
 def outcome(name, *faults, network=NETWORK_FILE, settings=None):

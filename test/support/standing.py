@@ -13,7 +13,7 @@ MAX_STOPPED_SPEED = 0.05
 """[m/s] Speed below which a vehicle counts as stopped."""
 MAX_BACKGROUND_ERROR = 2.0
 """Maximum error of a correct background, in standard deviations of a reading."""
-SOON_S = 3.0
+MAX_RECOVERY_S = 3.0
 """[s] Maximum time from the departure of a parked vehicle until the background is correct."""
 TRACKED_M = 2.0
 """[m] Maximum median error of a tracked vehicle."""
@@ -25,19 +25,19 @@ def poses_of(records):
     return [r for r in records if isinstance(r, Track) and not r.ended]
 
 
-def stands(a_world, body=0):
-    """(begin, end) [s] of the stop of a body in a `World`."""
+def stop_interval(a_world, body=0):
+    """Stop of a body in a `World`: (begin, end) [s]."""
     velocity = np.gradient(a_world.positions[body], a_world.t, axis=0)
     still = a_world.t[np.linalg.norm(velocity, axis=1) < MAX_STOPPED_SPEED]
     return still.min(), still.max()
 
 
 def is_one_track(name, run):
-    """Whether one track covers a vehicle from before its stop until 2 s after it."""
+    """Whether one track covers a vehicle from before its stop until 2 s after the stop."""
     a_world = simulated_world(name, SIMULATORS[run % 2], run // 2)
     pipeline = Pipeline(a_world.network, settings_for('vehicle'))
     poses = poses_of(pipeline.feed(a_world.readings) + pipeline.flush())
-    begin, end = stands(a_world)
+    begin, end = stop_interval(a_world)
     spans = {}
     for pose in poses:
         spans.setdefault(pose.id, []).append(pose.stamp_ns / 1e9)
@@ -73,9 +73,9 @@ def background_recovery_s(run):
 
 
 def error_after_parked(run):
-    """(median error [m] or inf, n_sure, n_wrong) of the first vehicle after the parked vehicle.
+    """Track the first vehicle after a parked vehicle: (median error [m], n_unflagged, n_wrong).
 
-    The readings are processed offline, with a prescan.
+    The readings are processed offline, with a prescan. The error is inf without a track.
     """
     a_world = simulated_world('there at the start, then cars', SIMULATORS[run % 2], run // 2)
     pipeline = Pipeline(a_world.network, settings_for('vehicle'))
@@ -86,6 +86,7 @@ def error_after_parked(run):
     for id in {pose.id for pose in poses}:
         own = [pose for pose in poses if pose.id == id]
         error = float(np.median(errors_of(own, a_world.t, a_world.positions[1])[0]))
-        sure = np.array([not pose.ambiguous for pose in own])
-        best = min(best, (error, int(sure.sum()), int((sure & wrong_of(own, a_world)).sum())))
+        unflagged = np.array([not pose.ambiguous for pose in own])
+        best = min(best, (error, int(unflagged.sum()),
+                          int((unflagged & wrong_of(own, a_world)).sum())))
     return best

@@ -27,8 +27,8 @@ def steady_frames(rng, network=ROAD, path=STRAIGHT, clocks=(), change=None, peri
     model = SteadyPass(times, network.positions[sensor], np.tile(np.eye(3), (len(times), 1, 1)),
                        sensor - 1, np.arange(len(theta)), theta, len(MOMENTS))
     # The linear parameters are combinations of the moments.
-    places = np.linspace(-0.5, 0.5, len(MOMENTS))
-    combinations = np.kron(np.linalg.qr(np.vander(places, increasing=True))[0], np.eye(3))
+    fractions = np.linspace(-0.5, 0.5, len(MOMENTS))
+    combinations = np.kron(np.linalg.qr(np.vander(fractions, increasing=True))[0], np.eye(3))
     B = (model.basis(theta[None])[0] @ combinations.T @ MOMENTS.ravel()).reshape(len(t), n, 3)
     B = B + NOISE * rng.standard_normal(B.shape)
     B = B if change is None else change(B)

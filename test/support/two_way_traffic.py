@@ -76,7 +76,7 @@ class Passing:
         return [one, -other], one - other
 
     def log_odds_of_north(self):
-        """([log odds of each sensor], fused log odds) of northbound."""
+        """Log odds of the northbound direction: ([log odds of each sensor], fused log odds)."""
         # Seen from the first sensor, a northbound vehicle moves from left to right.
         one, other = (r.log_odds for r in self.rotations())
         return [one, -other], fused_log_odds([one, other], [True, False])
@@ -146,7 +146,7 @@ def shares(vehicles, log_odds):
 
 
 def calibration(vehicles):
-    """(predicted, measured) error probability of the far sensor, for isolated vehicles."""
+    """Error probability of the far sensor for isolated vehicles: (predicted, measured)."""
     isolated = [v for v in vehicles if v.headway > 2.0]
     far = [(v.log_odds_of_north()[0][1 - v.near], v.is_north) for v in isolated]
     predicted = [1.0 / (1.0 + np.exp(min(abs(odds), 500.0))) for odds, _ in far]

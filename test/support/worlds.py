@@ -7,7 +7,7 @@ import numpy as np
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings
 from mag_tracking.simulation.scenario import Path, SensorErrorModel
-from support.box_vehicles import BOUGHT, magnetised
+from support.box_vehicles import UNCALIBRATED, magnetised
 from support.samples import scenario
 
 GRID_S = 0.01
@@ -63,7 +63,7 @@ class World:
 
 
 def box_two_wheeler(rng, length, moment, iron=1.0):
-    """Motorcycle, bicycle or trolley of boxes: frame, engine with weight `iron`, two wheels."""
+    """Motorcycle, bicycle or trolley of boxes: a frame, an engine of weight `iron`, two wheels."""
     parts = [((0.0, 0.0, 0.5), (0.5 * length, 0.06, 0.5), 1.0),
              ((0.05 * length, 0.0, 0.4), (0.35, 0.3, 0.3), iron)]
     parts += [((0.35 * end * length, 0.0, 0.3), (0.05, 0.15, 0.5), 0.4) for end in (-1, 1)]
@@ -109,5 +109,5 @@ def _flawed(B, flaws, t, rng):
     return out + flaws.noise_std * rng.standard_normal(out.shape)
 
 
-FLAWS = {'clouds': SensorErrorModel(), 'boxes': BOUGHT}
+FLAWS = {'clouds': SensorErrorModel(), 'boxes': UNCALIBRATED}
 """{simulator: `SensorErrorModel` of its sensors}."""

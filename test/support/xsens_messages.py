@@ -13,7 +13,7 @@ from mag_tracking.drivers.reading import Reading
 LAYOUT = ('temp', 'acc', 'gyr', 'mag', 'counter')
 """Blocks of the MTData messages of `encode_random_frame`, in float precision."""
 FLOAT, FP1220, FP1632, DOUBLE = range(4)
-MARKS = (0xFA, 0xFA, 0xFF, 0xFF, 0x36, 0x32, 0x3E)
+FREQUENT_BYTES = (0xFA, 0xFA, 0xFF, 0xFF, 0x36, 0x32, 0x3E)
 """Bytes that are frequent in garbage."""
 
 
@@ -41,8 +41,8 @@ def reals(numbers, precision):
         return b''.join(int(x * 2**20).to_bytes(4, 'big', signed=True) for x in numbers)
     out = b''
     for x in numbers:
-        whole = int(x * 2**32).to_bytes(6, 'big', signed=True)
-        out += whole[2:] + whole[:2]
+        fixed_point = int(x * 2**32).to_bytes(6, 'big', signed=True)
+        out += fixed_point[2:] + fixed_point[:2]
     return out
 
 
@@ -118,7 +118,7 @@ def garbage(rng, n):
         elif kind < 0.35:
             out += b'\xfa\xff\x36\xff' + struct.pack('>H', rng.randrange(600))
         elif kind < 0.6:
-            out.append(rng.choice(MARKS))
+            out.append(rng.choice(FREQUENT_BYTES))
         else:
             out.append(rng.getrandbits(8))
     return bytes(out[:n])
@@ -162,8 +162,8 @@ def main():
     parser.add_argument('--seed', type=int, default=0)
     arguments = parser.parse_args()
     rng, framing = random.Random(arguments.seed), XsensFraming(XsensSettings(mtdata=LAYOUT))
-    sent = lost = false = fed = 0
-    spent = 0.0
+    sent = lost = false = n_bytes = 0
+    parse_s = 0.0
     for _ in range(0, arguments.frames, 10_000):
         data, readings, _ = stream(rng, min(10_000, arguments.frames))
         found, rest, position = [], b'', 0
@@ -174,11 +174,12 @@ def main():
             parsed = framing.parse(piece, final=position >= len(data))
             rest = piece[parsed.consumed:]
             found += parsed.readings
-        spent += time.perf_counter() - begin
-        fewer, more = lost_and_false(readings, found)
-        sent, lost, false, fed = sent + len(readings), lost + fewer, false + more, fed + len(data)
-    print(f'{arguments.frames} frames with {sent} readings in {fed} bytes: {lost} lost, {false} '
-          f'false, {1e6 * spent / arguments.frames:.1f} us a frame')
+        parse_s += time.perf_counter() - begin
+        n_lost, n_false = lost_and_false(readings, found)
+        sent, lost, false, n_bytes = (sent + len(readings), lost + n_lost, false + n_false,
+                                      n_bytes + len(data))
+    print(f'{arguments.frames} frames with {sent} readings in {n_bytes} bytes: {lost} lost, '
+          f'{false} false, {1e6 * parse_s / arguments.frames:.1f} us a frame')
 
 
 if __name__ == '__main__':

@@ -41,7 +41,7 @@ def test_every_vehicle_of_a_recording_is_tracked(name):
 def test_every_vehicle_of_a_recording_is_counted(name):
     """Each vehicle is counted in the right direction, and no other passage is counted."""
     passages = tracked_recording(name).passages
-    right = busy_recordings.rightly_counted(name, passages)
+    right = busy_recordings.correctly_counted(name, passages)
     assert len(right) >= AIMS[name][0] and len(right) == len(passages)
     assert [p.number for p in passages] == list(range(1, len(passages) + 1))
     assert (np.diff([p.stamp_ns for p in passages]) > 0).all()
@@ -66,8 +66,9 @@ def test_smoothed_poses_of_new_targets_are_near_the_published_ones():
 
 def test_poses_without_a_flag_are_rarely_wrong():
     scores = [tracked_recording(name).score for name in IN_EVERY_TEST]
-    n_sure, n_wrong = (sum(getattr(s, of) for s in scores) for of in ('n_sure', 'n_wrong'))
-    assert n_sure > 250 and n_wrong <= MAX_WRONG_FRACTION * n_sure
+    n_unflagged, n_wrong = (sum(getattr(s, of) for s in scores)
+                            for of in ('n_unflagged', 'n_wrong'))
+    assert n_unflagged > 250 and n_wrong <= MAX_WRONG_FRACTION * n_unflagged
 
 
 @pytest.mark.study

@@ -9,7 +9,7 @@ import pytest
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.stages.align.frame_period import frame_period
 from mag_tracking.stages.align.settings import AlignSettings
-from support.close_pairs import PAIR, answers, readings_of
+from support.close_pairs import PAIR, estimates_of, readings_of
 
 SEEDS = range(40)
 
@@ -31,7 +31,7 @@ def delay_of(a):
 @pytest.mark.study
 def test_speed_and_direction_of_forty_passes_reach_the_aims():
     """Aims: 36 of 40 passes answered, all directions right, 95 % of the errors within 3 std."""
-    passes = [answers(seed) for seed in SEEDS]
+    passes = [estimates_of(seed) for seed in SEEDS]
     rows = {'fit': [(a.truth, a.fit) for a in passes if a.fit is not None],
             'delay': [(a.truth, delay_of(a)) for a in passes if not a.delay.reason],
             'track': [(a.truth, a.track) for a in passes if a.track is not None],
@@ -52,7 +52,7 @@ def test_speed_and_direction_of_forty_passes_reach_the_aims():
                    'model errors at the two sensors')
 def test_the_speed_of_a_track_at_a_close_pair_reaches_the_aims():
     """Aims for both tracks: speed within 10 % in 90 % of the passes, error within 3 std in 95 %."""
-    found = [answers(seed) for seed in SEEDS]
+    found = [estimates_of(seed) for seed in SEEDS]
     for name in ('track', 'smoothed'):
         n, _, near, consistent = counts([(a.truth, getattr(a, name)) for a in found])
         assert near >= 0.9 * n and consistent >= 0.95 * n
@@ -60,7 +60,7 @@ def test_the_speed_of_a_track_at_a_close_pair_reaches_the_aims():
 
 @pytest.mark.parametrize('seed', [2, 9, 20])
 def test_speed_and_direction_of_a_few_passes_are_right(seed):
-    a = answers(seed)
+    a = estimates_of(seed)
     for answer, std in (a.fit, delay_of(a)):
         assert abs(answer / a.truth - 1.0) < 0.1 and abs(answer - a.truth) <= 3.0 * std
     assert a.track[0] * a.truth > 0.0

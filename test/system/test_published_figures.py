@@ -88,11 +88,12 @@ def test_the_moment_and_field_of_the_car_match_the_equations(mitre12):
 
 def test_positions_follow_the_published_equations_of_motion(mitre12):
     theta, k = 0.4, np.arange(11)
-    r = mitre12.places(3.0, -2.0, 10.0, theta)
+    r = mitre12.source_positions(3.0, -2.0, 10.0, theta)
     np.testing.assert_allclose(r[:, 0], 3.0 - k / 22.0 * 10.0 * np.sin(theta), rtol=1e-12)
     np.testing.assert_allclose(r[:, 1], -2.0 + k / 22.0 * 10.0 * np.cos(theta), rtol=1e-12)
     # The direction along x is -90 degrees in the paper.
-    assert mitre12.places(0.0, 25.0, 10.0, mitre12.ALONG)[-1, 0] == pytest.approx(10.0 * 10 / 22)
+    assert mitre12.source_positions(0.0, 25.0, 10.0, mitre12.ROAD_HEADING)[-1, 0] \
+        == pytest.approx(10.0 * 10 / 22)
 
 
 @pytest.mark.parametrize('z', [[-20.0, 25.0, 11.0, -np.pi / 2, -137.0, 374.0],
@@ -100,7 +101,7 @@ def test_positions_follow_the_published_equations_of_motion(mitre12):
 def test_the_jacobian_matches_finite_differences_of_the_field(mitre12, z):
     def field(z):
         m = np.array([z[4], z[5], 0.0])
-        return dipole_field(-mitre12.places(*z[:4]), m)[:, :2]
+        return dipole_field(-mitre12.source_positions(*z[:4]), m)[:, :2]
 
     step = 1e-4 * np.array([1.0, 1.0, 1.0, 1.0, 100.0, 100.0])
     numeric = np.stack([(field(z + e) - field(z - e)) / (2.0 * e.max()) for e in np.diag(step)],
@@ -123,7 +124,7 @@ def test_the_detection_probability_matches_explicit_sums(mitre12, divisor, scale
         transform = np.exp(-2j * np.pi * line * k / 11.0) @ B / divisor
         square += 2.0 * 2.0 * np.sum(np.abs(transform)**2) / S
     expected = norm.sf(norm.isf(1e-6) - np.sqrt(square))
-    p = mitre12.detection(mitre12.moment('car'), cpa, np.array([-3.0]), mitre12.ONE, **scale)
+    p = mitre12.detection(mitre12.moment('car'), cpa, np.array([-3.0]), mitre12.ONE_SENSOR, **scale)
     assert p[0, 0] == pytest.approx(expected, rel=1e-9) and 0.3 < expected < 0.95
 
 
@@ -143,7 +144,8 @@ def test_detection_probabilities_are_near_the_published_ones(mitre12, detection_
     # The probability falls with the CPA distance and grows with the number of sensors.
     for vehicle in ('car', 'ATV'):
         m = mitre12.moment(vehicle)
-        once = np.array([[mitre12.at_least_once(m, c, s) for s in (mitre12.ONE, mitre12.FIVE)]
+        once = np.array([[mitre12.drive_detection(m, c, s)
+                          for s in (mitre12.ONE_SENSOR, mitre12.FIVE_SENSORS)]
                          for c in range(5, 45)])
         assert np.all(np.diff(once, axis=0) <= 1e-9) and np.all(once[:, 1] >= once[:, 0])
 
@@ -162,7 +164,7 @@ def test_bounds_of_one_sensor_without_a_prior_are_infinite(mitre12, bound_result
     assert n['at 0 mph'][1][3] == pytest.approx(15.0, rel=1e-9)
     assert n['at 10 mph'][0][3] > n['at 25 mph'][0][3] > n['at 80 mph'][0][3]
     # With two sensors, the scale is observable.
-    J = mitre12.measured(-20.0) + mitre12.measured(0.0)
+    J = mitre12.period_information(-20.0) + mitre12.period_information(0.0)
     assert np.all(np.isfinite(mitre12.std_bounds(J)))
 
 
@@ -171,7 +173,7 @@ def test_printed_jacobian_and_prior_do_not_explain_the_published_bounds(mitre12,
     x, y, h = -20.0, 25.0, 1e-5
     phi = np.array([np.arctan2(y, x + h) - np.arctan2(y, x - h),
                     np.arctan2(y + h, x) - np.arctan2(y - h, x)]) / (2.0 * h)
-    C = mitre12.bound(mitre12.measured(x), mitre12.PRIOR)[:2, :2]
+    C = mitre12.bound(mitre12.period_information(x), mitre12.PRIOR)[:2, :2]
     printed, right = bound_results['phi at -20 m']
     assert right == pytest.approx(np.degrees(np.sqrt(phi @ C @ phi)), rel=1e-6)
     assert printed < 0.8 * right
@@ -215,7 +217,8 @@ def test_the_best_position_of_the_second_sensor_depends_on_the_state(t10, observ
     z = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0, 1.0, 1.0])
     H = np.stack([(field(z + e) - field(z - e)) / 2e-5 for e in 1e-5 * np.eye(9)], axis=-1)
     J = np.einsum('tai,taj->ij', H, H)
-    np.testing.assert_allclose(t10.about_cpa(moved), J, rtol=1e-6, atol=1e-6 * np.abs(J).max())
+    np.testing.assert_allclose(t10.information_at_cpa(moved), J, rtol=1e-6,
+                               atol=1e-6 * np.abs(J).max())
 
 
 def test_the_threshold_and_the_ranges_match_t10(observability_results):
@@ -233,7 +236,7 @@ def test_the_threshold_and_the_ranges_match_t10(observability_results):
 def test_the_cost_of_simulated_passes_falls_with_the_model_order(tmp_path, capsys):
     """TSP14 Figure 7: the cost falls with the number of dipoles; for cars, nearly to one."""
     script = example('tsp14_model_order')
-    found = {rate: script.passes(rate, (1, 3)) for rate in script.RATES}
+    found = {rate: script.fit_passes(rate, (1, 3)) for rate in script.RATES}
     (cars, truck), (cars_3, truck_3) = (script.costs_of(found['12.5 Hz'], d) for d in (1, 3))
     assert len(cars) == 3 and (np.array(cars_3) < cars).all() and truck_3 < truck
     # With one dipole at 12.5 Hz, the cars are below and the truck is above the published range.
@@ -244,7 +247,7 @@ def test_the_cost_of_simulated_passes_falls_with_the_model_order(tmp_path, capsy
     for d, slow in ((1, [*cars, truck]), (3, [*cars_3, truck_3])):
         fast, fast_truck = script.costs_of(found['100 Hz'], d)
         assert (np.array([*fast, fast_truck]) < slow).all()
-    script.passes = lambda rate: found[rate]
+    script.fit_passes = lambda rate: found[rate]
     assert script.main(['--out', str(tmp_path)]) == 0
     for rate in ('12.5_Hz', '100_Hz'):
         assert (tmp_path / f'figure_7_{rate}.png').read_bytes().startswith(PNG_SIGNATURE)

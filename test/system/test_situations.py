@@ -61,7 +61,7 @@ def verdicts(name, runs):
     if name in MISSED_AIMS else ()))
 def test_poses_without_a_flag_are_not_wrong(name):
     found = verdicts(name, 1 if name in IN_EVERY_TEST else RUNS)
-    sure, wrong = sum(v.n_sure for v in found), sum(v.n_wrong for v in found)
+    sure, wrong = sum(v.n_unflagged for v in found), sum(v.n_wrong for v in found)
     assert wrong <= SITUATIONS[name].aim * sure
 
 
@@ -79,11 +79,11 @@ def test_disturbances_are_events_and_cars_are_not(name):
     found = verdicts(name, 1 if name in IN_EVERY_TEST else RUNS)
     if SITUATIONS[name].group == 'control':
         # A wrongly learnt background after a release counts as a disturbance.
-        assert sum(v.n_mistaken for v in found) == 0
-        right = sum(v.n_sure - v.n_wrong for v in found)
+        assert sum(v.n_false_disturbances for v in found) == 0
+        right = sum(v.n_unflagged - v.n_wrong for v in found)
         assert right >= 0.95 * RIGHT_WITHOUT_DOUBTS[name]
     else:
         # A run without a detection has no events.
         tracked = [v for v in found if v.n_tracks]
         assert sum(v.n_disturbances > 0 for v in tracked) >= 0.9 * len(tracked)
-        assert sum(v.n_sure for v in found) == 0
+        assert sum(v.n_unflagged for v in found) == 0

@@ -66,9 +66,9 @@ def run(value, more_is_better=False, name='a frame, mean'):
     (False, [np.nan], 9.0, False)])
 def test_a_figure_is_compared_with_the_best_of_recent_runs(more_is_better, values, now, is_worse):
     before = [{'figures': run(v, more_is_better)} for v in values]
-    found = figures.worse(run(now, more_is_better), before)
+    found = figures.worse_figures(run(now, more_is_better), before)
     assert bool(found) == is_worse
-    assert figures.worse(run(now, more_is_better, 'a new one'), before) == []
+    assert figures.worse_figures(run(now, more_is_better, 'a new one'), before) == []
 
 
 def test_figures_are_saved_and_regressions_are_printed(tmp_path, monkeypatch, capsys):

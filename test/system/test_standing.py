@@ -6,7 +6,7 @@
 import pytest
 
 from support.standing import (
-    SOON_S,
+    MAX_RECOVERY_S,
     STOPS,
     TRACKED_M,
     background_recovery_s,
@@ -31,11 +31,11 @@ def test_the_track_of_a_vehicle_that_stops_continues_and_leaves(runs):
 @pytest.mark.parametrize('runs, min_right', [
     (2, 2), pytest.param(RUNS, MIN_RIGHT, marks=pytest.mark.study)])
 def test_the_background_recovers_soon_after_a_standing_vehicle_leaves(runs, min_right):
-    assert sum(background_recovery_s(run) <= SOON_S for run in range(runs)) >= min_right
+    assert sum(background_recovery_s(run) <= MAX_RECOVERY_S for run in range(runs)) >= min_right
 
 
 @pytest.mark.parametrize('runs', [1, pytest.param(RUNS, marks=pytest.mark.study)])
 def test_the_first_vehicle_after_a_standing_one_is_tracked_offline(runs):
     for run in range(runs):
-        error, n_sure, n_wrong = error_after_parked(run)
-        assert error < TRACKED_M and n_sure and n_wrong == 0, run
+        error, n_unflagged, n_wrong = error_after_parked(run)
+        assert error < TRACKED_M and n_unflagged and n_wrong == 0, run

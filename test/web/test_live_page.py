@@ -42,7 +42,7 @@ def test_the_page_shows_all_tracked_poses(chromium, scene, server, records):
     assert not page.value('magTracking.follows')
     page.page.click('#latest')
     page.wait('magTracking.follows')
-    assert page.complaints == []
+    assert page.page_errors == []
     page.page.close()
 
 
@@ -140,5 +140,5 @@ def test_a_target_that_stays_for_hours_needs_bounded_memory(chromium, scene, ser
         (magTracking.scene.tracks[0])""")
     assert len(set(lengths)) == 1
     assert sum(len(message) for message in scene.snapshot()) < 10_000_000
-    assert page.complaints == []
+    assert page.page_errors == []
     page.page.close()

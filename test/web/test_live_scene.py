@@ -9,7 +9,7 @@ import pytest
 
 from mag_tracking.records import FieldFrame
 from mag_tracking.web.live_scene import HISTORY_S, MAX_POSES, LiveScene
-from support.live_records import NS, feed, later, poses
+from support.live_records import NS, delayed_records, feed, poses
 
 
 class Viewer:
@@ -52,7 +52,7 @@ def test_early_and_late_viewers_have_the_same_tracks(scene, records):
 def test_track_1_of_a_restarted_tracker_is_a_new_track(scene, records, seconds):
     viewer = follow(scene, records)
     viewer.receive(scene.updates())
-    for part in (later(records, seconds),):
+    for part in (delayed_records(records, seconds),):
         feed(scene, part)
         viewer.receive(scene.updates())
     assert len(viewer.tracks) == 2
@@ -63,7 +63,7 @@ def test_track_1_of_a_restarted_tracker_is_a_new_track(scene, records, seconds):
 def test_a_track_after_a_killed_tracker_is_a_new_track(scene, records):
     """Track 1 has no closing record; another track 1 begins minutes later."""
     viewer = follow(scene, records[:-1])
-    feed(scene, later(records, 300.0))
+    feed(scene, delayed_records(records, 300.0))
     viewer.receive(scene.updates())
     assert len(viewer.tracks) == 2
 

@@ -32,7 +32,7 @@ def open_page(chromium, path):
 
 def check_and_close(page, path):
     """Check that the page logged no error and loaded no other file, and close the page."""
-    assert page.complaints == []
+    assert page.page_errors == []
     assert page.requests == [path.as_uri()]
     page.page.close()
 

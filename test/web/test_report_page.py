@@ -85,7 +85,7 @@ def test_the_slider_updates_map_curves_and_text(shared_page, report):
         np.testing.assert_allclose(shared_page.pose_on_map(), [float(row['x']), float(row['y'])])
         shared_page.wait(f'Math.abs(document.getElementById("speed").layout.shapes[0].x0 - {t[k]})'
                          ' < 1e-9')
-        np.testing.assert_allclose(shared_page.lines(), t[k])
+        np.testing.assert_allclose(shared_page.line_times(), t[k])
         text = shared_page.value('document.getElementById("readout").textContent')
         assert f'x {float(row["x"]):.2f}, y {float(row["y"]):.2f}' in text
         assert ('ambiguous' in text) == (row['ambiguous'] == '1')
@@ -106,7 +106,7 @@ def test_the_page_loads_no_other_file_and_logs_no_error(shared_page, report):
     shared_page.page.click('#play')
     shared_page.wait('magTracking.plays')
     shared_page.wait(f'!magTracking.plays && magTracking.t >= {t[-1]}')
-    assert shared_page.complaints == []
+    assert shared_page.page_errors == []
     assert shared_page.requests == [report[0].as_uri()]
     assert report[0].stat().st_size < MAX_MB * 1e6
 
@@ -139,7 +139,7 @@ def test_the_table_selects_each_track(chromium, vehicle_replays, road_network, t
         assert f'Track {track_id}:' in page.value('document.getElementById("readout").textContent')
         x, y = page.pose_on_map()
         assert np.hypot(*(np.array(log.position)[:, :2] - [x, y]).T).min() < 1e-9
-    assert page.complaints == []
+    assert page.page_errors == []
     page.page.close()
 
 
@@ -168,7 +168,7 @@ def test_markup_in_names_is_shown_literally(chromium, road_network, tmp_path):
     assert MARKUP in page.value('document.getElementById("title").textContent')
     assert page.value('document.querySelectorAll("b, .plot b").length') == 0
     assert MARKUP in page.value('document.getElementById("weights").textContent')
-    assert page.complaints == []
+    assert page.page_errors == []
     page.page.close()
 
 
@@ -184,7 +184,7 @@ def test_notes_tables_and_missing_values_are_shown(chromium, tmp_path):
     cells = page.value('[...document.querySelectorAll("td")].map(td => td.textContent)')
     assert cells == ['mag_1', '–', 'mag_2', '12.35']
     assert not page.value('document.getElementById("scene").checkVisibility()')
-    assert page.complaints == []
+    assert page.page_errors == []
     page.page.close()
 
 

@@ -19,7 +19,7 @@ from mag_tracking.drivers.framings.text import TextFraming, TextSettings
 from mag_tracking.drivers.reading import Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import replace
-from support.framing_fuzz import CASES, fuzz, some_garbage
+from support.framing_fuzz import CASES, fuzz, random_garbage
 
 XYZ = ('x', 'y', 'z')
 XYZ_I16 = ('x:i16', 'y:i16', 'z:i16')
@@ -233,7 +233,7 @@ def random_stream(name, seed):
     out, case = b'', CASES[name]
     for _ in range(rng.randint(0, 6)):
         frame = case.encode_random_frame(rng)[0]
-        out += some_garbage(rng, case, frame) + frame
+        out += random_garbage(rng, case, frame) + frame
     return out[rng.randint(0, 20):-rng.randint(1, 20)]
 
 

@@ -352,21 +352,21 @@ def test_a_silent_server_is_reported(topics, tls):
 def test_the_reason_of_a_refusal_is_reported_without_a_retry(topics, code, text):
     with ScriptedBroker(bytes([0x20, 2, 0, code])) as server:
         assert f'127.0.0.1:{server.port}: {text}' in open_error(topics(server.port))
-    assert len(server.heard) == 1
+    assert len(server.received) == 1
 
 
 @pytest.mark.parametrize('qos', [0, 1, 2])
 def test_the_configured_quality_of_service_is_requested(topics, qos):
     with ScriptedBroker(CONNECTED, granted) as server:
         topics(server.port, qos=qos).open()
-    assert server.heard[1].endswith(b'mag/#' + bytes([qos]))
+    assert server.received[1].endswith(b'mag/#' + bytes([qos]))
 
 
 def test_a_broker_that_does_not_answer_a_subscription_is_reported(topics):
     with ScriptedBroker(CONNECTED, b'') as server:
         message = open_error(topics(server.port, connect_timeout_s=0.3))
         assert 'no answer within 0.3 s' in message
-    assert b'mag/#' in server.heard[1]
+    assert b'mag/#' in server.received[1]
 
 
 @pytest.mark.parametrize('garbage', [
@@ -466,7 +466,7 @@ def test_reopening_closes_the_previous_connection(topics):
         mqtt = topics(first.port)
         mqtt.open()
         assert 'connection refused; check that the broker is running' in open_error(mqtt)
-        wait_until(lambda: first.heard[-1] == b'\xe0\x00')
+        wait_until(lambda: first.received[-1] == b'\xe0\x00')
 
 
 def test_close_sends_a_disconnect_packet(topics):
@@ -474,9 +474,9 @@ def test_close_sends_a_disconnect_packet(topics):
         mqtt = topics(server.port)
         mqtt.open()
         mqtt.close()
-        wait_until(lambda: server.heard[-1] == b'\xe0\x00')
+        wait_until(lambda: server.received[-1] == b'\xe0\x00')
     # CONNECT, SUBSCRIBE and a single DISCONNECT.
-    assert [packet[0] >> 4 for packet in server.heard] == [1, 8, 14]
+    assert [packet[0] >> 4 for packet in server.received] == [1, 8, 14]
 
 
 def test_close_during_connecting_ends_open(topics, monkeypatch):

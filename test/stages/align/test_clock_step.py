@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mag_tracking.stages.align.clock_step import ClockStepFilter
-from support.clock_steps import sample, stepped, stream, wild
+from support.clock_steps import sample, stream, wild, with_clock_step
 
 LIMIT = 500
 """Maximum jump. Timestamps in these tests are in milliseconds, although the filter documents
@@ -57,7 +57,7 @@ def test_streams_without_clock_steps_pass_immediately(seed):
 @pytest.mark.parametrize('step', [10, 100, 1000])
 @pytest.mark.parametrize('n', [2, 3, 6])
 def test_samples_of_a_clock_that_steps_ahead_and_back_are_rejected(n, step):
-    arrivals = stepped(stream(n, 0, 20_000, step), {1}, 5000, 12_000, by=1803)
+    arrivals = with_clock_step(stream(n, 0, 20_000, step), {1}, 5000, 12_000, by=1803)
     clock_filter = ClockStepFilter(n, LIMIT, 10_000)
     passed, rejected = run(clock_filter, arrivals)
     wrong = [a for a, b in zip(arrivals, stream(n, 0, 20_000, step), strict=True) if a != b]
@@ -105,7 +105,7 @@ def test_sensors_that_have_just_stopped_delay_a_jump_by_the_limit_only():
 def test_a_stepped_clock_is_held_for_the_limit_only_after_all_others_stop(max_held):
     """Regression: samples of the stepped clock were rejected forever after all others stopped."""
     clock_filter = filter_after(6, max_held=max_held)
-    run(clock_filter, stepped(stream(6, 1000, 3000), {2}, 1500, 9999, by=1000))
+    run(clock_filter, with_clock_step(stream(6, 1000, 3000), {2}, 1500, 9999, by=1000))
     later_arrivals = [(2, t) for t in range(4000, 6000, 10)]
     passed, rejected = run(clock_filter, later_arrivals)
     assert passed[-1] == later_arrivals[-1] and len(passed) >= 150
@@ -116,7 +116,7 @@ def test_a_stepped_clock_is_held_for_the_limit_only_after_all_others_stop(max_he
 @pytest.mark.parametrize('stepped_sensors, is_accepted', [
     ({1, 4}, False), ({0, 1, 4}, False), ({0, 1, 3, 4}, True)])
 def test_the_majority_of_sensors_decides_which_clocks_stepped(stepped_sensors, is_accepted):
-    arrivals = stepped(stream(6, 0, 4000), stepped_sensors, 1000, 9999, by=1000)
+    arrivals = with_clock_step(stream(6, 0, 4000), stepped_sensors, 1000, 9999, by=1000)
     clock_filter = ClockStepFilter(6, LIMIT, 10_000)
     passed, rejected = run(clock_filter, arrivals)
     if is_accepted:
@@ -208,7 +208,7 @@ def test_a_clock_step_of_a_slow_sensor_among_fast_ones_is_rejected():
     fast, slow = stream(3, 0, 9000), [(3, t) for t in range(500, 9000, 1000)]
     arrivals = sorted(fast + slow, key=lambda a: a[1])
     assert run(ClockStepFilter(4, LIMIT, 10), arrivals) == (arrivals, [])
-    wrong = stepped(arrivals, {3}, 3000, 6000, by=1100)
+    wrong = with_clock_step(arrivals, {3}, 3000, 6000, by=1100)
     passed, rejected = run(ClockStepFilter(4, LIMIT, 10), wrong)
     assert rejected == [(3, t) for t in (4600, 5600, 6600)]
     assert passed == [a for a in wrong if a not in rejected]

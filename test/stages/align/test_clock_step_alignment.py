@@ -10,7 +10,7 @@ from mag_tracking.settings import replace
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import MAX_HELD, Align
 from mag_tracking.stages.stage import rejected
-from support.clock_steps import sample, stepped, stream, wild
+from support.clock_steps import sample, stream, wild, with_clock_step
 from support.networks import line_network
 from support.samples import one
 
@@ -68,7 +68,7 @@ def test_a_clock_step_leaves_the_frames_of_other_sensors_unchanged():
     """The frames equal the frames of a network in which the sensor with the step falls silent."""
     arrivals = stream(6, 0, 6000)
     stage, other = align(6), align(6)
-    frames = frames_of(stage, stepped(arrivals, {2}, 2000, 4000, by=1000)) + stage.flush()
+    frames = frames_of(stage, with_clock_step(arrivals, {2}, 2000, 4000, by=1000)) + stage.flush()
     without_steps = [a for a in arrivals if a[0] != 2 or not 2000 <= a[1] < 4000]
     expected = frames_of(other, without_steps) + other.flush()
     assert rejected(stage.counts) == {'ahead of all other sensors: mag_3': 200}
@@ -81,14 +81,14 @@ def test_a_gap_of_all_sensors_is_accepted_and_zero_disables_the_filter():
     frames = frames_of(stage, stream(6, 0, 2000) + stream(6, 12_000, 14_000)) + stage.flush()
     assert sum(int(f.n_samples.sum()) for f in frames) == 2400 and not rejected(stage.counts)
     disabled = align(6, max_clock_jump_s=0.0)
-    frames_of(disabled, stepped(stream(6, 0, 3000), {2}, 1000, 9999, by=1000))
+    frames_of(disabled, with_clock_step(stream(6, 0, 3000), {2}, 1000, 9999, by=1000))
     assert set(rejected(disabled.counts)) == {'late'}
 
 
 def test_clock_steps_are_detected_after_a_jump_back_in_time():
     stage = align(3)
     frames_of(stage, stream(3, 100_000, 102_000))
-    frames_of(stage, stepped(stream(3, 0, 4000), {1}, 2000, 3000, by=1000))
+    frames_of(stage, with_clock_step(stream(3, 0, 4000), {1}, 2000, 3000, by=1000))
     assert rejected(stage.counts) == {'ahead of all other sensors: mag_2': 100}
 
 
@@ -109,7 +109,7 @@ def test_the_number_of_held_samples_with_equal_timestamps_is_bounded():
 
 def test_rejections_by_clock_steps_are_counted_for_each_sensor():
     stage = align(6)
-    frames_of(stage, stepped(stream(6, 0, 4000), {0, 5}, 1000, 2000, by=5000))
+    frames_of(stage, with_clock_step(stream(6, 0, 4000), {0, 5}, 1000, 2000, by=5000))
     assert Counter(rejected(stage.counts)) == {
         'ahead of all other sensors: mag_1': 100, 'ahead of all other sensors: mag_6': 100}
 

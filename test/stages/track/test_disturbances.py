@@ -118,4 +118,4 @@ def test_poses_of_a_magnet_at_rest_are_unambiguous():
 
 
 def test_a_bicycle_has_no_unambiguous_poses():
-    assert verdict('a bicycle', 'boxes', 0).n_sure == 0
+    assert verdict('a bicycle', 'boxes', 0).n_unflagged == 0

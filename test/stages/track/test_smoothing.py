@@ -51,7 +51,7 @@ N_T, N_OWN, N_SENSORS, N_STEPS = 4, 2, 2, 9
 N_X = N_T + (N_OWN + 3) * N_SENSORS
 
 
-def whole_derivative(H):
+def full_jacobian(H):
     """Derivative (3 n_sensors, n_x) of the fields of all sensors, from the derivative `H` of each
     sensor."""
     out = np.zeros((3 * N_SENSORS, N_X))
@@ -106,7 +106,7 @@ def test_the_backward_pass_matches_least_squares_over_all_times(unit):
         np.random.default_rng(3).uniform(1.0, 9.0, N_X))
     missing = np.isnan(y).reshape(N_STEPS, -1)
     missing[list(without)] = True
-    whole = np.array([whole_derivative(h) for h in H])
+    whole = np.array([full_jacobian(h) for h in H])
     whole[missing] = 0.0
     R = block_diag(*C)
     # Missing rows are also removed from the noise.
