@@ -70,11 +70,11 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
                              f'{MIN_POSES} are required; check the moment and the box')
         geometry = fitted_geometry(network, field[rows], r, u, moment, stage, shared_unit,
                                    pose_unit)
-        used, (r, u) = rows, geometry.poses
-        inside = ((low <= r) & (r <= high)).all(axis=1)
-        rows, r, u = rows[inside], r[inside], u[inside]
-    return replace(geometry, rows=used,
-                   suspect_poses=tuple(int(used[k]) for k in geometry.suspect_poses))
+        fitted_rows, (r, u) = rows, geometry.poses
+        is_inside = ((low <= r) & (r <= high)).all(axis=1)
+        rows, r, u = rows[is_inside], r[is_inside], u[is_inside]
+    return replace(geometry, rows=fitted_rows,
+                   suspect_poses=tuple(int(fitted_rows[k]) for k in geometry.suspect_poses))
 
 
 def _initial_poses(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,

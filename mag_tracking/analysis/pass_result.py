@@ -226,7 +226,7 @@ class PassFit:
 
         Returns
         -------
-        time : float, s
+        t_cpa : float, s
             Relative to time zero.
         time_std : float, s
         range : float, m
@@ -237,10 +237,10 @@ class PassFit:
         [TSP14]_ eq. (24), with linearised standard deviations.
         """
         r, v = self.position - point, self.velocity
-        time, distance, r_cpa = closest_approach(r, v)
+        t_cpa, distance, r_cpa = closest_approach(r, v)
         u = r_cpa / distance if distance > 0.0 else np.zeros(3)
         P = self.robust_covariance[:6, :6]
-        g_time = -np.concatenate([v, r + 2.0 * time * v]) / (v @ v)
-        g_range = np.concatenate([u, time * u])
-        return (time, np.float64(np.sqrt(g_time @ P @ g_time)), distance,
+        g_time = -np.concatenate([v, r + 2.0 * t_cpa * v]) / (v @ v)
+        g_range = np.concatenate([u, t_cpa * u])
+        return (t_cpa, np.float64(np.sqrt(g_time @ P @ g_time)), distance,
                 np.float64(np.sqrt(g_range @ P @ g_range)))

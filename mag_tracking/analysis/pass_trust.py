@@ -33,11 +33,11 @@ MIN_ROW_REACH = 0.4
 NOISE_ENERGY = 16.3
 """Whitened energy of three axes that noise exceeds with a probability of 0.001."""
 
-MIN_ELSEWHERE, MAX_ELSEWHERE = 0.003, 0.1
+MAX_FIELD_ENERGY_ELSEWHERE, MAX_RESIDUAL_ENERGY_ELSEWHERE = 0.003, 0.1
 """Unexplained energy outside the reach of a plausible vehicle: maximum fraction of the field energy
 (gain errors, a swerve), and maximum fraction of the total residual. The larger limit applies."""
 
-MIN_DISTANCE = 0.3
+MIN_PASS_DISTANCE = 0.3
 """Minimum distance travelled during a pass, relative to the distance of the nearest sensor."""
 
 MAX_VELOCITY_CHANGE = 0.3
@@ -167,7 +167,7 @@ def rejection_reason(fit: PassFit) -> str:
     return ''
 
 
-def trusted(fit: PassFit) -> tuple[str, ...]:
+def trusted_quantities(fit: PassFit) -> tuple[str, ...]:
     """Quantities of a fit whose uncertainty is acceptable.
 
     Parameters
@@ -207,7 +207,7 @@ def _invalid_pass_reason(fit: PassFit) -> str:
     if has_velocity_change(fit):
         return ('not at constant velocity: the velocity changed by '
                 f'{fit.velocity_change:.0%} during the pass (a turn, braking)')
-    if np.linalg.norm(fit.velocity) * fit.duration_s < MIN_DISTANCE * _nearest_cpa_range(fit):
+    if np.linalg.norm(fit.velocity) * fit.duration_s < MIN_PASS_DISTANCE * _nearest_cpa_range(fit):
         return 'no pass: the distance travelled is too short'
     return ''
 
@@ -223,7 +223,7 @@ def has_plausible_residual(fit: PassFit) -> bool:
     -------
     bool
     """
-    limit = max(MIN_ELSEWHERE, MAX_ELSEWHERE * (1.0 - fit.explained))
+    limit = max(MAX_FIELD_ENERGY_ELSEWHERE, MAX_RESIDUAL_ENERGY_ELSEWHERE * (1.0 - fit.explained))
     return fit.residual_elsewhere <= limit
 
 

@@ -107,7 +107,9 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
     target : PlannedTarget
     sampling : Sampling
     points : (n, 2) array, m, world frame
+        Horizontal positions of the target at time zero of each pass.
     heading : float, rad
+        Heading of all passes, anticlockwise from x.
 
     Yields
     ------
@@ -142,8 +144,8 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
         h, H, _ = sensor_fields(positions, R_sw, r.reshape(n * size, 1, 3).copy(), repeated(m),
                                 repeated(dr_dx), repeated(dm_dx))
         # At the position of a sensor, the field is singular. The sensor is not used in this frame.
-        on_it = ~(np.isfinite(h).all(axis=-1) & np.isfinite(H).all(axis=(-2, -1)))
-        h[on_it], H[on_it] = 0.0, 0.0
+        is_at_sensor = ~(np.isfinite(h).all(axis=-1) & np.isfinite(H).all(axis=(-2, -1)))
+        h[is_at_sensor], H[is_at_sensor] = 0.0, 0.0
         yield (slice(first, first + n), h.reshape(n, *shape, -1, 3),
                H.reshape(n, *shape, len(positions), 3, 9))
 
@@ -162,7 +164,9 @@ def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTar
     target : PlannedTarget
     sampling : Sampling
     points : (n, 2) array, m, world frame
+        Horizontal positions of the target.
     heading : float, rad
+        Heading of the target, anticlockwise from x.
 
     Returns
     -------
@@ -217,7 +221,7 @@ def bounds_of(information: FloatArray, prior: FloatArray) -> FloatArray:
 
 def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
                             sampling: Sampling, points: FloatArray, false_alarm: float,
-                            allowance: float = 0.0) -> FloatArray:
+                            background_std: float = 0.0) -> FloatArray:
     """Probability of detection in one frame with the target at a point.
 
     Parameters
@@ -228,9 +232,10 @@ def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: Pla
     target : PlannedTarget
     sampling : Sampling
     points : (n, 2) array, m, world frame
+        Horizontal positions of the target.
     false_alarm : float
         False alarm probability of one frame.
-    allowance : float, T
+    background_std : float, T
         Standard deviation of the background errors, added to the noise.
 
     Returns
@@ -242,10 +247,11 @@ def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: Pla
     ----------
     [T10]_ eq. (5.14)-(5.19), applied to all sensors at once.
     """
-    still = Sampling(sampling.period, sampling.noise_std, half_window=0.0)
+    single_frame = Sampling(sampling.period, sampling.noise_std, half_window=0.0)
     ratio = np.empty((len(points), len(DIRECTIONS)))
-    for part, h, _ in pass_fields(positions, R_sw, target, still, points, 0.0):
+    for part, h, _ in pass_fields(positions, R_sw, target, single_frame, points, 0.0):
         squared_norm = np.einsum('pdksa,pdksa->pds', h, h)
-        ratio[part] = (squared_norm / (np.square(sampling.noise_std) + allowance**2)).sum(axis=-1)
+        ratio[part] = (squared_norm / (
+            np.square(sampling.noise_std) + background_std**2)).sum(axis=-1)
     axes = 3 * len(positions)
     return detection_probability(ratio, energy_threshold(false_alarm, axes), axes)

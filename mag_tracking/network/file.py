@@ -62,7 +62,7 @@ def _check_keys(label: str, mapping: object, keys: Collection[str]) -> None:
 
 
 def _parse_sensor(name: str, entry: Any) -> dict[str, Any]:
-    """Parse the entry of a sensor; return its values by attribute name of `SensorNetwork`."""
+    """Parse the entry of a sensor; return the values of its `SensorNetwork` attributes by name."""
     label = f'sensor {name}'
     _check_keys(label, entry, _SENSOR_KEYS)
     if 'position' not in entry:

@@ -1,6 +1,7 @@
 """Field of a dipole on a straight pass, expanded in Anderson functions.
 
-Positions are target minus sensor, as in TSP14. The sign does not affect the field of a dipole.
+Position vectors point from the sensor to the target, as in TSP14. Their sign does not affect the
+field of a dipole.
 """
 
 import numpy as np

@@ -53,7 +53,7 @@ def demagnetisation_factors(aspect: ArrayLike) -> tuple[FloatArray, FloatArray]:
 
 def ellipsoid_moment(semi_axes: Sequence[float] | FloatArray, mu_r: float, heading: ArrayLike,
                      earth_field: ArrayLike) -> FloatArray:
-    """Moment induced by the earth's field in a permeable ellipsoid of revolution.
+    """Moment induced by the Earth's field in a permeable ellipsoid of revolution.
 
     The axis of revolution is horizontal and points along the heading.
 

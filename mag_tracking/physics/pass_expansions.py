@@ -90,8 +90,8 @@ class AndersonPass:
 
     Path parameters (2): time of the closest point of approach (CPA) [s], speed over range at the
     CPA [1/s]. Linear parameters (9): coefficients of the three functions on each axis of the sensor
-    [T], axis by axis. A dipole has only six independent coefficients, but a search with nine free
-    coefficients is easier.
+    [T], axis by axis. A dipole has only six independent coefficients; nine free
+    coefficients keep the model linear.
 
     References
     ----------

@@ -36,7 +36,7 @@ def one_path(rng, at_s, direction, n_dipoles):
 
 
 def simulated_pass(rng, plan, n_dipoles, network=ROAD):
-    """Simulate vehicles that pass the origin at [(time [s], direction)]: (`PassData`, [path])."""
+    """Simulate vehicles; `plan` lists (time at the origin [s], direction). Return (data, paths)."""
     targets = [one_path(rng, *when, n_dipoles) for when in plan]
     fields = [measured(network, path, moments, rng, seconds=6.0, noise=1.2e-8 if k == 0 else 1e-15)
               for k, (path, moments) in enumerate(targets)]
@@ -255,11 +255,14 @@ def test_a_fit_that_differs_from_its_track_has_a_reason():
 
 
 def fits_with_minima(*others):
-    """Create fits of two points with additional minima, which `others` compute from theta (12,)."""
+    """Create fits of two points; each of `others` maps theta (12,) to an additional minimum.
+
+    Return (data, theta, fits, (linear parameters, minimum)).
+    """
     rng = np.random.default_rng(15)
     data, paths = simulated_pass(rng, MEETING, 1)
     theta = np.concatenate(paths)
-    model = SuperposedPasses.of((1, 1), data.t, data.positions, ROAD.R_sw[data.sensor])
+    model = SuperposedPasses.from_orders((1, 1), data.t, data.positions, ROAD.R_sw[data.sensor])
     A = model.basis(theta[None])[0]
     p = np.linalg.lstsq(A, data.field.ravel(), rcond=None)[0]
     found = Minimum(theta, float(data.n_values), True,

@@ -8,7 +8,12 @@ import pytest
 from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
-from mag_tracking.analysis.pass_trust import FittedRow, reach, residual_elsewhere, trusted
+from mag_tracking.analysis.pass_trust import (
+    FittedRow,
+    reach,
+    residual_elsewhere,
+    trusted_quantities,
+)
 from mag_tracking.apps.fit import RecordingFit
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.fit_folder import fit_row
@@ -106,8 +111,8 @@ def test_covariance_includes_the_errors_of_the_sensors(errors):
         for j in range(2):
             a, b, c = errors.rotation_std * rng.standard_normal(3)
             turn = np.array([[1.0, -c, b], [c, 1.0, -a], [-b, a, 1.0]])
-            of_sensor = data.sensor == j
-            field[of_sensor] = field[of_sensor] @ turn * (
+            sensor_mask = data.sensor == j
+            field[sensor_mask] = field[sensor_mask] @ turn * (
                 1.0 + errors.gain_std * rng.standard_normal(3))
         fit = fit_pass(replace(data, field=field), 1, errors=errors)
         without_errors = fit_pass(data, 1, errors=SensorErrors(0.0, 0.0))
@@ -145,17 +150,17 @@ def point_fit(std_speed, std_heading, change=0.0):
 
 
 def test_each_quantity_is_trusted_according_to_its_own_std():
-    assert trusted(point_fit(0.5, 0.1)) == ('speed', 'direction', 'time')
-    assert 'speed' not in trusted(point_fit(2.6, 0.1))
+    assert trusted_quantities(point_fit(0.5, 0.1)) == ('speed', 'direction', 'time')
+    assert 'speed' not in trusted_quantities(point_fit(2.6, 0.1))
     # The direction is unknown if the speed does not differ significantly from zero.
-    assert 'direction' not in trusted(point_fit(5.1, 0.1))
-    assert 'direction' not in trusted(point_fit(0.5, 0.6)) \
-        and 'speed' in trusted(point_fit(0.5, 0.6))
+    assert 'direction' not in trusted_quantities(point_fit(5.1, 0.1))
+    assert 'direction' not in trusted_quantities(point_fit(0.5, 0.6)) \
+        and 'speed' in trusted_quantities(point_fit(0.5, 0.6))
     late = point_fit(0.5, 0.1)
     late.robust_covariance[0, 0] = 4.0
-    assert trusted(late) == ('speed', 'direction')
-    assert trusted(point_fit(0.5, 0.1, change=0.5)) == ()
-    assert trusted(replace(point_fit(0.5, 0.1), residual_elsewhere=0.01)) == ()
+    assert trusted_quantities(late) == ('speed', 'direction')
+    assert trusted_quantities(point_fit(0.5, 0.1, change=0.5)) == ()
+    assert trusted_quantities(replace(point_fit(0.5, 0.1), residual_elsewhere=0.01)) == ()
 
 
 @pytest.mark.parametrize('name', [n for n in VEHICLES if 'turns' in n])

@@ -14,7 +14,7 @@ LINKOPING = Site(58.4, 15.6, 60.0, 2026.33, 90.0)
 
 
 def test_every_official_test_value_is_reproduced():
-    """Tolerances: 0.0051 degrees of declination, since two decimals are published, and 2 nT."""
+    """The declination agrees within 0.0051 degrees (two decimals), the field within 2 nT."""
     assert len(ROWS) == 100
     worst = np.zeros(4)
     for year, km, latitude, longitude, declination, _, _, x, y, z in ROWS[:, :10]:

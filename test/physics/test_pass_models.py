@@ -24,9 +24,9 @@ EXAMPLES = {
     **{f'RowPass with n_dipoles={d}': RowPass(T, PLACES, M, d) for d in (1, 2, 3, 4)},
     **{f'MultipolePass of order {d}': MultipolePass(T, PLACES, M, d) for d in (1, 2, 3)},
     'AndersonPass': AndersonPass(T, M),
-    'SuperposedPasses': SuperposedPasses.of((1, 3), T, PLACES, M)}
+    'SuperposedPasses': SuperposedPasses.from_orders((1, 3), T, PLACES, M)}
 N_PARAMETERS = {
-    name: model.paths[-1].stop if isinstance(model, SuperposedPasses) else len(model.names)
+    name: model.path_slices[-1].stop if isinstance(model, SuperposedPasses) else len(model.names)
     for name, model in EXAMPLES.items()}
 """Number of path parameters of each model."""
 
@@ -55,7 +55,7 @@ def test_superposed_fields_add_up():
     rows = [RowPass(T, PLACES, M, d) for d in (2, 1, 3)]
     paths = [rng.uniform(1.0, 4.0, len(row.names)) for row in rows]
     moments = [rng.standard_normal(3 * row.n_dipoles) for row in rows]
-    model = SuperposedPasses.of((2, 1, 3), T, PLACES, M)
+    model = SuperposedPasses.from_orders((2, 1, 3), T, PLACES, M)
     total = model.basis(np.concatenate(paths)[None])[0] @ np.concatenate(moments)
     np.testing.assert_allclose(total, sum(
         row.basis(path[None])[0] @ m for row, path, m in zip(rows, paths, moments, strict=True)))
@@ -65,14 +65,14 @@ def test_superposed_fields_add_up():
 
 def test_a_row_of_negative_length_is_reversed():
     rng = np.random.default_rng(8)
-    model = SuperposedPasses.of((3, 1), T, PLACES, M)
+    model = SuperposedPasses.from_orders((3, 1), T, PLACES, M)
     theta, p = rng.uniform(1.0, 4.0, 13), rng.standard_normal(12)
     theta[6] = -2.5
-    reversed_theta, moments = model.forward(theta, p)
+    reversed_theta, moments = model.with_nonnegative_length(theta, p)
     assert reversed_theta[6] == 2.5
     np.testing.assert_allclose(model.basis(reversed_theta[None])[0] @ moments,
                                model.basis(theta[None])[0] @ p)
-    same, unchanged = model.forward(reversed_theta, moments)
+    same, unchanged = model.with_nonnegative_length(reversed_theta, moments)
     np.testing.assert_array_equal(same, reversed_theta)
     np.testing.assert_array_equal(unchanged, moments)
 
