@@ -104,13 +104,13 @@ def test_stds_of_derived_quantities_agree_with_the_errors():
         rng = np.random.default_rng([seed, 21])
         path, moments = random_path(rng, 1, False)
         # With a CPA far from time zero, errors in the derivatives would be significant.
-        place = np.array([12.0, -9.0, 0.0])
+        point = np.array([12.0, -9.0, 0.0])
         fit = fit_pass(measured(ROAD, path, moments, rng), 1)
         fit = replace(fit, robust_covariance=fit.covariance)
         true = unknowns_at(path, moments, fit.data.stamp_ns / 1e9)
-        r, v = true[:3] - place, true[3:6]
+        r, v = true[:3] - point, true[3:6]
         t = -(r @ v) / (v @ v)
-        time, time_std, distance, distance_std = fit.closest_approach(place)
+        time, time_std, distance, distance_std = fit.closest_approach(point)
         heading = fit.heading[0] - np.arctan2(v[1], v[0])
         squares.append(np.square([
             np.arctan2(np.sin(heading), np.cos(heading)) / fit.heading[1],
@@ -141,12 +141,12 @@ def test_a_misfit_of_all_orders_does_not_favour_a_higher_order():
 
 def test_correlated_residuals_increase_the_covariance():
     """The Newey-West covariance of a straight-line fit accounts for correlated noise."""
-    rng, n, keep = np.random.default_rng(3), 3000, np.exp(-0.1)
+    rng, n, correlation = np.random.default_rng(3), 3000, np.exp(-0.1)
     H = np.column_stack([np.ones(n), np.linspace(-1.0, 1.0, n)])
     P = np.linalg.inv(H.T @ H)
     found, errors = np.zeros((2, 2)), []
     for _ in range(300):
-        e = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(n))
+        e = lfilter([np.sqrt(1.0 - correlation**2)], [1.0, -correlation], rng.standard_normal(n))
         x = P @ (H.T @ e)
         errors.append(x)
         found += P @ score_sum_covariance(H * (e - H @ x)[:, None], 60) @ P / 300.0
@@ -324,12 +324,12 @@ def test_missing_axes_and_sensors_only_reduce_the_accuracy():
     field = data.field.copy()
     field[data.sensor == 1, 2] = np.nan
     field[100:140] = np.nan
-    fit, whole = fit_pass(replace(data, field=field), 1), fit_pass(data, 1)
-    assert not fit.reason and fit.data.n_values == 2 * 400 * 3 - 400 - 120
-    assert len(fit.x) == 6 + 3 + 5 and len(whole.x) == 6 + 3 + 6
-    error = fit.x[:9] - unknowns_at(path, moments, fit.data.stamp_ns / 1e9)
-    assert error @ np.linalg.solve(fit.covariance[:9, :9], error) < chi2.ppf(0.999, 9)
-    assert (np.diagonal(fit.covariance)[:9] > np.diagonal(whole.covariance)[:9]).all()
+    partial, complete = fit_pass(replace(data, field=field), 1), fit_pass(data, 1)
+    assert not partial.reason and partial.data.n_values == 2 * 400 * 3 - 400 - 120
+    assert len(partial.x) == 6 + 3 + 5 and len(complete.x) == 6 + 3 + 6
+    error = partial.x[:9] - unknowns_at(path, moments, partial.data.stamp_ns / 1e9)
+    assert error @ np.linalg.solve(partial.covariance[:9, :9], error) < chi2.ppf(0.999, 9)
+    assert (np.diagonal(partial.covariance)[:9] > np.diagonal(complete.covariance)[:9]).all()
 
 
 @pytest.fixture(scope='session')

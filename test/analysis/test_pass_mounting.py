@@ -32,12 +32,12 @@ class SimulatedTracks:
     covariance: np.ndarray
 
 
-def simulated_tracks(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=NETWORK,
+def simulated_tracks(n_tracks, seed=0, noise=0.01, std_ratio=1.0, axes=3, network=NETWORK,
                      prior=PRIOR):
     """Simulate tracks that measure `axes` directions with noise of std `noise` [rad].
 
-    The tracks assume `claimed` times this standard deviation. The oracle is the joint least-squares
-    solution of all measurements.
+    The tracks assume `std_ratio` times this standard deviation. The oracle is the joint
+    least-squares solution of all measurements.
     """
     rng = np.random.default_rng(seed)
     n = len(network)
@@ -49,7 +49,7 @@ def simulated_tracks(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=
         for j in range(n):
             A = rng.standard_normal((axes, 3)) / noise
             y = A @ truth[j] + rng.standard_normal(axes)
-            A, y = A / claimed, y / claimed
+            A, y = A / std_ratio, y / std_ratio
             rows[j].append((A, y))
             P = np.linalg.inv(np.diag(prior[j]**-2.0) + A.T @ A)
             # The angles rotate the field in the sensor frame; the sensor has the inverse rotation.
@@ -68,7 +68,7 @@ def simulated_tracks(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=
 @pytest.mark.parametrize('n_tracks', [1, 2, 7])
 def test_fused_tracks_equal_one_joint_estimate(n_tracks, axes):
     # The assumed noise is too large, so the covariance is not inflated.
-    t = simulated_tracks(n_tracks, noise=0.01, claimed=3.0, axes=axes)
+    t = simulated_tracks(n_tracks, noise=0.01, std_ratio=3.0, axes=axes)
     e = fuse_mounting(NETWORK, PRIOR, t.tracks)
     assert e.n_tracks == n_tracks
     np.testing.assert_allclose(e.rotation, t.mean, rtol=1e-6, atol=1e-10)
@@ -100,7 +100,7 @@ def test_a_track_without_information_has_no_effect():
     assert np.abs(e.rotation).max() < 1e-9
 
 
-def scatters(n_runs, n_tracks, **kwargs):
+def scatter_and_nees(n_runs, n_tracks, **kwargs):
     """Scatter and NEES of the rotation of each run and sensor, each (n_runs * n_sensors,)."""
     out, nees = [], []
     for seed in range(n_runs):
@@ -114,7 +114,7 @@ def scatters(n_runs, n_tracks, **kwargs):
 
 def test_scatter_of_consistent_tracks_is_about_one():
     # The tracks are far more accurate than the prior, which therefore has no effect.
-    scatter, nees = scatters(60, 5, noise=1e-4)
+    scatter, nees = scatter_and_nees(60, 5, noise=1e-4)
     freedom = 3 * (5 - 1)
     low, high = chi2.ppf([0.001, 0.999], freedom * len(scatter)) / (freedom * len(scatter))
     print(f'scatter {scatter.mean():.3f}, NEES {nees.mean() / 3:.3f}')
@@ -126,7 +126,7 @@ def test_scatter_of_consistent_tracks_is_about_one():
 @pytest.mark.parametrize('n_tracks', [2, 5])
 def test_scatter_of_consistent_weak_tracks_is_not_above_one(n_tracks):
     """Each track has a tenth of the information of the prior, which adds no scatter."""
-    scatter, _ = scatters(80, n_tracks, noise=0.15)
+    scatter, _ = scatter_and_nees(80, n_tracks, noise=0.15)
     freedom = 3 * (n_tracks - 1)
     high = chi2.ppf(0.999, freedom * len(scatter)) / (freedom * len(scatter))
     print(f'{n_tracks} weak tracks: scatter {scatter.mean():.3f}')
@@ -134,12 +134,12 @@ def test_scatter_of_consistent_weak_tracks_is_not_above_one(n_tracks):
 
 
 def test_covariance_of_overconfident_tracks_is_inflated():
-    scatter, nees = scatters(60, 5, noise=1e-3, claimed=0.2)
+    scatter, nees = scatter_and_nees(60, 5, noise=1e-3, std_ratio=0.2)
     assert scatter.mean() == pytest.approx(25.0, rel=0.1)
     # The normalised errors have Student's t distribution with 12 degrees of freedom; without
     # inflation, the value would be 25.
     assert 0.6 < nees.mean() / 3 < 1.5
-    t = simulated_tracks(5, 3, noise=1e-3, claimed=0.2)
+    t = simulated_tracks(5, 3, noise=1e-3, std_ratio=0.2)
     e = fuse_mounting(NETWORK, PRIOR, t.tracks)
     ratio = np.trace(e.covariance, axis1=1, axis2=2) / np.trace(t.covariance, axis1=1, axis2=2)
     np.testing.assert_allclose(ratio, e.scatter, rtol=0.02)

@@ -94,8 +94,8 @@ def test_expected_calibration_error_follows_its_definition():
 def test_random_labels_are_not_learnt_from_sensors_of_one_pass():
     """The signatures of a pass at four sensors are similar; splitting a pass would leak labels."""
     rng = np.random.default_rng(2)
-    of_pass = rng.standard_normal((40, 20)).repeat(4, axis=0)
-    x = of_pass + 0.01 * rng.standard_normal(of_pass.shape)
+    pass_features = rng.standard_normal((40, 20)).repeat(4, axis=0)
+    x = pass_features + 0.01 * rng.standard_normal(pass_features.shape)
     labels = rng.choice(['a', 'b'], 40).repeat(4).tolist()
     groups = list(map(str, np.arange(40).repeat(4)))
     found = evaluate_splits(x, labels, groups, ('x',), 'T', 10)
