@@ -70,10 +70,10 @@ def bearing_of(fit: PassFit, sensor_position: FloatArray) -> Bearing:
     r, v = fit.position - sensor_position, fit.velocity
     P = fit.robust_covariance
     t_cpa, distance, r_cpa = closest_approach(r, v)
-    v2 = v @ v
-    g_time = -np.concatenate([v, r + 2.0 * t_cpa * v]) / v2
+    squared_speed = v @ v
+    g_time = -np.concatenate([v, r + 2.0 * t_cpa * v]) / squared_speed
     dr_cpa = np.hstack([np.eye(3), t_cpa * np.eye(3)]) + np.outer(v, g_time)
-    g_rate = np.concatenate([np.zeros(3), v / np.sqrt(v2)]) / distance
+    g_rate = np.concatenate([np.zeros(3), v / np.sqrt(squared_speed)]) / distance
     m, P_m = fit.moment
     sign = 1.0 if r_cpa[2] >= 0.0 else -1.0
     stds = np.array([_direction_std(r_cpa, dr_cpa @ P[:6, :6] @ dr_cpa.T),
@@ -82,7 +82,8 @@ def bearing_of(fit: PassFit, sensor_position: FloatArray) -> Bearing:
         x / np.linalg.norm(x) if std < MAX_DIRECTION_STD else np.full(3, np.nan)
         for x, std in zip((sign * r_cpa, sign * v, m), stds, strict=True))
     return Bearing(cpa_direction, motion_direction, moment_direction, stds, t_cpa,
-                   float(np.sqrt(g_time @ P[:6, :6] @ g_time)), float(np.sqrt(v2) / distance),
+                   float(np.sqrt(g_time @ P[:6, :6] @ g_time)),
+                   float(np.sqrt(squared_speed) / distance),
                    float(np.sqrt(g_rate @ P[:6, :6] @ g_rate)))
 
 

@@ -66,7 +66,7 @@ MAX_PAIRS = 12
 MIN_SAMPLES = 10
 """Minimum number of readings of each sensor."""
 
-_MAX_STEPS = 20
+_MAX_GAUSS_NEWTON_STEPS = 20
 
 
 @dataclass(frozen=True)
@@ -335,7 +335,7 @@ def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]
         # With such a long delay, the two fields hardly overlap.
         return tau, np.inf, 0.0
     std = norm / np.sqrt(y.size)
-    for _ in range(_MAX_STEPS):
+    for _ in range(_MAX_GAUSS_NEWTON_STEPS):
         residuals, J = _residuals(pair, t, y, theta)
         # Smoothing reduces noise, but not the quantisation error of a coarse sensor.
         std = max(float(np.linalg.norm(residuals)) / np.sqrt(dof), pair.noise, 1e-6 * norm)

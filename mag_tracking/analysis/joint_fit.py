@@ -35,10 +35,10 @@ from mag_tracking.units import NS
 N_REFINED, N_STEPS = 150, 6
 """Number of starting points that are refined in the coarse search, and number of steps of each."""
 
-N_PLACEMENTS = 10
+N_CONVERGED = 10
 """Number of coarse solutions that are refined until convergence."""
 
-N_FINE = 2
+N_FINE_STARTS = 2
 """Number of coarse minima from which the fit to all measurements starts."""
 
 INITIAL_LENGTH = 3.0
@@ -164,7 +164,7 @@ def _initial_paths(averaged: PassData, n_targets: int, ground: GroundPrior) -> F
         coarse = separable_problem(averaged, create_model, prior=prior)
         paths, _ = coarse_minima(separable_problem(averaged, create_model, COARSE_ERROR, prior),
                                  coarse, np.concatenate(starts), np.tile(PATH_TOLERANCE[:6], n),
-                                 N_REFINED, N_STEPS, N_PLACEMENTS)
+                                 N_REFINED, N_STEPS, N_CONVERGED)
         if n < n_targets:
             model = create_model(averaged.t, averaged.positions,
                                  averaged.network.R_sw[averaged.sensor])
@@ -233,7 +233,7 @@ class _JointFits:
         cost = _exclude_solutions(cost, np.array([are_separate(self._averaged, split(found))
                                                   for found in theta]), MAX_COST_RATIO)
         found = fine_minimum(fine, theta, cost, np.concatenate(
-            [PATH_TOLERANCE[:6 + (n > 1)] for n in orders]), N_FINE)
+            [PATH_TOLERANCE[:6 + (n > 1)] for n in orders]), N_FINE_STARTS)
         if not np.isfinite(found.cost):
             return tuple(PassFit(n, data, 'no valid start of the search') for n in orders)
         theta, p = create_model(data.t, data.positions, data.whitening).with_nonnegative_length(
@@ -298,7 +298,7 @@ def path_from(data: PassData, fit: PassFit) -> FloatArray:
 
 
 def _with_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[FloatArray]:
-    """Convert paths (6 or 7,) to other orders; the length of a former point is `INITIAL_LENGTH`."""
+    """Convert paths (6 or 7,) to numbers of dipoles; a point becomes a row of `INITIAL_LENGTH`."""
     return [np.concatenate([path[:6], path[6:] if len(path) > 6 else [INITIAL_LENGTH]])
             if n > 1 else path[:6] for path, n in zip(paths, orders, strict=True)]
 

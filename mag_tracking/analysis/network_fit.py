@@ -10,9 +10,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from mag_tracking.analysis.network_readings import (
-    POSE,
-    SENSOR,
-    SHARED,
+    N_POSE,
+    N_SENSOR,
+    N_SHARED,
     Prediction,
     TrackedMagnet,
     predicted_readings,
@@ -153,7 +153,7 @@ class GeometryProblem:
         Unknowns
         """
         n, K = len(self.network), len(self.magnet.tool)
-        x = np.zeros((n, SENSOR)), np.zeros(SHARED), np.zeros((K, POSE))
+        x = np.zeros((n, N_SENSOR)), np.zeros(N_SHARED), np.zeros((K, N_POSE))
         residuals = self.field - self.predicted(x)[0]
         for j, a in zip(*np.nonzero(self.has_readings), strict=True):
             x[0][j, a] = np.nanmedian(residuals[j, :, a]) / self.sensor_unit[j, a]
@@ -218,8 +218,8 @@ class GeometryProblem:
         sensor, pose = (np.sqrt(_robust_weights(np.square(v).sum(axis=1), v.shape[1]))[:, None]
                         for v in (x[0][:, 3:], x[2]))
         # A bias has no prior, except on an axis without readings, where it would be undetermined.
-        return (np.hstack([1.0 * ~self.has_readings, np.tile(sensor, SENSOR - 3)]), np.ones(SHARED),
-                np.tile(pose, POSE))
+        return (np.hstack([1.0 * ~self.has_readings, np.tile(sensor, N_SENSOR - 3)]),
+                np.ones(N_SHARED), np.tile(pose, N_POSE))
 
     def cost(self, x: Unknowns, f: FloatArray, W: FloatArray, prior_weights: Unknowns) -> float:
         """Weighted sum of the squared residuals and of the squared unknowns (priors).
@@ -305,26 +305,26 @@ class NormalEquations:
         Js, Jh = ((root[..., None] * J).reshape(n, 3 * K, -1) for J in (by_sensor, by_shared))
         Jp = root[..., None] * by_pose
         Jst = np.swapaxes(Js, 1, 2)
-        m = SENSOR * n
-        A = np.zeros((m + SHARED, m + SHARED))
+        m = N_SENSOR * n
+        A = np.zeros((m + N_SHARED, m + N_SHARED))
         for j, block in enumerate(Jst @ Js):
-            block_slice = slice(SENSOR * j, SENSOR * j + SENSOR)
+            block_slice = slice(N_SENSOR * j, N_SENSOR * j + N_SENSOR)
             A[block_slice, block_slice] = block + np.diag(prior_weights[0][j])
-        A[:m, m:] = (Jst @ Jh).reshape(m, SHARED)
+        A[:m, m:] = (Jst @ Jh).reshape(m, N_SHARED)
         A[m:, :m] = A[:m, m:].T
-        Jh_all = Jh.reshape(-1, SHARED)
+        Jh_all = Jh.reshape(-1, N_SHARED)
         A[m:, m:] = Jh_all.T @ Jh_all + np.diag(prior_weights[1])
         self.A = A
         self.g = np.concatenate([
             (np.einsum('nyi,ny->ni', Js, e) - prior_weights[0] * x[0]).ravel(),
             Jh_all.T @ e.ravel() - prior_weights[1] * x[1]])
-        by_k = np.swapaxes(Jp, 0, 1).reshape(K, 3 * n, POSE)
-        self.A_pose = np.swapaxes(by_k, 1, 2) @ by_k + prior_weights[2][:, :, None] * np.eye(POSE)
+        by_k = np.swapaxes(Jp, 0, 1).reshape(K, 3 * n, N_POSE)
+        self.A_pose = np.swapaxes(by_k, 1, 2) @ by_k + prior_weights[2][:, :, None] * np.eye(N_POSE)
         self.g_pose = np.einsum('kyi,ky->ki', by_k, np.swapaxes(
             e.reshape(n, K, 3), 0, 1).reshape(K, 3 * n)) - prior_weights[2] * x[2]
-        sensor_pose = np.einsum('nkai,nkap->knip', Js.reshape(n, K, 3, SENSOR), Jp)
-        shared_pose = np.einsum('nkai,nkap->kip', Jh.reshape(n, K, 3, SHARED), Jp)
-        self.C = np.concatenate([sensor_pose.reshape(K, m, POSE), shared_pose], axis=1)
+        sensor_pose = np.einsum('nkai,nkap->knip', Js.reshape(n, K, 3, N_SENSOR), Jp)
+        shared_pose = np.einsum('nkai,nkap->kip', Jh.reshape(n, K, 3, N_SHARED), Jp)
+        self.C = np.concatenate([sensor_pose.reshape(K, m, N_POSE), shared_pose], axis=1)
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """Solve the damped normal equations.
@@ -374,7 +374,7 @@ class NormalEquations:
     def _damped(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """Information of [sensors, shared] and of the poses, with damped (increased) diagonals."""
         return (self.A + damping * np.diag(np.diagonal(self.A)),
-                self.A_pose * (1.0 + damping * np.eye(POSE)))
+                self.A_pose * (1.0 + damping * np.eye(N_POSE)))
 
 
 def solve(problem: GeometryProblem,
@@ -420,5 +420,5 @@ def solve(problem: GeometryProblem,
 
 def _add_step(x: Unknowns, dx: FloatArray, dpose: FloatArray) -> Unknowns:
     """Return the unknowns after a step."""
-    m = len(dx) - SHARED
-    return x[0] + dx[:m].reshape(-1, SENSOR), x[1] + dx[m:], x[2] + dpose
+    m = len(dx) - N_SHARED
+    return x[0] + dx[:m].reshape(-1, N_SENSOR), x[1] + dx[m:], x[2] + dpose

@@ -17,9 +17,9 @@ from mag_tracking.analysis.network_fit import (
     solve,
 )
 from mag_tracking.analysis.network_readings import (
-    POSE,
-    SENSOR,
-    SHARED,
+    N_POSE,
+    N_SENSOR,
+    N_SHARED,
     Prediction,
     TrackedMagnet,
     rotation,
@@ -149,7 +149,7 @@ class NetworkGeometry:
         """
         magnet = replace(self.magnet, tool=np.asarray(positions, dtype=float),
                          R_tool=tool_rotations(np.asarray(axes, dtype=float)))
-        return _positions_and_axes(magnet, self.shared, np.zeros((len(magnet.tool), POSE)))
+        return _positions_and_axes(magnet, self.shared, np.zeros((len(magnet.tool), N_POSE)))
 
     @property
     def moment(self) -> tuple[float, float]:
@@ -183,7 +183,7 @@ def _positions_and_axes(magnet: TrackedMagnet, shared: FloatArray,
 MIN_POSES = 3
 """Minimum number of poses that separates the bias of a sensor from the field of the magnet."""
 
-MIN_CHANGE = 0.1
+MIN_POSE_VARIATION = 0.1
 """Minimum variation of the axis [rad], and of the position relative to the distance of the nearest
 sensor. If both variations are smaller, the poses do not determine the geometry."""
 
@@ -286,7 +286,7 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
     unit = np.append(problem.sensor_unit.ravel(), problem.shared_unit)
     covariance = P * unit[:, None] * unit
     std = np.sqrt(np.diagonal(covariance))
-    sensor_std, shared_std = std[:-SHARED].reshape(n, SENSOR), std[-SHARED:]
+    sensor_std, shared_std = std[:-N_SHARED].reshape(n, N_SENSOR), std[-N_SHARED:]
     sensor, shared, pose = problem.in_si(x)
     corrections = rotation(sensor[:, 4:7])
     sensor_residual, pose_residual = _sensor_and_pose_residuals(problem, predicted)
@@ -316,7 +316,7 @@ def _normalised_cost(problem: GeometryProblem, x: Unknowns, predicted: Predictio
     e2, count, _ = problem.squared_residuals(predicted[0], predicted[1])
     n_from_priors = np.append(prior_weights[0].ravel(), prior_weights[1]) @ np.diagonal(P)
     n_from_priors += np.einsum('ki,kii->', prior_weights[2], P_pose)
-    n_unknowns = len(P) + POSE * len(P_pose) - n_from_priors
+    n_unknowns = len(P) + N_POSE * len(P_pose) - n_from_priors
     dof = (robust_weights * count).sum() - n_unknowns
     return float((robust_weights[:, :, None] * e2).sum() / dof) if dof >= 1.0 else np.nan
 
@@ -338,20 +338,20 @@ def _sensor_and_pose_residuals(problem: GeometryProblem,
 def _suspects(problem: GeometryProblem, x: Unknowns, sensor_residual: FloatArray,
               pose_residual: FloatArray) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """Names of the suspect sensors and indices of the suspect poses."""
-    sensors = sensor_residual > MAX_RESIDUAL_RATIO * np.nanmedian(sensor_residual)
-    sensors |= (np.abs(x[0][:, 3:]) > MAX_CORRECTION).any(axis=1)
-    poses = pose_residual > MAX_RESIDUAL_RATIO * np.median(pose_residual)
-    poses |= (np.abs(x[2]) > MAX_CORRECTION).any(axis=1)
-    return (tuple(problem.network.names[j] for j in np.flatnonzero(sensors)),
-            tuple(int(k) for k in np.flatnonzero(poses)))
+    is_suspect_sensor = sensor_residual > MAX_RESIDUAL_RATIO * np.nanmedian(sensor_residual)
+    is_suspect_sensor |= (np.abs(x[0][:, 3:]) > MAX_CORRECTION).any(axis=1)
+    is_suspect_pose = pose_residual > MAX_RESIDUAL_RATIO * np.median(pose_residual)
+    is_suspect_pose |= (np.abs(x[2]) > MAX_CORRECTION).any(axis=1)
+    return (tuple(problem.network.names[j] for j in np.flatnonzero(is_suspect_sensor)),
+            tuple(int(k) for k in np.flatnonzero(is_suspect_pose)))
 
 
 def _is_magnet_at_rest(problem: GeometryProblem, x: Unknowns) -> bool:
-    """Whether the variations of position and axis of the magnet are less than `MIN_CHANGE`."""
+    """Whether position and axis of the magnet vary by less than `MIN_POSE_VARIATION`."""
     r, u = _positions_and_axes(problem.magnet, *problem.in_si(x)[1:])
-    nearest = np.linalg.norm(problem.network.positions - r.mean(axis=0), axis=1).min()
-    return bool((np.ptp(r, axis=0) < MIN_CHANGE * nearest).all()
-                and (np.ptp(u, axis=0) < MIN_CHANGE).all())
+    nearest_distance = np.linalg.norm(problem.network.positions - r.mean(axis=0), axis=1).min()
+    return bool((np.ptp(r, axis=0) < MIN_POSE_VARIATION * nearest_distance).all()
+                and (np.ptp(u, axis=0) < MIN_POSE_VARIATION).all())
 
 
 def _failure_reason(problem: GeometryProblem, x: Unknowns, converged: bool, cost: float) -> str:

@@ -149,12 +149,12 @@ class PassData:
                 field_weight[sensor_rows].sum(), 1e-300)
             group = np.floor(np.cumsum(weight) / weight.sum()
                              * max_samples * (1.0 - 1e-9)).astype(int)
-            first = np.flatnonzero(np.diff(group, prepend=-1))
-            n = np.diff(first, append=len(sensor_rows))
+            begins = np.flatnonzero(np.diff(group, prepend=-1))
+            n = np.diff(begins, append=len(sensor_rows))
             # A missing value makes the mean NaN: the other values have a different mean time.
-            columns.append((np.add.reduceat(self.t[sensor_rows], first) / n, np.full(len(n), j),
-                            np.add.reduceat(self.field[sensor_rows], first) / n[:, None],
-                            np.add.reduceat(self.covariance[sensor_rows], first)
+            columns.append((np.add.reduceat(self.t[sensor_rows], begins) / n, np.full(len(n), j),
+                            np.add.reduceat(self.field[sensor_rows], begins) / n[:, None],
+                            np.add.reduceat(self.covariance[sensor_rows], begins)
                             / n[:, None, None], n))
         t, sensor, field, covariance, n = (np.concatenate(c) for c in zip(*columns, strict=True))
         return replace(self, t=t, sensor=sensor, field=field, covariance=covariance, count=n)

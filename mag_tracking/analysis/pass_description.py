@@ -152,14 +152,14 @@ class _LinearisedFit:
         H = np.hstack([*(part for path, m in zip(model.path_slices, model.moment_slices,
                                                  strict=True)
                          for part in (D[:, path], A[:, m])), columns])
-        T, names, target_indices, first = np.eye(H.shape[1]), [], [], 0
-        shared = np.arange(H.shape[1] - len(backgrounds), H.shape[1])
+        T, names, target_indices, begin = np.eye(H.shape[1]), [], [], 0
+        background_indices = np.arange(H.shape[1] - len(backgrounds), H.shape[1])
         for row in model.rows:
-            end = first + len(row.names) + 3 * row.n_dipoles
-            T[first + len(row.names):end, first + len(row.names):end] = row.combinations
-            target_indices.append(np.concatenate([np.arange(first, end), shared]))
+            end = begin + len(row.names) + 3 * row.n_dipoles
+            T[begin + len(row.names):end, begin + len(row.names):end] = row.combinations
+            target_indices.append(np.concatenate([np.arange(begin, end), background_indices]))
             names += [*row.names, *row.moment_names]
-            first = end
+            begin = end
         names += [f'B {data.network.names[j]} {"xyz"[a]}' for j in data.sensors
                   for a in np.flatnonzero(measured[data.sensor == j].any(axis=0))]
         background = (columns @ backgrounds).reshape(-1, 3)

@@ -32,8 +32,8 @@ equivalent to a point. The maximum length is the distance travelled."""
 class Bearing:
     """Observable quantities of a pass at a single sensor, relative to the sensor.
 
-    The distance is not observable. Reflecting the path through the sensor leaves the
-    field unchanged.
+    The distance is not observable. A path and its reflection through the sensor have the same
+    field, so the sign of the path is not observable either.
     """
 
     cpa_direction: FloatArray

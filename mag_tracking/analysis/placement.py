@@ -183,9 +183,10 @@ def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTar
             'pdksa,pdksa->pdks', h, h)) / frame_weight
         weighted = H / variance[..., None, None]
         J = np.einsum('pdksai,pdksaj->pdsij', weighted, H, optimize=True)
-        mean = weighted.sum(axis=2)
-        total = (1.0 / variance).sum(axis=2) + 1.0 / sampling.background_std**2
-        result[part] = J - np.einsum('pdsai,pdsaj->pdsij', mean, mean) / total[..., None, None]
+        weighted_sum = weighted.sum(axis=2)
+        background_information = (1.0 / variance).sum(axis=2) + 1.0 / sampling.background_std**2
+        result[part] = J - np.einsum('pdsai,pdsaj->pdsij', weighted_sum,
+                                     weighted_sum) / background_information[..., None, None]
     return result
 
 

@@ -204,15 +204,16 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
     z = (x - mean) / scale
     folds = list(_folds(y, groups, min(N_FOLDS, min(counts.values())), seed))
     candidates = []
-    for name, create in _candidates():
-        logits = np.zeros((len(y), len(classes)))
+    for name, create_estimator in _candidates():
+        held_out_logits = np.zeros((len(y), len(classes)))
         for train_rows, test_rows in folds:
-            logits[test_rows] = _logits(create().fit(z[train_rows], y[train_rows]), z[test_rows])
-        losses = [_log_loss(logits / t, y) for t in TEMPERATURES]
+            held_out_logits[test_rows] = _logits(
+                create_estimator().fit(z[train_rows], y[train_rows]), z[test_rows])
+        losses = [_log_loss(held_out_logits / t, y) for t in TEMPERATURES]
         k = int(np.argmin(losses))
-        candidates.append((losses[k], name, create, float(TEMPERATURES[k])))
-    _, name, create, temperature = min(candidates, key=lambda s: s[0])
-    fitted = create().fit(z, y)
+        candidates.append((losses[k], name, create_estimator, float(TEMPERATURES[k])))
+    _, name, create_estimator, temperature = min(candidates, key=lambda s: s[0])
+    fitted = create_estimator().fit(z, y)
     centres, precision = _class_statistics(z, y)
     held_out = np.concatenate([_held_out_distances(z, y, train_rows, test_rows)
                                for train_rows, test_rows in folds])
@@ -244,7 +245,7 @@ def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]'
     """
     counts = Counter(label for label, _ in set(zip(labels, groups, strict=True)))
     if '' in counts:
-        raise LabelsError(f'labels are missing for {counts[""]} of the targets; label or '
+        raise LabelsError(f'labels are missing for {counts[""]} targets; label or '
                           'remove their signatures')
     if UNKNOWN in counts:
         raise LabelsError(f'the label {UNKNOWN!r} is reserved for unclassified signatures; rename '

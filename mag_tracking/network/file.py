@@ -19,8 +19,8 @@ from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
 from mag_tracking.network.topics import NAME
 from mag_tracking.yaml_file import is_text, read_yaml, short_repr
 
-_NAME = re.compile(r'[A-Za-z0-9_.-]+')
-_FRAME = re.compile(r'[A-Za-z0-9_./-]+')
+_SENSOR_NAME_PATTERN = re.compile(r'[A-Za-z0-9_.-]+')
+_FRAME_PATTERN = re.compile(r'[A-Za-z0-9_./-]+')
 _TOP_KEYS = {'frame', 'earth_field', 'site', 'sensors'}
 _SITE_KEYS = ('latitude', 'longitude', 'height', 'date', 'x_azimuth_deg')
 _SENSOR_KEYS = {'position', 'orientation', 'orientation_std_deg', 'clock_offset', 'noise_std',
@@ -71,8 +71,9 @@ def _parse_sensor(name: str, entry: Any) -> dict[str, Any]:
     if np.abs(position).max() > _MAX_COORDINATE:
         raise NetworkError(f'{label}: position: {position.tolist()} m is too far from the '
                            'origin for any place on Earth; positions are in metres')
-    q = _parse_vector(f'{label}: orientation', entry.get('orientation', [0, 0, 0, 1]), (4,))
-    R_ws = _parse_rotation(f'{label}: orientation', q)
+    quaternion = _parse_vector(f'{label}: orientation',
+                               entry.get('orientation', [0, 0, 0, 1]), (4,))
+    R_ws = _parse_rotation(f'{label}: orientation', quaternion)
     topic = _check_topic(label, 'topic', entry.get('topic', f'{name}/imu/mag'))
     # REP-145: the accelerometer topic data_raw and the magnetometer topic mag share a namespace.
     default_imu_topic = topic.removesuffix('/mag') + '/data_raw' if topic.endswith('/mag') else None
@@ -215,12 +216,12 @@ def _parse_network(content: Any) -> SensorNetwork:
         raise NetworkError('sensors: expected a mapping with at least one sensor')
     earth = _parse_earth_field(content)
     frame = content.get('frame', 'map')
-    if not isinstance(frame, str) or not _FRAME.fullmatch(frame):
+    if not isinstance(frame, str) or not _FRAME_PATTERN.fullmatch(frame):
         raise NetworkError('frame: expected a name of letters, digits, _ . / and -, got '
                            f'{short_repr(frame)}')
     names = tuple(str(name) for name in sensors)
     for name in names:
-        if not _NAME.fullmatch(name):
+        if not _SENSOR_NAME_PATTERN.fullmatch(name):
             raise NetworkError(f'{short_repr(name)} is not a valid sensor name: use letters, '
                                'digits, _ . and -')
     entries = [_parse_sensor(n, e) for n, e in zip(names, sensors.values(), strict=True)]

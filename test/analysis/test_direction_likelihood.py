@@ -42,8 +42,8 @@ def test_ratio_is_proportional_to_the_signal_to_noise_power_ratio():
 
 @pytest.mark.study
 @pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
-def test_directions_in_the_published_traffic(simulator):
-    """Results of PHD15 Paper B, Table 1: 510 of 511 are correct at the near sensor, 494 fused."""
+def test_directions_are_as_accurate_as_in_the_published_traffic(simulator):
+    """In PHD15 Paper B, Table 1, 510 of 511 near-sensor and 494 fused directions are correct."""
     vehicles = passings(simulator, 1)
     fractions = shares(vehicles, [v.log_odds_of_north() for v in vehicles])
     # The limits are three standard deviations (511 vehicles) below the targets, 99.8 % and 97 %.

@@ -171,7 +171,7 @@ def test_robust_covariance_is_slightly_larger_than_the_nominal_covariance(n_dipo
     assert 1.0 <= np.median(ratios) < 1.4
 
 
-def test_hard_and_soft_iron_from_four_headings():
+def test_hard_and_soft_iron_are_estimated_from_four_headings():
     """m0 and D from passes of three dipoles have errors below three stds; TSP14 section VI.E."""
     rng = np.random.default_rng(5)
     hard, soft = np.array([[60.0, 30.0, -40.0], [120.0, -10.0, -70.0], [20.0, 40.0, 30.0]]), 5.0

@@ -26,7 +26,7 @@ PATH = np.array([0.0, -2.0, 0.5, 10.0, 0.0, 0.0, 3.0])
 
 
 def test_reach_covers_the_residuals_of_published_vehicles():
-    """At 4.5 m, costs in TSP14 Tables I and II leave (cost - 1) / 87 of the energy unexplained."""
+    """A published cost at 4.5 m is equivalent to an unexplained energy of (cost - 1) / 87."""
     cars, trucks = (10, 14, 17), ((302.6, 9.09), (76.7, 11.25))
     for cost in cars:
         assert 1.0 < 4.5 * np.sqrt((cost - 1.0) / 87.0) <= reach(1, 0.0)

@@ -170,7 +170,7 @@ def test_vehicle_moment_is_rotated_hard_iron_plus_soft_iron():
 
 @pytest.mark.parametrize('heading', [0.0, 0.7, 2.0, -2.9])
 def test_soft_iron_is_induced_along_the_axes_of_the_vehicle(heading):
-    """Comparison with R D R' B0/mu0 and with `ellipsoid_moment`, MITRE12 eq. (A.5)."""
+    """The moment equals R D R' B0/mu0 and `ellipsoid_moment`; see MITRE12 eq. (A.5)."""
     model, axes = EXAMPLES['RowVehicle'], (2.1, 0.9)
     along = np.array([1.0, 0.0, 0.0])
     p1, p2 = (ellipsoid_moment(axes, 11.0, 0.0, b)[k] * MU0 for k, b in (
@@ -215,7 +215,7 @@ def field_of(model, x, points):
 
 
 def test_a_row_is_centred_at_the_position_along_the_heading():
-    """TSP14 eq. (10b), written out for four dipoles."""
+    """The positions of four dipoles follow TSP14 eq. (10b)."""
     x = row_state(4, 3.6)
     r = EXAMPLES['RowVehicle with four dipoles'].dipoles(x).r[0]
     heading = np.array([np.cos(0.6), np.sin(0.6), 0.0])
