@@ -191,8 +191,8 @@ def _fit_velocity(data: PassData, pairs: Sequence[PairDelay],
     positions = data.network.positions[:, :2]
     d = np.array([positions[p.second] - positions[p.first] for p in pairs])
     tau, std = (np.array([getattr(p, n) for p in pairs]) for n in ('delay', 'delay_std'))
-    _, singular, Vt = np.linalg.svd(d / std[:, None], full_matrices=False)
-    is_collinear = len(singular) < 2 or singular[1] < 0.1 * singular[0]
+    _, singular_values, Vt = np.linalg.svd(d / std[:, None], full_matrices=False)
+    is_collinear = len(singular_values) < 2 or singular_values[1] < 0.1 * singular_values[0]
     A = d @ Vt[:1].T if is_collinear else d
     covariance = np.linalg.inv((A / std[:, None] ** 2).T @ A)
     slowness = covariance @ (A.T @ (tau / std**2))

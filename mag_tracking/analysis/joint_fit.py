@@ -158,9 +158,9 @@ def _initial_paths(averaged: PassData, n_targets: int, ground: GroundPrior) -> F
         orders = n * (1,)
         create_model, prior = partial(SuperposedPasses.from_orders, orders), ground.prior(orders)
         starts = []
-        for known, residual_data in zip(paths, residuals, strict=True):
+        for known_path, residual_data in zip(paths, residuals, strict=True):
             target_starts = starting_paths(residual_data, 1)
-            starts.append(np.hstack([np.tile(known, (len(target_starts), 1)), target_starts]))
+            starts.append(np.hstack([np.tile(known_path, (len(target_starts), 1)), target_starts]))
         coarse = separable_problem(averaged, create_model, prior=prior)
         paths, _ = coarse_minima(separable_problem(averaged, create_model, COARSE_ERROR, prior),
                                  coarse, np.concatenate(starts), np.tile(PATH_TOLERANCE[:6], n),
@@ -226,20 +226,20 @@ class _JointFits:
         theta, cost, _, _ = refine(coarse.residual_and_jacobian, starts, 40, 1e-6)
         in_order = tuple(range(len(orders)))
         cost = _exclude_solutions(cost, np.array([
-            assignment(self._initial_paths[0], split(found)) == in_order
-            for found in theta]), np.inf)
+            assignment(self._initial_paths[0], split(solution)) == in_order
+            for solution in theta]), np.inf)
         # If all minima without overlap are much worse, keep those with overlap; `fit_targets`
         # rejects them.
-        cost = _exclude_solutions(cost, np.array([are_separate(self._averaged, split(found))
-                                                  for found in theta]), MAX_COST_RATIO)
-        found = fine_minimum(fine, theta, cost, np.concatenate(
+        cost = _exclude_solutions(cost, np.array([are_separate(self._averaged, split(solution))
+                                                  for solution in theta]), MAX_COST_RATIO)
+        minimum = fine_minimum(fine, theta, cost, np.concatenate(
             [PATH_TOLERANCE[:6 + (n > 1)] for n in orders]), N_FINE_STARTS)
-        if not np.isfinite(found.cost):
+        if not np.isfinite(minimum.cost):
             return tuple(PassFit(n, data, 'no valid start of the search') for n in orders)
         theta, p = create_model(data.t, data.positions, data.whitening).with_nonnegative_length(
-            found.theta, fine.linear(found.theta))
-        unexplained = max(found.cost - self._noise_dof, 0.0) / (fine.energy - self._noise_dof)
-        return fits_at_minimum(data, orders, replace(found, theta=theta), p, 1.0 - unexplained,
+            minimum.theta, fine.linear(minimum.theta))
+        unexplained = max(minimum.cost - self._noise_dof, 0.0) / (fine.energy - self._noise_dof)
+        return fits_at_minimum(data, orders, replace(minimum, theta=theta), p, 1.0 - unexplained,
                                self._errors, path_std=prior[1])
 
 

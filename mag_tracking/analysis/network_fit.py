@@ -300,10 +300,11 @@ class NormalEquations:
                  prior_weights: Unknowns) -> None:
         f, _, by_sensor, by_shared, by_pose = predicted
         n, K = W.shape[:2]
-        root = np.sqrt(W)
-        e = (root * np.nan_to_num(problem.field - f)).reshape(n, 3 * K)
-        Js, Jh = ((root[..., None] * J).reshape(n, 3 * K, -1) for J in (by_sensor, by_shared))
-        Jp = root[..., None] * by_pose
+        sqrt_weights = np.sqrt(W)
+        e = (sqrt_weights * np.nan_to_num(problem.field - f)).reshape(n, 3 * K)
+        Js, Jh = ((sqrt_weights[..., None] * J).reshape(n, 3 * K, -1)
+                  for J in (by_sensor, by_shared))
+        Jp = sqrt_weights[..., None] * by_pose
         Jst = np.swapaxes(Js, 1, 2)
         m = N_SENSOR * n
         A = np.zeros((m + N_SHARED, m + N_SHARED))
@@ -318,9 +319,10 @@ class NormalEquations:
         self.g = np.concatenate([
             (np.einsum('nyi,ny->ni', Js, e) - prior_weights[0] * x[0]).ravel(),
             Jh_all.T @ e.ravel() - prior_weights[1] * x[1]])
-        by_k = np.swapaxes(Jp, 0, 1).reshape(K, 3 * n, N_POSE)
-        self.A_pose = np.swapaxes(by_k, 1, 2) @ by_k + prior_weights[2][:, :, None] * np.eye(N_POSE)
-        self.g_pose = np.einsum('kyi,ky->ki', by_k, np.swapaxes(
+        pose_jacobians = np.swapaxes(Jp, 0, 1).reshape(K, 3 * n, N_POSE)
+        self.A_pose = np.swapaxes(pose_jacobians, 1, 2) @ pose_jacobians \
+            + prior_weights[2][:, :, None] * np.eye(N_POSE)
+        self.g_pose = np.einsum('kyi,ky->ki', pose_jacobians, np.swapaxes(
             e.reshape(n, K, 3), 0, 1).reshape(K, 3 * n)) - prior_weights[2] * x[2]
         sensor_pose = np.einsum('nkai,nkap->knip', Js.reshape(n, K, 3, N_SENSOR), Jp)
         shared_pose = np.einsum('nkai,nkap->kip', Jh.reshape(n, K, 3, N_SHARED), Jp)
@@ -399,10 +401,10 @@ def solve(problem: GeometryProblem,
     for _ in range(iterations):
         weights = problem.weights(predicted[0], predicted[1], x)
         W, prior_weights = weights[:2]
-        normal = NormalEquations(problem, x, predicted, W, prior_weights)
+        equations = NormalEquations(problem, x, predicted, W, prior_weights)
         cost = problem.cost(x, predicted[0], W, prior_weights)
         while damping < MAX_DAMPING:
-            dx, dpose = normal.step(damping)
+            dx, dpose = equations.step(damping)
             candidate = _add_step(x, dx, dpose)
             candidate_predicted = problem.predicted(candidate)
             if problem.cost(candidate, candidate_predicted[0], W, prior_weights) <= cost:
@@ -411,7 +413,7 @@ def solve(problem: GeometryProblem,
         else:
             break
         x, predicted, damping = candidate, candidate_predicted, 0.1 * damping
-        if dx @ normal.g + (dpose * normal.g_pose).sum() < STEP_TOLERANCE:
+        if dx @ equations.g + (dpose * equations.g_pose).sum() < STEP_TOLERANCE:
             converged = True
             break
     weights = problem.weights(predicted[0], predicted[1], x)

@@ -327,7 +327,7 @@ def _sensor_and_pose_residuals(problem: GeometryProblem,
     e2, count, _ = problem.squared_residuals(predicted[0], predicted[1])
     e2 = e2.sum(axis=2)
     pose_residual = np.sqrt([np.median(median_ratio(d2, c)[c > 0])
-                       for d2, c in zip(e2.T, count.T, strict=True)])
+                             for d2, c in zip(e2.T, count.T, strict=True)])
     is_consistent = pose_residual <= MAX_RESIDUAL_RATIO * np.median(pose_residual)
     n_values = count[:, is_consistent].sum(axis=1)
     sensor_residual = np.sqrt(e2[:, is_consistent].sum(axis=1)

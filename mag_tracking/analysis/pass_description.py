@@ -139,7 +139,7 @@ class _LinearisedFit:
               p: FloatArray) -> '_LinearisedFit':
         """Linearise a fit at the paths `theta` (n_theta,) and the linear parameters `p` (k,)."""
         model = SuperposedPasses.from_orders(orders, data.t, data.positions,
-                                    data.network.R_sw[data.sensor])
+                                             data.network.R_sw[data.sensor])
         measured = ~np.isnan(data.field)
         columns = background_columns(data, measured[:, :, None] * np.eye(3))
         D, A, W = model.derivative(theta[None], p[None])[0], model.basis(theta[None])[0], \
@@ -178,7 +178,7 @@ def _flatten(A: FloatArray) -> FloatArray:
 
 
 def _partial_fits(linear: _LinearisedFit, minimum: Minimum, explained: float, errors: SensorErrors,
-                covariance: FloatArray) -> list[PassFit]:
+                  covariance: FloatArray) -> list[PassFit]:
     """Create the `PassFit` of each target, except for `rivals`, `reason` and `trusted`.
 
     `covariance` contains only the effect of the noise.

@@ -159,7 +159,7 @@ def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
     sensor_mask = data.sensor == data.sensor[strongest]
     weight = energy[sensor_mask] / energy[sensor_mask].sum()
     t_cpa = weight @ data.t[sensor_mask]
-    width = np.sqrt(weight @ np.square(data.t[sensor_mask] - t_cpa))
+    duration_std = np.sqrt(weight @ np.square(data.t[sensor_mask] - t_cpa))
     heading, offset, speed_factor = (a.ravel() for a in np.meshgrid(
         np.arange(12) * np.pi / 6.0, (-8.0, -4.5, -2.0, 2.0, 4.5, 8.0),
         (0.25, 0.35, 0.5, 0.7, 1.0, 1.4), indexing='ij'))
@@ -167,7 +167,7 @@ def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
     along = np.stack([np.cos(heading), np.sin(heading), 0.0 * heading], axis=1)
     across = np.stack([-np.sin(heading), np.cos(heading), 0.0 * heading], axis=1)
     distance = np.hypot(np.hypot(offset, 0.5), 0.35 * length)
-    velocity = along * (speed_factor * distance / width)[:, None]
+    velocity = along * (speed_factor * distance / duration_std)[:, None]
     position = (data.positions[strongest] + offset[:, None] * across - t_cpa * velocity
                 + [0.0, 0.0, 0.5])
     return np.hstack([position, velocity, np.full((len(heading), int(n_dipoles > 1)), length)])

@@ -136,9 +136,9 @@ class PassFit:
         if self.n_dipoles == 1:
             return True
         length, length_std = self.length
-        travelled = np.linalg.norm(self.velocity) * self.duration_s
+        travelled_distance = np.linalg.norm(self.velocity) * self.duration_s
         return bool(length_std <= max(length, 1.0)
-                    and MIN_LENGTH_FRACTION * travelled <= length <= travelled)
+                    and MIN_LENGTH_FRACTION * travelled_distance <= length <= travelled_distance)
 
     @property
     def is_poor_mixture(self) -> bool:

@@ -114,11 +114,12 @@ def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], residuals: Flo
         squared_norm: FloatArray = np.einsum('ni,ni->n', whitened, whitened)
         return squared_norm
 
-    plausible = sum((_plausible_residual_fraction(data, row) * energy(row.field) for row in rows),
-                    np.zeros(len(residuals)))
-    excess = np.square(residuals).sum(axis=1) - plausible - NOISE_ENERGY
-    total = energy(np.sum([row.field for row in rows], axis=0))
-    return float(np.maximum(excess, 0.0).sum() / total.sum())
+    plausible_energy = sum(
+        (_plausible_residual_fraction(data, row) * energy(row.field) for row in rows),
+        np.zeros(len(residuals)))
+    excess_energy = np.square(residuals).sum(axis=1) - plausible_energy - NOISE_ENERGY
+    total_energy = energy(np.sum([row.field for row in rows], axis=0))
+    return float(np.maximum(excess_energy, 0.0).sum() / total_energy.sum())
 
 
 def _plausible_residual_fraction(data: PassData, row: FittedRow) -> FloatArray:
@@ -160,10 +161,10 @@ def rejection_reason(fit: PassFit) -> str:
         length, length_std = fit.length
         return (f'not determined: a length of {length:.1f} m with a standard deviation of '
                 f'{length_std:.1f} m; use fewer dipoles')
-    std, nearest = np.sqrt(np.trace(fit.robust_covariance[:3, :3])), _nearest_cpa_range(fit)
-    if std > nearest:
+    std, nearest_range = np.sqrt(np.trace(fit.robust_covariance[:3, :3])), _nearest_cpa_range(fit)
+    if std > nearest_range:
         return (f'out of range: the position has a standard deviation of {std:.1f} m, and the '
-                f'nearest sensor is {nearest:.1f} m away')
+                f'nearest sensor is {nearest_range:.1f} m away')
     return ''
 
 
@@ -184,14 +185,14 @@ def trusted_quantities(fit: PassFit) -> tuple[str, ...]:
         return ()
     speed, speed_std = fit.speed
     _, heading_std = fit.heading
-    nearest = _nearest_cpa_range(fit)
+    nearest_range = _nearest_cpa_range(fit)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     _, time_std, _, _ = fit.closest_approach(centre)
     # A comparison with NaN (an unknown variance) is false.
     is_determined = {
         'speed': speed_std <= MAX_SPEED_STD * speed,
         'direction': heading_std <= MAX_HEADING_STD and speed_std <= 0.5 * speed,
-        'time': time_std * speed <= MAX_TIME_STD * nearest}
+        'time': time_std * speed <= MAX_TIME_STD * nearest_range}
     return tuple(name for name, is_valid in is_determined.items() if is_valid)
 
 

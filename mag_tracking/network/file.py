@@ -118,8 +118,8 @@ def _parse_correction(label: str, value: object) -> FloatArray | None:
     if value is None:
         return None
     matrix = _parse_vector(f'{label}: correction', value, (9,)).reshape(3, 3)
-    singular = np.linalg.svd(matrix, compute_uv=False)
-    if not singular[-1] > 0.02 * singular[0]:
+    singular_values = np.linalg.svd(matrix, compute_uv=False)
+    if not singular_values[-1] > 0.02 * singular_values[0]:
         raise NetworkError(f'{label}: correction: {matrix.ravel().tolist()} is singular or almost '
                            'singular')
     return matrix
@@ -225,10 +225,10 @@ def _parse_network(content: Any) -> SensorNetwork:
             raise NetworkError(f'{short_repr(name)} is not a valid sensor name: use letters, '
                                'digits, _ . and -')
     entries = [_parse_sensor(n, e) for n, e in zip(names, sensors.values(), strict=True)]
-    columns: dict[str, Any] = {key: tuple(e[key] for e in entries) for key in entries[0]}
+    attributes: dict[str, Any] = {key: tuple(e[key] for e in entries) for key in entries[0]}
     for key in ('positions', 'R_ws', 'clock_offset'):
-        columns[key] = np.array(columns[key])
-    return SensorNetwork(names, frame=frame, earth_field=earth, **columns)
+        attributes[key] = np.array(attributes[key])
+    return SensorNetwork(names, frame=frame, earth_field=earth, **attributes)
 
 
 def _parse_earth_field(content: dict[str, Any]) -> FloatArray | None:

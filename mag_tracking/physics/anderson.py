@@ -77,14 +77,14 @@ def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatA
     if not 0.0 < speed < np.inf:
         raise ValueError(f'v0 must be finite and non-zero, got {v0.tolist()}')
     direction = v0 / speed
-    path = -(r0 @ direction)
-    r_cpa = r0 + path * direction
+    travelled = -(r0 @ direction)
+    r_cpa = r0 + travelled * direction
     # Project twice: rounding of r0 leaves a component along v0 in the first difference.
     r_cpa -= (r_cpa @ direction) * direction
     distance = float(np.linalg.norm(r_cpa))
     if distance <= 1e-15 * np.linalg.norm(r0):
         distance, r_cpa = 0.0, np.zeros(3)
-    return float(path / speed), distance, r_cpa
+    return float(travelled / speed), distance, r_cpa
 
 
 def anderson_coefficients(r_cpa: ArrayLike, v0: ArrayLike, m: ArrayLike) -> FloatArray:

@@ -47,8 +47,9 @@ def demagnetisation_factors(aspect: ArrayLike) -> tuple[FloatArray, FloatArray]:
     aspect = np.asarray(aspect, dtype=float)
     if not np.all((aspect >= 1e-100) & (aspect <= 1e100)):
         raise ValueError(f'aspect must be between 1e-100 and 1e100, got {aspect.tolist()}')
-    square = aspect * aspect
-    return aspect / 3 * elliprd(1.0, 1.0, square), aspect / 3 * elliprd(1.0, square, 1.0)
+    squared_aspect = aspect * aspect
+    return (aspect / 3 * elliprd(1.0, 1.0, squared_aspect),
+            aspect / 3 * elliprd(1.0, squared_aspect, 1.0))
 
 
 def ellipsoid_moment(semi_axes: Sequence[float] | FloatArray, mu_r: float, heading: ArrayLike,

@@ -137,7 +137,7 @@ class SuperposedPasses:
 
     @classmethod
     def from_orders(cls, orders: Sequence[int], t: FloatArray, positions: FloatArray,
-           M: FloatArray) -> 'SuperposedPasses':
+                    M: FloatArray) -> 'SuperposedPasses':
         """Create the passes of several rows with the same samples.
 
         Parameters

@@ -145,8 +145,8 @@ class Magnet:
         PHD15 Paper A eq. (24) lengthens the moment by half the squared angle in each step. In a
         filter with a known moment magnitude, this leads to an overestimated distance.
         """
-        n, angle = len(x), dt * x[:, 9:12]
-        R = rotation_from_quaternion(quaternion_from_rotation_vector(angle))
+        n, rotation_vector = len(x), dt * x[:, 9:12]
+        R = rotation_from_quaternion(quaternion_from_rotation_vector(rotation_vector))
         predicted = x.copy()
         predicted[:, :3] += dt * x[:, 3:6]
         predicted[:, 6:9] = np.einsum('nij,nj->ni', R, x[:, 6:9])
@@ -154,7 +154,7 @@ class Magnet:
         F = np.tile(np.eye(12), (n, 1, 1))
         F[:, :6, :6] = constant_velocity(dt)
         F[:, 6:9, 6:9] = R
-        F[:, 6:9, 9:12] = dt * C @ left_jacobian(angle)
+        F[:, 6:9, 9:12] = dt * C @ left_jacobian(rotation_vector)
         G = np.zeros((n, 6, 6))
         G[:, :3, :3] = C
         G[:, 3:, 3:] = np.eye(3)

@@ -87,9 +87,9 @@ class RowVehicle:
         It is relative to the squared magnitude of the hard and soft iron moments.
         """
         d = self.n_dipoles
-        mean = np.full((d, d), 1.0 / d)
-        return np.kron(self.moment_drift**2 / d * mean
-                       + self.difference_drift**2 * (np.eye(d) - mean), np.eye(3))
+        averaging = np.full((d, d), 1.0 / d)
+        return np.kron(self.moment_drift**2 / d * averaging
+                       + self.difference_drift**2 * (np.eye(d) - averaging), np.eye(3))
 
     def dipoles(self, x: FloatArray) -> Dipoles:
         """Compute the `n_dipoles` dipoles of each target state.

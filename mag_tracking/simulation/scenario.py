@@ -179,7 +179,7 @@ def random_vehicle(rng: np.random.Generator, length: float = 4.3, width: float =
     fractions = rng.dirichlet(np.full(n_parts, 1.5))
     common_direction = rng.standard_normal(3)
     permanent = (fractions[:, None] * (common_direction / np.linalg.norm(common_direction)
-                                      + 0.7 * rng.standard_normal((n_parts, 3)))
+                                       + 0.7 * rng.standard_normal((n_parts, 3)))
                  * moment / 1.4)
     # Sheet metal is easier to magnetise along the vehicle than across it.
     axis_factors = np.array([1.3, 1.0, 0.7]) * rng.uniform(0.8, 1.2, (n_parts, 3))
@@ -228,9 +228,9 @@ class Path:
                         0.0, abs(self.turn)) * np.sign(self.turn)
         after_arc = np.maximum(s - self.straight - arc, 0.0) if self.turn else 0.0 * s
         # In the frame of the start pose: x forward, y left.
-        side = np.sign(self.turn)
+        turn_sign = np.sign(self.turn)
         forward = before_arc + self.radius * np.sin(np.abs(angle)) + after_arc * np.cos(angle)
-        sideways = side * self.radius * (1.0 - np.cos(angle)) + after_arc * np.sin(angle)
+        sideways = turn_sign * self.radius * (1.0 - np.cos(angle)) + after_arc * np.sin(angle)
         c, w = np.cos(self.heading), np.sin(self.heading)
         position = self.start + np.stack([c * forward - w * sideways,
                                           w * forward + c * sideways], axis=1)

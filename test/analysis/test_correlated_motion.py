@@ -119,7 +119,7 @@ def test_contradictions_depend_on_speed_heading_and_their_stds():
 
 
 @pytest.mark.parametrize('positions', [((0.0, 0.0, 0.0), (0.0, 0.0, 0.6)),
-                                    ((0.0, 0.0, 0.0), (0.04, 0.0, 0.6))])
+                                       ((0.0, 0.0, 0.0), (0.04, 0.0, 0.6))])
 def test_sensors_above_one_another_have_no_delay(positions):
     data = simulated_pass(9.0, positions=positions)
     clock_offset = np.where(data.sensor == 1, 0.03, 0.0)

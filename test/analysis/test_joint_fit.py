@@ -29,15 +29,15 @@ FOUR_SENSORS = network_of([[-3.0, -4.5, 0.0], [-3.0, 4.5, 0.0], [3.0, -4.5, 0.0]
 def random_lane_path(rng, time_s, direction, n_dipoles):
     """Create random (path, moments) of a vehicle that passes the origin in its lane at `time_s`."""
     speed = direction * rng.uniform(8.0, 20.0)
-    place = [-speed * time_s, -direction * rng.uniform(1.4, 2.2), rng.uniform(0.4, 1.0)]
+    position = [-speed * time_s, -direction * rng.uniform(1.4, 2.2), rng.uniform(0.4, 1.0)]
     moments = random_moments(rng, n_dipoles)
     length = [rng.uniform(2.0, 3.5)] if n_dipoles > 1 else []
-    return np.concatenate([place, [speed, 0.1 * rng.standard_normal(), 0.0], length]), moments
+    return np.concatenate([position, [speed, 0.1 * rng.standard_normal(), 0.0], length]), moments
 
 
 def simulated_pass(rng, plan, n_dipoles, network=ROAD):
     """Simulate vehicles; `plan` lists (time at the origin [s], direction). Return (data, paths)."""
-    targets = [random_lane_path(rng, *when, n_dipoles) for when in plan]
+    targets = [random_lane_path(rng, *passing, n_dipoles) for passing in plan]
     fields = [measured(network, path, moments, rng, seconds=6.0, noise=1.2e-8 if k == 0 else 1e-15)
               for k, (path, moments) in enumerate(targets)]
     data = fields[0]
@@ -120,20 +120,21 @@ def test_order_of_each_vehicle_is_chosen_separately():
 def test_two_following_vehicles_are_not_fitted_as_one_long_row():
     """Without tracks, one row is fitted, whose length is the distance between the vehicles."""
     rng = np.random.default_rng(3)
-    one, moments = random_lane_path(rng, -0.5, 1, 2)
-    other = one.copy()
-    other[0] -= 18.0
-    data = together(measured(ROAD, one, moments, rng, seconds=6.0),
-                    measured(ROAD, other, 0.8 * moments, rng, seconds=6.0, noise=1e-15))
+    first_path, moments = random_lane_path(rng, -0.5, 1, 2)
+    second_path = first_path.copy()
+    second_path[0] -= 18.0
+    data = together(measured(ROAD, first_path, moments, rng, seconds=6.0),
+                    measured(ROAD, second_path, 0.8 * moments, rng, seconds=6.0, noise=1e-15))
     alone = [fit_pass(data, n) for n in (1, 2)]
     wrong = choose_order(alone)
     assert wrong is not None and wrong.length[0] > 12.0
-    paths = tracked_paths(rng, (one, other))
+    paths = tracked_paths(rng, (first_path, second_path))
     assert fit_targets(data, alone, paths[:1], GROUND, ORDERS) == (tuple(alone),)
     chosen = [choose_order(fits) for fits in fit_targets(data, alone, paths, GROUND, ORDERS)]
     assert len(chosen) == 2
     for fit in chosen:
-        assert abs(fit.velocity[0] - one[3]) < 4.0 * fit.speed[1] < 2.0 and fit.length[0] < 5.0
+        assert abs(fit.velocity[0] - first_path[3]) < 4.0 * fit.speed[1] < 2.0 \
+            and fit.length[0] < 5.0
 
 
 def test_two_tracks_of_one_vehicle_are_fitted_as_one():
@@ -267,7 +268,7 @@ def fits_with_minima(*others):
     A = model.basis(theta[None])[0]
     p = np.linalg.lstsq(A, data.field.ravel(), rcond=None)[0]
     minimum = Minimum(theta, float(data.n_values), True,
-                    tuple((x(theta), 1.01 * data.n_values) for x in others))
+                      tuple((x(theta), 1.01 * data.n_values) for x in others))
     return data, theta, fits_at_minimum(data, (1, 1), minimum, p, 1.0, SensorErrors()), (p, minimum)
 
 

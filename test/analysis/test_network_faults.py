@@ -13,7 +13,7 @@ from support.magnet_boards import MOMENT, SETTINGS, board, calibrated_boards, es
 
 @pytest.fixture(scope='module')
 def boards():
-    """Simulate and calibrate several boards: [(simulated, geometry)]."""
+    """Simulate and calibrate several boards; return a list of (simulated data, geometry)."""
     return calibrated_boards()
 
 
@@ -38,9 +38,9 @@ def test_a_dead_sensor_is_treated_as_missing(boards):
     assert g.network.background[4] is None and g.network.background[0] is not None
     others = np.delete(np.arange(9), 4)
     reduced = replace(network, names=tuple(np.array(network.names)[others].tolist()),
-                   positions=network.positions[others], R_ws=network.R_ws[others],
-                   topics=tuple(np.array(network.topics)[others].tolist()),
-                   noise_std=network.noise_std[:8], background=())
+                      positions=network.positions[others], R_ws=network.R_ws[others],
+                      topics=tuple(np.array(network.topics)[others].tolist()),
+                      noise_std=network.noise_std[:8], background=())
     h = calibrate_geometry(reduced, incomplete[:, others], positions, axes, MOMENT, SETTINGS)
     assert (np.abs(g.gain[others] - h.gain) < 1e-4 * h.gain_std).all()
     assert (np.abs(g.network.positions[others] - h.network.positions)

@@ -13,7 +13,7 @@ from support.magnet_boards import MOMENT, SETTINGS, board, calibrated_boards, es
 
 @pytest.fixture(scope='module')
 def boards():
-    """Simulate and calibrate several boards: [(simulated, geometry)]."""
+    """Simulate and calibrate several boards; return a list of (simulated data, geometry)."""
     return calibrated_boards()
 
 
@@ -69,8 +69,8 @@ def test_estimated_poses_are_closer_to_the_truth_than_tracked_ones(boards):
         assert (np.einsum('ki,ki->k', u, m) / np.linalg.norm(m, axis=1)).min() > np.cos(0.025)
         true_r, *_ = magnet.poses(x[1], x[2])
         # An error common to all poses is a gauge freedom; only the tracker error is compared.
-        for found, out in ((g.poses[0], estimated_error), (r, tracked_error)):
-            e = found - true_r
+        for estimate, out in ((g.poses[0], estimated_error), (r, tracked_error)):
+            e = estimate - true_r
             out.append(np.square(e - e.mean(axis=0)).mean())
         z2.append(np.mean(np.square(g.pose - x[2]) / np.einsum('kii->ki', g.pose_covariance)))
     print('remaining error of the tracker: '

@@ -144,17 +144,17 @@ def test_correlated_residuals_increase_the_covariance():
     rng, n, correlation = np.random.default_rng(3), 3000, np.exp(-0.1)
     H = np.column_stack([np.ones(n), np.linspace(-1.0, 1.0, n)])
     P = np.linalg.inv(H.T @ H)
-    found, errors = np.zeros((2, 2)), []
+    estimated, errors = np.zeros((2, 2)), []
     for _ in range(300):
         e = lfilter([np.sqrt(1.0 - correlation**2)], [1.0, -correlation], rng.standard_normal(n))
         x = P @ (H.T @ e)
         errors.append(x)
-        found += P @ score_sum_covariance(H * (e - H @ x)[:, None], 60) @ P / 300.0
+        estimated += P @ score_sum_covariance(H * (e - H @ x)[:, None], 60) @ P / 300.0
     true = np.cov(np.transpose(errors))
     # The covariance for white noise is too small by a factor of about twenty.
     assert (np.diagonal(P) < 0.1 * np.diagonal(true)).all()
-    assert (np.diagonal(found) > 0.7 * np.diagonal(true)).all()
-    assert (np.diagonal(found) < 1.2 * np.diagonal(true)).all()
+    assert (np.diagonal(estimated) > 0.7 * np.diagonal(true)).all()
+    assert (np.diagonal(estimated) < 1.2 * np.diagonal(true)).all()
 
 
 @pytest.mark.parametrize('n_dipoles', ORDERS)
@@ -231,9 +231,9 @@ def test_one_sensor_determines_directions_and_time_but_not_the_scale():
     zero = fit.data.stamp_ns / 1e9
     assert abs(b.cpa_time + zero - t_cpa) < 3.0 * b.cpa_time_std
     assert abs(b.rate - np.linalg.norm(v) / np.linalg.norm(r_cpa)) < 3.0 * b.rate_std
-    for found, true, std in zip((b.cpa_direction, b.motion_direction, b.moment_direction),
-                                (r_cpa, v, moments[0]), b.direction_std, strict=True):
-        assert np.arccos(found @ true / np.linalg.norm(true)) < 3.0 * std < 0.2
+    for estimate, true, std in zip((b.cpa_direction, b.motion_direction, b.moment_direction),
+                                   (r_cpa, v, moments[0]), b.direction_std, strict=True):
+        assert np.arccos(estimate @ true / np.linalg.norm(true)) < 3.0 * std < 0.2
 
 
 def test_a_fit_of_one_sensor_is_ambiguous_in_the_sign_of_the_path():
@@ -309,11 +309,12 @@ def test_data_that_cannot_be_fitted_result_in_a_reason():
 def test_two_vehicles_in_one_window_are_rejected():
     for seed, heading in ((1, 0.0), (2, np.pi)):
         rng = np.random.default_rng(seed)
-        one, m1 = random_path(rng, 3, True)
-        other, m2 = random_path(rng, 3, True)
-        one[:7] = 0.0, -1.75, 0.5, 9.0, 0.0, 0.0, 3.0
-        other[:7] = 6.0, 1.75, 0.5, 11.0 * np.cos(heading), 0.0, 0.0, 3.0
-        both = together(measured(ROAD, one, m1, rng), measured(ROAD, other, m2, rng, noise=1e-15))
+        first_path, m1 = random_path(rng, 3, True)
+        second_path, m2 = random_path(rng, 3, True)
+        first_path[:7] = 0.0, -1.75, 0.5, 9.0, 0.0, 0.0, 3.0
+        second_path[:7] = 6.0, 1.75, 0.5, 11.0 * np.cos(heading), 0.0, 0.0, 3.0
+        both = together(measured(ROAD, first_path, m1, rng),
+                        measured(ROAD, second_path, m2, rng, noise=1e-15))
         assert choose_order([fit_pass(both, d) for d in (1, 2, 3)]) is None
 
 
@@ -351,7 +352,7 @@ STRAIGHT = {'straight_car_right': 8.3, 'straight_small_left': 11.1, 'straight_ca
 
 @pytest.mark.parametrize('name', STRAIGHT)
 def test_order_three_describes_vehicles(recorded_passes, name):
-    """Normalised cost and speed are within the accuracy targets of the project."""
+    """The normalised cost is below 2, or 8 for trucks, and the speed error is below 8 %."""
     fit = next(f for f in recorded_passes[name].fits if f.n_dipoles == 3)
     assert not fit.reason
     assert fit.normalised_cost < (8.0 if 'truck' in name else 2.0)

@@ -90,7 +90,7 @@ def test_without_tracks_the_prior_remains():
 
 
 def test_a_track_without_information_has_no_effect():
-    """Due to linearisation, the covariance of such a track may slightly exceed the prior."""
+    """The linearised covariance of a track without information may slightly exceed the prior."""
     prior = np.einsum('jik,jk,jlk->jil', NETWORK.R_sw, PRIOR**2, NETWORK.R_sw)
     uninformative = SimpleNamespace(id=9, mounting=np.zeros((3, 3)),
                                     mounting_covariance=1.02 * prior)
@@ -155,12 +155,13 @@ def test_a_track_of_another_network_is_rejected():
 def test_network_is_rotated_about_the_world_axes():
     rotation = np.deg2rad([[0.0, 0.0, 6.0], [2.0, 0.0, 0.0], [1.0, -2.0, 3.0]])
     C = np.tile(np.diag(np.deg2rad([1.0, 2.0, 3.0])**2), (3, 1, 1))
-    found = with_pass_mounting(NETWORK, MountingEvidence(rotation, C, np.full(3, np.nan), 1))
-    np.testing.assert_allclose(found.R_ws[0], rotation_about_z(np.deg2rad(6.0)) @ NETWORK.R_ws[0])
-    np.testing.assert_allclose(found.R_ws,
+    corrected = with_pass_mounting(NETWORK, MountingEvidence(rotation, C, np.full(3, np.nan), 1))
+    np.testing.assert_allclose(corrected.R_ws[0],
+                               rotation_about_z(np.deg2rad(6.0)) @ NETWORK.R_ws[0])
+    np.testing.assert_allclose(corrected.R_ws,
                                Rotation.from_rotvec(rotation).as_matrix() @ NETWORK.R_ws)
-    np.testing.assert_allclose(found.orientation_std[2], np.deg2rad([1.0, 2.0, 3.0]))
-    assert found.names == NETWORK.names and found.earth_field is NETWORK.earth_field
+    np.testing.assert_allclose(corrected.orientation_std[2], np.deg2rad([1.0, 2.0, 3.0]))
+    assert corrected.names == NETWORK.names and corrected.earth_field is NETWORK.earth_field
 
 
 CHANGES = {**POINT, 'track.field_error': 0.0, 'track.vehicle.near_field_lengths': [0.0],
@@ -190,18 +191,18 @@ def rotated_sensor_passes():
 
 def test_passes_correct_the_orientation_of_a_rotated_sensor(rotated_sensor_passes):
     nominal, truth, evidence = rotated_sensor_passes
-    found = with_pass_mounting(nominal, evidence)
+    corrected = with_pass_mounting(nominal, evidence)
     before, after = (Rotation.from_matrix(truth @ np.swapaxes(R, 1, 2)).as_rotvec()
-                     for R in (nominal.R_ws, found.R_ws))
+                     for R in (nominal.R_ws, corrected.R_ws))
     print(np.degrees(evidence.rotation).round(2), np.degrees(after).round(2),
-          np.degrees(found.orientation_std).round(2))
+          np.degrees(corrected.orientation_std).round(2))
     # The correction about the vertical is towards the truth.
     assert evidence.rotation[1, 2] > np.deg2rad(3.0)
     assert abs(after[1, 2]) < 0.5 * abs(before[1, 2])
     # The corrections of the other sensors are small, and all errors agree with their stds.
     assert np.abs(evidence.rotation[[0, 2, 3]]).max() < 3.0 * np.deg2rad(5.0) / 3.0
-    assert np.abs(after / np.array(found.orientation_std)).max() < 4.0
-    assert np.array(found.orientation_std)[:, 2].max() < np.deg2rad(5.0)
+    assert np.abs(after / np.array(corrected.orientation_std)).max() < 4.0
+    assert np.array(corrected.orientation_std)[:, 2].max() < np.deg2rad(5.0)
 
 
 def test_a_track_without_mounting_angles_is_rejected():

@@ -26,7 +26,7 @@ PATH = np.array([0.0, -2.0, 0.5, 10.0, 0.0, 0.0, 3.0])
 
 
 def test_reach_covers_the_residuals_of_published_vehicles():
-    """A published cost at 4.5 m is equivalent to an unexplained energy of (cost - 1) / 87."""
+    """A published cost at 4.5 m means that a fraction (cost - 1) / 87 of energy is unexplained."""
     cars, trucks = (10, 14, 17), ((302.6, 9.09), (76.7, 11.25))
     for cost in cars:
         assert 1.0 < 4.5 * np.sqrt((cost - 1.0) / 87.0) <= reach(1, 0.0)
@@ -83,11 +83,12 @@ def test_speed_and_direction_are_trusted_without_the_length(seed):
 
 def test_a_single_fit_of_two_vehicles_is_not_trusted():
     rng = np.random.default_rng(2)
-    one, m1 = random_path(rng, 3, True)
-    other, m2 = random_path(rng, 3, True)
-    one[:7] = 0.0, -1.75, 0.5, 9.0, 0.0, 0.0, 3.0
-    other[:7] = 6.0, 1.75, 0.5, -11.0, 0.0, 0.0, 3.0
-    both = together(measured(ROAD, one, m1, rng), measured(ROAD, other, m2, rng, noise=1e-15))
+    first_path, m1 = random_path(rng, 3, True)
+    second_path, m2 = random_path(rng, 3, True)
+    first_path[:7] = 0.0, -1.75, 0.5, 9.0, 0.0, 0.0, 3.0
+    second_path[:7] = 6.0, 1.75, 0.5, -11.0, 0.0, 0.0, 3.0
+    both = together(measured(ROAD, first_path, m1, rng),
+                    measured(ROAD, second_path, m2, rng, noise=1e-15))
     fit = fit_pass(both, 3)
     assert 'not one target' in fit.reason and fit.trusted == ()
 
@@ -167,5 +168,5 @@ def test_each_quantity_is_trusted_according_to_its_own_std():
 def test_no_fit_of_a_turn_is_trusted(name, road_network):
     job = RecordingFit(Recording(vehicle_path(name)), road_network, settings_for('vehicle'),
                        (1, 2, 3, 4))
-    (one,) = job.passes()
-    assert one.chosen is None and one.known is None
+    (fitted_pass,) = job.passes()
+    assert fitted_pass.chosen is None and fitted_pass.known is None

@@ -38,8 +38,8 @@ def test_information_equals_the_stacked_measurements(error, background_std):
     """The oracle stacks the Jacobians of all frames, with the backgrounds as states."""
     network = line_network(4)
     sampling = Sampling(0.1, 4e-9, error, background_std, 1.0)
-    found = pass_information(*sensor_poses(network), CAR, sampling, POINTS, 0.7)
-    assert found.shape == (3, 7, 4, 9, 9)
+    computed = pass_information(*sensor_poses(network), CAR, sampling, POINTS, 0.7)
+    assert computed.shape == (3, 7, 4, 9, 9)
     t, frame_weight = sampling.times()
     assert frame_weight == 1.0 and len(t) == 21
     v = 10.0 * np.array([np.cos(0.7), np.sin(0.7), 0.0])
@@ -56,18 +56,18 @@ def test_information_equals_the_stacked_measurements(error, background_std):
             J = information(H, C) + np.diag([0.0] * 9 + [background_std**-2] * 3)
             expected = J[:9, :9] - J[:9, 9:] @ np.linalg.solve(J[9:, 9:], J[9:, :9])
             scale = np.sqrt(np.diagonal(J)[:9])
-            np.testing.assert_allclose(found[p, d, j] / np.outer(scale, scale),
+            np.testing.assert_allclose(computed[p, d, j] / np.outer(scale, scale),
                                        expected / np.outer(scale, scale), rtol=0, atol=1e-9)
 
 
 def test_bounds_equal_the_blocks_of_the_covariance():
     J = pass_information(*sensor_poses(ROAD), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
     for prior in (np.zeros((9, 9)), PlannedTarget(400.0, 0.5, 10.0, 0.2, 0.1).prior()):
-        found = bounds_of(J, prior)
+        bounds = bounds_of(J, prior)
         for at in ((0, 1), (2, 5)):
             variance = np.diagonal(bound(J[at], prior))
             expected = np.sqrt([variance[:2].sum(), variance[3:5].sum(), variance[6:].sum()])
-            np.testing.assert_allclose(found[at], expected, rtol=1e-5)
+            np.testing.assert_allclose(bounds[at], expected, rtol=1e-5)
 
 
 def test_neither_an_additional_sensor_nor_a_prior_increases_the_bounds():
@@ -118,15 +118,17 @@ def test_fits_reach_the_bound():
 def test_detection_probability_agrees_with_the_energy_detector():
     points = np.array([[12.0, 0.0], [0.0, 30.0], [14.0, 3.0]])
     noise = np.array([4e-9, 6e-9])
-    found = detection_probabilities(*sensor_poses(ROAD), CAR, Sampling(0.08, noise), points, 1e-3)
+    probability = detection_probabilities(*sensor_poses(ROAD), CAR, Sampling(0.08, noise), points,
+                                          1e-3)
     rng = np.random.default_rng(1)
     for p, d in ((0, 0), (1, 2), (2, 5)):
         r = np.append(points[p], 0.5)
         h = dipole_field(ROAD.positions - r, 400.0 * DIRECTIONS[d]) / noise[:, None]
         energy = np.square(h + rng.standard_normal((20000, 2, 3))).sum(axis=(1, 2))
         rate = np.mean(energy > chi2.isf(1e-3, 6))
-        assert found[p, d] == pytest.approx(ncx2.sf(chi2.isf(1e-3, 6), 6, np.square(h).sum()))
-        assert abs(rate - found[p, d]) < 4.0 * np.sqrt(found[p, d] * (1 - found[p, d]) / 20000)
+        assert probability[p, d] == pytest.approx(ncx2.sf(chi2.isf(1e-3, 6), 6, np.square(h).sum()))
+        assert abs(rate - probability[p, d]) < 4.0 * np.sqrt(
+            probability[p, d] * (1 - probability[p, d]) / 20000)
 
 
 @pytest.fixture(scope='module')
@@ -225,11 +227,12 @@ def test_the_additional_sensor_has_the_clearance_from_each_lane():
 def test_missed_detection_probability_agrees_with_simulation():
     rng = np.random.default_rng(2)
     p = rng.uniform(0.0, 0.6, (12, 2))
-    found = missed_detection_probability(p, 3)
+    probability = missed_detection_probability(p, 3)
     is_detected = rng.random((40000, 12, 2)) < p
     is_run = is_detected[:, :-2] & is_detected[:, 1:-1] & is_detected[:, 2:]
     rate = 1.0 - is_run.any(axis=1).mean(axis=0)
-    assert (np.abs(rate - found) < 4.0 * np.sqrt(found * (1.0 - found) / 40000)).all()
+    assert (np.abs(rate - probability) < 4.0 * np.sqrt(
+        probability * (1.0 - probability) / 40000)).all()
     np.testing.assert_allclose(missed_detection_probability(p, 1), np.prod(1.0 - p, axis=0))
 
 

@@ -48,7 +48,7 @@ def test_calibration_with_half_of_the_readings_is_accurate_for_the_other_half(re
 
 
 def fit_registration(r, u, positions, axes):
-    """Fit the map from tracked poses to world poses: rigid motion, tool offset and tool tilt."""
+    """Fit rigid motion, tool offset and tool tilt; return the map from tracked to world poses."""
     centre = positions.mean(axis=0)
 
     def poses(x, positions, axes):
@@ -67,7 +67,7 @@ def fit_registration(r, u, positions, axes):
 
 @pytest.mark.study
 def test_blind_calibration_is_accurate_for_the_other_readings(recorded):
-    """Calibrate without the tracker, register with the same data, validate with held-out data."""
+    """The calibration uses no tracked poses; they serve only for registration and validation."""
     network, field, positions, axes = recorded
     g = calibrate_geometry_blind(network, field[::2], MOMENT, *BOX, GeometrySettings())
     assert g.converged and g.suspect_sensors == () and len(g.rows) >= 155
