@@ -83,6 +83,7 @@ class GroundPrior:
         Returns
         -------
         mean : (n_theta,) array
+            Zero for parameters without a prior.
         std : (n_theta,) array
             Infinite for parameters without a prior.
         """

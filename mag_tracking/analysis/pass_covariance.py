@@ -1,4 +1,4 @@
-"""Covariance of a fitted pass that includes model errors and sensor errors."""
+"""Covariance of a fitted pass, including model errors and sensor errors."""
 
 from dataclasses import dataclass
 

@@ -202,7 +202,7 @@ def separable_problem(data: PassData, create_model: ModelFactory, relative_error
 
 
 def background_columns(data: PassData, W: FloatArray) -> FloatArray:
-    """Create the whitened columns of the design matrix for the backgrounds of the measured axes.
+    """Create the whitened design matrix of the backgrounds of all measured axes.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Estimates, covariances, rivals and rejection reasons of the targets of a batch fit."""
+"""Results of a batch fit for each target: estimates, covariances, rivals, rejection reasons."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

@@ -112,7 +112,7 @@ class PassFit:
 
     @property
     def n_unknowns(self) -> int:
-        """Number of unknowns of the joint fit."""
+        """Number of unknowns, including those of other targets of a joint fit."""
         return len(self.x) + self.n_other_unknowns
 
     @property
@@ -142,7 +142,7 @@ class PassFit:
 
     @property
     def is_poor_mixture(self) -> bool:
-        """Whether this is a joint fit with a cost above `MAX_NORMALISED_COST`."""
+        """Whether this is a joint fit with a normalised cost above `MAX_NORMALISED_COST`."""
         return self.n_other_unknowns > 0 and bool(self.normalised_cost > MAX_NORMALISED_COST)
 
     @property
@@ -228,7 +228,7 @@ class PassFit:
         -------
         t_cpa : float, s
             Relative to time zero.
-        time_std : float, s
+        t_cpa_std : float, s
         range : float, m
         range_std : float, m
 

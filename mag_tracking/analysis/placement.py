@@ -1,4 +1,4 @@
-"""Bounds and detection probabilities of a passing target for the planning of sensor positions.
+"""Error bounds and detection probabilities of passing targets, for planning sensor positions.
 
 The target is a point that moves on a straight line at constant speed, with the states [r, v, m].
 The direction of its moment is unknown in advance; each result is computed for all `DIRECTIONS`.
@@ -113,7 +113,7 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
 
     Yields
     ------
-    chunk : slice
+    part : slice
         Slice of `points` with n_p points.
     h : (n_p, 7, k, n_sensors, 3) array, T
         Fields at the k times of `sampling`.

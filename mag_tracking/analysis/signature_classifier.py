@@ -370,7 +370,7 @@ def expected_calibration_error(probability: FloatArray, correct: FloatArray, n_b
 
 
 def _candidates() -> list[tuple[str, Any]]:
-    """Candidate classifiers: (name, function that creates an estimator)."""
+    """List the candidate classifiers as (name, function that creates an estimator)."""
     try:
         from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
         from sklearn.linear_model import LogisticRegression
