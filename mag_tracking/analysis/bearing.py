@@ -14,7 +14,7 @@ MAX_DIRECTION_STD = 0.5
 """[rad] Maximum standard deviation of a direction. Less certain directions are set to NaN."""
 
 
-def scaled_to_range(theta: FloatArray, p: FloatArray, place: FloatArray,
+def scaled_to_range(theta: FloatArray, p: FloatArray, sensor_position: FloatArray,
                     distance: float) -> tuple[FloatArray, FloatArray] | None:
     """Scale a path and its moments to a given CPA range.
 
@@ -27,7 +27,7 @@ def scaled_to_range(theta: FloatArray, p: FloatArray, place: FloatArray,
         Path: position, velocity and, for a row of dipoles, length.
     p : (k,) array, A m²
         Moments.
-    place : (3,) array, m, world frame
+    sensor_position : (3,) array, m, world frame
         Position of the sensor.
     distance : float, m
         CPA range of the returned path.
@@ -41,39 +41,39 @@ def scaled_to_range(theta: FloatArray, p: FloatArray, place: FloatArray,
     ----------
     [TSP14]_ eq. (34).
     """
-    r, v = theta[:3] - place, theta[3:6]
-    time, cpa_range, _ = closest_approach(r, v)
-    if cpa_range <= MIN_CPA_FRACTION * np.linalg.norm(time * v):
+    r, v = theta[:3] - sensor_position, theta[3:6]
+    t_cpa, cpa_range, _ = closest_approach(r, v)
+    if cpa_range <= MIN_CPA_FRACTION * np.linalg.norm(t_cpa * v):
         return None
     u = distance / cpa_range
     # The path reversed through the sensor has the same field; use the path above the sensor.
-    sign = 1.0 if (r + time * v)[2] >= 0.0 else -1.0
+    sign = 1.0 if (r + t_cpa * v)[2] >= 0.0 else -1.0
     scaled = u * np.concatenate([sign * r, sign * v, theta[6:]])
-    scaled[:3] += place
+    scaled[:3] += sensor_position
     return scaled, p * u**3
 
 
-def bearing_of(fit: PassFit, place: FloatArray) -> Bearing:
+def bearing_of(fit: PassFit, sensor_position: FloatArray) -> Bearing:
     """Compute the quantities of a single-sensor fit that do not depend on the CPA range.
 
     Parameters
     ----------
     fit : PassFit
         Fit with an assumed CPA range.
-    place : (3,) array, m, world frame
+    sensor_position : (3,) array, m, world frame
         Position of the sensor.
 
     Returns
     -------
     Bearing
     """
-    r, v = fit.position - place, fit.velocity
+    r, v = fit.position - sensor_position, fit.velocity
     P = fit.robust_covariance
-    time, distance, r_cpa = closest_approach(r, v)
-    v2 = v @ v
-    g_time = -np.concatenate([v, r + 2.0 * time * v]) / v2
-    dr_cpa = np.hstack([np.eye(3), time * np.eye(3)]) + np.outer(v, g_time)
-    g_rate = np.concatenate([np.zeros(3), v / np.sqrt(v2)]) / distance
+    t_cpa, distance, r_cpa = closest_approach(r, v)
+    squared_speed = v @ v
+    g_time = -np.concatenate([v, r + 2.0 * t_cpa * v]) / squared_speed
+    dr_cpa = np.hstack([np.eye(3), t_cpa * np.eye(3)]) + np.outer(v, g_time)
+    g_rate = np.concatenate([np.zeros(3), v / np.sqrt(squared_speed)]) / distance
     m, P_m = fit.moment
     sign = 1.0 if r_cpa[2] >= 0.0 else -1.0
     stds = np.array([_direction_std(r_cpa, dr_cpa @ P[:6, :6] @ dr_cpa.T),
@@ -81,8 +81,9 @@ def bearing_of(fit: PassFit, place: FloatArray) -> Bearing:
     cpa_direction, motion_direction, moment_direction = (
         x / np.linalg.norm(x) if std < MAX_DIRECTION_STD else np.full(3, np.nan)
         for x, std in zip((sign * r_cpa, sign * v, m), stds, strict=True))
-    return Bearing(cpa_direction, motion_direction, moment_direction, stds, time,
-                   float(np.sqrt(g_time @ P[:6, :6] @ g_time)), float(np.sqrt(v2) / distance),
+    return Bearing(cpa_direction, motion_direction, moment_direction, stds, t_cpa,
+                   float(np.sqrt(g_time @ P[:6, :6] @ g_time)),
+                   float(np.sqrt(squared_speed) / distance),
                    float(np.sqrt(g_rate @ P[:6, :6] @ g_rate)))
 
 
@@ -91,5 +92,5 @@ def _direction_std(x: FloatArray, P: FloatArray) -> float:
     if not np.isfinite(P).all():
         return np.inf
     u = x / np.linalg.norm(x)
-    across = (np.eye(3) - np.outer(u, u)) / np.linalg.norm(x)
-    return float(np.sqrt(np.linalg.eigvalsh(across @ P @ across)[-1]))
+    normal_projection = (np.eye(3) - np.outer(u, u)) / np.linalg.norm(x)
+    return float(np.sqrt(np.linalg.eigvalsh(normal_projection @ P @ normal_projection)[-1]))

@@ -53,49 +53,50 @@ def error_over_bound(network: SensorNetwork, log: TrackLog,
     ----------
     [T10]_ Alg. 2, linearised at the truth; [Tichavsky98]_.
     """
-    true = interpolate_truth(truth, log.stamp_ns)
-    known = np.flatnonzero(np.isfinite(true).all(axis=1))
+    true_path = interpolate_truth(truth, log.stamp_ns)
+    truth_rows = np.flatnonzero(np.isfinite(true_path).all(axis=1))
     if axes == 2:
         # The ground truth contains the height of the road, not of the magnetic centre.
-        true[:, 2] = np.array(log.position)[:, 2]
-    rows = np.intersect1d(rows, known)
-    if len(known) < 2 or not len(rows):
+        true_path[:, 2] = np.array(log.position)[:, 2]
+    rows = np.intersect1d(rows, truth_rows)
+    if len(truth_rows) < 2 or not len(rows):
         return None
-    t = log.seconds()[known]
-    H, C = _measurement_model(network, log, true[known], t, known, field_error)
-    F, Q = _motion_model(t, acceleration, moment_walk, log, known, H.shape[-1])
+    t = log.seconds()[truth_rows]
+    H, C = _measurement_model(network, log, true_path[truth_rows], t, truth_rows, field_error)
+    F, Q = _motion_model(t, acceleration, moment_walk, log, truth_rows, H.shape[-1])
     P = path_bound(F, Q, H, C,
-                   _prior_covariance(network, true[known], t, log, known, background_std))
-    is_evaluated = np.isin(known, rows)
+                   _prior_covariance(network, true_path[truth_rows], t, log, truth_rows,
+                                     background_std))
+    is_evaluated = np.isin(truth_rows, rows)
     variance = np.einsum('kii->ki', P[is_evaluated])[:, :axes].sum(axis=1)
-    error = np.array(log.position)[known[is_evaluated]] - true[known[is_evaluated]]
+    error = np.array(log.position)[truth_rows[is_evaluated]] - true_path[truth_rows[is_evaluated]]
     return float(np.sqrt(np.mean(np.square(error[:, :axes]).sum(axis=1)) / np.mean(variance)))
 
 
-def _measurement_model(network: SensorNetwork, log: TrackLog, true: FloatArray, t: FloatArray,
-                       known: IntArray, field_error: float) -> tuple[FloatArray, FloatArray]:
+def _measurement_model(network: SensorNetwork, log: TrackLog, true_path: FloatArray, t: FloatArray,
+                       truth_rows: IntArray, field_error: float) -> tuple[FloatArray, FloatArray]:
     """Jacobians (k, n_sensors, 3, n_x) of the field, and noise covariances (k, n_sensors, 3, 3).
 
     The states are [r, v, m, backgrounds]. Jacobians of axes without a measurement are NaN.
     """
-    n, n_sensors = len(known), len(network)
+    n, n_sensors = len(truth_rows), len(network)
     dr_dx, dm_dx = np.zeros((2, n, 1, 3, 9))
     dr_dx[:, 0, range(3), range(3)] = 1.0
     dm_dx[:, 0, range(3), range(6, 9)] = 1.0
-    moment = np.array(log.moment)[known]
-    h, H, _ = sensor_fields(network.positions, network.R_sw, true[:, None].copy(),
+    moment = np.array(log.moment)[truth_rows]
+    h, H, _ = sensor_fields(network.positions, network.R_sw, true_path[:, None].copy(),
                             moment[:, None].copy(), dr_dx, dm_dx)
     backgrounds = np.eye(3 * n_sensors).reshape(n_sensors, 3, -1)
     H = np.concatenate([H, np.broadcast_to(backgrounds, (n, *backgrounds.shape))], axis=-1)
-    measured = ~np.isnan(np.array(log.measured)[known])
+    measured = ~np.isnan(np.array(log.measured)[truth_rows])
     H = np.where(measured[..., None], H, np.nan)
-    C = np.array(log.noise)[known] + field_error**2 * np.square(h).sum(axis=-1)[
+    C = np.array(log.noise)[truth_rows] + field_error**2 * np.square(h).sum(axis=-1)[
         ..., None, None] * np.eye(3)
     return H, C
 
 
 def _motion_model(t: FloatArray, acceleration: FloatArray, moment_walk: float, log: TrackLog,
-                  known: IntArray, n_x: int) -> tuple[FloatArray, FloatArray]:
+                  truth_rows: IntArray, n_x: int) -> tuple[FloatArray, FloatArray]:
     """Transition matrices F and process noise covariances Q, (k, n_x, n_x), between the poses.
 
     F[i] and Q[i] lead from pose i - 1 to pose i; F[0] is the identity and Q[0] is zero.
@@ -104,17 +105,17 @@ def _motion_model(t: FloatArray, acceleration: FloatArray, moment_walk: float, l
     for k, dt in enumerate(np.diff(t), 1):
         F[k, :6, :6] = constant_velocity(dt)
         Q[k, :6, :6] = integrator_noise(dt, acceleration)
-        walk = moment_walk**2 * dt * np.square(log.moment[known[k]]).sum()
+        walk = moment_walk**2 * dt * np.square(log.moment[truth_rows[k]]).sum()
         Q[k, 6:9, 6:9] = walk * np.eye(3)
     return F, Q
 
 
-def _prior_covariance(network: SensorNetwork, true: FloatArray, t: FloatArray, log: TrackLog,
-                      known: IntArray, background_std: float) -> FloatArray:
+def _prior_covariance(network: SensorNetwork, true_path: FloatArray, t: FloatArray, log: TrackLog,
+                      truth_rows: IntArray, background_std: float) -> FloatArray:
     """Prior covariance (n_x, n_x) of the first pose, from the extent and speed of the path."""
-    extent = max(np.ptp(true, axis=0).max(), np.ptp(network.positions, axis=0).max())
-    speed = max(np.linalg.norm(np.diff(true, axis=0), axis=1).max()
+    extent = max(np.ptp(true_path, axis=0).max(), np.ptp(network.positions, axis=0).max())
+    speed = max(np.linalg.norm(np.diff(true_path, axis=0), axis=1).max()
                 / np.diff(t).min(), MIN_VELOCITY_STD)
     std = np.full(9 + 3 * len(network), background_std)
-    std[:3], std[3:6], std[6:9] = extent, speed, np.linalg.norm(log.moment[known[0]])
+    std[:3], std[3:6], std[6:9] = extent, speed, np.linalg.norm(log.moment[truth_rows[0]])
     return np.diag(std**2)

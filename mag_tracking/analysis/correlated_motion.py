@@ -66,7 +66,7 @@ MAX_PAIRS = 12
 MIN_SAMPLES = 10
 """Minimum number of readings of each sensor."""
 
-_MAX_STEPS = 20
+_MAX_GAUSS_NEWTON_STEPS = 20
 
 
 @dataclass(frozen=True)
@@ -125,16 +125,17 @@ def correlated_motion(data: PassData) -> CorrelatedMotion:
     if not delays:
         return CorrelatedMotion('no pair of separate sensors has simultaneous readings of a '
                                 'varying field on a common axis')
-    best = max(d.similarity for d in delays)
+    best_similarity = max(d.similarity for d in delays)
     similar = tuple(d for d in delays if d.similarity >= MIN_CORRELATION)
     if not similar:
         return CorrelatedMotion(f'the sensors measure different fields (similarity '
-                                f'{max(best, 0.0):.0%}): the target did not pass them one after '
-                                'the other at the same distance', similarity=best)
+                                f'{max(best_similarity, 0.0):.0%}): the target did not pass them '
+                                'one after the other at the same distance',
+                                similarity=best_similarity)
     if all(abs(d.delay) < MIN_DELAY * d.delay_std for d in similar):
         return CorrelatedMotion('the sensors measure the same field at the same time',
-                                similarity=best, pairs=similar)
-    return _fit_velocity(data, similar, best)
+                                similarity=best_similarity, pairs=similar)
+    return _fit_velocity(data, similar, best_similarity)
 
 
 def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
@@ -162,12 +163,12 @@ def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
     angle = abs(np.angle(np.exp(1j * (heading[0] - delay.heading))))
     if angle > 0.5 * np.pi:
         return bool(angle - 0.5 * np.pi > MIN_DIFFERENCE_STDS * heading[1])
-    along = np.cos(angle) if np.isnan(delay.heading_std) else 1.0
-    if along < MIN_COSINE:
+    cosine = np.cos(angle) if np.isnan(delay.heading_std) else 1.0
+    if cosine < MIN_COSINE:
         return False
     # Standard deviation of the apparent speed along the line, including the heading error.
-    std = np.hypot(speed[1], speed[0] * np.tan(angle) * heading[1]) / along
-    difference = abs(speed[0] / along - delay.speed)
+    std = np.hypot(speed[1], speed[0] * np.tan(angle) * heading[1]) / cosine
+    difference = abs(speed[0] / cosine - delay.speed)
     return bool(difference > MIN_DIFFERENCE_STDS * np.hypot(std, delay.speed_std)
                 and difference > MIN_RELATIVE_DIFFERENCE * delay.speed)
 
@@ -190,21 +191,21 @@ def _fit_velocity(data: PassData, pairs: Sequence[PairDelay],
     positions = data.network.positions[:, :2]
     d = np.array([positions[p.second] - positions[p.first] for p in pairs])
     tau, std = (np.array([getattr(p, n) for p in pairs]) for n in ('delay', 'delay_std'))
-    _, singular, Vt = np.linalg.svd(d / std[:, None], full_matrices=False)
-    on_line = len(singular) < 2 or singular[1] < 0.1 * singular[0]
-    A = d @ Vt[:1].T if on_line else d
+    _, singular_values, Vt = np.linalg.svd(d / std[:, None], full_matrices=False)
+    is_collinear = len(singular_values) < 2 or singular_values[1] < 0.1 * singular_values[0]
+    A = d @ Vt[:1].T if is_collinear else d
     covariance = np.linalg.inv((A / std[:, None] ** 2).T @ A)
     slowness = covariance @ (A.T @ (tau / std**2))
-    residuals, freedom = (tau - A @ slowness) / std, len(tau) - A.shape[1]
+    residuals, dof = (tau - A @ slowness) / std, len(tau) - A.shape[1]
     # If the delays are inconsistent, their standard deviations are too small.
-    covariance *= max(1.0, float(residuals @ residuals) / freedom) if freedom else 1.0
+    covariance *= max(1.0, float(residuals @ residuals) / dof) if dof else 1.0
     norm = float(np.linalg.norm(slowness))
-    along = slowness / norm
-    norm_std = float(np.sqrt(along @ covariance @ along))
-    direction = Vt[0] * along[0] if on_line else along
+    unit_slowness = slowness / norm
+    norm_std = float(np.sqrt(unit_slowness @ covariance @ unit_slowness))
+    direction = Vt[0] * unit_slowness[0] if is_collinear else unit_slowness
     heading_std = np.nan
-    if not on_line:
-        normal = np.array([-along[1], along[0]])
+    if not is_collinear:
+        normal = np.array([-unit_slowness[1], unit_slowness[0]])
         heading_std = float(np.sqrt(normal @ covariance @ normal)) / norm
     return CorrelatedMotion('', 1.0 / norm, norm_std / norm**2,
                             float(np.arctan2(direction[1], direction[0])), heading_std, similarity,
@@ -215,13 +216,13 @@ class _SensorReadings:
     """Readings of one sensor in the world frame, or in the sensor frame if an axis is missing."""
 
     def __init__(self, data: PassData, j: int, R: FloatArray, axes: IntArray) -> None:
-        of_sensor = data.sensor == j
-        field = data.field[of_sensor]
+        sensor_mask = data.sensor == j
+        field = data.field[sensor_mask]
         is_complete = np.isfinite(field[:, axes]).all(axis=1)
-        self.t = data.t[of_sensor][is_complete]
+        self.t = data.t[sensor_mask][is_complete]
         self.field = (field[is_complete] @ R.T if len(axes) == 3 else field[is_complete])[:, axes]
         # The covariance of an excluded reading may be NaN.
-        variance = np.einsum('nii->ni', data.covariance[of_sensor][is_complete])[:, axes]
+        variance = np.einsum('nii->ni', data.covariance[sensor_mask][is_complete])[:, axes]
         self.noise = float(np.sqrt(variance.min(axis=0).mean())) if is_complete.any() else 0.0
 
     def smoothed(self, t: FloatArray, width: float) -> FloatArray:
@@ -229,8 +230,8 @@ class _SensorReadings:
         # Deferred: the import takes 0.25 s, and replays rarely need it.
         from scipy.ndimage import gaussian_filter1d
 
-        even = np.stack([np.interp(t, self.t, v) for v in self.field.T], axis=1)
-        smooth: FloatArray = gaussian_filter1d(even, width / (t[1] - t[0]), axis=0)
+        resampled = np.stack([np.interp(t, self.t, v) for v in self.field.T], axis=1)
+        smooth: FloatArray = gaussian_filter1d(resampled, width / (t[1] - t[0]), axis=0)
         return smooth
 
 
@@ -301,13 +302,13 @@ def _estimate_delay(data: PassData, i: int, j: int) -> PairDelay | None:
 
 def _correlation_maxima(pair: _SmoothedPair) -> list[float]:
     """Delays [s] of the highest maxima of the cross-correlation, at most five; [0.0] if none."""
-    every = max(1, len(pair.t) // N_COARSE)
-    step = every * (pair.t[1] - pair.t[0])
-    a, b = (y[::every] - np.median(y, axis=0) for y in (pair.first, pair.second))
+    stride = max(1, len(pair.t) // N_COARSE)
+    step = stride * (pair.t[1] - pair.t[0])
+    a, b = (y[::stride] - np.median(y, axis=0) for y in (pair.first, pair.second))
     c = np.sum([np.correlate(y, x, 'full') for x, y in zip(a.T, b.T, strict=True)], axis=0)
-    inner = np.flatnonzero((c[1:-1] >= c[:-2]) & (c[1:-1] > c[2:])) + 1
-    high = sorted(inner[c[inner] >= MIN_PEAK * c.max()], key=lambda k: -c[k])[:5]
-    return [float((k - (len(a) - 1)) * step) for k in high] or [0.0]
+    maxima = np.flatnonzero((c[1:-1] >= c[:-2]) & (c[1:-1] > c[2:])) + 1
+    highest = sorted(maxima[c[maxima] >= MIN_PEAK * c.max()], key=lambda k: -c[k])[:5]
+    return [float((k - (len(a) - 1)) * step) for k in highest] or [0.0]
 
 
 def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]:
@@ -323,21 +324,21 @@ def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]
     prior[1 + k:4 + k, 1 + k:4 + k] = np.eye(3) / ROTATION_STD**2
     prior[4 + k:, 4 + k:] = np.linalg.inv(SCALE_STD**2 * np.ones((k, k)) + GAIN_STD**2 * np.eye(k))
     # Samples at this spacing are nearly independent after the smoothing.
-    every = max(1, round(2.0 * pair.width / (pair.t[1] - pair.t[0])))
-    overlaps = (pair.t > pair.t[0] + max(tau, 0.0)) & (pair.t < pair.t[-1] + min(tau, 0.0))
-    t, y = pair.t[overlaps][::every], pair.second[overlaps][::every]
-    freedom = y.size - len(theta)
+    stride = max(1, round(2.0 * pair.width / (pair.t[1] - pair.t[0])))
+    is_overlap = (pair.t > pair.t[0] + max(tau, 0.0)) & (pair.t < pair.t[-1] + min(tau, 0.0))
+    t, y = pair.t[is_overlap][::stride], pair.second[is_overlap][::stride]
+    dof = y.size - len(theta)
     background = np.median(pair.second, axis=0)
     norm = np.linalg.norm(y - background)
-    total_norm = np.linalg.norm(pair.second[::every] - background)
-    if freedom <= 0 or not norm > 0.0 or norm < MIN_CORRELATION * total_norm:
+    total_norm = np.linalg.norm(pair.second[::stride] - background)
+    if dof <= 0 or not norm > 0.0 or norm < MIN_CORRELATION * total_norm:
         # With such a long delay, the two fields hardly overlap.
         return tau, np.inf, 0.0
     std = norm / np.sqrt(y.size)
-    for _ in range(_MAX_STEPS):
+    for _ in range(_MAX_GAUSS_NEWTON_STEPS):
         residuals, J = _residuals(pair, t, y, theta)
         # Smoothing reduces noise, but not the quantisation error of a coarse sensor.
-        std = max(float(np.linalg.norm(residuals)) / np.sqrt(freedom), pair.noise, 1e-6 * norm)
+        std = max(float(np.linalg.norm(residuals)) / np.sqrt(dof), pair.noise, 1e-6 * norm)
         information = J.T @ J / std**2 + prior
         step = np.linalg.solve(information, J.T @ residuals / std**2 - prior @ theta)
         theta = theta + step
@@ -350,7 +351,7 @@ def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]
         return tau, np.inf, 0.0
     residuals, J = _residuals(pair, t, y, theta)
     return (float(theta[0]), _delay_std(t, J / std, residuals / std, prior),
-            1.0 - max(0.0, float(residuals @ residuals) - freedom * pair.noise**2) / float(norm**2))
+            1.0 - max(0.0, float(residuals @ residuals) - dof * pair.noise**2) / float(norm**2))
 
 
 def _delay_std(t: FloatArray, J: FloatArray, residuals: FloatArray, prior: FloatArray) -> float:

@@ -30,6 +30,7 @@ def direction_likelihood_ratio(t: FloatArray, field: FloatArray, noise_std: floa
     Parameters
     ----------
     t : (n,) array, s
+        Times of the samples.
     field : (n, 2) array, T
         Horizontal field minus the background; x points along the road.
     noise_std : float, T
@@ -54,14 +55,14 @@ def _minimum_residual(t: FloatArray, field: FloatArray, lane: LaneHypothesis) ->
     """Minimum residual sum of squares [T²] over the moments and CPA times of a dipole in a lane."""
     step = float(MAX_STEP * abs(lane.distance / lane.speed))
     grid = np.arange(t[0], t[-1] + step, step)
-    at_grid = _residuals(t, field, lane, grid)
-    k = int(np.argmin(at_grid))
+    grid_residuals = _residuals(t, field, lane, grid)
+    k = int(np.argmin(grid_residuals))
 
     def cost(t_cpa: float) -> float:
         return float(_residuals(t, field, lane, np.array([t_cpa]))[0])
 
     t_best = float(fminbound(cost, float(grid[k] - step), float(grid[k] + step)))
-    return min(float(at_grid[k]), cost(t_best))
+    return min(float(grid_residuals[k]), cost(t_best))
 
 
 def _residuals(t: FloatArray, field: FloatArray, lane: LaneHypothesis,

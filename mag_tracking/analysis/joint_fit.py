@@ -35,10 +35,10 @@ from mag_tracking.units import NS
 N_REFINED, N_STEPS = 150, 6
 """Number of starting points that are refined in the coarse search, and number of steps of each."""
 
-N_PLACEMENTS = 10
+N_CONVERGED = 10
 """Number of coarse solutions that are refined until convergence."""
 
-N_FINE = 2
+N_FINE_STARTS = 2
 """Number of coarse minima from which the fit to all measurements starts."""
 
 INITIAL_LENGTH = 3.0
@@ -83,6 +83,7 @@ class GroundPrior:
         Returns
         -------
         mean : (n_theta,) array
+            Zero for parameters without a prior.
         std : (n_theta,) array
             Infinite for parameters without a prior.
         """
@@ -128,45 +129,47 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
     orders = [n for n in orders if not unusable_reason(data, n_targets * (n,))]
     if not orders:
         return ()
-    data, rough = centred_on_peak(data)
+    data, averaged = centred_on_peak(data)
     paths = propagated_path(paths, (data.stamp_ns - begin_ns) / NS)
-    placed = np.vstack([paths.ravel(), _initial_paths(rough, n_targets, ground)])
-    fits = _JointFits(data, rough, placed, ground, errors)
+    initial_paths = np.vstack([paths.ravel(), _initial_paths(averaged, n_targets, ground)])
+    fits = _JointFits(data, averaged, initial_paths, ground, errors)
     selected = [min(orders, key=lambda n: (abs(n - 2), n))] * n_targets
     for _ in range(MAX_ROUNDS):
         previous = list(selected)
         for k in range(n_targets):
             if stopped is not None and stopped():
                 return ()
-            criteria = order_criteria(fits.of(k, selected, orders))
+            criteria = order_criteria(fits.of_target(k, selected, orders))
             if np.isfinite(criteria).any():
                 selected[k] = orders[int(np.argmin(criteria))]
         if selected == previous:
             break
     shifted = [_shift_to_peak(
-        _check_against_track(fits.of(k, selected, orders), orders.index(selected[k]), paths[k]),
+        _check_against_track(fits.of_target(k, selected, orders), orders.index(selected[k]),
+                             paths[k]),
         orders.index(selected[k])) for k in range(n_targets)]
     return tuple(target_fits for _, target_fits in sorted(shifted, key=lambda pair: pair[0]))
 
 
-def _initial_paths(rough: PassData, n_targets: int, ground: GroundPrior) -> FloatArray:
+def _initial_paths(averaged: PassData, n_targets: int, ground: GroundPrior) -> FloatArray:
     """Search for the best paths (n, 6 n_targets) of point targets in averaged data."""
     paths: FloatArray = np.zeros((1, 0))
-    residuals = [rough]
+    residuals = [averaged]
     for n in range(1, n_targets + 1):
         orders = n * (1,)
-        model_of, prior = partial(SuperposedPasses.of, orders), ground.prior(orders)
+        create_model, prior = partial(SuperposedPasses.from_orders, orders), ground.prior(orders)
         starts = []
-        for known, residual_data in zip(paths, residuals, strict=True):
-            own = starting_paths(residual_data, 1)
-            starts.append(np.hstack([np.tile(known, (len(own), 1)), own]))
-        coarse = separable_problem(rough, model_of, prior=prior)
-        paths, _ = coarse_minima(separable_problem(rough, model_of, COARSE_ERROR, prior), coarse,
-                                 np.concatenate(starts), np.tile(PATH_TOLERANCE[:6], n), N_REFINED,
-                                 N_STEPS, N_PLACEMENTS)
+        for known_path, residual_data in zip(paths, residuals, strict=True):
+            target_starts = starting_paths(residual_data, 1)
+            starts.append(np.hstack([np.tile(known_path, (len(target_starts), 1)), target_starts]))
+        coarse = separable_problem(averaged, create_model, prior=prior)
+        paths, _ = coarse_minima(separable_problem(averaged, create_model, COARSE_ERROR, prior),
+                                 coarse, np.concatenate(starts), np.tile(PATH_TOLERANCE[:6], n),
+                                 N_REFINED, N_STEPS, N_CONVERGED)
         if n < n_targets:
-            model = model_of(rough.t, rough.positions, rough.network.R_sw[rough.sensor])
-            residuals = [replace(rough, field=rough.field - (
+            model = create_model(averaged.t, averaged.positions,
+                                 averaged.network.R_sw[averaged.sensor])
+            residuals = [replace(averaged, field=averaged.field - (
                 model.basis(path[None])[0] @ coarse.linear(path)).reshape(-1, 3))
                 for path in paths]
     return paths
@@ -175,20 +178,21 @@ def _initial_paths(rough: PassData, n_targets: int, ground: GroundPrior) -> Floa
 class _JointFits:
     """Cached joint fits of several targets, for any combination of their numbers of dipoles.
 
-    Each fit starts at the point solutions `placed` (n, 6 K), of which the first is the tracked
-    paths, and at any available fit with another number of dipoles of one target.
+    Each fit starts at the point solutions `initial_paths` (n, 6 K), and at any available fit with
+    another number of dipoles of one target. The first point solution is the tracked paths.
     """
 
-    def __init__(self, data: PassData, rough: PassData, placed: FloatArray, ground: GroundPrior,
-                 errors: SensorErrors) -> None:
-        self._data, self._rough, self._ground, self._errors = data, rough, ground, errors
+    def __init__(self, data: PassData, averaged: PassData, initial_paths: FloatArray,
+                 ground: GroundPrior, errors: SensorErrors) -> None:
+        self._data, self._averaged, self._ground, self._errors = data, averaged, ground, errors
         # Sort the targets of each solution in the order of the tracks.
-        split = [np.split(paths, paths.size // 6) for paths in placed]
+        split = [np.split(paths, paths.size // 6) for paths in initial_paths]
         self._initial_paths = [[paths[i] for i in assignment(split[0], paths)] for paths in split]
-        self._n_free = data.n_independent - background_columns(data, data.whitening).shape[1]
+        self._noise_dof = data.n_independent - background_columns(data, data.whitening).shape[1]
         self._cache: dict[tuple[int, ...], tuple[PassFit, ...]] = {}
 
-    def of(self, k: int, orders: Sequence[int], candidates: Sequence[int]) -> tuple[PassFit, ...]:
+    def of_target(self, k: int, orders: Sequence[int],
+                  candidates: Sequence[int]) -> tuple[PassFit, ...]:
         """Fits of target `k` with each of the `candidates`; the other targets have `orders`."""
         previous, fits = self._cache.get(tuple(orders)), []
         for n in candidates:
@@ -215,27 +219,28 @@ class _JointFits:
 
     def _fit(self, orders: tuple[int, ...], starts: FloatArray) -> tuple[PassFit, ...]:
         """Fit all targets jointly; return the `PassFit` of each target."""
-        data, model_of = self._data, partial(SuperposedPasses.of, orders)
-        prior, split = self._ground.prior(orders), model_of(
+        data, create_model = self._data, partial(SuperposedPasses.from_orders, orders)
+        prior, split = self._ground.prior(orders), create_model(
             data.t, data.positions, data.whitening).split
-        coarse, fine = (separable_problem(d, model_of, prior=prior) for d in (self._rough, data))
+        coarse, fine = (separable_problem(d, create_model, prior=prior)
+                        for d in (self._averaged, data))
         theta, cost, _, _ = refine(coarse.residual_and_jacobian, starts, 40, 1e-6)
         in_order = tuple(range(len(orders)))
         cost = _exclude_solutions(cost, np.array([
-            assignment(self._initial_paths[0], split(found)) == in_order
-            for found in theta]), np.inf)
+            assignment(self._initial_paths[0], split(solution)) == in_order
+            for solution in theta]), np.inf)
         # If all minima without overlap are much worse, keep those with overlap; `fit_targets`
         # rejects them.
-        cost = _exclude_solutions(cost, np.array([are_separate(self._rough, split(found))
-                                                  for found in theta]), MAX_COST_RATIO)
-        found = fine_minimum(fine, theta, cost, np.concatenate(
-            [PATH_TOLERANCE[:6 + (n > 1)] for n in orders]), N_FINE)
-        if not np.isfinite(found.cost):
+        cost = _exclude_solutions(cost, np.array([are_separate(self._averaged, split(solution))
+                                                  for solution in theta]), MAX_COST_RATIO)
+        minimum = fine_minimum(fine, theta, cost, np.concatenate(
+            [PATH_TOLERANCE[:6 + (n > 1)] for n in orders]), N_FINE_STARTS)
+        if not np.isfinite(minimum.cost):
             return tuple(PassFit(n, data, 'no valid start of the search') for n in orders)
-        theta, p = model_of(data.t, data.positions, data.whitening).forward(
-            found.theta, fine.linear(found.theta))
-        unexplained = max(found.cost - self._n_free, 0.0) / (fine.energy - self._n_free)
-        return fits_at_minimum(data, orders, replace(found, theta=theta), p, 1.0 - unexplained,
+        theta, p = create_model(data.t, data.positions, data.whitening).with_nonnegative_length(
+            minimum.theta, fine.linear(minimum.theta))
+        unexplained = max(minimum.cost - self._noise_dof, 0.0) / (fine.energy - self._noise_dof)
+        return fits_at_minimum(data, orders, replace(minimum, theta=theta), p, 1.0 - unexplained,
                                self._errors, path_std=prior[1])
 
 
@@ -294,7 +299,7 @@ def path_from(data: PassData, fit: PassFit) -> FloatArray:
 
 
 def _with_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[FloatArray]:
-    """Convert paths (6 or 7,) to other orders; the length of a former point is `INITIAL_LENGTH`."""
+    """Convert paths (6 or 7,) to numbers of dipoles; a point becomes a row of `INITIAL_LENGTH`."""
     return [np.concatenate([path[:6], path[6:] if len(path) > 6 else [INITIAL_LENGTH]])
             if n > 1 else path[:6] for path, n in zip(paths, orders, strict=True)]
 
@@ -330,7 +335,7 @@ def _agrees_with_path(fit: PassFit, path: FloatArray) -> bool:
 
 def _time_of_peak(fit: PassFit) -> float:
     """Time [s] at which the fitted field of a target is strongest."""
-    field = replace(fit.data, field=fit.predicted).departure
+    field = replace(fit.data, field=fit.predicted).field_change
     return float(fit.data.t[np.argmax(np.einsum('ni,ni->n', field, field))])
 
 

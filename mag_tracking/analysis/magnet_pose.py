@@ -98,28 +98,28 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
     _check_input(network, field, moment, low, high)
-    present = ~np.isnan(field)
-    n_values = int(np.count_nonzero(present))
+    is_measured = ~np.isnan(field)
+    n_values = int(np.count_nonzero(is_measured))
     if n_values <= N_UNKNOWNS:
-        nothing = np.full(3, np.nan)
-        return MagnetPose(nothing, nothing, np.full((6, 6), np.nan), nothing, np.nan, False,
-                          f'number of measured axes is {n_values}; more than {N_UNKNOWNS} are '
-                          'required')
+        nan_vector = np.full(3, np.nan)
+        return MagnetPose(nan_vector, nan_vector, np.full((6, 6), np.nan), nan_vector, np.nan,
+                          False, f'number of measured axes is {n_values}; more than '
+                          f'{N_UNKNOWNS} are required')
     squared_norm = np.nansum(np.square(field), axis=1)[:, None]
     std = np.sqrt(np.square(np.array(network.noise_std)) + settings.field_error**2 * squared_norm)
-    problem = _problem(network, field, std, present, moment, settings.ambient_std)
-    starts = _starting_states(network, field, std, present, low, high, settings)
+    problem = _residual_function(network, field, std, is_measured, moment, settings.ambient_std)
+    starts = _starting_states(network, field, std, is_measured, low, high, settings)
     x, cost, covariance, converged = refine(problem, starts, settings.iterations, 1e-9)
     best = int(np.argmin(cost))
     return _pose_of_minimum(x[best], covariance[best], cost[best] / (n_values - N_UNKNOWNS),
                             converged[best] or cost[best] < EXACT_COST, low, high, settings)
 
 
-def _problem(network: SensorNetwork, field: FloatArray, std: FloatArray, present: BoolArray,
-             moment: float, ambient_std: float) -> _Problem:
+def _residual_function(network: SensorNetwork, field: FloatArray, std: FloatArray,
+                       is_measured: BoolArray, moment: float, ambient_std: float) -> _Problem:
     """Create the residual function of x = [position, unnormalised axis, ambient field over std]."""
-    y = (field / std)[present]
-    uniform = (network.R_sw * ambient_std / std[:, :, None])[present]
+    y = (field / std)[is_measured]
+    ambient_jacobian = (network.R_sw * ambient_std / std[:, :, None])[is_measured]
     prior = np.hstack([np.zeros((3, 6)), np.eye(3)])
 
     def residual_and_jacobian(x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -131,9 +131,10 @@ def _problem(network: SensorNetwork, field: FloatArray, std: FloatArray, present
         h, H, _ = sensor_fields(network.positions, network.R_sw,
                                 np.ascontiguousarray(x[:, None, :3]), moment * u[:, None], dr_dx,
                                 dm_dx)
-        e = y - (h / std)[:, present] - x[:, 6:] @ uniform.T
-        J = np.concatenate([(H / std[:, :, None])[:, present],
-                            np.broadcast_to(uniform, (len(x), *uniform.shape))], axis=2)
+        e = y - (h / std)[:, is_measured] - x[:, 6:] @ ambient_jacobian.T
+        J = np.concatenate([(H / std[:, :, None])[:, is_measured],
+                            np.broadcast_to(ambient_jacobian, (len(x), *ambient_jacobian.shape))],
+                           axis=2)
         return (np.hstack([e, -x[:, 6:]]),
                 np.concatenate([J, np.broadcast_to(prior, (len(x), 3, 9))], axis=1))
 
@@ -141,20 +142,20 @@ def _problem(network: SensorNetwork, field: FloatArray, std: FloatArray, present
 
 
 def _starting_states(network: SensorNetwork, field: FloatArray, std: FloatArray,
-                     present: BoolArray, low: FloatArray, high: FloatArray,
+                     is_measured: BoolArray, low: FloatArray, high: FloatArray,
                      settings: PoseSettings) -> FloatArray:
     """Best states (k, 9) on a grid of positions, each with its best-fitting moment direction."""
-    per_axis = max(2, int(round(settings.grid_points ** (1.0 / 3.0))))
-    axes = [np.linspace(a, b, per_axis + 2)[1:-1] for a, b in zip(low, high, strict=True)]
+    points_per_axis = max(2, int(round(settings.grid_points ** (1.0 / 3.0))))
+    axes = [np.linspace(a, b, points_per_axis + 2)[1:-1] for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
     # The Jacobian with respect to the moment does not depend on the moment.
     dB_dm = dipole_jacobians(network.positions - grid[:, None], np.zeros(3))[1]
-    A = (network.R_sw @ dB_dm / std[:, :, None])[:, present]
-    usable = np.isfinite(A).all(axis=(1, 2))
-    m, residual, _ = project_out_linear(A[usable], (field / std)[present])
+    A = (network.R_sw @ dB_dm / std[:, :, None])[:, is_measured]
+    is_finite = np.isfinite(A).all(axis=(1, 2))
+    m, residual, _ = project_out_linear(A[is_finite], (field / std)[is_measured])
     best = np.argsort(np.einsum('gy,gy->g', residual, residual), kind='stable')[:settings.starts]
     m = m[best] / np.linalg.norm(m[best], axis=1)[:, None]
-    return np.hstack([grid[usable][best], m, np.zeros((len(m), 3))])
+    return np.hstack([grid[is_finite][best], m, np.zeros((len(m), 3))])
 
 
 def _pose_of_minimum(x: FloatArray, covariance: FloatArray, cost: float, converged: bool,

@@ -24,15 +24,15 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
     Returns
     -------
     (n,) array
-        Difference from the smallest criterion, which is the best. Infinite for a fit that is not
+        Criterion of each fit minus the smallest criterion. Infinite for a fit that is not
         determined by the measurements.
     """
-    usable = [f for f in fits if f.determined]
-    if not usable:
+    determined_fits = [f for f in fits if f.determined]
+    if not determined_fits:
         return np.full(len(fits), np.inf)
-    highest_order = max(usable, key=lambda f: f.n_dipoles)
-    excess = max(1.0, highest_order.normalised_cost)
-    criteria: FloatArray = np.array([f.cost / excess + f.n_unknowns * np.log(f.data.n_values)
+    highest_order = max(determined_fits, key=lambda f: f.n_dipoles)
+    cost_scale = max(1.0, highest_order.normalised_cost)
+    criteria: FloatArray = np.array([f.cost / cost_scale + f.n_unknowns * np.log(f.data.n_values)
                                      if f.determined else np.inf for f in fits])
     relative: FloatArray = criteria - criteria.min()
     return relative

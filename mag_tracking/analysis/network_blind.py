@@ -12,7 +12,7 @@ from mag_tracking.analysis.network_geometry import (
     NetworkGeometry,
     fitted_geometry,
 )
-from mag_tracking.analysis.network_readings import SHARED
+from mag_tracking.analysis.network_readings import N_SHARED
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 
@@ -58,7 +58,7 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
     s = settings
-    shared_unit = np.append(np.zeros(SHARED - 1), s.moment_std)
+    shared_unit = np.append(np.zeros(N_SHARED - 1), s.moment_std)
     pose_unit = np.repeat([s.start_position_std, np.deg2rad(s.start_tilt_std_deg), s.ambient_std],
                           [3, 2, 3])
     rows, r, u = _initial_poses(network, field, moment, low, high)
@@ -70,11 +70,11 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
                              f'{MIN_POSES} are required; check the moment and the box')
         geometry = fitted_geometry(network, field[rows], r, u, moment, stage, shared_unit,
                                    pose_unit)
-        used, (r, u) = rows, geometry.poses
-        inside = ((low <= r) & (r <= high)).all(axis=1)
-        rows, r, u = rows[inside], r[inside], u[inside]
-    return replace(geometry, rows=used,
-                   suspect_poses=tuple(int(used[k]) for k in geometry.suspect_poses))
+        fitted_rows, (r, u) = rows, geometry.poses
+        is_inside = ((low <= r) & (r <= high)).all(axis=1)
+        rows, r, u = rows[is_inside], r[is_inside], u[is_inside]
+    return replace(geometry, rows=fitted_rows,
+                   suspect_poses=tuple(int(fitted_rows[k]) for k in geometry.suspect_poses))
 
 
 def _initial_poses(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,

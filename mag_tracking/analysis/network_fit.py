@@ -10,9 +10,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from mag_tracking.analysis.network_readings import (
-    POSE,
-    SENSOR,
-    SHARED,
+    N_POSE,
+    N_SENSOR,
+    N_SHARED,
     Prediction,
     TrackedMagnet,
     predicted_readings,
@@ -93,7 +93,7 @@ class GeometryProblem:
     variance : (n, 1, 3) array, T²
         Noise variances.
     magnet : TrackedMagnet
-    reported : (n, 3) bool array
+    has_readings : (n, 3) bool array
         Whether an axis has any reading.
     """
 
@@ -106,7 +106,7 @@ class GeometryProblem:
         self.variance = np.square(np.array(network.noise_std))[:, None]
         self.magnet = TrackedMagnet(positions, tool_rotations(axes), positions.mean(axis=0),
                                     float(moment))
-        self.reported: BoolArray = np.any(~np.isnan(self.field), axis=1)
+        self.has_readings: BoolArray = np.any(~np.isnan(self.field), axis=1)
         n = len(network)
         s = settings
         self.sensor_unit = np.hstack([
@@ -145,7 +145,7 @@ class GeometryProblem:
         sensor, shared, pose = x
         return sensor * self.sensor_unit, shared * self.shared_unit, pose * self.pose_unit
 
-    def start(self) -> Unknowns:
+    def initial_unknowns(self) -> Unknowns:
         """Create the initial unknowns: biases from the median residuals, all other unknowns zero.
 
         Returns
@@ -153,14 +153,14 @@ class GeometryProblem:
         Unknowns
         """
         n, K = len(self.network), len(self.magnet.tool)
-        x = np.zeros((n, SENSOR)), np.zeros(SHARED), np.zeros((K, POSE))
+        x = np.zeros((n, N_SENSOR)), np.zeros(N_SHARED), np.zeros((K, N_POSE))
         residuals = self.field - self.predicted(x)[0]
-        for j, a in zip(*np.nonzero(self.reported), strict=True):
+        for j, a in zip(*np.nonzero(self.has_readings), strict=True):
             x[0][j, a] = np.nanmedian(residuals[j, :, a]) / self.sensor_unit[j, a]
         return x
 
-    def misfit(self, f: FloatArray,
-               signal: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
+    def squared_residuals(self, f: FloatArray,
+                          signal: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
         """Squared residuals normalised by their variance.
 
         Parameters
@@ -189,39 +189,39 @@ class GeometryProblem:
         Parameters
         ----------
         f, signal : (n, K, 3) array, T
-            As for `misfit`.
+            As for `squared_residuals`.
         x : Unknowns
 
         Returns
         -------
         W : (n, K, 3) array
             Weights of the readings.
-        priors : Unknowns
+        prior_weights : Unknowns
             Weights of the priors.
         scale : float
             Median of `median_ratio` over all sensors and poses with readings; at least one.
-        trust : (n, K) array
+        robust_weights : (n, K) array
             Robust weight of each sensor at each pose, 0 to 1.
         """
-        e2, count, variance = self.misfit(f, signal)
+        e2, count, variance = self.squared_residuals(f, signal)
         d2 = e2.sum(axis=2)
         scale = max(1.0, float(np.median(median_ratio(d2, count)[count > 0])))
-        trust = _robust_weights(d2 / scale, count)
-        W = trust[:, :, None] / (variance * scale)
+        robust_weights = _robust_weights(d2 / scale, count)
+        W = robust_weights[:, :, None] / (variance * scale)
         W[np.isnan(self.field)] = 0.0
-        return W, self._priors(x), scale, trust
+        return W, self._prior_weights(x), scale, robust_weights
 
-    def _priors(self, x: Unknowns) -> Unknowns:
+    def _prior_weights(self, x: Unknowns) -> Unknowns:
         """Robust weights of the priors."""
         # The square root limits the down-weighting: a large correction is an error to be estimated,
         # not an outlier to be ignored.
         sensor, pose = (np.sqrt(_robust_weights(np.square(v).sum(axis=1), v.shape[1]))[:, None]
                         for v in (x[0][:, 3:], x[2]))
         # A bias has no prior, except on an axis without readings, where it would be undetermined.
-        return (np.hstack([1.0 * ~self.reported, np.tile(sensor, SENSOR - 3)]), np.ones(SHARED),
-                np.tile(pose, POSE))
+        return (np.hstack([1.0 * ~self.has_readings, np.tile(sensor, N_SENSOR - 3)]),
+                np.ones(N_SHARED), np.tile(pose, N_POSE))
 
-    def cost(self, x: Unknowns, f: FloatArray, W: FloatArray, priors: Unknowns) -> float:
+    def cost(self, x: Unknowns, f: FloatArray, W: FloatArray, prior_weights: Unknowns) -> float:
         """Weighted sum of the squared residuals and of the squared unknowns (priors).
 
         Parameters
@@ -231,7 +231,7 @@ class GeometryProblem:
             Predicted readings.
         W : (n, K, 3) array
             Weights of the readings.
-        priors : Unknowns
+        prior_weights : Unknowns
             Weights of the priors.
 
         Returns
@@ -240,7 +240,8 @@ class GeometryProblem:
             Infinite if a prediction is not finite.
         """
         e = np.nan_to_num(self.field - f)
-        cost = (W * e * e).sum() + sum((w * v**2).sum() for w, v in zip(priors, x, strict=True))
+        cost = (W * e * e).sum() + sum(
+            (w * v**2).sum() for w, v in zip(prior_weights, x, strict=True))
         return cost if np.isfinite(f).all() else np.inf
 
 
@@ -278,7 +279,7 @@ class NormalEquations:
     predicted : Prediction
     W : (n, K, 3) array
         Weights of the readings.
-    priors : Unknowns
+    prior_weights : Unknowns
         Weights of the priors.
 
     Attributes
@@ -296,34 +297,36 @@ class NormalEquations:
     """
 
     def __init__(self, problem: GeometryProblem, x: Unknowns, predicted: Prediction, W: FloatArray,
-                 priors: Unknowns) -> None:
+                 prior_weights: Unknowns) -> None:
         f, _, by_sensor, by_shared, by_pose = predicted
         n, K = W.shape[:2]
-        root = np.sqrt(W)
-        e = (root * np.nan_to_num(problem.field - f)).reshape(n, 3 * K)
-        Js, Jh = ((root[..., None] * J).reshape(n, 3 * K, -1) for J in (by_sensor, by_shared))
-        Jp = root[..., None] * by_pose
+        sqrt_weights = np.sqrt(W)
+        e = (sqrt_weights * np.nan_to_num(problem.field - f)).reshape(n, 3 * K)
+        Js, Jh = ((sqrt_weights[..., None] * J).reshape(n, 3 * K, -1)
+                  for J in (by_sensor, by_shared))
+        Jp = sqrt_weights[..., None] * by_pose
         Jst = np.swapaxes(Js, 1, 2)
-        m = SENSOR * n
-        A = np.zeros((m + SHARED, m + SHARED))
+        m = N_SENSOR * n
+        A = np.zeros((m + N_SHARED, m + N_SHARED))
         for j, block in enumerate(Jst @ Js):
-            block_slice = slice(SENSOR * j, SENSOR * j + SENSOR)
-            A[block_slice, block_slice] = block + np.diag(priors[0][j])
-        A[:m, m:] = (Jst @ Jh).reshape(m, SHARED)
+            block_slice = slice(N_SENSOR * j, N_SENSOR * j + N_SENSOR)
+            A[block_slice, block_slice] = block + np.diag(prior_weights[0][j])
+        A[:m, m:] = (Jst @ Jh).reshape(m, N_SHARED)
         A[m:, :m] = A[:m, m:].T
-        Jh_all = Jh.reshape(-1, SHARED)
-        A[m:, m:] = Jh_all.T @ Jh_all + np.diag(priors[1])
+        Jh_all = Jh.reshape(-1, N_SHARED)
+        A[m:, m:] = Jh_all.T @ Jh_all + np.diag(prior_weights[1])
         self.A = A
         self.g = np.concatenate([
-            (np.einsum('nyi,ny->ni', Js, e) - priors[0] * x[0]).ravel(),
-            Jh_all.T @ e.ravel() - priors[1] * x[1]])
-        by_k = np.swapaxes(Jp, 0, 1).reshape(K, 3 * n, POSE)
-        self.A_pose = np.swapaxes(by_k, 1, 2) @ by_k + priors[2][:, :, None] * np.eye(POSE)
-        self.g_pose = np.einsum('kyi,ky->ki', by_k, np.swapaxes(
-            e.reshape(n, K, 3), 0, 1).reshape(K, 3 * n)) - priors[2] * x[2]
-        sensor_pose = np.einsum('nkai,nkap->knip', Js.reshape(n, K, 3, SENSOR), Jp)
-        shared_pose = np.einsum('nkai,nkap->kip', Jh.reshape(n, K, 3, SHARED), Jp)
-        self.C = np.concatenate([sensor_pose.reshape(K, m, POSE), shared_pose], axis=1)
+            (np.einsum('nyi,ny->ni', Js, e) - prior_weights[0] * x[0]).ravel(),
+            Jh_all.T @ e.ravel() - prior_weights[1] * x[1]])
+        pose_jacobians = np.swapaxes(Jp, 0, 1).reshape(K, 3 * n, N_POSE)
+        self.A_pose = np.swapaxes(pose_jacobians, 1, 2) @ pose_jacobians \
+            + prior_weights[2][:, :, None] * np.eye(N_POSE)
+        self.g_pose = np.einsum('kyi,ky->ki', pose_jacobians, np.swapaxes(
+            e.reshape(n, K, 3), 0, 1).reshape(K, 3 * n)) - prior_weights[2] * x[2]
+        sensor_pose = np.einsum('nkai,nkap->knip', Js.reshape(n, K, 3, N_SENSOR), Jp)
+        shared_pose = np.einsum('nkai,nkap->kip', Jh.reshape(n, K, 3, N_SHARED), Jp)
+        self.C = np.concatenate([sensor_pose.reshape(K, m, N_POSE), shared_pose], axis=1)
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """Solve the damped normal equations.
@@ -373,7 +376,7 @@ class NormalEquations:
     def _damped(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """Information of [sensors, shared] and of the poses, with damped (increased) diagonals."""
         return (self.A + damping * np.diag(np.diagonal(self.A)),
-                self.A_pose * (1.0 + damping * np.eye(POSE)))
+                self.A_pose * (1.0 + damping * np.eye(N_POSE)))
 
 
 def solve(problem: GeometryProblem,
@@ -393,24 +396,24 @@ def solve(problem: GeometryProblem,
     predicted : Prediction
     converged : bool
     """
-    x, damping, converged = problem.start(), 1e-3, False
+    x, damping, converged = problem.initial_unknowns(), 1e-3, False
     predicted = problem.predicted(x)
     for _ in range(iterations):
         weights = problem.weights(predicted[0], predicted[1], x)
-        W, priors = weights[:2]
-        normal = NormalEquations(problem, x, predicted, W, priors)
-        cost = problem.cost(x, predicted[0], W, priors)
+        W, prior_weights = weights[:2]
+        equations = NormalEquations(problem, x, predicted, W, prior_weights)
+        cost = problem.cost(x, predicted[0], W, prior_weights)
         while damping < MAX_DAMPING:
-            dx, dpose = normal.step(damping)
+            dx, dpose = equations.step(damping)
             candidate = _add_step(x, dx, dpose)
             candidate_predicted = problem.predicted(candidate)
-            if problem.cost(candidate, candidate_predicted[0], W, priors) <= cost:
+            if problem.cost(candidate, candidate_predicted[0], W, prior_weights) <= cost:
                 break
             damping *= 10.0
         else:
             break
         x, predicted, damping = candidate, candidate_predicted, 0.1 * damping
-        if dx @ normal.g + (dpose * normal.g_pose).sum() < STEP_TOLERANCE:
+        if dx @ equations.g + (dpose * equations.g_pose).sum() < STEP_TOLERANCE:
             converged = True
             break
     weights = problem.weights(predicted[0], predicted[1], x)
@@ -419,5 +422,5 @@ def solve(problem: GeometryProblem,
 
 def _add_step(x: Unknowns, dx: FloatArray, dpose: FloatArray) -> Unknowns:
     """Return the unknowns after a step."""
-    m = len(dx) - SHARED
-    return x[0] + dx[:m].reshape(-1, SENSOR), x[1] + dx[m:], x[2] + dpose
+    m = len(dx) - N_SHARED
+    return x[0] + dx[:m].reshape(-1, N_SENSOR), x[1] + dx[m:], x[2] + dpose

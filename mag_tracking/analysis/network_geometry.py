@@ -17,9 +17,9 @@ from mag_tracking.analysis.network_fit import (
     solve,
 )
 from mag_tracking.analysis.network_readings import (
-    POSE,
-    SENSOR,
-    SHARED,
+    N_POSE,
+    N_SENSOR,
+    N_SHARED,
     Prediction,
     TrackedMagnet,
     rotation,
@@ -75,17 +75,17 @@ class NetworkGeometry:
     network: SensorNetwork
     """Network with corrected positions and orientations, and with the biases as background."""
     position_std: FloatArray
-    """(n, 3) [m], world frame."""
+    """(n, 3) [m] standard deviations of the sensor positions, world frame."""
     rotation_std: FloatArray
-    """(n, 3) [rad], about the axes of the sensor."""
+    """(n, 3) [rad] standard deviations of the rotations about the axes of the sensor."""
     gain: FloatArray
     """(n,) gain; one is nominal."""
     gain_std: FloatArray
     """(n,) standard deviations of `gain`."""
     bias: FloatArray
-    """(n, 3) [T], sensor frame; NaN for an axis without readings."""
+    """(n, 3) [T] biases, sensor frame; NaN for an axis without readings."""
     bias_std: FloatArray
-    """(n, 3) [T]; infinite for an axis without readings."""
+    """(n, 3) [T] standard deviations of `bias`; infinite for an axis without readings."""
     magnet: TrackedMagnet
     """Tracked poses of the magnet, and its nominal moment."""
     rows: IntArray
@@ -99,8 +99,8 @@ class NetworkGeometry:
     pose_covariance: FloatArray
     """(K, 8, 8) covariance of `pose`."""
     covariance: FloatArray
-    """(10 n + 12, 10 n + 12), of the unknowns of all sensors (bias, gain, rotation, position), then
-    of the shared unknowns."""
+    """(10 n + 12, 10 n + 12) covariance of the sensor unknowns (bias, gain, rotation, position),
+    followed by the shared unknowns."""
     normalised_cost: float
     """Cost per degree of freedom; about one if model, noise and field error are correct."""
     sensor_residual: FloatArray
@@ -149,7 +149,7 @@ class NetworkGeometry:
         """
         magnet = replace(self.magnet, tool=np.asarray(positions, dtype=float),
                          R_tool=tool_rotations(np.asarray(axes, dtype=float)))
-        return _positions_and_axes(magnet, self.shared, np.zeros((len(magnet.tool), POSE)))
+        return _positions_and_axes(magnet, self.shared, np.zeros((len(magnet.tool), N_POSE)))
 
     @property
     def moment(self) -> tuple[float, float]:
@@ -164,7 +164,7 @@ class NetworkGeometry:
 
     @property
     def tool_tilt(self) -> tuple[FloatArray, FloatArray]:
-        """Slopes x/z and y/z of the moment and their standard deviations, (2,), tool frame."""
+        """Slopes x/z and y/z of the moment and their standard deviations, (2,) each, tool frame."""
         return self.shared[9:11], self.shared_std[9:11]
 
     @property
@@ -183,7 +183,7 @@ def _positions_and_axes(magnet: TrackedMagnet, shared: FloatArray,
 MIN_POSES = 3
 """Minimum number of poses that separates the bias of a sensor from the field of the magnet."""
 
-MIN_CHANGE = 0.1
+MIN_POSE_VARIATION = 0.1
 """Minimum variation of the axis [rad], and of the position relative to the distance of the nearest
 sensor. If both variations are smaller, the poses do not determine the geometry."""
 
@@ -276,80 +276,82 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
     _check_input(network, field, positions, axes, moment)
     problem = GeometryProblem(network, field, positions, axes, moment, settings, shared_unit,
                               pose_unit)
-    x, (W, priors, scale, trust), predicted, converged = solve(problem, settings.iterations)
-    cost = _normalised_cost(problem, x, predicted, W, trust, priors)
+    x, (W, prior_weights, scale, robust_weights), predicted, converged = solve(
+        problem, settings.iterations)
+    cost = _normalised_cost(problem, x, predicted, W, robust_weights, prior_weights)
     # Scale up only the noise of the readings, not the priors.
     noise_scale = max(1.0, cost / scale)
-    P, P_pose = NormalEquations(problem, x, predicted, W / noise_scale, priors).covariance()
+    P, P_pose = NormalEquations(problem, x, predicted, W / noise_scale, prior_weights).covariance()
     n = len(network)
     unit = np.append(problem.sensor_unit.ravel(), problem.shared_unit)
     covariance = P * unit[:, None] * unit
     std = np.sqrt(np.diagonal(covariance))
-    sensor_std, shared_std = std[:-SHARED].reshape(n, SENSOR), std[-SHARED:]
+    sensor_std, shared_std = std[:-N_SHARED].reshape(n, N_SENSOR), std[-N_SHARED:]
     sensor, shared, pose = problem.in_si(x)
     corrections = rotation(sensor[:, 4:7])
-    by_sensor, by_pose = _sensor_and_pose_residuals(problem, predicted)
-    outlier_sensors, outlier_poses = _suspects(problem, x, by_sensor, by_pose)
+    sensor_residual, pose_residual = _sensor_and_pose_residuals(problem, predicted)
+    outlier_sensors, outlier_poses = _suspects(problem, x, sensor_residual, pose_residual)
     reason = _failure_reason(problem, x, converged, cost)
     return NetworkGeometry(
         network=replace(network, positions=network.positions + sensor[:, 7:],
                         R_ws=network.R_ws @ corrections, background=tuple(
                             b if h.all() else None
-                            for b, h in zip(sensor[:, :3], problem.reported, strict=True))),
+                            for b, h in zip(sensor[:, :3], problem.has_readings, strict=True))),
         position_std=sensor_std[:, 7:], rotation_std=sensor_std[:, 4:7],
         gain=1.0 + sensor[:, 3], gain_std=sensor_std[:, 3],
-        bias=np.where(problem.reported, sensor[:, :3], np.nan),
-        bias_std=np.where(problem.reported, sensor_std[:, :3], np.inf),
+        bias=np.where(problem.has_readings, sensor[:, :3], np.nan),
+        bias_std=np.where(problem.has_readings, sensor_std[:, :3], np.inf),
         magnet=problem.magnet, rows=np.arange(len(pose)), shared=shared,
         shared_std=shared_std, pose=pose,
         pose_covariance=P_pose * np.outer(problem.pose_unit, problem.pose_unit),
-        covariance=covariance, normalised_cost=cost, sensor_residual=by_sensor,
-        pose_residual=by_pose, suspect_sensors=outlier_sensors, suspect_poses=outlier_poses,
+        covariance=covariance, normalised_cost=cost, sensor_residual=sensor_residual,
+        pose_residual=pose_residual, suspect_sensors=outlier_sensors, suspect_poses=outlier_poses,
         converged=not reason, reason=reason)
 
 
 def _normalised_cost(problem: GeometryProblem, x: Unknowns, predicted: Prediction, W: FloatArray,
-                     trust: FloatArray, priors: Unknowns) -> float:
+                     robust_weights: FloatArray, prior_weights: Unknowns) -> float:
     """Weighted sum of squared residuals per degree of freedom; NaN without a degree of freedom."""
-    P, P_pose = NormalEquations(problem, x, predicted, W, priors).covariance()
-    e2, count, _ = problem.misfit(predicted[0], predicted[1])
-    known = np.append(priors[0].ravel(), priors[1]) @ np.diagonal(P)
-    known += np.einsum('ki,kii->', priors[2], P_pose)
-    unknowns = len(P) + POSE * len(P_pose) - known
-    freedom = (trust * count).sum() - unknowns
-    return float((trust[:, :, None] * e2).sum() / freedom) if freedom >= 1.0 else np.nan
+    P, P_pose = NormalEquations(problem, x, predicted, W, prior_weights).covariance()
+    e2, count, _ = problem.squared_residuals(predicted[0], predicted[1])
+    n_from_priors = np.append(prior_weights[0].ravel(), prior_weights[1]) @ np.diagonal(P)
+    n_from_priors += np.einsum('ki,kii->', prior_weights[2], P_pose)
+    n_unknowns = len(P) + N_POSE * len(P_pose) - n_from_priors
+    dof = (robust_weights * count).sum() - n_unknowns
+    return float((robust_weights[:, :, None] * e2).sum() / dof) if dof >= 1.0 else np.nan
 
 
 def _sensor_and_pose_residuals(problem: GeometryProblem,
                                predicted: Prediction) -> tuple[FloatArray, FloatArray]:
-    """RMS residual (n,) of each sensor over the poses that fit; median residual (K,) per pose."""
-    e2, count, _ = problem.misfit(predicted[0], predicted[1])
+    """RMS residual (n,) of each sensor over consistent poses, and median residual (K,) per pose."""
+    e2, count, _ = problem.squared_residuals(predicted[0], predicted[1])
     e2 = e2.sum(axis=2)
-    by_pose = np.sqrt([np.median(median_ratio(d2, c)[c > 0])
-                       for d2, c in zip(e2.T, count.T, strict=True)])
-    fits = by_pose <= MAX_RESIDUAL_RATIO * np.median(by_pose)
-    reported = count[:, fits].sum(axis=1)
-    by_sensor = np.sqrt(e2[:, fits].sum(axis=1) / np.where(reported > 0, reported, np.nan))
-    return by_sensor, by_pose
+    pose_residual = np.sqrt([np.median(median_ratio(d2, c)[c > 0])
+                             for d2, c in zip(e2.T, count.T, strict=True)])
+    is_consistent = pose_residual <= MAX_RESIDUAL_RATIO * np.median(pose_residual)
+    n_values = count[:, is_consistent].sum(axis=1)
+    sensor_residual = np.sqrt(e2[:, is_consistent].sum(axis=1)
+                              / np.where(n_values > 0, n_values, np.nan))
+    return sensor_residual, pose_residual
 
 
-def _suspects(problem: GeometryProblem, x: Unknowns, by_sensor: FloatArray,
-              by_pose: FloatArray) -> tuple[tuple[str, ...], tuple[int, ...]]:
+def _suspects(problem: GeometryProblem, x: Unknowns, sensor_residual: FloatArray,
+              pose_residual: FloatArray) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """Names of the suspect sensors and indices of the suspect poses."""
-    sensors = by_sensor > MAX_RESIDUAL_RATIO * np.nanmedian(by_sensor)
-    sensors |= (np.abs(x[0][:, 3:]) > MAX_CORRECTION).any(axis=1)
-    poses = by_pose > MAX_RESIDUAL_RATIO * np.median(by_pose)
-    poses |= (np.abs(x[2]) > MAX_CORRECTION).any(axis=1)
-    return (tuple(problem.network.names[j] for j in np.flatnonzero(sensors)),
-            tuple(int(k) for k in np.flatnonzero(poses)))
+    is_suspect_sensor = sensor_residual > MAX_RESIDUAL_RATIO * np.nanmedian(sensor_residual)
+    is_suspect_sensor |= (np.abs(x[0][:, 3:]) > MAX_CORRECTION).any(axis=1)
+    is_suspect_pose = pose_residual > MAX_RESIDUAL_RATIO * np.median(pose_residual)
+    is_suspect_pose |= (np.abs(x[2]) > MAX_CORRECTION).any(axis=1)
+    return (tuple(problem.network.names[j] for j in np.flatnonzero(is_suspect_sensor)),
+            tuple(int(k) for k in np.flatnonzero(is_suspect_pose)))
 
 
 def _is_magnet_at_rest(problem: GeometryProblem, x: Unknowns) -> bool:
-    """Whether the variations of position and axis of the magnet are less than `MIN_CHANGE`."""
+    """Whether position and axis of the magnet vary by less than `MIN_POSE_VARIATION`."""
     r, u = _positions_and_axes(problem.magnet, *problem.in_si(x)[1:])
-    nearest = np.linalg.norm(problem.network.positions - r.mean(axis=0), axis=1).min()
-    return bool((np.ptp(r, axis=0) < MIN_CHANGE * nearest).all()
-                and (np.ptp(u, axis=0) < MIN_CHANGE).all())
+    nearest_distance = np.linalg.norm(problem.network.positions - r.mean(axis=0), axis=1).min()
+    return bool((np.ptp(r, axis=0) < MIN_POSE_VARIATION * nearest_distance).all()
+                and (np.ptp(u, axis=0) < MIN_POSE_VARIATION).all())
 
 
 def _failure_reason(problem: GeometryProblem, x: Unknowns, converged: bool, cost: float) -> str:

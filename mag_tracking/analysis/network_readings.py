@@ -19,7 +19,7 @@ from mag_tracking.geometry import (
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import dipole_field, dipole_jacobians
 
-SENSOR, SHARED, POSE = 10, 12, 8
+N_SENSOR, N_SHARED, N_POSE = 10, 12, 8
 """Numbers of unknowns: per sensor (bias, gain, rotation, position); shared (shift and rotation of
 the board, offset and tilt of the magnet in the tool, log of the moment); per pose (position, tilt,
 ambient field)."""
@@ -107,14 +107,14 @@ class TrackedMagnet:
         m = self.moment * np.exp(shared[11]) * np.einsum('kij,kj->ki', R, axis)
         slope = (np.eye(3) - axis[:, :, None] * axis[:, None, :])[:, :, :2] / length[:, :, None]
         dm_dtilt = self.moment * np.exp(shared[11]) * R @ slope
-        dr, dm = np.zeros((2, K, 3, SHARED))
+        dr, dm = np.zeros((2, K, 3, N_SHARED))
         dr[:, :, :3] = np.eye(3)
         dr[:, :, 3:6] = -cross_matrix(arm) @ J_b
         dr[:, :, 6:9] = R
         dm[:, :, 3:6] = -cross_matrix(m) @ J_b
         dm[:, :, 9:11] = dm_dtilt
         dm[:, :, 11] = m
-        dr_pose, dm_pose = np.zeros((2, K, 3, POSE))
+        dr_pose, dm_pose = np.zeros((2, K, 3, N_POSE))
         dr_pose[:, :, :3] = np.eye(3)
         dm_pose[:, :, 3:5] = dm_dtilt
         return self.pivot + shared[:3] + arm + pose[:, :3], m, dr, dm, dr_pose, dm_pose
@@ -161,7 +161,7 @@ def predicted_readings(network: SensorNetwork, magnet: TrackedMagnet, sensor: Fl
     nominal = np.einsum('nij,nkj->nki', network.R_sw, dipole_field(d, m) + pose[:, 5:])
     dB_dr, dB_dm = dipole_jacobians(d, m)
     dB_dr, dB_dm = M[:, None] @ dB_dr, M[:, None] @ dB_dm
-    by_sensor = np.zeros((*d.shape, SENSOR))
+    by_sensor = np.zeros((*d.shape, N_SENSOR))
     by_sensor[..., :3] = np.eye(3)
     field = np.einsum('nij,nkj->nki', R_correction, nominal)
     by_sensor[..., 3] = field

@@ -1,4 +1,4 @@
-"""Covariance of a fitted pass that includes model errors and sensor errors."""
+"""Covariance of a fitted pass, including model errors and sensor errors."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ class SensorErrors:
     rotation_std: float = float(np.deg2rad(2.0))
     """Standard deviation of the orientation about each axis [rad], for sensors without
     `orientation_std` in the network. The default is for mounting by hand with a spirit level.
-    Between two sensors at 0.5 m, its effect equals a delay of milliseconds."""
+    For two sensors at a distance of 0.5 m, this error is equivalent to a delay of milliseconds."""
     gain_std: float = 0.01
     """Standard deviation of the gain of each axis; 1 to 3 % according to data sheets."""
 
@@ -62,22 +62,22 @@ def _sensor_error_covariance(data: PassData, whitened: FloatArray, target: Float
     total = np.zeros_like(covariance)
     R_sw = data.network.R_sw
     for j in data.sensors:
-        of_sensor = data.sensor == j
+        sensor_mask = data.sensor == j
         configured = data.network.orientation_std[j]
         std = np.full(3, errors.rotation_std) if configured is None else configured
         rotation_covariance = R_sw[j] @ np.diag(np.square(std)) @ R_sw[j].T
-        field = target[of_sensor]
+        field = target[sensor_mask]
         G = np.concatenate([np.stack([np.cross(axis, field) for axis in np.eye(3)], axis=2),
                             field[:, :, None] * np.eye(3)], axis=2)
-        shift = covariance @ np.einsum('nax,nab->xb', whitened[of_sensor],
-                                       data.whitening[of_sensor] @ G)
+        shift = covariance @ np.einsum('nax,nab->xb', whitened[sensor_mask],
+                                       data.whitening[sensor_mask] @ G)
         P = np.zeros((6, 6))
         P[:3, :3], P[3:, 3:] = rotation_covariance, errors.gain_std**2 * np.eye(3)
         total += shift @ P @ shift.T
     return total
 
 
-def velocity_change(data: PassData, whitened: FloatArray, residuals: FloatArray, first: int,
+def velocity_change(data: PassData, whitened: FloatArray, residuals: FloatArray, x_index: int,
                     velocity: FloatArray, duration_s: float) -> tuple[float, float]:
     """Estimate the relative change of the velocity while the target is observed.
 
@@ -92,7 +92,7 @@ def velocity_change(data: PassData, whitened: FloatArray, residuals: FloatArray,
         Whitened derivatives of the field with respect to the unknowns.
     residuals : (n, 3) array
         Whitened residuals.
-    first : int
+    x_index : int
         Index of the unknown x of the target; the next unknown is y.
     velocity : (3,) array, m/s
     duration_s : float, s
@@ -105,7 +105,7 @@ def velocity_change(data: PassData, whitened: FloatArray, residuals: FloatArray,
     std : float
         Standard deviation of the change, including model error.
     """
-    by_acceleration = 0.5 * np.square(data.t)[:, None, None] * whitened[:, :, first:first + 2]
+    by_acceleration = 0.5 * np.square(data.t)[:, None, None] * whitened[:, :, x_index:x_index + 2]
     extended = np.concatenate([whitened, by_acceleration], axis=2)
     flat = extended.reshape(residuals.size, -1)
     norm = np.linalg.norm(flat, axis=0)

@@ -12,7 +12,7 @@ from mag_tracking.inference.separable_fit import SeparableModel, SeparableProble
 from mag_tracking.network import SensorNetwork
 from mag_tracking.units import NS
 
-ModelOf: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], SeparableModel]
+ModelFactory: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], SeparableModel]
 """Function that creates a model from times (n,) [s], positions (n, 3) [m] and matrices (n, 3, 3)
 that multiply the field."""
 
@@ -78,9 +78,9 @@ class PassData:
         """
         total = 0.0
         for j in self.sensors:
-            of_sensor = self.sensor == j
-            variance = np.where(np.isnan(self.field[of_sensor]), np.nan,
-                                np.einsum('nii->ni', self.covariance[of_sensor]))
+            sensor_mask = self.sensor == j
+            variance = np.where(np.isnan(self.field[sensor_mask]), np.nan,
+                                np.einsum('nii->ni', self.covariance[sensor_mask]))
             variance = variance[:, ~np.isnan(variance).all(axis=0)]
             fraction = np.nanmin(variance, axis=0) / variance
             # Small variations of the estimated noise do not indicate repeated readings.
@@ -141,43 +141,45 @@ class PassData:
         -------
         PassData
         """
-        size = np.sqrt(np.linalg.norm(self.departure, axis=1))
-        rows = []
+        field_weight = np.sqrt(np.linalg.norm(self.field_change, axis=1))
+        columns = []
         for j in np.unique(self.sensor):
-            own = np.flatnonzero(self.sensor == j)
-            weight = 1.0 / len(own) + size[own] / max(size[own].sum(), 1e-300)
+            sensor_rows = np.flatnonzero(self.sensor == j)
+            weight = 1.0 / len(sensor_rows) + field_weight[sensor_rows] / max(
+                field_weight[sensor_rows].sum(), 1e-300)
             group = np.floor(np.cumsum(weight) / weight.sum()
                              * max_samples * (1.0 - 1e-9)).astype(int)
-            first = np.flatnonzero(np.diff(group, prepend=-1))
-            n = np.diff(first, append=len(own))
+            begins = np.flatnonzero(np.diff(group, prepend=-1))
+            n = np.diff(begins, append=len(sensor_rows))
             # A missing value makes the mean NaN: the other values have a different mean time.
-            rows.append((np.add.reduceat(self.t[own], first) / n, np.full(len(n), j),
-                         np.add.reduceat(self.field[own], first) / n[:, None],
-                         np.add.reduceat(self.covariance[own], first) / n[:, None, None], n))
-        t, sensor, field, covariance, n = (np.concatenate(c) for c in zip(*rows, strict=True))
+            columns.append((np.add.reduceat(self.t[sensor_rows], begins) / n, np.full(len(n), j),
+                            np.add.reduceat(self.field[sensor_rows], begins) / n[:, None],
+                            np.add.reduceat(self.covariance[sensor_rows], begins)
+                            / n[:, None, None], n))
+        t, sensor, field, covariance, n = (np.concatenate(c) for c in zip(*columns, strict=True))
         return replace(self, t=t, sensor=sensor, field=field, covariance=covariance, count=n)
 
     @cached_property
-    def departure(self) -> FloatArray:
+    def field_change(self) -> FloatArray:
         """Field minus its median at each sensor, (n, 3) T: approximately the target's field."""
         out = np.zeros_like(self.field)
         for j in self.sensors:
-            of_sensor = self.sensor == j
-            is_measured = ~np.isnan(self.field[of_sensor]).all(axis=0)
+            sensor_mask = self.sensor == j
+            is_measured = ~np.isnan(self.field[sensor_mask]).all(axis=0)
             median = np.zeros(3)
-            median[is_measured] = np.nanmedian(self.field[of_sensor][:, is_measured], axis=0)
-            out[of_sensor] = np.nan_to_num(self.field[of_sensor] - median)
+            median[is_measured] = np.nanmedian(self.field[sensor_mask][:, is_measured], axis=0)
+            out[sensor_mask] = np.nan_to_num(self.field[sensor_mask] - median)
         return out
 
 
-def separable_problem(data: PassData, model_of: ModelOf, relative_error: float = 0.0,
+def separable_problem(data: PassData, create_model: ModelFactory, relative_error: float = 0.0,
                       prior: tuple[FloatArray, FloatArray] | None = None) -> SeparableProblem:
     """Create the separable least-squares problem of a pass, with unknown backgrounds.
 
     Parameters
     ----------
     data : PassData
-    model_of : function
+    create_model : function
         Creates a `SeparableModel` from t (n,), positions (n, 3) and whitened world-to-sensor
         rotations M (n, 3, 3).
     relative_error : float
@@ -191,16 +193,16 @@ def separable_problem(data: PassData, model_of: ModelOf, relative_error: float =
     """
     W = data.whitening
     if relative_error > 0.0:
-        signal = np.einsum('nij,nj->ni', W, data.departure)
+        signal = np.einsum('nij,nj->ni', W, data.field_change)
         squared_norm = np.einsum('ni,ni->n', signal, signal)
         W = W / np.sqrt(1.0 + relative_error**2 * squared_norm)[:, None, None]
-    model = model_of(data.t, data.positions, W @ data.network.R_sw[data.sensor])
+    model = create_model(data.t, data.positions, W @ data.network.R_sw[data.sensor])
     y = np.einsum('nij,nj->ni', W, np.nan_to_num(data.field)).ravel()
     return SeparableProblem(model, y, background_columns(data, W), prior)
 
 
 def background_columns(data: PassData, W: FloatArray) -> FloatArray:
-    """Create the whitened columns of the design matrix for the backgrounds of the measured axes.
+    """Create the whitened design matrix of the backgrounds of all measured axes.
 
     Parameters
     ----------

@@ -64,24 +64,25 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
     reason = unusable_reason(data, (n_dipoles,))
     if reason:
         return PassFit(n_dipoles, data, reason)
-    data, rough = centred_on_peak(data)
-    model_of = partial(RowPass, n_dipoles=n_dipoles)
-    problem = separable_problem(data, model_of)
-    n_free = data.n_independent - background_columns(data, data.whitening).shape[1]
-    limit = energy_threshold(FALSE_ALARM, n_free)
-    if problem.energy <= limit:
+    data, averaged = centred_on_peak(data)
+    create_model = partial(RowPass, n_dipoles=n_dipoles)
+    problem = separable_problem(data, create_model)
+    noise_dof = data.n_independent - background_columns(data, data.whitening).shape[1]
+    threshold = energy_threshold(FALSE_ALARM, noise_dof)
+    if problem.energy <= threshold:
         return PassFit(n_dipoles, data, 'out of range: the field is no stronger than noise '
-                       f'(energy {problem.energy:.0f}, threshold {limit:.0f})')
-    starts = starting_paths(rough, n_dipoles)
-    found = search(separable_problem(rough, model_of, COARSE_ERROR),
-                   separable_problem(rough, model_of), problem, starts,
-                   PATH_TOLERANCE[:starts.shape[1]], shorter_rows if n_dipoles > 1 else None)
-    if not np.isfinite(found.cost):
+                       f'(energy {problem.energy:.0f}, threshold {threshold:.0f})')
+    starts = starting_paths(averaged, n_dipoles)
+    minimum = search(separable_problem(averaged, create_model, COARSE_ERROR),
+                     separable_problem(averaged, create_model), problem, starts,
+                     PATH_TOLERANCE[:starts.shape[1]], shorter_rows if n_dipoles > 1 else None)
+    if not np.isfinite(minimum.cost):
         return PassFit(n_dipoles, data, 'no valid start of the search')
-    theta, p = found.theta, problem.linear(found.theta)
-    theta, p = model_of(data.t, data.positions, data.whitening).forward(theta, p)
-    unexplained = max(found.cost - n_free, 0.0) / (problem.energy - n_free)
-    fit, = fits_at_minimum(data, (n_dipoles,), replace(found, theta=theta), p, 1.0 - unexplained,
+    theta, p = minimum.theta, problem.linear(minimum.theta)
+    theta, p = create_model(
+        data.t, data.positions, data.whitening).with_nonnegative_length(theta, p)
+    unexplained = max(minimum.cost - noise_dof, 0.0) / (problem.energy - noise_dof)
+    fit, = fits_at_minimum(data, (n_dipoles,), replace(minimum, theta=theta), p, 1.0 - unexplained,
                            errors, cpa_range)
     return fit
 
@@ -97,17 +98,17 @@ def centred_on_peak(data: PassData) -> tuple[PassData, PassData]:
     -------
     data : PassData
         All samples of the pass.
-    rough : PassData
+    averaged : PassData
         Averaged samples, at most `N_COARSE` per sensor.
     """
-    rough = data.averaged(N_COARSE)
-    departure = rough.departure
-    seconds = rough.t[np.argmax(np.einsum('ni,ni->n', departure, departure))]
-    return data.shifted(seconds), rough.shifted(seconds)
+    averaged = data.averaged(N_COARSE)
+    field_change = averaged.field_change
+    seconds = averaged.t[np.argmax(np.einsum('ni,ni->n', field_change, field_change))]
+    return data.shifted(seconds), averaged.shifted(seconds)
 
 
 def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
-    """Reason why a fit is not possible; empty if there are enough measurements.
+    """Check that there are enough measurements for a fit.
 
     Parameters
     ----------
@@ -152,28 +153,28 @@ def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
     -------
     (n, 6 or 7) array, m, m/s, m
     """
-    departure = data.departure
-    energy = np.einsum('ni,ni->n', departure, departure)
+    field_change = data.field_change
+    energy = np.einsum('ni,ni->n', field_change, field_change)
     strongest = int(np.argmax(energy))
-    of_sensor = data.sensor == data.sensor[strongest]
-    weight = energy[of_sensor] / energy[of_sensor].sum()
-    t_cpa = weight @ data.t[of_sensor]
-    width = np.sqrt(weight @ np.square(data.t[of_sensor] - t_cpa))
-    heading, offset, ratio = (a.ravel() for a in np.meshgrid(
+    sensor_mask = data.sensor == data.sensor[strongest]
+    weight = energy[sensor_mask] / energy[sensor_mask].sum()
+    t_cpa = weight @ data.t[sensor_mask]
+    duration_std = np.sqrt(weight @ np.square(data.t[sensor_mask] - t_cpa))
+    heading, offset, speed_factor = (a.ravel() for a in np.meshgrid(
         np.arange(12) * np.pi / 6.0, (-8.0, -4.5, -2.0, 2.0, 4.5, 8.0),
         (0.25, 0.35, 0.5, 0.7, 1.0, 1.4), indexing='ij'))
     length = 3.0 if n_dipoles > 1 else 0.0
     along = np.stack([np.cos(heading), np.sin(heading), 0.0 * heading], axis=1)
     across = np.stack([-np.sin(heading), np.cos(heading), 0.0 * heading], axis=1)
     distance = np.hypot(np.hypot(offset, 0.5), 0.35 * length)
-    velocity = along * (ratio * distance / width)[:, None]
+    velocity = along * (speed_factor * distance / duration_std)[:, None]
     position = (data.positions[strongest] + offset[:, None] * across - t_cpa * velocity
                 + [0.0, 0.0, 0.5])
     return np.hstack([position, velocity, np.full((len(heading), int(n_dipoles > 1)), length)])
 
 
 def shorter_rows(path: FloatArray) -> FloatArray:
-    """Alternative starting paths of a row, mostly with a shorter length.
+    """Create alternative starting paths of a row: seven shorter rows and one longer row.
 
     If a dipole at the end of a row has no moment, a shorter row with a different centre fits almost
     as well.

@@ -1,8 +1,8 @@
 """Sensor orientations from the mounting angles estimated by tracks.
 
 The prior of the mounting errors is common to all tracks. The information that a track adds to the
-prior is independent of other tracks, so the sum is used. The result is less accurate than a
-calibration with a known target, because vehicle model errors are similar in all passes of a lane.
+prior is independent of other tracks and is summed over all tracks. The result is less accurate than
+a calibration with a known target, because vehicle model errors are similar in all passes of a lane.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,7 +27,7 @@ class MountingEvidence:
     rotation: FloatArray
     """(n_sensors, 3) [rad] small rotations about the world axes, which correct the orientations."""
     covariance: FloatArray
-    """(n_sensors, 3, 3) [rad²] of `rotation`, world axes."""
+    """(n_sensors, 3, 3) [rad²] covariance of `rotation`, world axes."""
     scatter: FloatArray
     """(n_sensors,) chi-square per degree of freedom of the tracks relative to `rotation`. About one
     if the track covariances are consistent; NaN for fewer than two tracks. Values above one scale
@@ -95,12 +95,12 @@ def _remove_negative_eigenvalues(information: FloatArray) -> FloatArray:
     return clipped
 
 
-def _track_scatter(gains: Sequence[FloatArray], pulls: Sequence[FloatArray], rotation: FloatArray,
-                   covariance: FloatArray) -> FloatArray:
+def _track_scatter(gains: Sequence[FloatArray], information_vectors: Sequence[FloatArray],
+                   rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     """Chi-square per degree of freedom (n_sensors,) of the tracks relative to the fused angles."""
     squares, freedom = np.zeros(len(rotation)), np.zeros(len(rotation))
-    for gain, pull in zip(gains, pulls, strict=True):
-        residual = pull - np.einsum('jik,jk->ji', gain, rotation)
+    for gain, information_vector in zip(gains, information_vectors, strict=True):
+        residual = information_vector - np.einsum('jik,jk->ji', gain, rotation)
         inverse = np.linalg.pinv(gain, rcond=MIN_INFORMATION_FRACTION, hermitian=True)
         squares += np.einsum('ji,jik,jk->j', residual, inverse, residual)
         # The fused estimate includes the track, which reduces the degrees of freedom.

@@ -32,8 +32,8 @@ equivalent to a point. The maximum length is the distance travelled."""
 class Bearing:
     """Observable quantities of a pass at a single sensor, relative to the sensor.
 
-    The distance is not observable. Reflecting the path through the sensor leaves the
-    field unchanged.
+    The distance is not observable. A path and its reflection through the sensor have the same
+    field, so the sign of the path is not observable either.
     """
 
     cpa_direction: FloatArray
@@ -112,7 +112,7 @@ class PassFit:
 
     @property
     def n_unknowns(self) -> int:
-        """Number of unknowns of the joint fit."""
+        """Number of unknowns, including those of other targets of a joint fit."""
         return len(self.x) + self.n_other_unknowns
 
     @property
@@ -136,13 +136,13 @@ class PassFit:
         if self.n_dipoles == 1:
             return True
         length, length_std = self.length
-        travelled = np.linalg.norm(self.velocity) * self.duration_s
+        travelled_distance = np.linalg.norm(self.velocity) * self.duration_s
         return bool(length_std <= max(length, 1.0)
-                    and MIN_LENGTH_FRACTION * travelled <= length <= travelled)
+                    and MIN_LENGTH_FRACTION * travelled_distance <= length <= travelled_distance)
 
     @property
     def is_poor_mixture(self) -> bool:
-        """Whether this is a joint fit with a cost above `MAX_NORMALISED_COST`."""
+        """Whether this is a joint fit with a normalised cost above `MAX_NORMALISED_COST`."""
         return self.n_other_unknowns > 0 and bool(self.normalised_cost > MAX_NORMALISED_COST)
 
     @property
@@ -226,9 +226,9 @@ class PassFit:
 
         Returns
         -------
-        time : float, s
+        t_cpa : float, s
             Relative to time zero.
-        time_std : float, s
+        t_cpa_std : float, s
         range : float, m
         range_std : float, m
 
@@ -237,10 +237,10 @@ class PassFit:
         [TSP14]_ eq. (24), with linearised standard deviations.
         """
         r, v = self.position - point, self.velocity
-        time, distance, r_cpa = closest_approach(r, v)
+        t_cpa, distance, r_cpa = closest_approach(r, v)
         u = r_cpa / distance if distance > 0.0 else np.zeros(3)
         P = self.robust_covariance[:6, :6]
-        g_time = -np.concatenate([v, r + 2.0 * time * v]) / (v @ v)
-        g_range = np.concatenate([u, time * u])
-        return (time, np.float64(np.sqrt(g_time @ P @ g_time)), distance,
+        g_time = -np.concatenate([v, r + 2.0 * t_cpa * v]) / (v @ v)
+        g_range = np.concatenate([u, t_cpa * u])
+        return (t_cpa, np.float64(np.sqrt(g_time @ P @ g_time)), distance,
                 np.float64(np.sqrt(g_range @ P @ g_range)))

@@ -21,16 +21,16 @@ MAX_TARGETS = 3
 """Maximum number of targets in a joint fit, each with about twelve unknowns."""
 
 MAX_LENGTH = 18.75
-"""[m] Maximum length of the iron of one vehicle: a road train (Directive 96/53/EC)."""
+"""[m] Maximum length of the iron of one vehicle: the limit for road trains (Directive 96/53/EC)."""
 
 MAX_VELOCITY_SPREAD = 0.25
 """Maximum difference between the velocity of a part of a vehicle and the mean velocity of all
 parts, relative to the mean."""
 
 
-def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, ground: GroundPrior,
-                orders: Sequence[int], stopped: Callable[[], bool] | None = None
-                ) -> tuple[tuple[PassFit, ...], ...]:
+def fit_targets(data: PassData, single_fits: Sequence[PassFit], paths: FloatArray,
+                ground: GroundPrior, orders: Sequence[int],
+                stopped: Callable[[], bool] | None = None) -> tuple[tuple[PassFit, ...], ...]:
     """Select between a fit of a pass as one target and a joint fit of the tracked targets.
 
     A fit alone does not determine the number of targets: a long row of dipoles can explain two
@@ -39,7 +39,7 @@ def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, gro
     Parameters
     ----------
     data : PassData
-    alone : sequence of PassFit
+    single_fits : sequence of PassFit
         Fits as a single target, one for each number of dipoles.
     paths : (K, 6) array, m, m/s
         Positions of the tracked targets at time zero of `data`, and their velocities.
@@ -53,27 +53,28 @@ def fit_targets(data: PassData, alone: Sequence[PassFit], paths: FloatArray, gro
     Returns
     -------
     tuple of tuples of PassFit
-        For each target, one fit per number of dipoles. The fits `alone` are returned if one target
+        For each target, one fit per number of dipoles. `single_fits` are returned if one target
         explains the field equally well, or if the fitted targets are parts of one vehicle (long
-        vehicles are sometimes tracked as two). If the joint fit is impossible or is rejected, the
-        fits `alone` are returned with a reason.
+        vehicles are sometimes tracked as two). If the joint fit is impossible or is rejected,
+        `single_fits` are returned with a reason.
     """
     n_targets = len(paths)
     if n_targets < 2 or len(data.sensors) < 2:
-        return (tuple(alone),)
+        return (tuple(single_fits),)
     if n_targets > MAX_TARGETS:
-        return (_reject(alone, n_targets, f'but at most {MAX_TARGETS} can be fitted together'),)
+        return (_reject(single_fits, n_targets,
+                        f'but at most {MAX_TARGETS} can be fitted together'),)
     joint_fits = fit_joint(data, paths, ground, orders, stopped=stopped)
     if not joint_fits:
-        return (_reject(alone, n_targets,
+        return (_reject(single_fits, n_targets,
                         'but there are too few measurements to fit them together'),)
-    best, single = [_best_fit(fits) for fits in joint_fits], _best_fit(alone)
-    if not single.reason and single.length[0] <= MAX_LENGTH and all(
-            fit.determined for fit in best) and (
-            _are_parts(data, best) or order_criteria([single, best[0]])[0] == 0.0):
-        return (tuple(alone),)
-    reason = _rejection_reason(data, best)
-    return (_reject(alone, n_targets, reason),) if reason else joint_fits
+    best_joint, best_single = [_best_fit(fits) for fits in joint_fits], _best_fit(single_fits)
+    if not best_single.reason and best_single.length[0] <= MAX_LENGTH and all(
+            fit.determined for fit in best_joint) and (
+            _are_parts(data, best_joint) or order_criteria([best_single, best_joint[0]])[0] == 0.0):
+        return (tuple(single_fits),)
+    reason = _rejection_reason(data, best_joint)
+    return (_reject(single_fits, n_targets, reason),) if reason else joint_fits
 
 
 def _best_fit(fits: Sequence[PassFit]) -> PassFit:

@@ -33,11 +33,11 @@ MIN_ROW_REACH = 0.4
 NOISE_ENERGY = 16.3
 """Whitened energy of three axes that noise exceeds with a probability of 0.001."""
 
-MIN_ELSEWHERE, MAX_ELSEWHERE = 0.003, 0.1
+MAX_FIELD_ENERGY_ELSEWHERE, MAX_RESIDUAL_ENERGY_ELSEWHERE = 0.003, 0.1
 """Unexplained energy outside the reach of a plausible vehicle: maximum fraction of the field energy
 (gain errors, a swerve), and maximum fraction of the total residual. The larger limit applies."""
 
-MIN_DISTANCE = 0.3
+MIN_PASS_DISTANCE = 0.3
 """Minimum distance travelled during a pass, relative to the distance of the nearest sensor."""
 
 MAX_VELOCITY_CHANGE = 0.3
@@ -114,11 +114,12 @@ def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], residuals: Flo
         squared_norm: FloatArray = np.einsum('ni,ni->n', whitened, whitened)
         return squared_norm
 
-    plausible = sum((_plausible_residual_fraction(data, row) * energy(row.field) for row in rows),
-                    np.zeros(len(residuals)))
-    excess = np.square(residuals).sum(axis=1) - plausible - NOISE_ENERGY
-    total = energy(np.sum([row.field for row in rows], axis=0))
-    return float(np.maximum(excess, 0.0).sum() / total.sum())
+    plausible_energy = sum(
+        (_plausible_residual_fraction(data, row) * energy(row.field) for row in rows),
+        np.zeros(len(residuals)))
+    excess_energy = np.square(residuals).sum(axis=1) - plausible_energy - NOISE_ENERGY
+    total_energy = energy(np.sum([row.field for row in rows], axis=0))
+    return float(np.maximum(excess_energy, 0.0).sum() / total_energy.sum())
 
 
 def _plausible_residual_fraction(data: PassData, row: FittedRow) -> FloatArray:
@@ -160,14 +161,14 @@ def rejection_reason(fit: PassFit) -> str:
         length, length_std = fit.length
         return (f'not determined: a length of {length:.1f} m with a standard deviation of '
                 f'{length_std:.1f} m; use fewer dipoles')
-    std, nearest = np.sqrt(np.trace(fit.robust_covariance[:3, :3])), _nearest_cpa_range(fit)
-    if std > nearest:
+    std, nearest_range = np.sqrt(np.trace(fit.robust_covariance[:3, :3])), _nearest_cpa_range(fit)
+    if std > nearest_range:
         return (f'out of range: the position has a standard deviation of {std:.1f} m, and the '
-                f'nearest sensor is {nearest:.1f} m away')
+                f'nearest sensor is {nearest_range:.1f} m away')
     return ''
 
 
-def trusted(fit: PassFit) -> tuple[str, ...]:
+def trusted_quantities(fit: PassFit) -> tuple[str, ...]:
     """Quantities of a fit whose uncertainty is acceptable.
 
     Parameters
@@ -184,14 +185,14 @@ def trusted(fit: PassFit) -> tuple[str, ...]:
         return ()
     speed, speed_std = fit.speed
     _, heading_std = fit.heading
-    nearest = _nearest_cpa_range(fit)
+    nearest_range = _nearest_cpa_range(fit)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     _, time_std, _, _ = fit.closest_approach(centre)
     # A comparison with NaN (an unknown variance) is false.
     is_determined = {
         'speed': speed_std <= MAX_SPEED_STD * speed,
         'direction': heading_std <= MAX_HEADING_STD and speed_std <= 0.5 * speed,
-        'time': time_std * speed <= MAX_TIME_STD * nearest}
+        'time': time_std * speed <= MAX_TIME_STD * nearest_range}
     return tuple(name for name, is_valid in is_determined.items() if is_valid)
 
 
@@ -207,7 +208,7 @@ def _invalid_pass_reason(fit: PassFit) -> str:
     if has_velocity_change(fit):
         return ('not at constant velocity: the velocity changed by '
                 f'{fit.velocity_change:.0%} during the pass (a turn, braking)')
-    if np.linalg.norm(fit.velocity) * fit.duration_s < MIN_DISTANCE * _nearest_cpa_range(fit):
+    if np.linalg.norm(fit.velocity) * fit.duration_s < MIN_PASS_DISTANCE * _nearest_cpa_range(fit):
         return 'no pass: the distance travelled is too short'
     return ''
 
@@ -223,7 +224,7 @@ def has_plausible_residual(fit: PassFit) -> bool:
     -------
     bool
     """
-    limit = max(MIN_ELSEWHERE, MAX_ELSEWHERE * (1.0 - fit.explained))
+    limit = max(MAX_FIELD_ENERGY_ELSEWHERE, MAX_RESIDUAL_ENERGY_ELSEWHERE * (1.0 - fit.explained))
     return fit.residual_elsewhere <= limit
 
 

@@ -1,4 +1,4 @@
-"""Bounds and detection probabilities of a passing target for the planning of sensor positions.
+"""Error bounds and detection probabilities of passing targets, for planning sensor positions.
 
 The target is a point that moves on a straight line at constant speed, with the states [r, v, m].
 The direction of its moment is unknown in advance; each result is computed for all `DIRECTIONS`.
@@ -107,7 +107,9 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
     target : PlannedTarget
     sampling : Sampling
     points : (n, 2) array, m, world frame
+        Horizontal positions of the target at time zero of each pass.
     heading : float, rad
+        Heading of all passes, anticlockwise from x.
 
     Yields
     ------
@@ -121,29 +123,29 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
     t, _ = sampling.times()
     v = target.speed * np.array([np.cos(heading), np.sin(heading), 0.0])
     shape = len(DIRECTIONS), len(t)
-    size = shape[0] * shape[1]
+    n_hypotheses = shape[0] * shape[1]
     # [r, v, m] at the point; the target is at r + t v.
     dr_dx, dm_dx = np.zeros((2, *shape, 3, 9))
     dr_dx[..., range(3), range(3)] = 1.0
     dr_dx[..., range(3), range(3, 6)] = t[:, None]
     dm_dx[..., range(3), range(6, 9)] = 1.0
     m = np.broadcast_to(target.moment * DIRECTIONS[:, None], (*shape, 3))
-    step = max(1, MAX_FIELDS // (size * len(positions)))
+    step = max(1, MAX_FIELDS // (n_hypotheses * len(positions)))
     for first in range(0, len(points), step):
-        part = points[first:first + step]
-        n = len(part)
-        r0 = np.column_stack([part, np.full(n, target.height)])
+        chunk = points[first:first + step]
+        n = len(chunk)
+        r0 = np.column_stack([chunk, np.full(n, target.height)])
         r = np.broadcast_to(r0[:, None, None] + t[:, None] * v, (n, *shape, 3))
 
         def repeated(a: FloatArray, n: int = n) -> FloatArray:
             """Repeat the array `a` for each of the `n` points."""
-            return np.tile(a.reshape(size, 1, *a.shape[2:]), (n, *[1] * (a.ndim - 1)))
+            return np.tile(a.reshape(n_hypotheses, 1, *a.shape[2:]), (n, *[1] * (a.ndim - 1)))
 
-        h, H, _ = sensor_fields(positions, R_sw, r.reshape(n * size, 1, 3).copy(), repeated(m),
-                                repeated(dr_dx), repeated(dm_dx))
+        h, H, _ = sensor_fields(positions, R_sw, r.reshape(n * n_hypotheses, 1, 3).copy(),
+                                repeated(m), repeated(dr_dx), repeated(dm_dx))
         # At the position of a sensor, the field is singular. The sensor is not used in this frame.
-        on_it = ~(np.isfinite(h).all(axis=-1) & np.isfinite(H).all(axis=(-2, -1)))
-        h[on_it], H[on_it] = 0.0, 0.0
+        is_at_sensor = ~(np.isfinite(h).all(axis=-1) & np.isfinite(H).all(axis=(-2, -1)))
+        h[is_at_sensor], H[is_at_sensor] = 0.0, 0.0
         yield (slice(first, first + n), h.reshape(n, *shape, -1, 3),
                H.reshape(n, *shape, len(positions), 3, 9))
 
@@ -162,7 +164,9 @@ def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTar
     target : PlannedTarget
     sampling : Sampling
     points : (n, 2) array, m, world frame
+        Horizontal positions of the target.
     heading : float, rad
+        Heading of the target, anticlockwise from x.
 
     Returns
     -------
@@ -177,11 +181,12 @@ def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTar
     for part, h, H in pass_fields(positions, R_sw, target, sampling, points, heading):
         variance = (np.square(sampling.noise_std) + sampling.field_error**2 * np.einsum(
             'pdksa,pdksa->pdks', h, h)) / frame_weight
-        weighted = H / variance[..., None, None]
-        J = np.einsum('pdksai,pdksaj->pdsij', weighted, H, optimize=True)
-        mean = weighted.sum(axis=2)
-        total = (1.0 / variance).sum(axis=2) + 1.0 / sampling.background_std**2
-        result[part] = J - np.einsum('pdsai,pdsaj->pdsij', mean, mean) / total[..., None, None]
+        weighted_jacobians = H / variance[..., None, None]
+        J = np.einsum('pdksai,pdksaj->pdsij', weighted_jacobians, H, optimize=True)
+        weighted_sum = weighted_jacobians.sum(axis=2)
+        background_information = (1.0 / variance).sum(axis=2) + 1.0 / sampling.background_std**2
+        result[part] = J - np.einsum('pdsai,pdsaj->pdsij', weighted_sum,
+                                     weighted_sum) / background_information[..., None, None]
     return result
 
 
@@ -217,7 +222,7 @@ def bounds_of(information: FloatArray, prior: FloatArray) -> FloatArray:
 
 def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
                             sampling: Sampling, points: FloatArray, false_alarm: float,
-                            allowance: float = 0.0) -> FloatArray:
+                            background_std: float = 0.0) -> FloatArray:
     """Probability of detection in one frame with the target at a point.
 
     Parameters
@@ -228,9 +233,10 @@ def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: Pla
     target : PlannedTarget
     sampling : Sampling
     points : (n, 2) array, m, world frame
+        Horizontal positions of the target.
     false_alarm : float
         False alarm probability of one frame.
-    allowance : float, T
+    background_std : float, T
         Standard deviation of the background errors, added to the noise.
 
     Returns
@@ -242,10 +248,11 @@ def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: Pla
     ----------
     [T10]_ eq. (5.14)-(5.19), applied to all sensors at once.
     """
-    still = Sampling(sampling.period, sampling.noise_std, half_window=0.0)
-    ratio = np.empty((len(points), len(DIRECTIONS)))
-    for part, h, _ in pass_fields(positions, R_sw, target, still, points, 0.0):
+    single_frame = Sampling(sampling.period, sampling.noise_std, half_window=0.0)
+    energy_ratio = np.empty((len(points), len(DIRECTIONS)))
+    for part, h, _ in pass_fields(positions, R_sw, target, single_frame, points, 0.0):
         squared_norm = np.einsum('pdksa,pdksa->pds', h, h)
-        ratio[part] = (squared_norm / (np.square(sampling.noise_std) + allowance**2)).sum(axis=-1)
+        energy_ratio[part] = (squared_norm / (
+            np.square(sampling.noise_std) + background_std**2)).sum(axis=-1)
     axes = 3 * len(positions)
-    return detection_probability(ratio, energy_threshold(false_alarm, axes), axes)
+    return detection_probability(energy_ratio, energy_threshold(false_alarm, axes), axes)

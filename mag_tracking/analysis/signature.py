@@ -108,12 +108,12 @@ def _resample(t: FloatArray, field: FloatArray) -> FloatArray:
     fraction = np.cumsum(energy) / energy.sum()
     begin = int(np.searchsorted(fraction, TAIL_FRACTION))
     end = int(np.searchsorted(fraction, 1.0 - TAIL_FRACTION)) + 1
-    at = np.linspace(begin, min(end, len(even_times) - 1), N_SAMPLES)
+    sample_indices = np.linspace(begin, min(end, len(even_times) - 1), N_SAMPLES)
     # Average over the new sampling interval to prevent aliasing.
-    width = max(1, round((at[-1] - at[0]) / N_SAMPLES))
+    width = max(1, round((sample_indices[-1] - sample_indices[0]) / N_SAMPLES))
     smooth = np.stack([np.convolve(axis, np.ones(width) / width, 'same') for axis in fine_field.T],
                       axis=1)
-    out: FloatArray = np.stack([np.interp(at, np.arange(len(even_times)), axis)
+    out: FloatArray = np.stack([np.interp(sample_indices, np.arange(len(even_times)), axis)
                                 for axis in smooth.T], axis=1)
     return out
 

@@ -204,18 +204,19 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
     z = (x - mean) / scale
     folds = list(_folds(y, groups, min(N_FOLDS, min(counts.values())), seed))
     candidates = []
-    for name, create in _candidates():
-        logits = np.zeros((len(y), len(classes)))
-        for inside, outside in folds:
-            logits[outside] = _logits(create().fit(z[inside], y[inside]), z[outside])
-        losses = [_log_loss(logits / t, y) for t in TEMPERATURES]
+    for name, create_estimator in _candidates():
+        held_out_logits = np.zeros((len(y), len(classes)))
+        for train_rows, test_rows in folds:
+            held_out_logits[test_rows] = _logits(
+                create_estimator().fit(z[train_rows], y[train_rows]), z[test_rows])
+        losses = [_log_loss(held_out_logits / t, y) for t in TEMPERATURES]
         k = int(np.argmin(losses))
-        candidates.append((losses[k], name, create, float(TEMPERATURES[k])))
-    _, name, create, temperature = min(candidates, key=lambda s: s[0])
-    fitted = create().fit(z, y)
+        candidates.append((losses[k], name, create_estimator, float(TEMPERATURES[k])))
+    _, name, create_estimator, temperature = min(candidates, key=lambda s: s[0])
+    fitted = create_estimator().fit(z, y)
     centres, precision = _class_statistics(z, y)
-    held_out = np.concatenate([_held_out_distances(z, y, inside, outside)
-                               for inside, outside in folds])
+    held_out = np.concatenate([_held_out_distances(z, y, train_rows, test_rows)
+                               for train_rows, test_rows in folds])
     return SignatureModel(classes, axes, unit, name, mean, scale,
                           *_weights_and_offsets(fitted, len(classes)), temperature,
                           centres, precision,
@@ -244,17 +245,17 @@ def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]'
     """
     counts = Counter(label for label, _ in set(zip(labels, groups, strict=True)))
     if '' in counts:
-        raise LabelsError(f'labels are missing for {counts[""]} of the targets; label or '
+        raise LabelsError(f'labels are missing for {counts[""]} targets; label or '
                           'remove their signatures')
     if UNKNOWN in counts:
         raise LabelsError(f'the label {UNKNOWN!r} is reserved for unclassified signatures; rename '
                           'the class')
     if len(counts) < 2:
         raise LabelsError(f'expected at least two classes, got {", ".join(counts) or "none"}')
-    few = {name: n for name, n in counts.items() if n < MIN_SAMPLES}
-    if few:
+    scarce = {name: n for name, n in counts.items() if n < MIN_SAMPLES}
+    if scarce:
         raise LabelsError('expected at least ' + str(MIN_SAMPLES) + ' examples of each class, got '
-                          + ', '.join(f'{n} of {name!r}' for name, n in sorted(few.items())))
+                          + ', '.join(f'{n} of {name!r}' for name, n in sorted(scarce.items())))
     return counts
 
 
@@ -294,9 +295,10 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
     y, g = np.array(labels), np.array(groups)
     parts = []
     for seed in progress(range(n_splits)):
-        inside, outside = _random_split(y, g, test_fraction, seed)
-        model = train(x[inside], y[inside].tolist(), g[inside].tolist(), axes, unit, seed)
-        parts.append((model, x[outside], y[outside]))
+        train_rows, test_rows = _random_split(y, g, test_fraction, seed)
+        model = train(x[train_rows], y[train_rows].tolist(), g[train_rows].tolist(), axes, unit,
+                      seed)
+        parts.append((model, x[test_rows], y[test_rows]))
     return _evaluate_parts(parts)
 
 
@@ -368,7 +370,7 @@ def expected_calibration_error(probability: FloatArray, correct: FloatArray, n_b
 
 
 def _candidates() -> list[tuple[str, Any]]:
-    """Candidate classifiers: (name, function that creates an estimator)."""
+    """List the candidate classifiers as (name, function that creates an estimator)."""
     try:
         from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
         from sklearn.linear_model import LogisticRegression
@@ -415,7 +417,7 @@ def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
 
 def _random_split(y: Any, groups: Any, test_fraction: float, seed: int
                   ) -> tuple[IntArray, IntArray]:
-    """Stratified random split without splitting groups; return (training, test) indices."""
+    """Split each class at random without splitting groups; return (training, test) indices."""
     rng, test_groups = np.random.default_rng(seed), set[str]()
     for name in np.unique(y):
         class_groups = rng.permutation(np.unique(groups[y == name]))
@@ -423,11 +425,11 @@ def _random_split(y: Any, groups: Any, test_fraction: float, seed: int
         n = min(max(1, round(test_fraction * len(class_groups))),
                 max(len(class_groups) - MIN_SAMPLES, 0))
         test_groups |= set(class_groups[:n].tolist())
-    outside = np.isin(groups, list(test_groups))
-    if not outside.any():
+    is_test = np.isin(groups, list(test_groups))
+    if not is_test.any():
         raise LabelsError('too few examples for a test set: at least one class requires more than '
                           f'{MIN_SAMPLES} examples')
-    return np.flatnonzero(~outside), np.flatnonzero(outside)
+    return np.flatnonzero(~is_test), np.flatnonzero(is_test)
 
 
 def _class_statistics(z: FloatArray, y: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -439,13 +441,13 @@ def _class_statistics(z: FloatArray, y: IntArray) -> tuple[FloatArray, FloatArra
     return centres, np.linalg.inv(covariance + 1e-6 * np.eye(z.shape[1]))
 
 
-def _held_out_distances(z: FloatArray, y: IntArray, inside: IntArray,
-                        outside: IntArray) -> FloatArray:
-    """Squared distances (n_outside,) of held-out examples to the centres of their own classes."""
-    centres, precision = _class_statistics(z[inside], y[inside])
-    own: FloatArray = _squared_distances(z[outside], centres, precision)[np.arange(len(outside)),
-                                                                         y[outside]]
-    return own
+def _held_out_distances(z: FloatArray, y: IntArray, train_rows: IntArray,
+                        test_rows: IntArray) -> FloatArray:
+    """Squared distances (n_test,) of held-out examples to the centres of their own classes."""
+    centres, precision = _class_statistics(z[train_rows], y[train_rows])
+    own_distances: FloatArray = _squared_distances(z[test_rows], centres, precision)[
+        np.arange(len(test_rows)), y[test_rows]]
+    return own_distances
 
 
 def _squared_distances(z: FloatArray, centres: FloatArray, precision: FloatArray) -> FloatArray:

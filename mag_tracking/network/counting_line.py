@@ -171,14 +171,14 @@ class CrossingDetector:
         """Interpolate the crossing between the poses before and after the line."""
         assert self._crossing_poses is not None
         before, after = self._crossing_poses
-        forward = [self.line.forward(p.position) for p in self._crossing_poses]
-        fraction = forward[0] / (forward[0] - forward[1])
+        distances = [self.line.forward(p.position) for p in self._crossing_poses]
+        fraction = distances[0] / (distances[0] - distances[1])
         return Crossing(before.stamp_ns + round(fraction * (after.stamp_ns - before.stamp_ns)),
                         (1.0 - fraction) * before.position + fraction * after.position,
-                        forward[1] > forward[0], before if fraction < 0.5 else after, False)
+                        distances[1] > distances[0], before if fraction < 0.5 else after, False)
 
     def _extrapolate(self, first: Pose, last: Pose) -> Crossing | None:
-        """Crossing shortly before the first or after the last pose; None without a crossing."""
+        """Extrapolate a crossing before the first or after the last pose; None if it is too far."""
         for pose, sign in ((first, -1.0), (last, 1.0)):
             speed = float(pose.velocity[:2] @ self.line.along)
             if abs(speed) < MIN_SPEED:

@@ -19,8 +19,8 @@ from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
 from mag_tracking.network.topics import NAME
 from mag_tracking.yaml_file import is_text, read_yaml, short_repr
 
-_NAME = re.compile(r'[A-Za-z0-9_.-]+')
-_FRAME = re.compile(r'[A-Za-z0-9_./-]+')
+_SENSOR_NAME_PATTERN = re.compile(r'[A-Za-z0-9_.-]+')
+_FRAME_PATTERN = re.compile(r'[A-Za-z0-9_./-]+')
 _TOP_KEYS = {'frame', 'earth_field', 'site', 'sensors'}
 _SITE_KEYS = ('latitude', 'longitude', 'height', 'date', 'x_azimuth_deg')
 _SENSOR_KEYS = {'position', 'orientation', 'orientation_std_deg', 'clock_offset', 'noise_std',
@@ -62,7 +62,7 @@ def _check_keys(label: str, mapping: object, keys: Collection[str]) -> None:
 
 
 def _parse_sensor(name: str, entry: Any) -> dict[str, Any]:
-    """Parse the entry of a sensor; return its values by attribute name of `SensorNetwork`."""
+    """Parse the entry of a sensor; return the values of its `SensorNetwork` attributes by name."""
     label = f'sensor {name}'
     _check_keys(label, entry, _SENSOR_KEYS)
     if 'position' not in entry:
@@ -71,8 +71,9 @@ def _parse_sensor(name: str, entry: Any) -> dict[str, Any]:
     if np.abs(position).max() > _MAX_COORDINATE:
         raise NetworkError(f'{label}: position: {position.tolist()} m is too far from the '
                            'origin for any place on Earth; positions are in metres')
-    q = _parse_vector(f'{label}: orientation', entry.get('orientation', [0, 0, 0, 1]), (4,))
-    R_ws = _parse_rotation(f'{label}: orientation', q)
+    quaternion = _parse_vector(f'{label}: orientation',
+                               entry.get('orientation', [0, 0, 0, 1]), (4,))
+    R_ws = _parse_rotation(f'{label}: orientation', quaternion)
     topic = _check_topic(label, 'topic', entry.get('topic', f'{name}/imu/mag'))
     # REP-145: the accelerometer topic data_raw and the magnetometer topic mag share a namespace.
     default_imu_topic = topic.removesuffix('/mag') + '/data_raw' if topic.endswith('/mag') else None
@@ -117,8 +118,8 @@ def _parse_correction(label: str, value: object) -> FloatArray | None:
     if value is None:
         return None
     matrix = _parse_vector(f'{label}: correction', value, (9,)).reshape(3, 3)
-    singular = np.linalg.svd(matrix, compute_uv=False)
-    if not singular[-1] > 0.02 * singular[0]:
+    singular_values = np.linalg.svd(matrix, compute_uv=False)
+    if not singular_values[-1] > 0.02 * singular_values[0]:
         raise NetworkError(f'{label}: correction: {matrix.ravel().tolist()} is singular or almost '
                            'singular')
     return matrix
@@ -215,19 +216,19 @@ def _parse_network(content: Any) -> SensorNetwork:
         raise NetworkError('sensors: expected a mapping with at least one sensor')
     earth = _parse_earth_field(content)
     frame = content.get('frame', 'map')
-    if not isinstance(frame, str) or not _FRAME.fullmatch(frame):
+    if not isinstance(frame, str) or not _FRAME_PATTERN.fullmatch(frame):
         raise NetworkError('frame: expected a name of letters, digits, _ . / and -, got '
                            f'{short_repr(frame)}')
     names = tuple(str(name) for name in sensors)
     for name in names:
-        if not _NAME.fullmatch(name):
+        if not _SENSOR_NAME_PATTERN.fullmatch(name):
             raise NetworkError(f'{short_repr(name)} is not a valid sensor name: use letters, '
                                'digits, _ . and -')
     entries = [_parse_sensor(n, e) for n, e in zip(names, sensors.values(), strict=True)]
-    columns: dict[str, Any] = {key: tuple(e[key] for e in entries) for key in entries[0]}
+    attributes: dict[str, Any] = {key: tuple(e[key] for e in entries) for key in entries[0]}
     for key in ('positions', 'R_ws', 'clock_offset'):
-        columns[key] = np.array(columns[key])
-    return SensorNetwork(names, frame=frame, earth_field=earth, **columns)
+        attributes[key] = np.array(attributes[key])
+    return SensorNetwork(names, frame=frame, earth_field=earth, **attributes)
 
 
 def _parse_earth_field(content: dict[str, Any]) -> FloatArray | None:

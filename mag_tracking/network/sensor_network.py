@@ -64,9 +64,11 @@ class SensorNetwork:
     """Offset of the clock of each sensor, (n,) s, positive if the clock is ahead. The offset is
     subtracted from the timestamps. None is replaced by zeros."""
     offset: tuple[FloatArray | None, ...] = ()
-    """Hard iron offset of each sensor, (3,) T, sensor frame, from a tumbling calibration."""
+    """Hard iron offset of each sensor, (3,) T, sensor frame, from a tumbling calibration. None if
+    the sensor has no such calibration."""
     correction: tuple[FloatArray | None, ...] = ()
-    """Correction matrix of each sensor, (3, 3): B = correction @ (reading - offset)."""
+    """Correction matrix of each sensor, (3, 3): B = correction @ (reading - offset). None if the
+    sensor has no tumbling calibration."""
     imu_topics: tuple[str | None, ...] = ()
     """Topic of each sensor's accelerometer. None if the sensor has no accelerometer."""
     calibrated: tuple[CalibrationRecord | None, ...] = ()
@@ -187,8 +189,8 @@ class SensorNetwork:
         Returns
         -------
         CalibrationRecord
-            Record that includes the orientation that was entered by hand, which is the current
-            orientation if no previous record contains one.
+            Record that includes the orientation that was entered by hand. If no previous record
+            contains this orientation, the current orientation is recorded.
         """
         previous, std = self.calibrated[j], self.orientation_std[j]
         if previous is not None and previous.stated is not None:

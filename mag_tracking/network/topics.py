@@ -7,7 +7,7 @@ from mag_tracking.errors import NetworkError
 
 NAME = re.compile(r'/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 """Pattern of a valid relative or absolute topic name."""
-_NAMESPACE = re.compile(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+')
+_NAMESPACE_PATTERN = re.compile(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 
 def absolute(topic: str, namespace: str = '/') -> str:
@@ -65,7 +65,7 @@ def checked_namespace(namespace: str) -> str:
     NetworkError
         If `namespace` is not a valid absolute namespace.
     """
-    if not _NAMESPACE.fullmatch(namespace):
+    if not _NAMESPACE_PATTERN.fullmatch(namespace):
         raise NetworkError(f'{namespace!r} is not a valid namespace: it must begin with / and '
                            'contain only letters, digits and _; no part may begin with a digit')
     return namespace

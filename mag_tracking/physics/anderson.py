@@ -1,6 +1,7 @@
 """Field of a dipole on a straight pass, expanded in Anderson functions.
 
-Positions are target minus sensor, as in TSP14. The sign does not affect the field of a dipole.
+Position vectors point from the sensor to the target, as in TSP14. Their sign does not affect the
+field of a dipole.
 """
 
 import numpy as np
@@ -76,14 +77,14 @@ def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatA
     if not 0.0 < speed < np.inf:
         raise ValueError(f'v0 must be finite and non-zero, got {v0.tolist()}')
     direction = v0 / speed
-    path = -(r0 @ direction)
-    r_cpa = r0 + path * direction
+    travelled = -(r0 @ direction)
+    r_cpa = r0 + travelled * direction
     # Project twice: rounding of r0 leaves a component along v0 in the first difference.
     r_cpa -= (r_cpa @ direction) * direction
     distance = float(np.linalg.norm(r_cpa))
     if distance <= 1e-15 * np.linalg.norm(r0):
         distance, r_cpa = 0.0, np.zeros(3)
-    return float(path / speed), distance, r_cpa
+    return float(travelled / speed), distance, r_cpa
 
 
 def anderson_coefficients(r_cpa: ArrayLike, v0: ArrayLike, m: ArrayLike) -> FloatArray:

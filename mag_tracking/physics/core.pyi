@@ -1,4 +1,4 @@
-"""Compiled physics. Each function is documented by the Python function of the same name.
+"""Compiled physics, documented by the Python functions and methods that call it.
 
 Arrays must be C-contiguous. ValueError is raised if their shapes do not match.
 """

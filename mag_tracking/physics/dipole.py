@@ -12,7 +12,7 @@ MU0 = 4e-7 * math.pi
 """Vacuum permeability [T m/A]; 4e-7 pi, as in the cited papers."""
 
 K_DIPOLE = core.K_DIPOLE
-"""mu0 / (4 pi) [T m/A]."""
+"""Constant mu0 / (4 pi) of the dipole field [T m/A]."""
 
 
 def sensor_fields(positions: FloatArray, R_sw: FloatArray, r: FloatArray, m: FloatArray,
@@ -43,9 +43,9 @@ def sensor_fields(positions: FloatArray, R_sw: FloatArray, r: FloatArray, m: Flo
         Derivative of `h` with respect to the target state.
     gradient : (n_hyp, n_sensors) array, T/m
         Sum of mu0/(4 pi) ‖m‖ / ‖d‖^4 over the dipoles, where d is the vector from dipole to sensor.
-        Each term is the magnitude of the first neglected multipole term, per metre of the body that
-        is represented by the dipole. Magnitudes are added instead of squares, because the errors of
-        adjacent dipoles of a body are correlated.
+        A term times the extent [m] of the body that the dipole represents is the magnitude of the
+        first neglected multipole order. Magnitudes are added instead of squares, because the errors
+        of adjacent dipoles of a body are correlated.
 
     Notes
     -----

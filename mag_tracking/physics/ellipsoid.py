@@ -47,13 +47,14 @@ def demagnetisation_factors(aspect: ArrayLike) -> tuple[FloatArray, FloatArray]:
     aspect = np.asarray(aspect, dtype=float)
     if not np.all((aspect >= 1e-100) & (aspect <= 1e100)):
         raise ValueError(f'aspect must be between 1e-100 and 1e100, got {aspect.tolist()}')
-    square = aspect * aspect
-    return aspect / 3 * elliprd(1.0, 1.0, square), aspect / 3 * elliprd(1.0, square, 1.0)
+    squared_aspect = aspect * aspect
+    return (aspect / 3 * elliprd(1.0, 1.0, squared_aspect),
+            aspect / 3 * elliprd(1.0, squared_aspect, 1.0))
 
 
 def ellipsoid_moment(semi_axes: Sequence[float] | FloatArray, mu_r: float, heading: ArrayLike,
                      earth_field: ArrayLike) -> FloatArray:
-    """Moment induced by the earth's field in a permeable ellipsoid of revolution.
+    """Moment induced by the Earth's field in a permeable ellipsoid of revolution.
 
     The axis of revolution is horizontal and points along the heading.
 
@@ -102,6 +103,6 @@ def ellipsoid_moment(semi_axes: Sequence[float] | FloatArray, mu_r: float, headi
     kappa = mu_r - 1.0
     p1, p2 = (volume * kappa / (1.0 + kappa * L) for L in demagnetisation_factors(a / b))
     axis = np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=-1)
-    along = np.sum(axis * earth_field, axis=-1, keepdims=True)
-    moment: FloatArray = (p2 * earth_field + (p1 - p2) * along * axis) / MU0
+    axial_field = np.sum(axis * earth_field, axis=-1, keepdims=True)
+    moment: FloatArray = (p2 * earth_field + (p1 - p2) * axial_field * axis) / MU0
     return moment

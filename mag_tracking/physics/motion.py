@@ -1,4 +1,4 @@
-"""Motion models in exact discretisation: constant velocity and coordinated turn.
+"""Exactly discretised motion models: constant velocity and coordinated turn.
 
 The process noise is the exact discretisation of continuous white noise in the highest derivative.
 T10 eq. (4.2) and ICASSP11 eq. (2) instead assume noise that is constant over a sample. PHD15 Paper
@@ -20,8 +20,9 @@ def integrator_noise(dt: float, density: ArrayLike) -> FloatArray:
     Parameters
     ----------
     dt : float, s
+        Time step.
     density : (3,) array, unit²/s³
-        Power spectral density of the second derivative, per axis.
+        Power spectral density of the second derivative, per axis. The positions are in `unit`.
 
     Returns
     -------
@@ -46,10 +47,12 @@ def constant_velocity(dt: float) -> FloatArray:
     Parameters
     ----------
     dt : float, s
+        Time step.
 
     Returns
     -------
     (6, 6) array
+        Matrix for the state order x, y, z, vx, vy, vz.
     """
     F = np.eye(6)
     F[_INTEGRAL, _RATE] = dt
@@ -65,6 +68,7 @@ def coordinated_turn(x: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
         States: the first six are position [m] and velocity [m/s], the last is the turn rate
         [rad/s], anticlockwise as seen from above.
     dt : float, s
+        Time step; negative to propagate backwards.
 
     Returns
     -------
@@ -77,10 +81,10 @@ def coordinated_turn(x: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
     ----------
     [BarShalom01]_ section 11.7.
     """
-    return fading_turn(x, dt, 1.0, 1.0)
+    return decaying_turn(x, dt, 1.0, 1.0)
 
 
-def fading_turn(x: FloatArray, dt: float, mean: float, fading: float
+def decaying_turn(x: FloatArray, dt: float, mean_factor: float, final_factor: float
                 ) -> tuple[FloatArray, FloatArray]:
     """Propagate states along an arc with a decaying turn rate.
 
@@ -89,9 +93,10 @@ def fading_turn(x: FloatArray, dt: float, mean: float, fading: float
     x : (n, n_x) array
         States, as for `coordinated_turn`.
     dt : float, s
-    mean : float
+        Time step.
+    mean_factor : float
         Mean turn rate over `dt`, relative to the initial rate.
-    fading : float
+    final_factor : float
         Turn rate after `dt`, relative to the initial rate.
 
     Returns
@@ -101,4 +106,4 @@ def fading_turn(x: FloatArray, dt: float, mean: float, fading: float
     F : (n, n_x, n_x) array
         Derivative of `moved` with respect to `x`.
     """
-    return core.turned(np.ascontiguousarray(x, dtype=float), dt, mean, fading)
+    return core.turned(np.ascontiguousarray(x, dtype=float), dt, mean_factor, final_factor)

@@ -27,7 +27,7 @@ from mag_tracking.physics import core
 
 def _field_and_jacobians(r: ArrayLike,
                          moments: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Broadcast the arguments; return the field and its Jacobians for position and moments."""
+    """Field of broadcast arguments, and its Jacobians with respect to position and moments."""
     r, moments = np.asarray(r, dtype=float), np.asarray(moments, dtype=float)
     if r.shape[-1:] != (3,):
         raise ValueError(f'r requires a last axis of length 3, got shape {r.shape}')
@@ -143,13 +143,13 @@ def multipole_moments(points: ArrayLike, dipoles: ArrayLike, order: int) -> Floa
     if x.ndim < 2 or x.shape[-1] != 3:
         raise ValueError(f'points and dipoles must have shape (..., n, 3), got {x.shape}')
     delta = np.eye(3)
-    along = np.sum(x * m, axis=-1)
+    m_dot_x = np.sum(x * m, axis=-1)
     moments = [m[..., i] for i in range(3)]
     if order > 1:
-        moments += [3 * (m[..., i] * x[..., j] + x[..., i] * m[..., j]) - 2 * along * delta[i, j]
+        moments += [3 * (m[..., i] * x[..., j] + x[..., i] * m[..., j]) - 2 * m_dot_x * delta[i, j]
                     for i, j in _stored_components(2)]
     if order > 2:
-        u = 6 * along[..., None] * x + 3 * np.sum(x * x, axis=-1, keepdims=True) * m
+        u = 6 * m_dot_x[..., None] * x + 3 * np.sum(x * x, axis=-1, keepdims=True) * m
         moments += [sum(15 * m[..., a] * x[..., b] * x[..., c] - delta[b, c] * u[..., a]
                         for a, b, c in ((i, j, k), (j, k, i), (k, i, j)))
                     for i, j, k in _stored_components(3)]

@@ -90,8 +90,8 @@ class AndersonPass:
 
     Path parameters (2): time of the closest point of approach (CPA) [s], speed over range at the
     CPA [1/s]. Linear parameters (9): coefficients of the three functions on each axis of the sensor
-    [T], axis by axis. A dipole has only six independent coefficients, but a search with nine free
-    coefficients is easier.
+    [T], axis by axis. A dipole has only six independent coefficients; nine free
+    coefficients keep the model linear.
 
     References
     ----------
@@ -145,6 +145,7 @@ class AndersonPass:
         # f_n = tau^n (tau^2 + 1)^(-5/2), so f_n' = n f_{n-1} - 5 tau/(tau^2 + 1) f_n.
         decay = 5.0 * tau / (tau * tau + 1.0)
         slope = np.stack([-decay * f0, f0 - decay * f1, 2.0 * f1 - decay * f2], axis=-1)
-        by_tau = np.einsum('pyk,pk->py', self._design_matrix(slope), p)
-        by_time = np.repeat(self.t - theta[:, :1], 3, axis=1)
-        return np.stack([-theta[:, 1:] * by_tau, by_time * by_tau], axis=-1)
+        derivative_by_tau = np.einsum('pyk,pk->py', self._design_matrix(slope), p)
+        tau_by_rate = np.repeat(self.t - theta[:, :1], 3, axis=1)
+        return np.stack([-theta[:, 1:] * derivative_by_tau, tau_by_rate * derivative_by_tau],
+                        axis=-1)

@@ -63,7 +63,8 @@ class RowPass:
         d = self.n_dipoles
         return np.linspace(-0.5, 0.5, d, dtype=np.float64) if d > 1 else np.zeros(1)
 
-    def forward(self, theta: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def with_nonnegative_length(self, theta: FloatArray,
+                                p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Convert to the equivalent parameters with a non-negative length.
 
         A row of negative length equals a row of positive length with the opposite order of dipoles.
@@ -135,8 +136,8 @@ class SuperposedPasses:
     """Pass of each row. All passes have the same samples."""
 
     @classmethod
-    def of(cls, orders: Sequence[int], t: FloatArray, positions: FloatArray,
-           M: FloatArray) -> 'SuperposedPasses':
+    def from_orders(cls, orders: Sequence[int], t: FloatArray, positions: FloatArray,
+                    M: FloatArray) -> 'SuperposedPasses':
         """Create the passes of several rows with the same samples.
 
         Parameters
@@ -157,12 +158,12 @@ class SuperposedPasses:
         return cls(tuple(RowPass(t, positions, M, n_dipoles) for n_dipoles in orders))
 
     @cached_property
-    def paths(self) -> tuple[slice, ...]:
+    def path_slices(self) -> tuple[slice, ...]:
         """Slice of each row in the concatenated path parameters."""
         return _consecutive_slices([len(row.names) for row in self.rows])
 
     @cached_property
-    def moments(self) -> tuple[slice, ...]:
+    def moment_slices(self) -> tuple[slice, ...]:
         """Slice of each row in the concatenated linear parameters."""
         return _consecutive_slices([3 * row.n_dipoles for row in self.rows])
 
@@ -179,9 +180,10 @@ class SuperposedPasses:
         list of (6 or 7,) array
             Path parameters of each row.
         """
-        return [theta[own] for own in self.paths]
+        return [theta[path_slice] for path_slice in self.path_slices]
 
-    def forward(self, theta: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def with_nonnegative_length(self, theta: FloatArray,
+                                p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Convert to the equivalent parameters with non-negative lengths.
 
         Parameters
@@ -198,9 +200,9 @@ class SuperposedPasses:
         p : (k,) array
             Linear parameters; the dipoles of rows with a negative length are in reversed order.
         """
-        converted = [row.forward(path, p[linear])
-                     for row, path, linear in zip(self.rows, self.split(theta), self.moments,
-                                                  strict=True)]
+        converted = [row.with_nonnegative_length(path, p[moment_slice])
+                     for row, path, moment_slice in zip(self.rows, self.split(theta),
+                                                        self.moment_slices, strict=True)]
         return (np.concatenate([path for path, _ in converted]),
                 np.concatenate([moments for _, moments in converted]))
 
@@ -217,8 +219,9 @@ class SuperposedPasses:
         (n_paths, 3 n, k) array
             NaN where a dipole is at a sensor.
         """
-        return np.concatenate([row.basis(theta[:, own])
-                               for row, own in zip(self.rows, self.paths, strict=True)], axis=2)
+        return np.concatenate([
+            row.basis(theta[:, path_slice])
+            for row, path_slice in zip(self.rows, self.path_slices, strict=True)], axis=2)
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
         """Derivative of the whitened field with respect to the path parameters.
@@ -236,8 +239,9 @@ class SuperposedPasses:
             Derivative of basis(theta) p with respect to theta.
         """
         return np.concatenate([
-            row.derivative(theta[:, own], p[:, linear])
-            for row, own, linear in zip(self.rows, self.paths, self.moments, strict=True)], axis=2)
+            row.derivative(theta[:, path_slice], p[:, moment_slice])
+            for row, path_slice, moment_slice in zip(self.rows, self.path_slices,
+                                                     self.moment_slices, strict=True)], axis=2)
 
 
 def _consecutive_slices(lengths: Sequence[int]) -> tuple[slice, ...]:

@@ -145,8 +145,8 @@ class Magnet:
         PHD15 Paper A eq. (24) lengthens the moment by half the squared angle in each step. In a
         filter with a known moment magnitude, this leads to an overestimated distance.
         """
-        n, angle = len(x), dt * x[:, 9:12]
-        R = rotation_from_quaternion(quaternion_from_rotation_vector(angle))
+        n, rotation_vector = len(x), dt * x[:, 9:12]
+        R = rotation_from_quaternion(quaternion_from_rotation_vector(rotation_vector))
         predicted = x.copy()
         predicted[:, :3] += dt * x[:, 3:6]
         predicted[:, 6:9] = np.einsum('nij,nj->ni', R, x[:, 6:9])
@@ -154,7 +154,7 @@ class Magnet:
         F = np.tile(np.eye(12), (n, 1, 1))
         F[:, :6, :6] = constant_velocity(dt)
         F[:, 6:9, 6:9] = R
-        F[:, 6:9, 9:12] = dt * C @ left_jacobian(angle)
+        F[:, 6:9, 9:12] = dt * C @ left_jacobian(rotation_vector)
         G = np.zeros((n, 6, 6))
         G[:, :3, :3] = C
         G[:, 3:, 3:] = np.eye(3)
@@ -165,34 +165,34 @@ class Magnet:
         if P is not None:
             # The uncertainty of the moment is rotated exactly. Only the increase due to the
             # uncertain rotation is added.
-            before = R @ P[:, 6:9, 6:9] @ np.swapaxes(R, 1, 2)
-            after = F[:, 6:9] @ P @ np.swapaxes(F[:, 6:9], 1, 2) + Q[:, 6:9, 6:9]
-            Q[:, 6:9, 6:9] += _second_order_noise(predicted[:, 6:9], before, after)
+            P_before = R @ P[:, 6:9, 6:9] @ np.swapaxes(R, 1, 2)
+            P_after = F[:, 6:9] @ P @ np.swapaxes(F[:, 6:9], 1, 2) + Q[:, 6:9, 6:9]
+            Q[:, 6:9, 6:9] += _second_order_noise(predicted[:, 6:9], P_before, P_after)
         return predicted, F, Q
 
 
-def _second_order_noise(m: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+def _second_order_noise(m: FloatArray, P_before: FloatArray, P_after: FloatArray) -> FloatArray:
     """Process noise (n, 3, 3) due to the shortening of the moment m by an uncertain rotation.
 
     A rotation by small angles (a, b) about axes perpendicular to `m` (n, 3) shortens the component
     along m by (a^2 + b^2)/2 |m|, which the Jacobian neglects. With the variances p, q of a, b, the
-    second moment of the shortening is (3 p^2 + 3 q^2 + 2 p q)/4 |m|^2. The result is its increase
-    from the covariance `before` (n, 3, 3) to the covariance `after` (n, 3, 3) of the rotated
-    moment, at most |m|^2.
+    second moment of the shortening is (3 p^2 + 3 q^2 + 2 p q)/4 |m|^2. The noise is along m. Its
+    variance is the increase of this second moment from the covariance `P_before` (n, 3, 3) to the
+    covariance `P_after` (n, 3, 3) of the rotated moment, at most |m|^2.
     """
     squared_norm = np.einsum('ni,ni->n', m, m)
-    along = np.einsum('ni,nj->nij', m, m)
-    # The result for a zero moment is zero because `along` is zero.
+    outer_product = np.einsum('ni,nj->nij', m, m)
+    # The result for a zero moment is zero because `outer_product` is zero.
     squared_norm = np.where(squared_norm > 0.0, squared_norm, 1.0)
-    across = np.eye(3) - along / squared_norm[:, None, None]
+    normal_projection = np.eye(3) - outer_product / squared_norm[:, None, None]
 
     def second_moment(P: FloatArray) -> FloatArray:
-        S = across @ P @ across / squared_norm[:, None, None]
+        S = normal_projection @ P @ normal_projection / squared_norm[:, None, None]
         # The sum of the two variances and the sum of their squares are sufficient.
         moment: FloatArray = 0.25 * (2.0 * np.einsum('nij,nji->n', S, S)
                                      + np.trace(S, axis1=1, axis2=2) ** 2)
         return moment
 
-    increase = np.clip(second_moment(after) - second_moment(before), 0.0, 1.0)
-    noise: FloatArray = increase[:, None, None] * along
+    increase = np.clip(second_moment(P_after) - second_moment(P_before), 0.0, 1.0)
+    noise: FloatArray = increase[:, None, None] * outer_product
     return noise

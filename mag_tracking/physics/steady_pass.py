@@ -45,9 +45,10 @@ class SteadyPass:
     clock: IntArray
     """Index of the clock of each sample, (n,); -1 for the reference clock, which has no offset."""
     free: IntArray
-    """Indices of the entries of theta in the concatenated path and clock offsets, ascending."""
+    """Indices of theta in the concatenated path parameters and clock offsets, ascending."""
     fixed: FloatArray
-    """Path and clock offsets [s], (N_PATH + n_clocks,). The entries `free` are ignored."""
+    """Path parameters and clock offsets [s], (N_PATH + n_clocks,). The entries with the indices
+    `free` are ignored."""
     n_dipoles: int
     """Number of dipoles of the row."""
     places: FloatArray = field(init=False)
@@ -79,7 +80,7 @@ class SteadyPass:
         Returns
         -------
         (n_paths, N_PATH + n_clocks) array
-            Path and clock offsets.
+            Path parameters and clock offsets [s].
         """
         out = np.tile(self.fixed, (len(theta), 1))
         out[:, self.free] = theta

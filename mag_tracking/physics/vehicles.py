@@ -9,7 +9,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.physics import core
 from mag_tracking.physics.dipole import MU0
-from mag_tracking.physics.motion import constant_velocity, fading_turn, integrator_noise
+from mag_tracking.physics.motion import constant_velocity, decaying_turn, integrator_noise
 from mag_tracking.physics.sources import Dipoles
 
 MAX_TURN_RATE = 1.0
@@ -49,15 +49,15 @@ class RowVehicle:
     """
 
     earth_field: FloatArray
-    """Flux density B0 of the earth's field, (3,) T, world frame. Zeros disable soft iron."""
+    """Flux density B0 of the Earth's field, (3,) T, world frame. Zeros disable soft iron."""
     acceleration_density: FloatArray
     """Power spectral density of the acceleration, per axis, (3,) m²/s³."""
     moment_drift: float = 0.0
-    """Random walk of the total hard iron moment per axis, 1/s^0.5, relative to the magnitude of the
+    """Random walk of the total hard iron moment, 1/s^0.5 per axis, relative to the magnitude of the
     hard and soft iron moments."""
     difference_drift: float = 0.0
-    """Random walk of the difference of each hard iron moment from the mean of the row, 1/s^0.5,
-    normalised as `moment_drift`."""
+    """Random walk of the difference between a hard iron moment and the mean of the row, 1/s^0.5 per
+    axis, normalised as `moment_drift`."""
     n_dipoles: int = 3
     """Number of dipoles of the row."""
     turn_acceleration: float = 0.0
@@ -77,7 +77,7 @@ class RowVehicle:
 
     @cached_property
     def induction(self) -> FloatArray:
-        """Magnetic field strength B0/mu0 of the earth, (3,) A/m, world frame."""
+        """Magnetic field strength B0/mu0 of the Earth, (3,) A/m, world frame."""
         return np.asarray(self.earth_field, dtype=float) / MU0
 
     @cached_property
@@ -87,9 +87,9 @@ class RowVehicle:
         It is relative to the squared magnitude of the hard and soft iron moments.
         """
         d = self.n_dipoles
-        mean = np.full((d, d), 1.0 / d)
-        return np.kron(self.moment_drift**2 / d * mean
-                       + self.difference_drift**2 * (np.eye(d) - mean), np.eye(3))
+        averaging = np.full((d, d), 1.0 / d)
+        return np.kron(self.moment_drift**2 / d * averaging
+                       + self.difference_drift**2 * (np.eye(d) - averaging), np.eye(3))
 
     def dipoles(self, x: FloatArray) -> Dipoles:
         """Compute the `n_dipoles` dipoles of each target state.
@@ -123,8 +123,8 @@ class RowVehicle:
         x : (n_hyp, n_t) array
             Target states.
         dt : float, s
-            Prediction interval; negative to propagate backwards, without process noise of the turn
-            rate.
+            Prediction interval; negative to propagate backwards. In backward propagation, the turn
+            rate has no process noise.
         P : (n_hyp, n_t, n_t) array, optional
             Covariances of `x`. A turn rate of zero variance has no process noise, so that straight
             paths remain straight.
@@ -150,11 +150,12 @@ class RowVehicle:
             F[:6, :6] = constant_velocity(dt)
             return x @ F.T, F, Q
         # The turn rate does not decay backwards: without process noise, its variance would shrink.
-        fading = math.exp(-max(dt, 0.0) / self.turn_time)
-        mean = (1.0 - fading) * self.turn_time / dt if dt > 0.0 else 1.0
-        predicted, F_turn = fading_turn(x, dt, mean, fading)
-        turns = np.ones(len(x)) if P is None else P[:, -1, -1] > 0.0
-        Q[:, -1, -1] = turns * (1.0 - fading**2) * self.turn_variance(np.hypot(x[:, 3], x[:, 4]))
+        final_factor = math.exp(-max(dt, 0.0) / self.turn_time)
+        mean_factor = (1.0 - final_factor) * self.turn_time / dt if dt > 0.0 else 1.0
+        predicted, F_turn = decaying_turn(x, dt, mean_factor, final_factor)
+        is_turning = np.ones(len(x)) if P is None else P[:, -1, -1] > 0.0
+        Q[:, -1, -1] = is_turning * (1.0 - final_factor**2) * self.turn_variance(
+            np.hypot(x[:, 3], x[:, 4]))
         return predicted, F_turn, Q
 
     def turn_variance(self, speed: FloatArray) -> FloatArray:
@@ -169,6 +170,6 @@ class RowVehicle:
         -------
         (...) array, rad²/s²
         """
-        slowest = self.turn_acceleration / MAX_TURN_RATE
-        variance: FloatArray = np.square(self.turn_acceleration / np.maximum(speed, slowest))
+        min_speed = self.turn_acceleration / MAX_TURN_RATE
+        variance: FloatArray = np.square(self.turn_acceleration / np.maximum(speed, min_speed))
         return variance

@@ -151,7 +151,9 @@ def point_body(hard_iron: Sequence[float] | FloatArray, soft_iron: float,
 
 def random_vehicle(rng: np.random.Generator, length: float = 4.3, width: float = 1.7,
                    height: float = 1.3, n_parts: int = 60, moment: float = 400.0) -> MagneticBody:
-    """Create a random vehicle of magnetised parts in a box, most of them low and at the ends.
+    """Create a vehicle of randomly magnetised parts in a box.
+
+    Most parts are in the lower half of the box and near its ends.
 
     Parameters
     ----------
@@ -174,15 +176,16 @@ def random_vehicle(rng: np.random.Generator, length: float = 4.3, width: float =
                      rng.uniform(-0.5, 0.5, n_parts))
     parts = np.stack([length * np.clip(along, -0.5, 0.5), width * rng.uniform(-0.5, 0.5, n_parts),
                       0.2 + (height - 0.2) * rng.beta(1.5, 3.0, n_parts)], axis=1)
-    fraction = rng.dirichlet(np.full(n_parts, 1.5))
-    common = rng.standard_normal(3)
-    permanent = (fraction[:, None] * (common / np.linalg.norm(common)
-                                      + 0.7 * rng.standard_normal((n_parts, 3)))
+    fractions = rng.dirichlet(np.full(n_parts, 1.5))
+    common_direction = rng.standard_normal(3)
+    permanent = (fractions[:, None] * (common_direction / np.linalg.norm(common_direction)
+                                       + 0.7 * rng.standard_normal((n_parts, 3)))
                  * moment / 1.4)
     # Sheet metal is easier to magnetise along the vehicle than across it.
-    easy = np.array([1.3, 1.0, 0.7]) * rng.uniform(0.8, 1.2, (n_parts, 3))
-    total = moment / 1.4 * MU0 / 50e-6
-    susceptibility = np.einsum('n,ni,ij->nij', fraction * total, easy, np.eye(3))
+    axis_factors = np.array([1.3, 1.0, 0.7]) * rng.uniform(0.8, 1.2, (n_parts, 3))
+    total_susceptibility = moment / 1.4 * MU0 / 50e-6
+    susceptibility = np.einsum('n,ni,ij->nij', fractions * total_susceptibility, axis_factors,
+                               np.eye(3))
     return MagneticBody(parts, permanent, susceptibility)
 
 
@@ -220,14 +223,14 @@ class Path:
         """
         s = self.speed * np.asarray(t, dtype=float)
         arc = abs(self.turn) * self.radius
-        lead = np.minimum(s, self.straight)
+        before_arc = np.minimum(s, self.straight)
         angle = np.clip((s - self.straight) / self.radius if self.turn else 0.0 * s,
                         0.0, abs(self.turn)) * np.sign(self.turn)
-        tail = np.maximum(s - self.straight - arc, 0.0) if self.turn else 0.0 * s
+        after_arc = np.maximum(s - self.straight - arc, 0.0) if self.turn else 0.0 * s
         # In the frame of the start pose: x forward, y left.
-        side = np.sign(self.turn)
-        forward = lead + self.radius * np.sin(np.abs(angle)) + tail * np.cos(angle)
-        sideways = side * self.radius * (1.0 - np.cos(angle)) + tail * np.sin(angle)
+        turn_sign = np.sign(self.turn)
+        forward = before_arc + self.radius * np.sin(np.abs(angle)) + after_arc * np.cos(angle)
+        sideways = turn_sign * self.radius * (1.0 - np.cos(angle)) + after_arc * np.sin(angle)
         c, w = np.cos(self.heading), np.sin(self.heading)
         position = self.start + np.stack([c * forward - w * sideways,
                                           w * forward + c * sideways], axis=1)

@@ -14,7 +14,7 @@ RIGHT, LEFT = LaneHypothesis(25.0, 3.5), LaneHypothesis(-25.0, 6.5)
 T = np.arange(-0.75, 0.75, 0.01)
 
 
-def passing(rng, lane):
+def passing_field(rng, lane):
     """Horizontal field (n, 2) [T] of a random dipole in a lane, at the sensor."""
     r = np.stack([lane.speed * (T - rng.uniform(-0.1, 0.1)), np.full(len(T), lane.distance),
                   np.full(len(T), lane.height)], axis=1)
@@ -27,7 +27,7 @@ def test_sign_of_the_ratio_identifies_the_lane_of_a_dipole(height):
     right_lane, left_lane = RIGHT._replace(height=height), LEFT._replace(height=height)
     for _ in range(30):
         for lane, sign in ((right_lane, 1.0), (left_lane, -1.0)):
-            h = passing(rng, lane)
+            h = passing_field(rng, lane)
             noisy = h + 1e-8 * rng.standard_normal(h.shape)
             assert sign * direction_likelihood_ratio(T, noisy, 1e-8, right_lane, left_lane) > 0.0
 
@@ -35,15 +35,15 @@ def test_sign_of_the_ratio_identifies_the_lane_of_a_dipole(height):
 def test_ratio_is_proportional_to_the_signal_to_noise_power_ratio():
     """Without noise, the residual in the correct lane is zero."""
     rng = np.random.default_rng(1)
-    h = passing(rng, RIGHT)
+    h = passing_field(rng, RIGHT)
     ratios = [direction_likelihood_ratio(T, h, std, RIGHT, LEFT) for std in (2e-8, 1e-8)]
     assert ratios[1] == pytest.approx(4.0 * ratios[0], rel=1e-6)
 
 
 @pytest.mark.study
 @pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
-def test_directions_in_the_published_traffic(simulator):
-    """Results of PHD15 Paper B, Table 1: 510 of 511 are correct at the near sensor, 494 fused."""
+def test_directions_are_as_accurate_as_in_the_published_traffic(simulator):
+    """In PHD15 Paper B, Table 1, 510 of 511 near-sensor and 494 fused directions are correct."""
     vehicles = passings(simulator, 1)
     fractions = shares(vehicles, [v.log_odds_of_north() for v in vehicles])
     # The limits are three standard deviations (511 vehicles) below the targets, 99.8 % and 97 %.

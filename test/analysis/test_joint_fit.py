@@ -23,21 +23,21 @@ from mag_tracking.physics.passes import RowPass, SuperposedPasses
 from support.passes import ROAD, measured, network_of, random_moments, superposed
 
 GROUND, ORDERS = GroundPrior((0.7, 0.4), 0.1), (1, 2)
-FOUR = network_of([[-3.0, -4.5, 0.0], [-3.0, 4.5, 0.0], [3.0, -4.5, 0.0], [3.0, 4.5, 0.0]])
+FOUR_SENSORS = network_of([[-3.0, -4.5, 0.0], [-3.0, 4.5, 0.0], [3.0, -4.5, 0.0], [3.0, 4.5, 0.0]])
 
 
-def one_path(rng, at_s, direction, n_dipoles):
-    """Create random (path, moments) of a vehicle that passes the origin in its lane at `at_s`."""
+def random_lane_path(rng, time_s, direction, n_dipoles):
+    """Create random (path, moments) of a vehicle that passes the origin in its lane at `time_s`."""
     speed = direction * rng.uniform(8.0, 20.0)
-    place = [-speed * at_s, -direction * rng.uniform(1.4, 2.2), rng.uniform(0.4, 1.0)]
+    position = [-speed * time_s, -direction * rng.uniform(1.4, 2.2), rng.uniform(0.4, 1.0)]
     moments = random_moments(rng, n_dipoles)
     length = [rng.uniform(2.0, 3.5)] if n_dipoles > 1 else []
-    return np.concatenate([place, [speed, 0.1 * rng.standard_normal(), 0.0], length]), moments
+    return np.concatenate([position, [speed, 0.1 * rng.standard_normal(), 0.0], length]), moments
 
 
 def simulated_pass(rng, plan, n_dipoles, network=ROAD):
-    """Simulate vehicles that pass the origin at [(time [s], direction)]: (`PassData`, [path])."""
-    targets = [one_path(rng, *when, n_dipoles) for when in plan]
+    """Simulate vehicles; `plan` lists (time at the origin [s], direction). Return (data, paths)."""
+    targets = [random_lane_path(rng, *passing, n_dipoles) for passing in plan]
     fields = [measured(network, path, moments, rng, seconds=6.0, noise=1.2e-8 if k == 0 else 1e-15)
               for k, (path, moments) in enumerate(targets)]
     data = fields[0]
@@ -63,9 +63,9 @@ def test_two_vehicles_are_fitted_with_consistent_covariances(plan, n_dipoles):
     for seed in range(6):
         rng = np.random.default_rng([seed, n_dipoles])
         data, paths = simulated_pass(rng, plan, n_dipoles)
-        found = fit_joint(data, tracked_paths(rng, paths), GROUND, (n_dipoles,))
-        assert len(found) == 2
-        for (fit,), path in zip(found, paths, strict=True):
+        joint_fits = fit_joint(data, tracked_paths(rng, paths), GROUND, (n_dipoles,))
+        assert len(joint_fits) == 2
+        for (fit,), path in zip(joint_fits, paths, strict=True):
             assert fit.converged and fit.n_other_unknowns == 6 + (n_dipoles > 1) + 3 * n_dipoles
             assert not fit.reason and abs(fit.normalised_cost - 1.0) < 0.15
             true = path[:6].copy()
@@ -79,10 +79,10 @@ def test_two_vehicles_are_fitted_with_consistent_covariances(plan, n_dipoles):
 
 def test_three_vehicles_are_fitted():
     rng = np.random.default_rng(5)
-    data, paths = simulated_pass(rng, ((-1.2, 1), (0.1, -1), (1.1, 1)), 1, FOUR)
-    found = fit_joint(data, tracked_paths(rng, paths), GROUND, (1, 2))
-    assert [choose_order(fits).n_dipoles for fits in found] == [1, 1, 1]
-    for fits, path in zip(found, paths, strict=True):
+    data, paths = simulated_pass(rng, ((-1.2, 1), (0.1, -1), (1.1, 1)), 1, FOUR_SENSORS)
+    joint_fits = fit_joint(data, tracked_paths(rng, paths), GROUND, (1, 2))
+    assert [choose_order(fits).n_dipoles for fits in joint_fits] == [1, 1, 1]
+    for fits, path in zip(joint_fits, paths, strict=True):
         fit = choose_order(fits)
         assert abs(fit.velocity[0] - path[3]) < 4.0 * fit.speed[1] < 1.0
         assert fit.data.stamp_ns / 1e9 == pytest.approx(-path[0] / path[3], abs=0.5)
@@ -103,15 +103,15 @@ def test_data_of_each_fit_exclude_the_fields_of_the_others():
 
 def test_order_of_each_vehicle_is_chosen_separately():
     rng = np.random.default_rng(9)
-    point, m = one_path(rng, -0.3, 1, 1)
-    row, moments = one_path(rng, 0.3, -1, 3)
+    point, m = random_lane_path(rng, -0.3, 1, 1)
+    row, moments = random_lane_path(rng, 0.3, -1, 3)
     data = superposed(measured(ROAD, point, m, rng, seconds=6.0),
-                      measured(ROAD, row, moments, rng, seconds=6.0, noise=1e-15))
-    found = fit_joint(data, tracked_paths(rng, (point, row)), GROUND, (1, 2, 3))
-    orders = [choose_order(fits).n_dipoles for fits in found]
+                    measured(ROAD, row, moments, rng, seconds=6.0, noise=1e-15))
+    joint_fits = fit_joint(data, tracked_paths(rng, (point, row)), GROUND, (1, 2, 3))
+    orders = [choose_order(fits).n_dipoles for fits in joint_fits]
     assert orders[0] == 1 and orders[1] >= 2
     # The fits of all orders describe the same vehicle and have the same time zero.
-    for fits, path in zip(found, (point, row), strict=True):
+    for fits, path in zip(joint_fits, (point, row), strict=True):
         assert [fit.n_dipoles for fit in fits] == [1, 2, 3]
         assert len({(fit.data.stamp_ns, fit.data.t[0]) for fit in fits}) == 1
         assert all(fit.velocity[0] * path[3] > 0.0 for fit in fits if fit.converged)
@@ -120,25 +120,26 @@ def test_order_of_each_vehicle_is_chosen_separately():
 def test_two_following_vehicles_are_not_fitted_as_one_long_row():
     """Without tracks, one row is fitted, whose length is the distance between the vehicles."""
     rng = np.random.default_rng(3)
-    one, moments = one_path(rng, -0.5, 1, 2)
-    other = one.copy()
-    other[0] -= 18.0
-    data = superposed(measured(ROAD, one, moments, rng, seconds=6.0),
-                      measured(ROAD, other, 0.8 * moments, rng, seconds=6.0, noise=1e-15))
+    first_path, moments = random_lane_path(rng, -0.5, 1, 2)
+    second_path = first_path.copy()
+    second_path[0] -= 18.0
+    data = superposed(measured(ROAD, first_path, moments, rng, seconds=6.0),
+                    measured(ROAD, second_path, 0.8 * moments, rng, seconds=6.0, noise=1e-15))
     alone = [fit_pass(data, n) for n in (1, 2)]
     wrong = choose_order(alone)
     assert wrong is not None and wrong.length[0] > 12.0
-    paths = tracked_paths(rng, (one, other))
+    paths = tracked_paths(rng, (first_path, second_path))
     assert fit_targets(data, alone, paths[:1], GROUND, ORDERS) == (tuple(alone),)
-    found = [choose_order(fits) for fits in fit_targets(data, alone, paths, GROUND, ORDERS)]
-    assert len(found) == 2
-    for fit in found:
-        assert abs(fit.velocity[0] - one[3]) < 4.0 * fit.speed[1] < 2.0 and fit.length[0] < 5.0
+    chosen = [choose_order(fits) for fits in fit_targets(data, alone, paths, GROUND, ORDERS)]
+    assert len(chosen) == 2
+    for fit in chosen:
+        assert abs(fit.velocity[0] - first_path[3]) < 4.0 * fit.speed[1] < 2.0 \
+            and fit.length[0] < 5.0
 
 
 def test_two_tracks_of_one_vehicle_are_fitted_as_one():
     rng = np.random.default_rng(4)
-    row, moments = one_path(rng, 0.0, 1, 3)
+    row, moments = random_lane_path(rng, 0.0, 1, 3)
     row[6] = 7.0
     data = measured(ROAD, row, moments, rng, seconds=6.0)
     alone = [fit_pass(data, n) for n in (2, 3)]
@@ -150,8 +151,8 @@ def test_two_tracks_of_one_vehicle_are_fitted_as_one():
 
 def test_fits_of_overlapping_vehicles_are_rejected():
     rng = np.random.default_rng(1)
-    slow, slow_moments = one_path(rng, 0.0, 1, 1)
-    fast, fast_moments = one_path(rng, 0.3, 1, 1)
+    slow, slow_moments = random_lane_path(rng, 0.0, 1, 1)
+    fast, fast_moments = random_lane_path(rng, 0.3, 1, 1)
     fast[1], fast[3] = slow[1], 2.0 * slow[3]
     data = superposed(measured(ROAD, slow, slow_moments, rng, seconds=6.0),
                       measured(ROAD, fast, fast_moments, rng, seconds=6.0, noise=1e-15))
@@ -171,9 +172,9 @@ def test_a_rejected_joint_fit_has_a_reason():
                  covariance=data.covariance[::200]), two),
              # A third vehicle is not tracked.
              ('of the field unexplained', superposed(data, measured(
-                 ROAD, *one_path(rng, 1.5, 1, 1), rng, seconds=6.0, noise=1e-15)), two)]
-    for reason, of, tracks in cases:
-        fits, = fit_targets(of, alone, tracks, GROUND, (1,))
+                 ROAD, *random_lane_path(rng, 1.5, 1, 1), rng, seconds=6.0, noise=1e-15)), two)]
+    for reason, pass_data, tracks in cases:
+        fits, = fit_targets(pass_data, alone, tracks, GROUND, (1,))
         assert reason in fits[0].reason and fits[0].trusted == (), fits[0].reason
         assert choose_order(fits) is None
     # With one sensor, the scale is not observable, even for a single vehicle.
@@ -183,63 +184,64 @@ def test_a_rejected_joint_fit_has_a_reason():
 
 def test_vehicles_side_by_side_or_following_are_separate():
     data, _ = simulated_pass(np.random.default_rng(8), MEETING, 1)
-    one = np.array([0.0, -1.75, 0.5, 10.0, 0.0, 0.0, 3.0])
+    path = np.array([0.0, -1.75, 0.5, 10.0, 0.0, 0.0, 3.0])
 
-    def moved(*by):
-        return one + np.pad(by, (0, 7 - len(by)))
+    def shifted_path(*by):
+        return path + np.pad(by, (0, 7 - len(by)))
 
-    assert are_separate(data, (one, moved(0.0, 3.5)))
-    assert are_separate(data, (one, moved(-7.0)))
-    assert not are_separate(data, (one, moved(-5.0)))
+    assert are_separate(data, (path, shifted_path(0.0, 3.5)))
+    assert are_separate(data, (path, shifted_path(-7.0)))
+    assert not are_separate(data, (path, shifted_path(-5.0)))
     # In the first case, a vehicle catches up within range of the sensors; in the second case,
     # outside this range.
-    assert not are_separate(data, (one, moved(-9.0, 0.0, 0.0, 6.0)))
-    assert are_separate(data, (one, moved(-60.0, 0.0, 0.0, 2.0)))
-    assert are_separate(data, (one,))
+    assert not are_separate(data, (path, shifted_path(-9.0, 0.0, 0.0, 6.0)))
+    assert are_separate(data, (path, shifted_path(-60.0, 0.0, 0.0, 2.0)))
+    assert are_separate(data, (path,))
 
 
 def test_path_from_refers_to_the_time_zero_of_the_data():
     rng = np.random.default_rng(2)
     data, paths = simulated_pass(rng, MEETING, 2)
     data = replace(data, stamp_ns=1_700_000_000_000_000_000)
-    found = fit_joint(data, tracked_paths(rng, paths), GROUND, (2,))
-    for (fit,), path in zip(found, paths, strict=True):
+    joint_fits = fit_joint(data, tracked_paths(rng, paths), GROUND, (2,))
+    for (fit,), path in zip(joint_fits, paths, strict=True):
         np.testing.assert_allclose(path_from(data, fit)[:2], path[:2], atol=1.0)
-    assert np.isfinite(order_criteria([fits[0] for fits in found])).all()
+    assert np.isfinite(order_criteria([fits[0] for fits in joint_fits])).all()
 
 
 def test_a_false_track_is_not_fitted_as_a_vehicle():
     rng = np.random.default_rng(12)
-    row, moments = one_path(rng, 0.0, 1, 2)
+    row, moments = random_lane_path(rng, 0.0, 1, 2)
     data = measured(ROAD, row, moments, rng, seconds=6.0)
     alone = [fit_pass(data, n) for n in ORDERS]
-    ghost = row[:6] * [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0]
-    assert fit_targets(data, alone, np.array([row[:6], ghost]), GROUND, ORDERS) == (tuple(alone),)
+    ghost_track = row[:6] * [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0]
+    assert fit_targets(data, alone, np.array([row[:6], ghost_track]), GROUND,
+                       ORDERS) == (tuple(alone),)
 
 
 def test_a_velocity_change_of_one_target_rejects_all_fits():
     """The second vehicle changes from half its nominal speed to twice its nominal speed."""
     rng = np.random.default_rng(11)
     (first, first_moments), (second, second_moments) = (
-        one_path(rng, -0.3, 1, 1), one_path(rng, 0.2, -1, 1))
+        random_lane_path(rng, -0.3, 1, 1), random_lane_path(rng, 0.2, -1, 1))
     data = measured(ROAD, first, first_moments, rng, seconds=6.0)
-    warped = np.where(data.t < 0.2, 0.1 + 0.5 * data.t, 2.0 * data.t - 0.2)
-    model = RowPass(warped, data.positions, ROAD.R_sw[data.sensor], 1)
+    warped_times = np.where(data.t < 0.2, 0.1 + 0.5 * data.t, 2.0 * data.t - 0.2)
+    model = RowPass(warped_times, data.positions, ROAD.R_sw[data.sensor], 1)
     field = (model.basis(second[None])[0] @ second_moments[0]).reshape(-1, 3)
     data = replace(data, field=data.field + field)
     paths = np.array([first, second])
     changes = [fits[0].velocity_change for fits in fit_joint(data, paths, GROUND, (1,))]
     assert changes[1] > 2.0 * changes[0]
-    found = fit_targets(data, [fit_pass(data, 1)], paths, GROUND, (1,))
-    assert all(choose_order(fits) is None for fits in found)
+    joint_fits = fit_targets(data, [fit_pass(data, 1)], paths, GROUND, (1,))
+    assert all(choose_order(fits) is None for fits in joint_fits)
 
 
 def test_fits_are_in_the_order_of_the_passes():
     rng = np.random.default_rng(13)
     data, paths = simulated_pass(rng, FOLLOWING, 1)
     for order in ([0, 1], [1, 0]):
-        found = fit_joint(data, tracked_paths(rng, paths)[order], GROUND, (1,))
-        assert found[0][0].data.stamp_ns < found[1][0].data.stamp_ns
+        joint_fits = fit_joint(data, tracked_paths(rng, paths)[order], GROUND, (1,))
+        assert joint_fits[0][0].data.stamp_ns < joint_fits[1][0].data.stamp_ns
 
 
 def test_a_fit_that_differs_from_its_track_has_a_reason():
@@ -248,23 +250,26 @@ def test_a_fit_that_differs_from_its_track_has_a_reason():
     wrong_tracks = tracked_paths(rng, paths)
     # The track is three times as fast as the vehicle.
     wrong_tracks[1, 3] *= 3.0
-    found = fit_joint(data, wrong_tracks, GROUND, (1,))
-    assert sorted(fit.reason for fit, in found) == [
+    joint_fits = fit_joint(data, wrong_tracks, GROUND, (1,))
+    assert sorted(fit.reason for fit, in joint_fits) == [
         '', 'the fit differs from the track in position or velocity']
     assert fit_joint(data, wrong_tracks, GROUND, (1,), stopped=lambda: True) == ()
 
 
 def fits_with_minima(*others):
-    """Create fits of two points with additional minima, which `others` compute from theta (12,)."""
+    """Create fits of two points; each of `others` maps theta (12,) to an additional minimum.
+
+    Return (data, theta, fits, (linear parameters, minimum)).
+    """
     rng = np.random.default_rng(15)
     data, paths = simulated_pass(rng, MEETING, 1)
     theta = np.concatenate(paths)
-    model = SuperposedPasses.of((1, 1), data.t, data.positions, ROAD.R_sw[data.sensor])
+    model = SuperposedPasses.from_orders((1, 1), data.t, data.positions, ROAD.R_sw[data.sensor])
     A = model.basis(theta[None])[0]
     p = np.linalg.lstsq(A, data.field.ravel(), rcond=None)[0]
-    found = Minimum(theta, float(data.n_values), True,
-                    tuple((x(theta), 1.01 * data.n_values) for x in others))
-    return data, theta, fits_at_minimum(data, (1, 1), found, p, 1.0, SensorErrors()), (p, found)
+    minimum = Minimum(theta, float(data.n_values), True,
+                      tuple((x(theta), 1.01 * data.n_values) for x in others))
+    return data, theta, fits_at_minimum(data, (1, 1), minimum, p, 1.0, SensorErrors()), (p, minimum)
 
 
 def test_exchanged_targets_are_not_rivals():
@@ -287,10 +292,10 @@ def test_exchanged_targets_are_not_rivals():
 
 
 def test_a_prior_adds_information():
-    data, _, (_, second), (p, found) = fits_with_minima()
+    data, _, (_, second), (p, minimum) = fits_with_minima()
     std = np.full(12, np.inf)
     std[8] = 0.05
-    _, known = fits_at_minimum(data, (1, 1), found, p, 1.0, SensorErrors(), path_std=std)
+    _, known = fits_at_minimum(data, (1, 1), minimum, p, 1.0, SensorErrors(), path_std=std)
     # Sherman-Morrison update for one additional measurement of one parameter.
     P = second.covariance
     gain = P[:, 2] / (P[2, 2] + 0.05**2)

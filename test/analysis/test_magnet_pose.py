@@ -55,9 +55,9 @@ def test_a_rejected_pose_has_a_reason():
         return np.einsum('nij,nj->ni', network.R_sw,
                          dipole_field(network.positions - np.array(r), m * u))
 
-    few = np.full((9, 3), np.nan)
-    few[:2, :2] = 1e-6
-    pose = locate_magnet(network, few, MOMENT, LOW, HIGH, PoseSettings())
+    few_readings = np.full((9, 3), np.nan)
+    few_readings[:2, :2] = 1e-6
+    pose = locate_magnet(network, few_readings, MOMENT, LOW, HIGH, PoseSettings())
     assert not pose.converged and 'number of measured axes is 4' in pose.reason
     assert np.isnan(pose.position).all()
     pose = locate_magnet(network, reading([0.06, 0.05, 0.3], MOMENT), MOMENT, LOW, HIGH,
@@ -67,13 +67,14 @@ def test_a_rejected_pose_has_a_reason():
     pose = locate_magnet(network, reading([0.06, 0.05, 0.08], 4.0 * MOMENT), MOMENT, LOW, HIGH,
                          PoseSettings())
     assert not pose.converged and 'normalised cost' in pose.reason
-    good = reading([0.06, 0.05, 0.08], MOMENT)
+    valid = reading([0.06, 0.05, 0.08], MOMENT)
     for change, message in (
-            ({'field': good[:8]}, r'expected field \(9, 3\)'), ({'moment': -1.0}, 'moment is -1.0'),
-            ({'high': LOW}, 'has no volume'), ({'field': good * np.inf}, 'infinite'),
+            ({'field': valid[:8]}, r'expected field \(9, 3\)'),
+            ({'moment': -1.0}, 'moment is -1.0'),
+            ({'high': LOW}, 'has no volume'), ({'field': valid * np.inf}, 'infinite'),
             ({'network': replace(network, noise_std=(None,) * 9)}, 'noise_std is None')):
         with pytest.raises(ValueError, match=message):
-            locate_magnet(**{'network': network, 'field': good, 'moment': MOMENT, 'low': LOW,
+            locate_magnet(**{'network': network, 'field': valid, 'moment': MOMENT, 'low': LOW,
                              'high': HIGH, 'settings': PoseSettings(), **change})
 
 

@@ -13,11 +13,11 @@ from support.magnet_boards import MOMENT, SETTINGS, board, calibrated_boards, es
 
 @pytest.fixture(scope='module')
 def boards():
-    """Simulate and calibrate several boards: [(simulated, geometry)]."""
+    """Simulate and calibrate several boards; return a list of (simulated data, geometry)."""
     return calibrated_boards()
 
 
-def agrees_within(g, h, network, max_stds):
+def agree_within(g, h, network, max_stds):
     """Whether two estimates agree within `max_stds` stds of the first estimate."""
     return bool((np.abs(estimated(g, network) - estimated(h, network))
                  < max_stds * np.sqrt(np.diagonal(g.covariance))).all())
@@ -25,11 +25,11 @@ def agrees_within(g, h, network, max_stds):
 
 def test_a_dead_sensor_is_treated_as_missing(boards):
     (network, field, positions, axes, _), _ = boards[2]
-    dead = field.copy()
-    dead[:, 4] = np.nan
-    dead[3, 5, 1] = np.nan
-    dead[:, 6, 2] = np.nan
-    g = calibrate_geometry(network, dead, positions, axes, MOMENT, SETTINGS)
+    incomplete = field.copy()
+    incomplete[:, 4] = np.nan
+    incomplete[3, 5, 1] = np.nan
+    incomplete[:, 6, 2] = np.nan
+    g = calibrate_geometry(network, incomplete, positions, axes, MOMENT, SETTINGS)
     assert g.converged
     assert np.isnan(g.bias[4]).all() and np.isinf(g.bias_std[4]).all()
     assert np.isnan(g.bias[6]).tolist() == [False, False, True]
@@ -37,11 +37,11 @@ def test_a_dead_sensor_is_treated_as_missing(boards):
     assert g.gain[4] == 1.0 and np.isnan(g.sensor_residual[4])
     assert g.network.background[4] is None and g.network.background[0] is not None
     others = np.delete(np.arange(9), 4)
-    less = replace(network, names=tuple(np.array(network.names)[others].tolist()),
-                   positions=network.positions[others], R_ws=network.R_ws[others],
-                   topics=tuple(np.array(network.topics)[others].tolist()),
-                   noise_std=network.noise_std[:8], background=())
-    h = calibrate_geometry(less, dead[:, others], positions, axes, MOMENT, SETTINGS)
+    reduced = replace(network, names=tuple(np.array(network.names)[others].tolist()),
+                      positions=network.positions[others], R_ws=network.R_ws[others],
+                      topics=tuple(np.array(network.topics)[others].tolist()),
+                      noise_std=network.noise_std[:8], background=())
+    h = calibrate_geometry(reduced, incomplete[:, others], positions, axes, MOMENT, SETTINGS)
     assert (np.abs(g.gain[others] - h.gain) < 1e-4 * h.gain_std).all()
     assert (np.abs(g.network.positions[others] - h.network.positions)
             < 1e-4 * h.position_std).all()
@@ -51,38 +51,38 @@ def test_a_dead_sensor_is_treated_as_missing(boards):
 @pytest.mark.parametrize('shift', [2e-2, 4e-3])
 def test_an_outlying_pose_is_reported_and_has_little_effect(boards, shift):
     (network, field, positions, axes, _), g = boards[5]
-    wrong = positions.copy()
-    wrong[7, 0] += shift
-    h = calibrate_geometry(network, field, wrong, axes, MOMENT, SETTINGS)
+    faulty = positions.copy()
+    faulty[7, 0] += shift
+    h = calibrate_geometry(network, field, faulty, axes, MOMENT, SETTINGS)
     assert h.converged and h.suspect_poses == (7,) and h.suspect_sensors == ()
-    assert agrees_within(g, h, network, 1.0)
+    assert agree_within(g, h, network, 1.0)
     # The faulty pose does not increase the residuals of the sensors.
     np.testing.assert_allclose(h.sensor_residual, g.sensor_residual, rtol=0.1)
 
 
 def test_a_pose_with_the_readings_of_another_pose_is_reported(boards):
     (network, field, positions, axes, _), g = boards[6]
-    wrong = field.copy()
-    wrong[7] = field[8]
-    h = calibrate_geometry(network, wrong, positions, axes, MOMENT, SETTINGS)
+    faulty = field.copy()
+    faulty[7] = field[8]
+    h = calibrate_geometry(network, faulty, positions, axes, MOMENT, SETTINGS)
     assert h.converged and h.suspect_poses == (7,) and h.suspect_sensors == ()
-    assert agrees_within(g, h, network, 1.0)
+    assert agree_within(g, h, network, 1.0)
 
 
 def apply_fault(field, fault):
     """Copy readings and apply a fault to sensor 2."""
-    wrong = field.copy()
+    faulty = field.copy()
     if fault == 'flipped':
-        wrong[:, 2, 1] *= -1.0
+        faulty[:, 2, 1] *= -1.0
     elif fault == 'swapped':
-        wrong[:, 2] = wrong[:, 2][:, [1, 0, 2]]
+        faulty[:, 2] = faulty[:, 2][:, [1, 0, 2]]
     elif fault == 'rotated':
-        wrong[:, 2] = wrong[:, 2] @ rotation(np.array([0.0, 0.4, 0.0]))
+        faulty[:, 2] = faulty[:, 2] @ rotation(np.array([0.0, 0.4, 0.0]))
     elif fault == 'gain':
-        wrong[:, 2] *= 2.0
+        faulty[:, 2] *= 2.0
     else:
-        wrong[:, 2] = np.nan
-    return wrong
+        faulty[:, 2] = np.nan
+    return faulty
 
 
 @pytest.mark.parametrize('fault', ['flipped', 'swapped', 'rotated', 'gain'])
@@ -123,16 +123,16 @@ def test_too_few_poses_do_not_converge():
 
 def test_one_sensor_adds_almost_no_information():
     network, field, positions, axes, _ = simulated(9)
-    scarce = np.full((3, 9, 3), np.nan)
-    scarce[:, 0] = field[:3, 0]
-    g = calibrate_geometry(network, scarce, positions[:3], axes[:3], MOMENT, SETTINGS)
+    scarce_field = np.full((3, 9, 3), np.nan)
+    scarce_field[:, 0] = field[:3, 0]
+    g = calibrate_geometry(network, scarce_field, positions[:3], axes[:3], MOMENT, SETTINGS)
     assert (g.position_std > 0.95 * SETTINGS.position_std).all()
     assert (g.gain_std > 0.95 * SETTINGS.gain_std).all()
     # The std never exceeds the prior, even for a poor fit.
     assert (g.position_std <= (1.0 + 1e-9) * SETTINGS.position_std).all()
-    free = np.repeat([0.1, 0.5, 0.0], [3, 2, 3])
-    g = fitted_geometry(network, scarce, positions[:3], axes[:3], MOMENT, SETTINGS,
-                        np.zeros(12), free)
+    free_pose_unit = np.repeat([0.1, 0.5, 0.0], [3, 2, 3])
+    g = fitted_geometry(network, scarce_field, positions[:3], axes[:3], MOMENT, SETTINGS,
+                        np.zeros(12), free_pose_unit)
     assert not g.converged and 'too few readings' in g.reason
     assert np.isnan(g.normalised_cost)
 

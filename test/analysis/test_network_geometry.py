@@ -13,7 +13,7 @@ from support.magnet_boards import MOMENT, SETTINGS, board, calibrated_boards, es
 
 @pytest.fixture(scope='module')
 def boards():
-    """Simulate and calibrate several boards: [(simulated, geometry)]."""
+    """Simulate and calibrate several boards; return a list of (simulated data, geometry)."""
     return calibrated_boards()
 
 
@@ -41,7 +41,7 @@ def test_covariance_agrees_with_the_errors(boards):
 def test_calibration_reduces_the_prior_errors(boards):
     """Errors are relative to the mean of all sensors, because a common error is a gauge freedom."""
     for part, max_ratio in ((slice(3, 4), 0.35), (slice(4, 7), 0.35), (slice(7, 10), 0.6)):
-        error, before, std = [], [], []
+        error, prior_errors, std = [], [], []
         for (network, *_, x), g in boards:
             e = (estimated(g, network)[:90] - x[0].ravel()).reshape(9, 10)[:, part]
             if part.start == 4:
@@ -50,17 +50,17 @@ def test_calibration_reduces_the_prior_errors(boards):
             else:
                 prior_error = x[0][:, part]
             error.append(e - e.mean(axis=0))
-            before.append(prior_error - prior_error.mean(axis=0))
+            prior_errors.append(prior_error - prior_error.mean(axis=0))
             std.append(np.sqrt(np.diagonal(g.covariance)[:90]).reshape(9, 10)[:, part])
-        error, before = (np.sqrt(np.mean(np.square(v))) for v in (error, before))
-        print(f'remaining error of {part}: {error / before:.2f}')
-        assert error < max_ratio * before
+        error, prior_errors = (np.sqrt(np.mean(np.square(v))) for v in (error, prior_errors))
+        print(f'remaining error of {part}: {error / prior_errors:.2f}')
+        assert error < max_ratio * prior_errors
         # The errors are consistent with the estimated stds.
         assert error < 1.1 * np.sqrt(np.mean(np.square(std)))
 
 
 def test_estimated_poses_are_closer_to_the_truth_than_tracked_ones(boards):
-    remaining, without, z2 = [], [], []
+    estimated_error, tracked_error, z2 = [], [], []
     for (_, _, positions, axes, x), g in boards:
         magnet = TrackedMagnet(positions, tool_rotations(axes), positions.mean(axis=0), MOMENT)
         r, u = g.magnet_poses(positions, axes)
@@ -69,12 +69,13 @@ def test_estimated_poses_are_closer_to_the_truth_than_tracked_ones(boards):
         assert (np.einsum('ki,ki->k', u, m) / np.linalg.norm(m, axis=1)).min() > np.cos(0.025)
         true_r, *_ = magnet.poses(x[1], x[2])
         # An error common to all poses is a gauge freedom; only the tracker error is compared.
-        for found, out in ((g.poses[0], remaining), (r, without)):
-            e = found - true_r
+        for estimate, out in ((g.poses[0], estimated_error), (r, tracked_error)):
+            e = estimate - true_r
             out.append(np.square(e - e.mean(axis=0)).mean())
         z2.append(np.mean(np.square(g.pose - x[2]) / np.einsum('kii->ki', g.pose_covariance)))
-    print(f'remaining error of the tracker: {np.sqrt(np.mean(remaining) / np.mean(without)):.2f}')
-    assert np.mean(remaining) < 0.8 * np.mean(without)
+    print('remaining error of the tracker: '
+          f'{np.sqrt(np.mean(estimated_error) / np.mean(tracked_error)):.2f}')
+    assert np.mean(estimated_error) < 0.8 * np.mean(tracked_error)
     assert np.mean(z2) == pytest.approx(1.0, abs=0.1)
 
 
@@ -116,14 +117,15 @@ def test_parameters_known_exactly_do_not_change():
 
 def test_a_worse_fit_has_larger_stds():
     """The simulated noise is five times the configured noise."""
-    loud = board(noise=5e-7)
+    noisy_network = board(noise=5e-7)
     network, field, positions, axes, x = simulated(
-        4, network=loud, settings=replace(SETTINGS, field_error=0.05))
-    nominal = board()
-    g = calibrate_geometry(nominal, field, positions, axes, MOMENT, SETTINGS)
+        4, network=noisy_network, settings=replace(SETTINGS, field_error=0.05))
+    nominal_network = board()
+    g = calibrate_geometry(nominal_network, field, positions, axes, MOMENT, SETTINGS)
     assert g.converged and 15.0 < g.normalised_cost < 30.0
     e = estimated(g, network) - np.append(x[0].ravel(), x[1])
     assert np.mean(np.square(e / np.sqrt(np.diagonal(g.covariance)))) < 1.6
-    quiet = calibrate_geometry(nominal, simulated(4)[1], positions, axes, MOMENT, SETTINGS)
-    assert (g.bias_std > 3.0 * quiet.bias_std).all()
+    nominal = calibrate_geometry(nominal_network, simulated(4)[1], positions, axes, MOMENT,
+                                 SETTINGS)
+    assert (g.bias_std > 3.0 * nominal.bias_std).all()
     assert (g.position_std <= (1.0 + 1e-9) * SETTINGS.position_std).all()

@@ -22,17 +22,17 @@ def test_derivatives_agree_with_differences():
          rng.standard_normal((5, 8)) * np.repeat([5e-3, 0.2, 1e-6], [3, 2, 3])]
     exact = predicted_readings(network, magnet, *x)[2:]
     size = np.abs(exact[1]).max()
-    for which, J in enumerate(exact):
+    for block, J in enumerate(exact):
         for c in range(J.shape[-1]):
             step = 1e-5
             f = []
             for sign in (1.0, -1.0):
                 shifted = [v.copy() for v in x]
-                shifted[which][..., c] += sign * step
+                shifted[block][..., c] += sign * step
                 f.append(predicted_readings(network, magnet, *shifted)[0])
             numeric = (f[0] - f[1]) / (2.0 * step)
             scale = max(np.abs(J[..., c]).max(), 1e-6 * size)
-            assert np.abs(numeric - J[..., c]).max() < 1e-5 * scale, (which, c)
+            assert np.abs(numeric - J[..., c]).max() < 1e-5 * scale, (block, c)
 
 
 def test_a_network_without_errors_measures_the_dipole_field():

@@ -32,12 +32,12 @@ class SimulatedTracks:
     covariance: np.ndarray
 
 
-def simulated_tracks(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=NETWORK,
+def simulated_tracks(n_tracks, seed=0, noise=0.01, std_ratio=1.0, axes=3, network=NETWORK,
                      prior=PRIOR):
     """Simulate tracks that measure `axes` directions with noise of std `noise` [rad].
 
-    The tracks assume `claimed` times this standard deviation. The oracle is the joint least-squares
-    solution of all measurements.
+    The tracks assume `std_ratio` times this standard deviation. The oracle is the joint
+    least-squares solution of all measurements.
     """
     rng = np.random.default_rng(seed)
     n = len(network)
@@ -49,7 +49,7 @@ def simulated_tracks(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=
         for j in range(n):
             A = rng.standard_normal((axes, 3)) / noise
             y = A @ truth[j] + rng.standard_normal(axes)
-            A, y = A / claimed, y / claimed
+            A, y = A / std_ratio, y / std_ratio
             rows[j].append((A, y))
             P = np.linalg.inv(np.diag(prior[j]**-2.0) + A.T @ A)
             # The angles rotate the field in the sensor frame; the sensor has the inverse rotation.
@@ -68,7 +68,7 @@ def simulated_tracks(n_tracks, seed=0, noise=0.01, claimed=1.0, axes=3, network=
 @pytest.mark.parametrize('n_tracks', [1, 2, 7])
 def test_fused_tracks_equal_one_joint_estimate(n_tracks, axes):
     # The assumed noise is too large, so the covariance is not inflated.
-    t = simulated_tracks(n_tracks, noise=0.01, claimed=3.0, axes=axes)
+    t = simulated_tracks(n_tracks, noise=0.01, std_ratio=3.0, axes=axes)
     e = fuse_mounting(NETWORK, PRIOR, t.tracks)
     assert e.n_tracks == n_tracks
     np.testing.assert_allclose(e.rotation, t.mean, rtol=1e-6, atol=1e-10)
@@ -90,7 +90,7 @@ def test_without_tracks_the_prior_remains():
 
 
 def test_a_track_without_information_has_no_effect():
-    """Due to linearisation, the covariance of such a track may slightly exceed the prior."""
+    """The linearised covariance of a track without information may slightly exceed the prior."""
     prior = np.einsum('jik,jk,jlk->jil', NETWORK.R_sw, PRIOR**2, NETWORK.R_sw)
     uninformative = SimpleNamespace(id=9, mounting=np.zeros((3, 3)),
                                     mounting_covariance=1.02 * prior)
@@ -100,7 +100,7 @@ def test_a_track_without_information_has_no_effect():
     assert np.abs(e.rotation).max() < 1e-9
 
 
-def scatters(n_runs, n_tracks, **kwargs):
+def scatter_and_nees(n_runs, n_tracks, **kwargs):
     """Scatter and NEES of the rotation of each run and sensor, each (n_runs * n_sensors,)."""
     out, nees = [], []
     for seed in range(n_runs):
@@ -114,7 +114,7 @@ def scatters(n_runs, n_tracks, **kwargs):
 
 def test_scatter_of_consistent_tracks_is_about_one():
     # The tracks are far more accurate than the prior, which therefore has no effect.
-    scatter, nees = scatters(60, 5, noise=1e-4)
+    scatter, nees = scatter_and_nees(60, 5, noise=1e-4)
     freedom = 3 * (5 - 1)
     low, high = chi2.ppf([0.001, 0.999], freedom * len(scatter)) / (freedom * len(scatter))
     print(f'scatter {scatter.mean():.3f}, NEES {nees.mean() / 3:.3f}')
@@ -126,7 +126,7 @@ def test_scatter_of_consistent_tracks_is_about_one():
 @pytest.mark.parametrize('n_tracks', [2, 5])
 def test_scatter_of_consistent_weak_tracks_is_not_above_one(n_tracks):
     """Each track has a tenth of the information of the prior, which adds no scatter."""
-    scatter, _ = scatters(80, n_tracks, noise=0.15)
+    scatter, _ = scatter_and_nees(80, n_tracks, noise=0.15)
     freedom = 3 * (n_tracks - 1)
     high = chi2.ppf(0.999, freedom * len(scatter)) / (freedom * len(scatter))
     print(f'{n_tracks} weak tracks: scatter {scatter.mean():.3f}')
@@ -134,12 +134,12 @@ def test_scatter_of_consistent_weak_tracks_is_not_above_one(n_tracks):
 
 
 def test_covariance_of_overconfident_tracks_is_inflated():
-    scatter, nees = scatters(60, 5, noise=1e-3, claimed=0.2)
+    scatter, nees = scatter_and_nees(60, 5, noise=1e-3, std_ratio=0.2)
     assert scatter.mean() == pytest.approx(25.0, rel=0.1)
     # The normalised errors have Student's t distribution with 12 degrees of freedom; without
     # inflation, the value would be 25.
     assert 0.6 < nees.mean() / 3 < 1.5
-    t = simulated_tracks(5, 3, noise=1e-3, claimed=0.2)
+    t = simulated_tracks(5, 3, noise=1e-3, std_ratio=0.2)
     e = fuse_mounting(NETWORK, PRIOR, t.tracks)
     ratio = np.trace(e.covariance, axis1=1, axis2=2) / np.trace(t.covariance, axis1=1, axis2=2)
     np.testing.assert_allclose(ratio, e.scatter, rtol=0.02)
@@ -155,12 +155,13 @@ def test_a_track_of_another_network_is_rejected():
 def test_network_is_rotated_about_the_world_axes():
     rotation = np.deg2rad([[0.0, 0.0, 6.0], [2.0, 0.0, 0.0], [1.0, -2.0, 3.0]])
     C = np.tile(np.diag(np.deg2rad([1.0, 2.0, 3.0])**2), (3, 1, 1))
-    found = with_pass_mounting(NETWORK, MountingEvidence(rotation, C, np.full(3, np.nan), 1))
-    np.testing.assert_allclose(found.R_ws[0], rotation_about_z(np.deg2rad(6.0)) @ NETWORK.R_ws[0])
-    np.testing.assert_allclose(found.R_ws,
+    corrected = with_pass_mounting(NETWORK, MountingEvidence(rotation, C, np.full(3, np.nan), 1))
+    np.testing.assert_allclose(corrected.R_ws[0],
+                               rotation_about_z(np.deg2rad(6.0)) @ NETWORK.R_ws[0])
+    np.testing.assert_allclose(corrected.R_ws,
                                Rotation.from_rotvec(rotation).as_matrix() @ NETWORK.R_ws)
-    np.testing.assert_allclose(found.orientation_std[2], np.deg2rad([1.0, 2.0, 3.0]))
-    assert found.names == NETWORK.names and found.earth_field is NETWORK.earth_field
+    np.testing.assert_allclose(corrected.orientation_std[2], np.deg2rad([1.0, 2.0, 3.0]))
+    assert corrected.names == NETWORK.names and corrected.earth_field is NETWORK.earth_field
 
 
 CHANGES = {**POINT, 'track.field_error': 0.0, 'track.vehicle.near_field_lengths': [0.0],
@@ -190,18 +191,18 @@ def rotated_sensor_passes():
 
 def test_passes_correct_the_orientation_of_a_rotated_sensor(rotated_sensor_passes):
     nominal, truth, evidence = rotated_sensor_passes
-    found = with_pass_mounting(nominal, evidence)
+    corrected = with_pass_mounting(nominal, evidence)
     before, after = (Rotation.from_matrix(truth @ np.swapaxes(R, 1, 2)).as_rotvec()
-                     for R in (nominal.R_ws, found.R_ws))
+                     for R in (nominal.R_ws, corrected.R_ws))
     print(np.degrees(evidence.rotation).round(2), np.degrees(after).round(2),
-          np.degrees(found.orientation_std).round(2))
+          np.degrees(corrected.orientation_std).round(2))
     # The correction about the vertical is towards the truth.
     assert evidence.rotation[1, 2] > np.deg2rad(3.0)
     assert abs(after[1, 2]) < 0.5 * abs(before[1, 2])
     # The corrections of the other sensors are small, and all errors agree with their stds.
     assert np.abs(evidence.rotation[[0, 2, 3]]).max() < 3.0 * np.deg2rad(5.0) / 3.0
-    assert np.abs(after / np.array(found.orientation_std)).max() < 4.0
-    assert np.array(found.orientation_std)[:, 2].max() < np.deg2rad(5.0)
+    assert np.abs(after / np.array(corrected.orientation_std)).max() < 4.0
+    assert np.array(corrected.orientation_std)[:, 2].max() < np.deg2rad(5.0)
 
 
 def test_a_track_without_mounting_angles_is_rejected():

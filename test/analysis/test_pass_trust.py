@@ -8,7 +8,12 @@ import pytest
 from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
-from mag_tracking.analysis.pass_trust import FittedRow, reach, residual_elsewhere, trusted
+from mag_tracking.analysis.pass_trust import (
+    FittedRow,
+    reach,
+    residual_elsewhere,
+    trusted_quantities,
+)
 from mag_tracking.apps.fit import RecordingFit
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.fit_folder import fit_row
@@ -21,7 +26,7 @@ PATH = np.array([0.0, -2.0, 0.5, 10.0, 0.0, 0.0, 3.0])
 
 
 def test_reach_covers_the_residuals_of_published_vehicles():
-    """At 4.5 m, costs in TSP14 Tables I and II leave (cost - 1) / 87 of the energy unexplained."""
+    """A published cost at 4.5 m means that a fraction (cost - 1) / 87 of energy is unexplained."""
     cars, trucks = (10, 14, 17), ((302.6, 9.09), (76.7, 11.25))
     for cost in cars:
         assert 1.0 < 4.5 * np.sqrt((cost - 1.0) / 87.0) <= reach(1, 0.0)
@@ -31,7 +36,7 @@ def test_reach_covers_the_residuals_of_published_vehicles():
         assert 4.5 * np.sqrt((cost - 1.0) / (20.0 * 87.0)) <= reach(3, length)
 
 
-def field_and_data(seed=3):
+def noisy_data_and_field(seed=3):
     rng = np.random.default_rng(seed)
     moments = 150.0 * rng.standard_normal((3, 3))
     noisy = measured(ROAD, PATH, moments, rng)
@@ -40,7 +45,7 @@ def field_and_data(seed=3):
 
 
 def test_residuals_near_the_vehicle_are_not_elsewhere():
-    data, field = field_and_data()
+    data, field = noisy_data_and_field()
     W = data.whitening
     position = PATH[:3] + data.t[:, None] * PATH[3:6] - data.positions
     scale = np.minimum(1.0, 0.3 / np.linalg.norm(position, axis=1))[:, None]
@@ -50,14 +55,14 @@ def test_residuals_near_the_vehicle_are_not_elsewhere():
                                       np.einsum('nij,nj->ni', W, residual))
         assert low <= fraction <= high
     # The same residual at another time, as caused by a second vehicle.
-    late = np.roll(field, 150, axis=0)
+    shifted_field = np.roll(field, 150, axis=0)
     fraction = residual_elsewhere(data, [FittedRow(3, PATH, field)],
-                                  np.einsum('nij,nj->ni', W, 0.2 * late))
+                                  np.einsum('nij,nj->ni', W, 0.2 * shifted_field))
     assert fraction > 0.02
 
 
 def test_noise_is_not_counted_as_residual_elsewhere():
-    data, field = field_and_data()
+    data, field = noisy_data_and_field()
     residual = np.random.default_rng(0).standard_normal(field.shape)
     weak = 1e-3 * field
     assert residual_elsewhere(data, [FittedRow(3, PATH, field)], residual) < 1e-6
@@ -78,11 +83,12 @@ def test_speed_and_direction_are_trusted_without_the_length(seed):
 
 def test_a_single_fit_of_two_vehicles_is_not_trusted():
     rng = np.random.default_rng(2)
-    one, m1 = random_path(rng, 3, True)
-    other, m2 = random_path(rng, 3, True)
-    one[:7] = 0.0, -1.75, 0.5, 9.0, 0.0, 0.0, 3.0
-    other[:7] = 6.0, 1.75, 0.5, -11.0, 0.0, 0.0, 3.0
-    both = superposed(measured(ROAD, one, m1, rng), measured(ROAD, other, m2, rng, noise=1e-15))
+    first_path, m1 = random_path(rng, 3, True)
+    second_path, m2 = random_path(rng, 3, True)
+    first_path[:7] = 0.0, -1.75, 0.5, 9.0, 0.0, 0.0, 3.0
+    second_path[:7] = 6.0, 1.75, 0.5, -11.0, 0.0, 0.0, 3.0
+    both = superposed(measured(ROAD, first_path, m1, rng),
+                    measured(ROAD, second_path, m2, rng, noise=1e-15))
     fit = fit_pass(both, 3)
     assert 'not one target' in fit.reason and fit.trusted == ()
 
@@ -105,9 +111,9 @@ def test_covariance_includes_the_errors_of_the_sensors(errors):
         field = data.field.copy()
         for j in range(2):
             a, b, c = errors.rotation_std * rng.standard_normal(3)
-            turn = np.array([[1.0, -c, b], [c, 1.0, -a], [-b, a, 1.0]])
-            of_sensor = data.sensor == j
-            field[of_sensor] = field[of_sensor] @ turn * (
+            rotation = np.array([[1.0, -c, b], [c, 1.0, -a], [-b, a, 1.0]])
+            sensor_mask = data.sensor == j
+            field[sensor_mask] = field[sensor_mask] @ rotation * (
                 1.0 + errors.gain_std * rng.standard_normal(3))
         fit = fit_pass(replace(data, field=field), 1, errors=errors)
         without_errors = fit_pass(data, 1, errors=SensorErrors(0.0, 0.0))
@@ -121,22 +127,22 @@ def test_covariance_includes_the_errors_of_the_sensors(errors):
 
 
 def test_repeated_readings_of_a_coarse_sensor_are_counted_as_fractions():
-    data, _ = field_and_data()
-    coarse = data.covariance.copy()
-    coarse[::2] *= 60.0
+    data, _ = noisy_data_and_field()
+    scaled_covariance = data.covariance.copy()
+    scaled_covariance[::2] *= 60.0
     assert data.n_independent == data.n_values
-    mixed = replace(data, covariance=coarse)
-    assert mixed.n_independent == pytest.approx(data.n_values / 2.0 * (1.0 + 1.0 / 60.0))
-    np.testing.assert_allclose(mixed.whitening[0], data.whitening[0] / np.sqrt(60.0))
-    np.testing.assert_allclose(mixed.whitening[1], np.eye(3) / NOISE)
+    coarse_data = replace(data, covariance=scaled_covariance)
+    assert coarse_data.n_independent == pytest.approx(data.n_values / 2.0 * (1.0 + 1.0 / 60.0))
+    np.testing.assert_allclose(coarse_data.whitening[0], data.whitening[0] / np.sqrt(60.0))
+    np.testing.assert_allclose(coarse_data.whitening[1], np.eye(3) / NOISE)
     # Small variations of the noise estimate do not reduce the number of independent values.
-    slightly = data.covariance * np.linspace(1.0, 1.3, len(data.t))[:, None, None]
-    assert replace(data, covariance=slightly).n_independent == data.n_values
+    varied_covariance = data.covariance * np.linspace(1.0, 1.3, len(data.t))[:, None, None]
+    assert replace(data, covariance=varied_covariance).n_independent == data.n_values
 
 
 def point_fit(std_speed, std_heading, change=0.0):
     """Create the `PassFit` of a point with given stds of speed [m/s] and heading [rad]."""
-    data, _ = field_and_data()
+    data, _ = noisy_data_and_field()
     x = np.concatenate([[0.0, -2.0, 0.5], [10.0, 0.0, 0.0], np.ones(9)])
     P = 1e-4 * np.eye(len(x))
     P[3, 3], P[4, 4] = std_speed**2, (10.0 * std_heading)**2
@@ -145,22 +151,22 @@ def point_fit(std_speed, std_heading, change=0.0):
 
 
 def test_each_quantity_is_trusted_according_to_its_own_std():
-    assert trusted(point_fit(0.5, 0.1)) == ('speed', 'direction', 'time')
-    assert 'speed' not in trusted(point_fit(2.6, 0.1))
+    assert trusted_quantities(point_fit(0.5, 0.1)) == ('speed', 'direction', 'time')
+    assert 'speed' not in trusted_quantities(point_fit(2.6, 0.1))
     # The direction is unknown if the speed does not differ significantly from zero.
-    assert 'direction' not in trusted(point_fit(5.1, 0.1))
-    assert 'direction' not in trusted(point_fit(0.5, 0.6)) \
-        and 'speed' in trusted(point_fit(0.5, 0.6))
-    late = point_fit(0.5, 0.1)
-    late.robust_covariance[0, 0] = 4.0
-    assert trusted(late) == ('speed', 'direction')
-    assert trusted(point_fit(0.5, 0.1, change=0.5)) == ()
-    assert trusted(replace(point_fit(0.5, 0.1), residual_elsewhere=0.01)) == ()
+    assert 'direction' not in trusted_quantities(point_fit(5.1, 0.1))
+    assert 'direction' not in trusted_quantities(point_fit(0.5, 0.6)) \
+        and 'speed' in trusted_quantities(point_fit(0.5, 0.6))
+    uncertain_position = point_fit(0.5, 0.1)
+    uncertain_position.robust_covariance[0, 0] = 4.0
+    assert trusted_quantities(uncertain_position) == ('speed', 'direction')
+    assert trusted_quantities(point_fit(0.5, 0.1, change=0.5)) == ()
+    assert trusted_quantities(replace(point_fit(0.5, 0.1), residual_elsewhere=0.01)) == ()
 
 
 @pytest.mark.parametrize('name', [n for n in VEHICLES if 'turns' in n])
 def test_no_fit_of_a_turn_is_trusted(name, road_network):
     job = RecordingFit(Recording(vehicle_path(name)), road_network, settings_for('vehicle'),
                        (1, 2, 3, 4))
-    (one,) = job.passes()
-    assert one.chosen is None and one.known is None
+    (fitted_pass,) = job.passes()
+    assert fitted_pass.chosen is None and fitted_pass.known is None

@@ -31,7 +31,7 @@ CAR = PlannedTarget(400.0, 0.5, 10.0)
 POINTS = np.array([[0.0, 1.0], [4.0, -2.0], [-9.0, 6.0]])
 
 
-def poses_of(network):
+def sensor_poses(network):
     return network.positions, network.R_sw
 
 
@@ -40,10 +40,10 @@ def test_information_equals_the_stacked_measurements(error, background_std):
     """The oracle stacks the Jacobians of all frames, with the backgrounds as states."""
     network = line_network(4)
     sampling = Sampling(0.1, 4e-9, error, background_std, 1.0)
-    found = pass_information(*poses_of(network), CAR, sampling, POINTS, 0.7)
-    assert found.shape == (3, 7, 4, 9, 9)
-    t, each = sampling.times()
-    assert each == 1.0 and len(t) == 21
+    computed = pass_information(*sensor_poses(network), CAR, sampling, POINTS, 0.7)
+    assert computed.shape == (3, 7, 4, 9, 9)
+    t, frame_weight = sampling.times()
+    assert frame_weight == 1.0 and len(t) == 21
     v = 10.0 * np.array([np.cos(0.7), np.sin(0.7), 0.0])
     for p, d in ((0, 0), (1, 4), (2, 6)):
         r = np.append(POINTS[p], 0.5) + t[:, None] * v
@@ -58,23 +58,23 @@ def test_information_equals_the_stacked_measurements(error, background_std):
             J = information(H, C) + np.diag([0.0] * 9 + [background_std**-2] * 3)
             expected = J[:9, :9] - J[:9, 9:] @ np.linalg.solve(J[9:, 9:], J[9:, :9])
             scale = np.sqrt(np.diagonal(J)[:9])
-            np.testing.assert_allclose(found[p, d, j] / np.outer(scale, scale),
+            np.testing.assert_allclose(computed[p, d, j] / np.outer(scale, scale),
                                        expected / np.outer(scale, scale), rtol=0, atol=1e-9)
 
 
 def test_bounds_equal_the_blocks_of_the_covariance():
-    J = pass_information(*poses_of(ROAD), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
+    J = pass_information(*sensor_poses(ROAD), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
     for prior in (np.zeros((9, 9)), PlannedTarget(400.0, 0.5, 10.0, 0.2, 0.1).prior()):
-        found = bounds_of(J, prior)
+        bounds = bounds_of(J, prior)
         for at in ((0, 1), (2, 5)):
             variance = np.diagonal(bound(J[at], prior))
             expected = np.sqrt([variance[:2].sum(), variance[3:5].sum(), variance[6:].sum()])
-            np.testing.assert_allclose(found[at], expected, rtol=1e-5)
+            np.testing.assert_allclose(bounds[at], expected, rtol=1e-5)
 
 
 def test_neither_an_additional_sensor_nor_a_prior_increases_the_bounds():
-    place = np.vstack([ROAD.positions, [[6.0, 1.0, 0.0]]]), np.tile(np.eye(3), (3, 1, 1))
-    J = pass_information(*place, CAR, Sampling(0.1, 4e-9), POINTS, 0.0)
+    three_poses = np.vstack([ROAD.positions, [[6.0, 1.0, 0.0]]]), np.tile(np.eye(3), (3, 1, 1))
+    J = pass_information(*three_poses, CAR, Sampling(0.1, 4e-9), POINTS, 0.0)
     two, three = bounds_of(J[:, :, :2].sum(axis=2), np.zeros((9, 9))), bounds_of(
         J.sum(axis=2), np.zeros((9, 9)))
     assert (three <= two * (1.0 + 1e-9)).all() and (three < 0.9 * two).any()
@@ -86,17 +86,18 @@ def test_bounds_scale_with_the_network():
     """If the network is scaled by u and the moments by u^3, the position bounds scale with u."""
     u = 0.02
     small = PlannedTarget(400.0 * u**3, 0.5 * u, 10.0 * u)
-    J = pass_information(*poses_of(ROAD), CAR, Sampling(0.1, 4e-9), POINTS, 0.3).sum(axis=2)
+    J = pass_information(*sensor_poses(ROAD), CAR, Sampling(0.1, 4e-9), POINTS, 0.3).sum(axis=2)
     K = pass_information(u * ROAD.positions, ROAD.R_sw, small, Sampling(0.1, 4e-9), u * POINTS,
                          0.3).sum(axis=2)
-    none = np.zeros((9, 9))
+    no_prior = np.zeros((9, 9))
     # The constant information of 1e-12 in `bounds_of` is not scaled.
-    np.testing.assert_allclose(bounds_of(K, none) / [u, u, u**3], bounds_of(J, none), rtol=1e-4)
+    np.testing.assert_allclose(bounds_of(K, no_prior) / [u, u, u**3], bounds_of(J, no_prior),
+                               rtol=1e-4)
 
 
 def test_position_bound_of_one_sensor_is_very_large():
     network = network_of([[0.0, -4.5, 0.0]])
-    J = pass_information(*poses_of(network), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
+    J = pass_information(*sensor_poses(network), CAR, Sampling(0.1, 4e-9), POINTS, 0.0).sum(axis=2)
     assert (bounds_of(J, np.zeros((9, 9)))[..., 0] > 1e3).all()
 
 
@@ -104,7 +105,7 @@ def test_fits_reach_the_bound():
     """The normalised squared errors of 40 fits of a point are chi-square distributed."""
     rng, path = np.random.default_rng(3), np.array([0.0, 1.0, 0.5, 10.0, 0.0, 0.0])
     sampling = Sampling(0.01, NOISE, half_window=2.0, max_frames=500)
-    J = pass_information(*poses_of(ROAD), CAR, sampling, path[None, :2], 0.0)[0, 4].sum(axis=0)
+    J = pass_information(*sensor_poses(ROAD), CAR, sampling, path[None, :2], 0.0)[0, 4].sum(axis=0)
     P = bound(J)[:2, :2]
     nees = 0.0
     for _ in range(40):
@@ -119,15 +120,17 @@ def test_fits_reach_the_bound():
 def test_detection_probability_agrees_with_the_energy_detector():
     points = np.array([[12.0, 0.0], [0.0, 30.0], [14.0, 3.0]])
     noise = np.array([4e-9, 6e-9])
-    found = detection_probabilities(*poses_of(ROAD), CAR, Sampling(0.08, noise), points, 1e-3)
+    probability = detection_probabilities(*sensor_poses(ROAD), CAR, Sampling(0.08, noise), points,
+                                          1e-3)
     rng = np.random.default_rng(1)
     for p, d in ((0, 0), (1, 2), (2, 5)):
         r = np.append(points[p], 0.5)
         h = dipole_field(ROAD.positions - r, 400.0 * DIRECTIONS[d]) / noise[:, None]
         energy = np.square(h + rng.standard_normal((20000, 2, 3))).sum(axis=(1, 2))
         rate = np.mean(energy > chi2.isf(1e-3, 6))
-        assert found[p, d] == pytest.approx(ncx2.sf(chi2.isf(1e-3, 6), 6, np.square(h).sum()))
-        assert abs(rate - found[p, d]) < 4.0 * np.sqrt(found[p, d] * (1 - found[p, d]) / 20000)
+        assert probability[p, d] == pytest.approx(ncx2.sf(chi2.isf(1e-3, 6), 6, np.square(h).sum()))
+        assert abs(rate - probability[p, d]) < 4.0 * np.sqrt(
+            probability[p, d] * (1 - probability[p, d]) / 20000)
 
 
 @pytest.fixture(scope='module')
@@ -219,8 +222,8 @@ def test_the_additional_sensor_has_the_clearance_from_each_lane():
                      [('a', 0.0, 2.0), ('b', 0.0, -3.0)], (-12.0, -12.0, 12.0, 12.0),
                      settings_for('vehicle'), clearance=1.5, n_grid=13)
     y = np.linspace(-12.0, 12.0, p.with_one_more.shape[0])
-    free = (np.abs(y - 2.0) >= 1.5) & (np.abs(y + 3.0) >= 1.5)
-    assert np.array_equal(np.isfinite(p.with_one_more).all(axis=1), free)
+    is_clear = (np.abs(y - 2.0) >= 1.5) & (np.abs(y + 3.0) >= 1.5)
+    assert np.array_equal(np.isfinite(p.with_one_more).all(axis=1), is_clear)
 
 
 def test_the_summary_states_on_which_side_of_the_centre_detection_begins(road_plan):
@@ -237,11 +240,12 @@ def test_the_summary_states_on_which_side_of_the_centre_detection_begins(road_pl
 def test_missed_detection_probability_agrees_with_simulation():
     rng = np.random.default_rng(2)
     p = rng.uniform(0.0, 0.6, (12, 2))
-    found = missed_detection_probability(p, 3)
-    hits = rng.random((40000, 12, 2)) < p
-    runs = hits[:, :-2] & hits[:, 1:-1] & hits[:, 2:]
-    rate = 1.0 - runs.any(axis=1).mean(axis=0)
-    assert (np.abs(rate - found) < 4.0 * np.sqrt(found * (1.0 - found) / 40000)).all()
+    probability = missed_detection_probability(p, 3)
+    is_detected = rng.random((40000, 12, 2)) < p
+    is_run = is_detected[:, :-2] & is_detected[:, 1:-1] & is_detected[:, 2:]
+    rate = 1.0 - is_run.any(axis=1).mean(axis=0)
+    assert (np.abs(rate - probability) < 4.0 * np.sqrt(
+        probability * (1.0 - probability) / 40000)).all()
     np.testing.assert_allclose(missed_detection_probability(p, 1), np.prod(1.0 - p, axis=0))
 
 
@@ -258,7 +262,7 @@ def test_the_std_of_a_lane_does_not_depend_on_the_frame_rate():
 
 def test_std_of_a_lane_is_the_median_over_moment_directions(road_plan):
     lane, = road_plan.lanes
-    J = pass_information(*poses_of(ROAD), road_plan.target, road_plan.sampling, lane.points,
+    J = pass_information(*sensor_poses(ROAD), road_plan.target, road_plan.sampling, lane.points,
                          lane.heading).sum(axis=2)
     std = bounds_of(J, road_plan.target.prior())
     np.testing.assert_allclose(lane.pass_std, np.median(std, axis=1))

@@ -30,9 +30,9 @@ def test_calibration_with_half_of_the_readings_is_accurate_for_the_other_half(re
     test_rows = slice(1 - first, None, 2)
     position_error, axis_error = errors(g, field[test_rows], positions[test_rows],
                                         axes[test_rows], g.magnet_poses)
-    low = positions[test_rows, 2] < 0.1
-    print_errors(f'known poses, rows {first}::2', position_error, axis_error, low)
-    assert_within_limits(position_error, axis_error, low)
+    is_low = positions[test_rows, 2] < 0.1
+    print_errors(f'known poses, rows {first}::2', position_error, axis_error, is_low)
+    assert_within_limits(position_error, axis_error, is_low)
     if first == 0:
         # If only the biases are calibrated, the errors are at least three times as large.
         bias_only = GeometrySettings(
@@ -40,15 +40,15 @@ def test_calibration_with_half_of_the_readings_is_accurate_for_the_other_half(re
             board_rotation_std_deg=0.0, tool_offset_std=0.0, tool_tilt_std_deg=0.0)
         nominal = calibrate_geometry(network, field[::2], positions[::2], axes[::2], MOMENT,
                                      bias_only)
-        few = slice(1, None, 6)
-        nominal_error, axis_error = errors(nominal, field[few], positions[few], axes[few],
-                                           nominal.magnet_poses)
-        print_errors('as stated', nominal_error, axis_error, positions[few, 2] < 0.1)
+        sixth_rows = slice(1, None, 6)
+        nominal_error, axis_error = errors(nominal, field[sixth_rows], positions[sixth_rows],
+                                           axes[sixth_rows], nominal.magnet_poses)
+        print_errors('as stated', nominal_error, axis_error, positions[sixth_rows, 2] < 0.1)
         assert np.median(nominal_error) > 3.0 * np.median(position_error)
 
 
 def fit_registration(r, u, positions, axes):
-    """Fit the map from tracked poses to world poses: rigid motion, tool offset and tool tilt."""
+    """Fit rigid motion, tool offset and tool tilt; return the map from tracked to world poses."""
     centre = positions.mean(axis=0)
 
     def poses(x, positions, axes):
@@ -67,12 +67,12 @@ def fit_registration(r, u, positions, axes):
 
 @pytest.mark.study
 def test_blind_calibration_is_accurate_for_the_other_readings(recorded):
-    """Calibrate without the tracker, register with the same data, validate with held-out data."""
+    """The calibration uses no tracked poses; they serve only for registration and validation."""
     network, field, positions, axes = recorded
     g = calibrate_geometry_blind(network, field[::2], MOMENT, *BOX, GeometrySettings())
     assert g.converged and g.suspect_sensors == () and len(g.rows) >= 155
     poses = fit_registration(*g.poses, positions[::2][g.rows], axes[::2][g.rows])
-    place, turn = errors(g, field[1::2], positions[1::2], axes[1::2], poses)
-    low = positions[1::2, 2] < 0.1
-    print_errors('unknown poses, rows 0::2', place, turn, low)
-    assert_within_limits(place, turn, low)
+    position_error, axis_error = errors(g, field[1::2], positions[1::2], axes[1::2], poses)
+    is_low = positions[1::2, 2] < 0.1
+    print_errors('unknown poses, rows 0::2', position_error, axis_error, is_low)
+    assert_within_limits(position_error, axis_error, is_low)

@@ -32,8 +32,8 @@ def test_the_unit_affects_only_the_magnitude_feature():
 @pytest.mark.parametrize('unit', [1e200, 1e-200])
 def test_values_of_any_magnitude_have_features(unit):
     s = example_signature()
-    found = features(changed(s, field=unit * 1e6 * s.field))
-    np.testing.assert_allclose(found[1:], features(s)[1:], atol=1e-6)
+    scaled_features = features(changed(s, field=unit * 1e6 * s.field))
+    np.testing.assert_allclose(scaled_features[1:], features(s)[1:], atol=1e-6)
 
 
 def test_baseline_and_drift_have_no_effect():

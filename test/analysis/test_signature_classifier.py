@@ -32,14 +32,14 @@ def train_model(e):
 @pytest.mark.parametrize('simulator', ['clouds', 'boxes'])
 def test_accuracy_exceeds_the_fraction_of_the_largest_class(simulator):
     e = examples(simulator)
-    found = evaluate_splits(e.x, e.labels, e.groups, e.axes, e.unit, 5)
-    assert found.majority == pytest.approx(100 / 140, abs=0.03)
-    assert found.accuracy.mean() > found.majority + 0.05
+    evaluation = evaluate_splits(e.x, e.labels, e.groups, e.axes, e.unit, 5)
+    assert evaluation.majority == pytest.approx(100 / 140, abs=0.03)
+    assert evaluation.accuracy.mean() > evaluation.majority + 0.05
     # A constant prediction has a balanced accuracy of one third.
-    assert found.balanced_accuracy.mean() > 0.65
+    assert evaluation.balanced_accuracy.mean() > 0.65
     # The target is 0.05; the limit adds three standard errors of 5 x 42 predictions.
-    assert found.expected_calibration_error < 0.05 + 3.0 * np.sqrt(0.1 / 210)
-    assert found.unknown.mean() < 0.1
+    assert evaluation.expected_calibration_error < 0.05 + 3.0 * np.sqrt(0.1 / 210)
+    assert evaluation.unknown.mean() < 0.1
 
 
 def test_a_signature_far_from_all_examples_is_unknown():
@@ -56,9 +56,9 @@ def test_training_is_reproducible_and_a_model_file_is_lossless(tmp_path):
     model = train_model(e)
     write_model(tmp_path / 'classes.json', model)
     again, stored = train_model(e), read_model(tmp_path / 'classes.json')
-    for found in (again, stored):
-        np.testing.assert_array_equal(found.posterior(other.x), model.posterior(other.x))
-        assert found.names(other.x) == model.names(other.x)
+    for model_copy in (again, stored):
+        np.testing.assert_array_equal(model_copy.posterior(other.x), model.posterior(other.x))
+        assert model_copy.names(other.x) == model.names(other.x)
     assert evaluate(stored, other.x, other.labels).accuracy[0] > 0.8
     with pytest.raises(LabelsError, match="no classes for the labels 'tank'"):
         evaluate(stored, other.x, ['tank'] * len(other.labels))
@@ -94,11 +94,11 @@ def test_expected_calibration_error_follows_its_definition():
 def test_random_labels_are_not_learnt_from_sensors_of_one_pass():
     """The signatures of a pass at four sensors are similar; splitting a pass would leak labels."""
     rng = np.random.default_rng(2)
-    of_pass = rng.standard_normal((40, 20)).repeat(4, axis=0)
-    x = of_pass + 0.01 * rng.standard_normal(of_pass.shape)
+    pass_features = rng.standard_normal((40, 20)).repeat(4, axis=0)
+    x = pass_features + 0.01 * rng.standard_normal(pass_features.shape)
     labels = rng.choice(['a', 'b'], 40).repeat(4).tolist()
     groups = list(map(str, np.arange(40).repeat(4)))
-    found = evaluate_splits(x, labels, groups, ('x',), 'T', 10)
+    evaluation = evaluate_splits(x, labels, groups, ('x',), 'T', 10)
     # The limit is three standard errors of ten overlapping splits with twelve test passes each.
-    assert abs(found.balanced_accuracy.mean() - 0.5) < 0.25
-    assert found.accuracy.mean() < 0.8
+    assert abs(evaluation.balanced_accuracy.mean() - 0.5) < 0.25
+    assert evaluation.accuracy.mean() < 0.8

@@ -39,11 +39,11 @@ def fit_one_pass(seed, n_dipoles, road, compared=True):
     path, moments = random_path(rng, n_dipoles, road)
     data = measured(ROAD, path, moments, rng)
 
-    def model_of(t, positions, M):
+    def create_model(t, positions, M):
         return RowPass(t, positions, M, n_dipoles)
 
     fit, duration = timed(fit_pass, data, n_dipoles)
-    problem = separable_problem(data, model_of)
+    problem = separable_problem(data, create_model)
     _, truth, _, _ = refine(problem.residual_and_jacobian, path[None], 100, 1e-8)
     found = fit.cost <= truth[0] * (1.0 + 1e-6)
     if not compared:
@@ -58,7 +58,7 @@ def fit_one_pass(seed, n_dipoles, road, compared=True):
 
     starts = starting_paths(data, n_dipoles)
     guess = np.array([0.0, 0.0, 0.5, 10.0, 0.0, 0.0, 3.0])[:first]
-    guess[:3] -= data.t[np.argmax(np.square(data.departure).sum(axis=1))] * guess[3:6]
+    guess[:3] -= data.t[np.argmax(np.square(data.field_change).sum(axis=1))] * guess[3:6]
     seconds = []
     for start in (guess, starts[np.argmin(problem.cost(starts))]):
         x0 = np.concatenate([start, problem.linear(start), np.zeros(columns.shape[1])])

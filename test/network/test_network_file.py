@@ -16,7 +16,7 @@ from mag_tracking.network import CalibrationRecord
 from mag_tracking.network.file import read_network, write_network
 from mag_tracking.network.geomagnetic import Site, earth_field
 
-GOOD = '''
+VALID_FILE = '''
 frame: map
 earth_field: [2.0e-6, 1.55e-5, -4.9e-5]
 sensors:
@@ -32,14 +32,14 @@ sensors:
 '''
 
 
-def read(tmp_path, text):
+def parse(tmp_path, text):
     path = tmp_path / 'network.yaml'
     path.write_text(text)
     return read_network(path)
 
 
 def test_a_network_file_is_read(tmp_path):
-    n = read(tmp_path, GOOD)
+    n = parse(tmp_path, VALID_FILE)
     assert n.names == ('a', 'b') and n.topics == ('a/imu/mag', '/other/mag')
     # A rotation by 90 degrees about z maps the x axis of the sensor to the y axis of the world.
     np.testing.assert_allclose(n.R_ws[0] @ [1, 0, 0], [0, 1, 0], atol=1e-12)
@@ -49,7 +49,7 @@ def test_a_network_file_is_read(tmp_path):
     assert n.background[0] is None and n.background[1][0] == 1e-6
 
 
-CALIBRATED = """
+CALIBRATED_FILE = """
 site: {latitude: 58.4, longitude: 15.6, height: 60, date: 2026-05-01, x_azimuth_deg: 90}
 sensors:
   a:
@@ -71,7 +71,7 @@ sensors:
 
 
 def test_the_calibration_of_a_sensor_is_read(tmp_path):
-    n = read(tmp_path, CALIBRATED)
+    n = parse(tmp_path, CALIBRATED_FILE)
     np.testing.assert_allclose(np.degrees(n.orientation_std[0]), [0.3, 0.4, 2.3])
     np.testing.assert_allclose(np.degrees(n.orientation_std[1]), 5.0)
     assert n.orientation_std[2] is None
@@ -88,7 +88,7 @@ def test_the_calibration_of_a_sensor_is_read(tmp_path):
 
 
 def test_the_site_determines_the_earth_field(tmp_path):
-    n = read(tmp_path, CALIBRATED)
+    n = parse(tmp_path, CALIBRATED_FILE)
     np.testing.assert_array_equal(
         n.earth_field, earth_field(Site(58.4, 15.6, 60.0, 2026.0 + 120 / 365, 90.0)))
 
@@ -111,9 +111,9 @@ def assert_equal_networks(a, b):
                                 other and (other.date, other.by, other.clock_offset_std))
 
 
-@pytest.mark.parametrize('text', [GOOD, CALIBRATED])
+@pytest.mark.parametrize('text', [VALID_FILE, CALIBRATED_FILE])
 def test_a_written_network_is_read_back(tmp_path, text):
-    n = read(tmp_path, text)
+    n = parse(tmp_path, text)
     n = replace(n, R_ws=n.R_ws @ Rotation.random(len(n), random_state=1).as_matrix())
     write_network(tmp_path / 'copy.yaml', n, 'A copy.\nOf two lines.')
     assert (tmp_path / 'copy.yaml').read_text().startswith('# A copy.\n# Of two lines.\n')
@@ -125,21 +125,21 @@ def test_a_written_network_is_read_back(tmp_path, text):
 @pytest.mark.parametrize('deg', [1e-5, 0.06, 30.0, 45.0, 180.0])
 def test_any_orientation_std_of_a_survey_is_read_back(tmp_path, deg):
     """A value of 180 degrees marks an unknown heading; see survey.stated_std_deg."""
-    n = read(tmp_path, GOOD)
+    n = parse(tmp_path, VALID_FILE)
     n = replace(n, orientation_std=(np.deg2rad([0.3, 0.3, deg]), None))
     write_network(tmp_path / 'copy.yaml', n)
     assert_equal_networks(read_network(tmp_path / 'copy.yaml'), n)
 
 
 def test_a_sensor_without_an_accelerometer_is_read_back(tmp_path):
-    n = read(tmp_path, GOOD.replace('topic: /other', 'imu_topic: null\n    topic: /other'))
+    n = parse(tmp_path, VALID_FILE.replace('topic: /other', 'imu_topic: null\n    topic: /other'))
     assert n.imu_topics == ('a/imu/data_raw', None)
     write_network(tmp_path / 'copy.yaml', n)
     assert_equal_networks(read_network(tmp_path / 'copy.yaml'), n)
 
 
 def test_a_string_with_special_characters_is_read_back(tmp_path):
-    n = read(tmp_path, GOOD)
+    n = parse(tmp_path, VALID_FILE)
     n = replace(n, calibrated=(
         CalibrationRecord('2026-05-01', "the installer's eye: # 1", np.nan), None))
     write_network(tmp_path / 'copy.yaml', n)
@@ -173,9 +173,9 @@ def test_a_string_with_special_characters_is_read_back(tmp_path):
     ('site:', 'earth_field: [2.0e-6, 1.55e-5, -4.9e-5]\nsite:', 'both define the field'),
 ])
 def test_invalid_calibrations_are_rejected(tmp_path, old, new, message):
-    assert old in CALIBRATED
+    assert old in CALIBRATED_FILE
     with pytest.raises(NetworkError, match=message):
-        read(tmp_path, CALIBRATED.replace(old, new))
+        parse(tmp_path, CALIBRATED_FILE.replace(old, new))
 
 
 @pytest.mark.parametrize('old, new, message', [
@@ -204,9 +204,9 @@ def test_invalid_calibrations_are_rejected(tmp_path, old, new, message):
     ('position: [0, -4.5, 0]', 'position: [0, 2.0e+8, 0]', 'too far from the origin'),
 ])
 def test_invalid_networks_are_rejected(tmp_path, old, new, message):
-    assert old in GOOD
+    assert old in VALID_FILE
     with pytest.raises(NetworkError, match=message.replace('[', r'\[')):
-        read(tmp_path, GOOD.replace(old, new))
+        parse(tmp_path, VALID_FILE.replace(old, new))
 
 
 def test_missing_and_empty_files_are_rejected(tmp_path):
@@ -214,12 +214,12 @@ def test_missing_and_empty_files_are_rejected(tmp_path):
         read_network(tmp_path / 'nowhere.yaml')
     for text in ('', 'sensors: {}', 'sensors: [a]'):
         with pytest.raises(NetworkError):
-            read(tmp_path, text)
+            parse(tmp_path, text)
 
 
 def test_an_unknown_sensor_is_rejected(tmp_path):
     with pytest.raises(NetworkError, match='unknown sensor c; the network has a, b'):
-        read(tmp_path, GOOD).index('c')
+        parse(tmp_path, VALID_FILE).index('c')
 
 
 def test_rotations_agree_with_scipy():

@@ -13,7 +13,7 @@ from mag_tracking.recording.writer import RecordingWriter
 from support.networks import line_network
 from support.samples import MagSample, recorded, sample_dict
 
-RELATIVE = ('mag_1/imu/mag', 'mag_2/imu/mag')
+RELATIVE_TOPICS = ('mag_1/imu/mag', 'mag_2/imu/mag')
 
 
 def recording_of(path, *namespaces):
@@ -29,7 +29,7 @@ def recording_of(path, *namespaces):
 
 def read_fields(recording, namespace=None):
     """Read a recording with relative topics; return (x components, missing topics)."""
-    network = dataclasses.replace(line_network(2), topics=RELATIVE, namespace=namespace)
+    network = dataclasses.replace(line_network(2), topics=RELATIVE_TOPICS, namespace=namespace)
     reader = SampleReader(recording, network)
     return [s.field[0] for s in recorded(reader)], reader.missing_topics()
 

@@ -96,7 +96,7 @@ def test_cpa_of_a_grazing_pass_is_perpendicular_to_the_velocity():
         assert abs(r_cpa @ v0) <= 1e-14 * distance * np.linalg.norm(v0)
 
 
-def test_closest_approach_of_a_known_pass():
+def test_closest_approach_of_a_known_pass_is_exact():
     time, distance, r_cpa = closest_approach([-3.0, 1.0, 0.0], [1.5, 0.0, 0.0])
     assert (time, distance) == (2.0, 1.0)
     np.testing.assert_array_equal(r_cpa, [0.0, 1.0, 0.0])
@@ -112,7 +112,7 @@ def test_a_pass_through_the_sensor_has_range_zero_and_no_expansion(v0, factor, s
     assert B.shape == (4, 3) and np.isnan(B).all()
 
 
-def test_coefficients_of_a_known_pass():
+def test_coefficients_of_a_known_pass_are_exact():
     # Path along x at y = 2, moment along z: only the third row is not zero.
     C = anderson_coefficients([0.0, 2.0, 0.0], [3.0, 0.0, 0.0], [0.0, 0.0, 8.0])
     np.testing.assert_allclose(C, [[0, 0, 0], [0, 0, 0], [-1e-7, 0, -1e-7]], rtol=0, atol=1e-22)

@@ -59,7 +59,7 @@ def test_factors_equal_the_corrected_published_ones(m):
     np.testing.assert_allclose(L2, (m - (t1 + 1) / m) * m / (2 * c**2), rtol=1e-12)
 
 
-def test_sphere_needle_and_disk():
+def test_factors_of_sphere_needle_and_disk_equal_their_limits():
     np.testing.assert_allclose(demagnetisation_factors(1.0), [1 / 3, 1 / 3], rtol=1e-15)
     # Near the sphere L1 = 1/3 - 4/15 (m - 1).
     np.testing.assert_allclose(demagnetisation_factors(1 + 1e-8)[0] - 1 / 3, -4e-8 / 15, rtol=1e-6)

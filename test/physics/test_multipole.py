@@ -31,7 +31,7 @@ COMPONENTS = {1: ('x', 'y', 'z'), 2: ('xx', 'xy', 'xz', 'yy', 'yz'),
 
 
 def only(order, moments):
-    """Set the moments of all other orders to zero."""
+    """Copy the moments and set those of all orders except `order` to zero."""
     out = np.zeros_like(moments)
     out[..., PARTS[order]] = moments[..., PARTS[order]]
     return out

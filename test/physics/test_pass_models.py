@@ -18,15 +18,15 @@ from mag_tracking.simulation.scenario import random_vehicle
 from support.passes import NOISE, measured, network_of
 
 RNG = np.random.default_rng(4)
-T, PLACES, M = RNG.uniform(-1.0, 1.0, 6), RNG.uniform(-5.0, 5.0, (6, 3)), RNG.standard_normal(
+T, POSITIONS, M = RNG.uniform(-1.0, 1.0, 6), RNG.uniform(-5.0, 5.0, (6, 3)), RNG.standard_normal(
     (6, 3, 3))
 EXAMPLES = {
-    **{f'RowPass with n_dipoles={d}': RowPass(T, PLACES, M, d) for d in (1, 2, 3, 4)},
-    **{f'MultipolePass of order {d}': MultipolePass(T, PLACES, M, d) for d in (1, 2, 3)},
+    **{f'RowPass with n_dipoles={d}': RowPass(T, POSITIONS, M, d) for d in (1, 2, 3, 4)},
+    **{f'MultipolePass of order {d}': MultipolePass(T, POSITIONS, M, d) for d in (1, 2, 3)},
     'AndersonPass': AndersonPass(T, M),
-    'SuperposedPasses': SuperposedPasses.of((1, 3), T, PLACES, M)}
+    'SuperposedPasses': SuperposedPasses.from_orders((1, 3), T, POSITIONS, M)}
 N_PARAMETERS = {
-    name: model.paths[-1].stop if isinstance(model, SuperposedPasses) else len(model.names)
+    name: model.path_slices[-1].stop if isinstance(model, SuperposedPasses) else len(model.names)
     for name, model in EXAMPLES.items()}
 """Number of path parameters of each model."""
 
@@ -52,10 +52,10 @@ def test_derivatives_agree_with_differences(name):
 
 def test_superposed_fields_add_up():
     rng = np.random.default_rng(7)
-    rows = [RowPass(T, PLACES, M, d) for d in (2, 1, 3)]
+    rows = [RowPass(T, POSITIONS, M, d) for d in (2, 1, 3)]
     paths = [rng.uniform(1.0, 4.0, len(row.names)) for row in rows]
     moments = [rng.standard_normal(3 * row.n_dipoles) for row in rows]
-    model = SuperposedPasses.of((2, 1, 3), T, PLACES, M)
+    model = SuperposedPasses.from_orders((2, 1, 3), T, POSITIONS, M)
     total = model.basis(np.concatenate(paths)[None])[0] @ np.concatenate(moments)
     np.testing.assert_allclose(total, sum(
         row.basis(path[None])[0] @ m for row, path, m in zip(rows, paths, moments, strict=True)))
@@ -65,29 +65,29 @@ def test_superposed_fields_add_up():
 
 def test_a_row_of_negative_length_is_reversed():
     rng = np.random.default_rng(8)
-    model = SuperposedPasses.of((3, 1), T, PLACES, M)
+    model = SuperposedPasses.from_orders((3, 1), T, POSITIONS, M)
     theta, p = rng.uniform(1.0, 4.0, 13), rng.standard_normal(12)
     theta[6] = -2.5
-    reversed_theta, moments = model.forward(theta, p)
+    reversed_theta, moments = model.with_nonnegative_length(theta, p)
     assert reversed_theta[6] == 2.5
     np.testing.assert_allclose(model.basis(reversed_theta[None])[0] @ moments,
                                model.basis(theta[None])[0] @ p)
-    same, unchanged = model.forward(reversed_theta, moments)
+    same, unchanged = model.with_nonnegative_length(reversed_theta, moments)
     np.testing.assert_array_equal(same, reversed_theta)
     np.testing.assert_array_equal(unchanged, moments)
 
 
 def test_a_row_far_away_has_the_field_of_its_multipoles():
     path, moments = np.array([1.0, 2.0, 0.5, 3.0, 1.0, 0.0, 2.0]), RNG.standard_normal((3, 3))
-    far = PLACES + [60.0, 0.0, 0.0]
-    row = RowPass(T, far, M, 3)
+    far_positions = POSITIONS + [60.0, 0.0, 0.0]
+    row = RowPass(T, far_positions, M, 3)
     field = row.basis(path[None])[0] @ (row.combinations.T @ moments.ravel())
     u = path[3:6] / np.linalg.norm(path[3:6])
-    places = np.linspace(-1.0, 1.0, 3)[:, None] * u
+    dipoles = np.linspace(-1.0, 1.0, 3)[:, None] * u
     errors = []
     for order in (1, 2, 3):
-        model = MultipolePass(T, far, M, order)
-        expansion = model.basis(path[None, :6])[0] @ multipole_moments(places, moments, order)
+        model = MultipolePass(T, far_positions, M, order)
+        expansion = model.basis(path[None, :6])[0] @ multipole_moments(dipoles, moments, order)
         errors.append(np.abs(expansion - field).max() / np.abs(field).max())
     assert errors[0] < 0.1 and errors[1] < 0.2 * errors[0] and errors[2] < 0.2 * errors[1]
 

@@ -11,37 +11,37 @@ RNG = np.random.default_rng(3)
 HYPOTHESES, SENSORS, DIPOLES, STATES, SAMPLES = 2, 4, 3, 19, 5
 
 
-def numbers(*shape):
+def normal(*shape):
     return RNG.standard_normal(shape)
 
 
-PASS = {'places': np.linspace(-0.5, 0.5, DIPOLES), 't': numbers(SAMPLES),
-        'positions': numbers(SAMPLES, 3), 'M': numbers(SAMPLES, 3, 3)}
-MOMENTS = numbers(HYPOTHESES, 3 * DIPOLES)
+PASS = {'places': np.linspace(-0.5, 0.5, DIPOLES), 't': normal(SAMPLES),
+        'positions': normal(SAMPLES, 3), 'M': normal(SAMPLES, 3, 3)}
+MOMENTS = normal(HYPOTHESES, 3 * DIPOLES)
 CLOCK = np.array([-1, 0, 1, -1, 0])
-BENT = numbers(HYPOTHESES, N_PATH + 2)
+CURVED_PATHS = normal(HYPOTHESES, N_PATH + 2)
 CALLS = {
-    'dipole_field': {'d': numbers(4, 3), 'm': numbers(4, 3)},
-    'dipole_jacobians': {'d': numbers(4, 3), 'm': numbers(4, 3)},
+    'dipole_field': {'d': normal(4, 3), 'm': normal(4, 3)},
+    'dipole_jacobians': {'d': normal(4, 3), 'm': normal(4, 3)},
     'sensor_fields': {
-        'positions': numbers(SENSORS, 3), 'R_sw': numbers(SENSORS, 3, 3),
-        'r': numbers(HYPOTHESES, DIPOLES, 3), 'm': numbers(HYPOTHESES, DIPOLES, 3),
-        'dr_dx': numbers(HYPOTHESES, DIPOLES, 3, STATES),
-        'dm_dx': numbers(HYPOTHESES, DIPOLES, 3, STATES)},
-    'multipoles': {'d': numbers(4, 3), 'moments': numbers(4, 15)},
+        'positions': normal(SENSORS, 3), 'R_sw': normal(SENSORS, 3, 3),
+        'r': normal(HYPOTHESES, DIPOLES, 3), 'm': normal(HYPOTHESES, DIPOLES, 3),
+        'dr_dx': normal(HYPOTHESES, DIPOLES, 3, STATES),
+        'dm_dx': normal(HYPOTHESES, DIPOLES, 3, STATES)},
+    'multipoles': {'d': normal(4, 3), 'moments': normal(4, 15)},
     'rotated_fields': {
-        'h': numbers(HYPOTHESES, SENSORS, 3), 'H': numbers(HYPOTHESES, SENSORS, 3, STATES),
-        'angles': numbers(HYPOTHESES, SENSORS, 3)},
-    'turned': {'x': numbers(HYPOTHESES, STATES), 'dt': 0.1, 'mean': 1.0, 'fading': 1.0},
-    'row_dipoles': {'x': numbers(HYPOTHESES, STATES), 'n_dipoles': DIPOLES,
-                    'induction': numbers(3)},
-    'set_moment_noise': {'x': numbers(HYPOTHESES, STATES), 'walk': numbers(9, 9),
+        'h': normal(HYPOTHESES, SENSORS, 3), 'H': normal(HYPOTHESES, SENSORS, 3, STATES),
+        'angles': normal(HYPOTHESES, SENSORS, 3)},
+    'turned': {'x': normal(HYPOTHESES, STATES), 'dt': 0.1, 'mean': 1.0, 'fading': 1.0},
+    'row_dipoles': {'x': normal(HYPOTHESES, STATES), 'n_dipoles': DIPOLES,
+                    'induction': normal(3)},
+    'set_moment_noise': {'x': normal(HYPOTHESES, STATES), 'walk': normal(9, 9),
                          'induction2': 1.0, 'Q': np.zeros((HYPOTHESES, STATES, STATES))},
-    'row_bases': {'theta': numbers(HYPOTHESES, 7), **PASS},
-    'row_derivatives': {'theta': numbers(HYPOTHESES, 7), 'moments': MOMENTS, **PASS},
-    'steady_bases': {'theta': BENT, **PASS, 'clock': CLOCK},
-    'steady_derivatives': {'theta': BENT, 'moments': MOMENTS, **PASS, 'clock': CLOCK},
-    'anderson_residual': {'t': numbers(20), 'y': numbers(20, 2), 'time': 0.1, 'scale': 1.0},
+    'row_bases': {'theta': normal(HYPOTHESES, 7), **PASS},
+    'row_derivatives': {'theta': normal(HYPOTHESES, 7), 'moments': MOMENTS, **PASS},
+    'steady_bases': {'theta': CURVED_PATHS, **PASS, 'clock': CLOCK},
+    'steady_derivatives': {'theta': CURVED_PATHS, 'moments': MOMENTS, **PASS, 'clock': CLOCK},
+    'anderson_residual': {'t': normal(20), 'y': normal(20, 2), 'time': 0.1, 'scale': 1.0},
 }
 INDEPENDENT_AXES = {
     ('rotated_fields', 'H', 3), ('turned', 'x', 0), ('turned', 'x', 1),
@@ -73,8 +73,8 @@ def test_an_array_of_another_shape_is_rejected(name, argument):
 @pytest.mark.parametrize(('name', 'argument'), ARRAYS)
 def test_an_array_of_another_type_or_layout_is_rejected(name, argument):
     value = CALLS[name][argument]
-    wide = np.repeat(value, 2, axis=-1)[..., ::2]
-    for other in (value.astype(np.float32), value.astype(np.complex128), wide):
+    strided = np.repeat(value, 2, axis=-1)[..., ::2]
+    for other in (value.astype(np.float32), value.astype(np.complex128), strided):
         with pytest.raises(TypeError):
             getattr(core, name)(**{**CALLS[name], argument: other})
 
@@ -95,7 +95,7 @@ def test_a_clock_index_outside_theta_is_rejected(name):
     with pytest.raises(ValueError, match='clock'):
         getattr(core, name)(**{**CALLS[name], 'clock': np.array([0, 1, 2, 0, 0])})
     with pytest.raises(ValueError, match='theta'):
-        getattr(core, name)(**{**CALLS[name], 'theta': BENT[:, :N_PATH - 1].copy()})
+        getattr(core, name)(**{**CALLS[name], 'theta': CURVED_PATHS[:, :N_PATH - 1].copy()})
 
 
 @pytest.mark.parametrize('n_dipoles', [-1, 0, 4])
@@ -115,7 +115,7 @@ def test_a_walk_of_incomplete_moments_is_rejected(k):
 
 def test_a_state_without_turn_rate_is_rejected():
     with pytest.raises(ValueError, match='turn rate'):
-        core.turned(numbers(2, 6), 0.1, 1.0, 1.0)
+        core.turned(normal(2, 6), 0.1, 1.0, 1.0)
 
 
 def test_dipole_constant_equals_mu0_over_4_pi():

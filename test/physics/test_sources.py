@@ -86,9 +86,9 @@ def test_constant_velocity_noise_is_the_exact_integral():
     A[:3, 3:] = np.eye(3)
     G = np.zeros((6, 6))
     G[3:, 3:] = np.diag(density)
-    big = expm(np.block([[-A, G], [np.zeros((6, 6)), A.T]]) * dt)
-    np.testing.assert_allclose(integrator_noise(dt, density), big[6:, 6:].T @ big[:6, 6:],
-                               rtol=1e-12)
+    exp_block = expm(np.block([[-A, G], [np.zeros((6, 6)), A.T]]) * dt)
+    np.testing.assert_allclose(integrator_noise(dt, density),
+                               exp_block[6:, 6:].T @ exp_block[:6, 6:], rtol=1e-12)
     np.testing.assert_allclose(constant_velocity(dt), expm(A * dt), rtol=1e-14)
 
 
@@ -114,10 +114,10 @@ def test_turn_rate_is_a_stationary_gauss_markov_process():
     x = states(model, 200_000)
     x[:, 3:6] = [6.0, 0.0, 0.0]
     x[:, -1] = 0.5 * rng.standard_normal(len(x))
-    later, _, Q = model.propagate(x, dt)
-    later = later[:, -1] + np.sqrt(Q[0, -1, -1]) * rng.standard_normal(len(x))
-    assert later.std() == pytest.approx(0.5, rel=0.01)
-    assert np.corrcoef(x[:, -1], later)[0, 1] == pytest.approx(np.exp(-dt / 1.5), abs=0.01)
+    later_rate, _, Q = model.propagate(x, dt)
+    later_rate = later_rate[:, -1] + np.sqrt(Q[0, -1, -1]) * rng.standard_normal(len(x))
+    assert later_rate.std() == pytest.approx(0.5, rel=0.01)
+    assert np.corrcoef(x[:, -1], later_rate)[0, 1] == pytest.approx(np.exp(-dt / 1.5), abs=0.01)
     assert model.turn_variance(np.array([0.0, 1.0, 12.0])).tolist() == [
         MAX_TURN_RATE**2, MAX_TURN_RATE**2, 0.25**2]
 
@@ -170,7 +170,7 @@ def test_vehicle_moment_is_rotated_hard_iron_plus_soft_iron():
 
 @pytest.mark.parametrize('heading', [0.0, 0.7, 2.0, -2.9])
 def test_soft_iron_is_induced_along_the_axes_of_the_vehicle(heading):
-    """Comparison with R D R' B0/mu0 and with `ellipsoid_moment`, MITRE12 eq. (A.5)."""
+    """The moment equals R D R' B0/mu0 and `ellipsoid_moment`; see MITRE12 eq. (A.5)."""
     model, axes = EXAMPLES['RowVehicle'], (2.1, 0.9)
     along = np.array([1.0, 0.0, 0.0])
     p1, p2 = (ellipsoid_moment(axes, 11.0, 0.0, b)[k] * MU0 for k, b in (
@@ -209,13 +209,13 @@ def row_state(d, length, heading=0.6):
     return x
 
 
-def field_of(model, x, places):
-    """Field (n, 3) [T] of a state at `places` (n, 3) [m]."""
-    return sensor_fields(places, np.tile(np.eye(3), (len(places), 1, 1)), *model.dipoles(x))[0][0]
+def field_of(model, x, points):
+    """Field (n, 3) [T] of a state at `points` (n, 3) [m]."""
+    return sensor_fields(points, np.tile(np.eye(3), (len(points), 1, 1)), *model.dipoles(x))[0][0]
 
 
 def test_a_row_is_centred_at_the_position_along_the_heading():
-    """TSP14 eq. (10b), written out for four dipoles."""
+    """The positions of four dipoles follow TSP14 eq. (10b)."""
     x = row_state(4, 3.6)
     r = EXAMPLES['RowVehicle with four dipoles'].dipoles(x).r[0]
     heading = np.array([np.cos(0.6), np.sin(0.6), 0.0])
@@ -224,10 +224,10 @@ def test_a_row_is_centred_at_the_position_along_the_heading():
 
 
 def test_a_row_of_zero_length_equals_a_point():
-    places = np.random.default_rng(0).uniform(-8.0, 8.0, (20, 3))
-    point = field_of(EXAMPLES['RowVehicle with one dipole'], row_state(1, 0.0), places)
+    points = np.random.default_rng(0).uniform(-8.0, 8.0, (20, 3))
+    point = field_of(EXAMPLES['RowVehicle with one dipole'], row_state(1, 0.0), points)
     for name, d in (('RowVehicle', 3), ('RowVehicle with four dipoles', 4)):
-        np.testing.assert_allclose(field_of(EXAMPLES[name], row_state(d, 0.0), places), point,
+        np.testing.assert_allclose(field_of(EXAMPLES[name], row_state(d, 0.0), points), point,
                                    rtol=1e-11, atol=1e-11 * np.abs(point).max())
 
 
@@ -237,9 +237,9 @@ def test_a_row_reversed_end_to_end_has_the_same_field():
     y = x.copy()
     y[0, 6:15] = x[0, 6:15].reshape(3, 3)[::-1].ravel()
     y[0, -1] = -3.0
-    places = np.random.default_rng(0).uniform(-8.0, 8.0, (20, 3))
-    B = field_of(EXAMPLES['RowVehicle'], x, places)
-    np.testing.assert_allclose(field_of(EXAMPLES['RowVehicle'], y, places), B, rtol=1e-12,
+    points = np.random.default_rng(0).uniform(-8.0, 8.0, (20, 3))
+    B = field_of(EXAMPLES['RowVehicle'], x, points)
+    np.testing.assert_allclose(field_of(EXAMPLES['RowVehicle'], y, points), B, rtol=1e-12,
                                atol=1e-12 * np.abs(B).max())
 
 
@@ -249,9 +249,9 @@ def test_a_uniform_row_approaches_a_dipole_with_the_squared_distance():
     errors = []
     for distance in (40.0, 80.0, 160.0):
         x1, x3 = row_state(1, 0.0), row_state(3, 3.0)
-        places = x1[:, :3] + distance * direction / np.linalg.norm(direction)
-        B = field_of(EXAMPLES['RowVehicle with one dipole'], x1, places)
-        errors.append(np.linalg.norm(field_of(EXAMPLES['RowVehicle'], x3, places) - B)
+        points = x1[:, :3] + distance * direction / np.linalg.norm(direction)
+        B = field_of(EXAMPLES['RowVehicle with one dipole'], x1, points)
+        errors.append(np.linalg.norm(field_of(EXAMPLES['RowVehicle'], x3, points) - B)
                       / np.linalg.norm(B))
     assert errors[0] < 0.02
     np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 4.0, rtol=0.02)
@@ -309,38 +309,38 @@ def test_a_small_rotation_of_a_magnet_follows_the_published_model():
 
 
 def rotation_noise(std_w, std_m, dt, density=0.0):
-    """Variance along the rotated moment: (sampled variance, additional noise of the model)."""
+    """Return (sampled, modelled) variance along the moment of the neglected rotation terms."""
     model = Magnet(np.zeros(3), density)
     rng = np.random.default_rng(8)
     x = magnet_state(np.array([0.3, -0.4, 1.2]), np.array([0.2, 0.1, 0.0]))
     P = np.zeros((1, 12, 12))
     P[0, 6:9, 6:9], P[0, 9:, 9:] = np.diag(std_m**2), np.diag(std_w**2)
-    predicted, F, without = model.propagate(x, dt)
-    extra = (model.propagate(x, dt, P)[2] - without)[0, 6:9, 6:9]
+    predicted, F, Q_nominal = model.propagate(x, dt)
+    added_noise = (model.propagate(x, dt, P)[2] - Q_nominal)[0, 6:9, 6:9]
     samples = np.repeat(x, 400_000, axis=0)
     samples[:, 6:9] += std_m * rng.standard_normal((len(samples), 3))
     samples[:, 9:] += std_w * rng.standard_normal((len(samples), 3))
     neglected = model.propagate(samples, dt)[0][:, 6:9] - predicted[0, 6:9] - np.einsum(
         'ij,nj->ni', F[0, 6:9], samples - x)
     u = predicted[0, 6:9] / np.linalg.norm(predicted[0, 6:9])
-    np.testing.assert_allclose(extra, (u @ extra @ u) * np.outer(u, u), atol=1e-12)
-    return np.mean((neglected @ u) ** 2), u @ extra @ u
+    np.testing.assert_allclose(added_noise, (u @ added_noise @ u) * np.outer(u, u), atol=1e-12)
+    return np.mean((neglected @ u) ** 2), u @ added_noise @ u
 
 
 @pytest.mark.study
 def test_noise_covers_the_second_order_of_an_uncertain_rotation():
     """The oracle is the difference between exact and linearised rotation of sampled moments."""
     std_w = np.array([0.10, 0.25, 0.15])
-    expected, extra = rotation_noise(std_w, np.zeros(3), 0.5)
-    assert extra == pytest.approx(expected, rel=0.05)
+    expected, added_noise = rotation_noise(std_w, np.zeros(3), 0.5)
+    assert added_noise == pytest.approx(expected, rel=0.05)
     # The noise is limited to the squared magnitude of the moment.
     assert rotation_noise(1e3 * std_w, np.zeros(3), 0.5)[1] == pytest.approx(1.69)
 
 
 def test_a_known_rotation_adds_no_noise_to_an_uncertain_moment():
     """If a known rotation added noise, the noise would accumulate over many short steps."""
-    expected, extra = rotation_noise(np.zeros(3), np.full(3, 0.2), 0.5)
-    assert expected < 1e-20 and extra < 1e-20
+    expected, added_noise = rotation_noise(np.zeros(3), np.full(3, 0.2), 0.5)
+    assert expected < 1e-20 and added_noise < 1e-20
     # The noise of the angular velocity adds an angle variance proportional to dt^3.
     assert rotation_noise(np.zeros(3), np.zeros(3), 1.0, 0.04)[1] == pytest.approx(
         2.0 * (0.04 / 3.0) ** 2 * 1.69)

@@ -7,7 +7,7 @@ from mag_tracking.physics.passes import RowPass
 from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, PATH, SteadyPass
 
 RNG = np.random.default_rng(4)
-T, PLACES, M = RNG.uniform(-1.0, 1.0, 6), RNG.uniform(-5.0, 5.0, (6, 3)), RNG.standard_normal(
+T, POSITIONS, M = RNG.uniform(-1.0, 1.0, 6), RNG.uniform(-5.0, 5.0, (6, 3)), RNG.standard_normal(
     (6, 3, 3))
 CLOCK = np.array([-1, 0, -1, 1, 0, 1])
 STRAIGHT = np.array([1.0, 2.0, 0.5, 9.0, 0.3, 0.2, 2.5])
@@ -15,7 +15,7 @@ CURVED = np.append(STRAIGHT, [1.5, -0.6, 0.8])
 
 
 def model(free, n_dipoles=3, t=T, fixed=None):
-    return SteadyPass(t, PLACES, M, CLOCK, np.arange(free),
+    return SteadyPass(t, POSITIONS, M, CLOCK, np.arange(free),
                       np.zeros(N_PATH + 2) if fixed is None else fixed, n_dipoles)
 
 
@@ -23,17 +23,18 @@ def model(free, n_dipoles=3, t=T, fixed=None):
 def test_a_straight_path_equals_a_row_at_constant_velocity(n_dipoles):
     v, heading = STRAIGHT[3:5]
     path = np.array([*STRAIGHT[:3], v * np.cos(heading), v * np.sin(heading), 0.0, STRAIGHT[6]])
-    level = np.where(np.arange(N_STRAIGHT) == PATH.index('climb'), 0.0, STRAIGHT)
-    row = RowPass(T, PLACES, M, n_dipoles).basis(path[None, :7 if n_dipoles > 1 else 6])
-    np.testing.assert_allclose(model(N_STRAIGHT, n_dipoles).basis(level[None]), row, rtol=1e-9,
+    level_path = np.where(np.arange(N_STRAIGHT) == PATH.index('climb'), 0.0, STRAIGHT)
+    row = RowPass(T, POSITIONS, M, n_dipoles).basis(path[None, :7 if n_dipoles > 1 else 6])
+    np.testing.assert_allclose(model(N_STRAIGHT, n_dipoles).basis(level_path[None]), row, rtol=1e-9,
                                atol=1e-20)
 
 
 def test_clock_offsets_shift_the_sample_times():
     offsets = np.array([0.12, -0.05])
-    late = T - np.append(offsets, 0.0)[CLOCK]
+    shifted = T - np.append(offsets, 0.0)[CLOCK]
     with_offsets = model(N_PATH + 2).basis(np.append(CURVED, offsets)[None])
-    np.testing.assert_allclose(with_offsets, model(N_PATH, t=late).basis(CURVED[None]), rtol=1e-12)
+    np.testing.assert_allclose(with_offsets, model(N_PATH, t=shifted).basis(CURVED[None]),
+                               rtol=1e-12)
 
 
 def test_a_curved_path_equals_its_numerical_integration():
@@ -48,8 +49,8 @@ def test_a_curved_path_equals_its_numerical_integration():
         end = np.zeros(N_PATH + 2)
         end[:3] = CURVED[:3] + time * mean_velocity
         curved = model(N_PATH, 1, np.full(6, time)).basis(CURVED[None])
-        still = model(N_PATH, 1, np.zeros(6)).basis(end[None, :N_PATH])
-        np.testing.assert_allclose(curved, still, rtol=1e-6, atol=1e-20)
+        stationary = model(N_PATH, 1, np.zeros(6)).basis(end[None, :N_PATH])
+        np.testing.assert_allclose(curved, stationary, rtol=1e-6, atol=1e-20)
 
 
 @pytest.mark.parametrize('path', [np.append(STRAIGHT, [0.0, 0.0, 0.0]), CURVED])
@@ -66,9 +67,9 @@ def test_derivatives_agree_with_differences(path):
 
 def test_parameters_that_are_not_free_keep_their_fixed_values():
     fixed = np.append(CURVED, [0.1, 0.2])
-    part = SteadyPass(T, PLACES, M, CLOCK, np.array([0, 3, 10]), fixed, 3)
+    partial = SteadyPass(T, POSITIONS, M, CLOCK, np.array([0, 3, 10]), fixed, 3)
     theta = np.array([[1.5, 8.0, 0.3]])
-    whole = fixed.copy()
-    whole[[0, 3, 10]] = theta[0]
-    np.testing.assert_array_equal(part.whole(theta), whole[None])
-    np.testing.assert_array_equal(part.basis(theta), model(N_PATH + 2).basis(whole[None]))
+    expected = fixed.copy()
+    expected[[0, 3, 10]] = theta[0]
+    np.testing.assert_array_equal(partial.whole(theta), expected[None])
+    np.testing.assert_array_equal(partial.basis(theta), model(N_PATH + 2).basis(expected[None]))
