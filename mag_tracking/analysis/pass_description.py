@@ -123,7 +123,7 @@ class _LinearisedFit:
     """(n_x, n_x) transformation of the parameters of `H` into the unknowns `x`."""
     x: FloatArray
     """(n_x,) unknowns."""
-    own: tuple[IntArray, ...]
+    target_indices: tuple[IntArray, ...]
     """For each target, the indices of its unknowns, followed by the indices of the backgrounds."""
     names: tuple[str, ...]
     """Names of the unknowns."""
