@@ -87,10 +87,10 @@ def ros():
     import rclpy
     from rclpy.node import Node
 
-    from mag_tracking.nodes.middleware import begin
+    from mag_tracking.nodes.middleware import init_ros
     from mag_tracking.nodes.stage_node import make_executor, spin
     from support.node_processes import MAX_S
-    begin()
+    init_ros()
     node, executor = Node('tester'), make_executor()
     executor.add_node(node)
 

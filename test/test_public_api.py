@@ -367,6 +367,6 @@ def test_the_plan_from_python_equals_the_plan_of_the_command(tmp_path):
     written = json.loads((tmp_path / 'plan.json').read_text())
     found = mt.plan(NETWORK_FILE, 'truck', heading=np.array([0.0]), grid=9)
     assert found.position_std.tolist() == written['position_std']
-    assert list(found.best_place) == written['best_place']
+    assert list(found.best_position) == written['best_position']
     with pytest.raises(mt.SettingsError, match='^moment: required for a magnet'):
         mt.plan(NETWORK_FILE, 'magnet')

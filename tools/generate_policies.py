@@ -59,8 +59,8 @@ def add_rules(profile, kind, access, names):
 def policies(namespace='/'):
     """Create the nodes in a namespace; return the content of the policy file."""
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
-    from mag_tracking.nodes.middleware import begin
-    begin()
+    from mag_tracking.nodes.middleware import init_ros
+    init_ros()
     root = ElementTree.Element('policy', {'version': '0.2.0'})
     root.append(ElementTree.Comment(COMMENT))
     enclaves = ElementTree.SubElement(root, 'enclaves')

@@ -78,10 +78,10 @@ def main():
     """Create the nodes without discovery and print their graph."""
     import rclpy
 
-    from mag_tracking.nodes.middleware import begin
+    from mag_tracking.nodes.middleware import init_ros
 
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
-    begin()
+    init_ros()
     sys.path.insert(0, str(ROOT / 'tools'))
     graph = node_graph()
     print(json.dumps(graph))

@@ -37,7 +37,7 @@ class PassData:
     """(n,) number of averaged samples; None if no samples were averaged."""
 
     @classmethod
-    def of_frames(cls, network: SensorNetwork, stamps_ns: Sequence[int],
+    def from_frames(cls, network: SensorNetwork, stamps_ns: Sequence[int],
                   fields: Sequence[FloatArray], covariances: Sequence[FloatArray],
                   offsets: Sequence[FloatArray] | None = None) -> 'PassData':
         """Create the data of a pass from frames of all sensors.

@@ -21,7 +21,7 @@ N_COARSE = 24
 COARSE_ERROR = 0.1
 """Assumed error relative to the field in the coarse search; it smooths the cost function."""
 
-FALSE_ALARM = 1e-6
+FALSE_ALARM_PROBABILITY = 1e-6
 """False alarm probability of the energy threshold of a pass."""
 
 DEFAULT_ERRORS = SensorErrors()
@@ -68,7 +68,7 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
     create_model = partial(RowPass, n_dipoles=n_dipoles)
     problem = separable_problem(data, create_model)
     noise_dof = data.n_independent - background_columns(data, data.whitening).shape[1]
-    threshold = energy_threshold(FALSE_ALARM, noise_dof)
+    threshold = energy_threshold(FALSE_ALARM_PROBABILITY, noise_dof)
     if problem.energy <= threshold:
         return PassFit(n_dipoles, data, 'out of range: the field is no stronger than noise '
                        f'(energy {problem.energy:.0f}, threshold {threshold:.0f})')

@@ -38,7 +38,7 @@ FIRST_ROW = 2
 class GeometrySurvey:
     """Result of the geometry calibration of a board."""
 
-    stated: SensorNetwork
+    nominal: SensorNetwork
     """Network before the calibration, including the assumed noise."""
     network: SensorNetwork
     """Calibrated network; invalid if the estimation has not converged."""
@@ -56,7 +56,7 @@ class GeometrySurvey:
     @property
     def rotation_angle(self) -> FloatArray:
         """Angle between nominal and estimated orientation of each sensor, (n,) rad."""
-        trace: FloatArray = np.einsum('nij,nij->n', self.stated.R_ws, self.network.R_ws)
+        trace: FloatArray = np.einsum('nij,nij->n', self.nominal.R_ws, self.network.R_ws)
         return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
 
 

@@ -18,7 +18,7 @@ from mag_tracking.physics.dipole import MU0
 from mag_tracking.recording.fleet_file import FleetPass
 
 
-def induction_of(network: SensorNetwork) -> FloatArray:
+def earth_field_strength(network: SensorNetwork) -> FloatArray:
     """Return the magnetic field strength of the Earth at a network.
 
     Parameters
@@ -92,14 +92,14 @@ class Fleet:
     """
 
     def __init__(self, passes: dict[str, list[FleetPass]], network: SensorNetwork) -> None:
-        self._induction = induction_of(network)
+        self._field_strength = earth_field_strength(network)
         self.vehicles: list[EnrolledVehicle] = []
         for name, vehicle_passes in passes.items():
             try:
                 self.vehicles.append(enrol(
                     name, np.array([p.moment for p in vehicle_passes]).reshape(-1, 3),
                     np.array([p.covariance for p in vehicle_passes]).reshape(-1, 3, 3),
-                    np.array([p.heading for p in vehicle_passes]), self._induction))
+                    np.array([p.heading for p in vehicle_passes]), self._field_strength))
             except ValueError as error:
                 raise LabelsError(str(error)) from error
 
@@ -115,7 +115,7 @@ class Fleet:
         Identification
         """
         return identify(self.vehicles, passage.moment, passage.moment_covariance,
-                        _heading(passage), passage.heading_std, self._induction)
+                        _heading(passage), passage.heading_std, self._field_strength)
 
 
 def _heading(passage: VehiclePassage) -> float:

@@ -57,7 +57,7 @@ class FittedPass:
         return choose_order(self.fits)
 
     @property
-    def known(self) -> PassFit | None:
+    def reported(self) -> PassFit | None:
         """Fit whose trusted values are reported: the chosen fit, or else the fit of lowest cost.
 
         Without a chosen fit, the result is None if no fit has trusted values, or if any fit shows

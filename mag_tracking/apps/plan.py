@@ -77,21 +77,21 @@ class Plan:
     """(ny, nx) probability that one frame detects the target at the point."""
     lanes: tuple[Lane, ...]
     """Lanes through the network."""
-    with_one_more: FloatArray
+    std_with_added_sensor: FloatArray
     """(my, mx) m, coarser map of the median position bound on the lanes near the network if a
     sensor is added at the point; NaN where no sensor is allowed."""
-    without: float
+    std_without_added_sensor: float
     """Median position bound on the lanes near the network without an additional sensor [m]; NaN if
     no additional sensor is allowed."""
-    best_place: tuple[float, float]
+    best_position: tuple[float, float]
     """Best position of the additional sensor (x, y) [m]; not valid if no sensor is allowed."""
     observability: Observability
     """Observability at the closest point of the first lane, for one direction of the moment,
     without priors."""
-    blocks: dict[str, FloatArray]
+    bounds_at_closest: dict[str, FloatArray]
     """{'with prior' or 'without prior': (3,) bounds of position [m], velocity [m/s] and moment
     [A m²]} at the closest point of the first lane; medians over the directions of the moment."""
-    missed: FloatArray
+    miss_probability: FloatArray
     """(n, 2) lateral distance [m] of a pass with the heading of the first lane, and probability
     that the pass is missed."""
 
@@ -328,7 +328,7 @@ def _added_sensor_bounds(network: SensorNetwork, target: PlannedTarget, sampling
 
 def _miss_probabilities(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                         lane: Lane, area: Area, settings: Settings) -> FloatArray:
-    """Compute `Plan.missed`; a detection needs `detect.onset_frames` consecutive frames."""
+    """Compute `Plan.miss_probability`; `detect.onset_frames` consecutive frames are a detection."""
     half_length = 0.5 * max(area[2] - area[0], area[3] - area[1])
     offsets = np.linspace(0.0, 2.0 * half_length, 25)
     u = np.array([np.cos(lane.heading), np.sin(lane.heading)])

@@ -10,7 +10,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.files import replace_text
 from mag_tracking.quantities import quantity
 from mag_tracking.report.page import NOTE, REPORT, Chart, Note, Page, Table, report_html
-from mag_tracking.report.page_charts import axes, curve, heat_map, places
+from mag_tracking.report.page_charts import axes, curve, heat_map, sensor_trace
 from mag_tracking.report.plan_figures import MIN_MISSED, distinct_lanes, length_text
 from mag_tracking.report.scales import scale_of
 
@@ -64,7 +64,7 @@ def summary_lines(p: Plan) -> list[str]:
                   if observability.unobservable
                   else f'observable, condition number {observability.condition_number:.3g}')
     lines.append(f'single pass on lane {p.lanes[0].name}, without priors: {observable}')
-    for name, (r, v, m) in p.blocks.items():
+    for name, (r, v, m) in p.bounds_at_closest.items():
         lines.append(f'  bounds at the closest point, {name}: position {length_text(r)}, '
                      f'velocity {v:.3g} m/s, moment {m:.3g} A m^2')
     for lane in p.lanes:
@@ -78,21 +78,22 @@ def summary_lines(p: Plan) -> list[str]:
                      f'{GOOD_PD:.0%} {first_text}; position bound at the centre '
                      f'{length_text(lane.filter_std[closest])} (filter), '
                      f'{length_text(lane.pass_std[closest, 0])} (whole pass)')
-    detected = p.missed[p.missed[:, 1] < 0.01, 0]
+    detected = p.miss_probability[p.miss_probability[:, 1] < 0.01, 0]
     lines.append(
         f'99% of passes are detected up to {detected.max():.3g} m from the centre'
         if len(detected) else 'the detection probability of a pass is below 99% everywhere')
     lines.append('(bounds for a point target; errors with real vehicles are several times larger)')
-    if not np.isfinite(p.with_one_more).any():
+    if not np.isfinite(p.std_with_added_sensor).any():
         lines.append('additional sensor: no position in the area is far enough from the lanes')
-    elif np.nanmin(p.with_one_more) > 0.99 * p.without:
+    elif np.nanmin(p.std_with_added_sensor) > 0.99 * p.std_without_added_sensor:
         lines.append('additional sensor: no improvement anywhere in the area')
     else:
-        x, y = p.best_place
+        x, y = p.best_position
         edge = ' (on the edge of the area)' if x in p.x[[0, -1]] or y in p.y[[0, -1]] else ''
         lines.append(f'additional sensor: best at ({x:.2f}, {y:.2f}) m{edge}, where the median '
-                     f'bound near the sensors is {length_text(np.nanmin(p.with_one_more))} instead '
-                     f'of {length_text(p.without)}')
+                     'bound near the sensors is '
+                     f'{length_text(np.nanmin(p.std_with_added_sensor))} instead of '
+                     f'{length_text(p.std_without_added_sensor)}')
     return lines
 
 
@@ -130,7 +131,7 @@ def _maps(plan: Plan) -> list[Chart]:
     position = heat_map(x, y, bound, 'Viridis', '', float(low), float(high)) | {
         'colorbar': bar, 'text': [[f'{10.0**v:.3g} {unit}' for v in row] for row in bound],
         'hoverinfo': 'x+y+text'}
-    gain = 100.0 * (1.0 - plan.with_one_more / plan.without)
+    gain = 100.0 * (1.0 - plan.std_with_added_sensor / plan.std_without_added_sensor)
     ny, nx = gain.shape
     charts = [Chart('Position bound from a whole pass', [position, *_site_traces(plan, f)], layout),
               Chart('Probability that one frame detects the target', [
@@ -140,8 +141,8 @@ def _maps(plan: Plan) -> list[Chart]:
         charts.append(Chart('Gain of an additional sensor', [
             heat_map(np.linspace(x[0], x[-1], nx), np.linspace(y[0], y[-1], ny), gain, 'Cividis',
                      'reduction [%]'), *_site_traces(plan, f),
-            {'type': 'scatter', 'mode': 'markers', 'x': [f * plan.best_place[0]],
-             'y': [f * plan.best_place[1]], 'name': 'best position', 'hoverinfo': 'name+x+y',
+            {'type': 'scatter', 'mode': 'markers', 'x': [f * plan.best_position[0]],
+             'y': [f * plan.best_position[1]], 'name': 'best position', 'hoverinfo': 'name+x+y',
              'marker': {'symbol': 'star', 'size': 15, 'color': '#D55E00',
                         'line': {'color': '#ffffff', 'width': 1}}}], layout))
     return charts
@@ -164,7 +165,7 @@ def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:
         traces.append({'type': 'scatter', 'mode': 'lines', 'x': inside[:, 0].tolist(),
                        'y': inside[:, 1].tolist(), 'hoverinfo': 'skip', 'showlegend': False,
                        'line': {'color': '#ffffff', 'dash': 'dash', 'width': 1.5}})
-    return [*traces, places(f * plan.network.positions, plan.network.names)]
+    return [*traces, sensor_trace(f * plan.network.positions, plan.network.names)]
 
 
 def _lanes(plan: Plan) -> list[Chart]:
@@ -176,7 +177,7 @@ def _lanes(plan: Plan) -> list[Chart]:
         bounds += [curve(along, f * lane.filter_std, f'{name}: filter so far', 2 * k),
                    curve(along, f * lane.pass_std[:, 0], f'{name}: whole pass', 2 * k + 1)]
         detection.append(curve(along, lane.detection, name, k))
-    missed = plan.missed[plan.missed[:, 1] >= MIN_MISSED]
+    missed = plan.miss_probability[plan.miss_probability[:, 1] >= MIN_MISSED]
     label = f'distance along the lane from the point nearest to the centre [{unit}]'
     return [Chart('Position bound along the lanes', bounds,
                   axes(label, f'standard deviation [{unit}]', log_y=True)),

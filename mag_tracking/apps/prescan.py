@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.frequent_level import QuietLevel
+from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.quiet_level import BlockRecorder
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
@@ -32,7 +32,7 @@ N_READINGS_AT_ONCE = 8
 class Prescan:
     """Backgrounds and resolutions found by a first pass over a recording."""
 
-    levels: dict[str, QuietLevel]
+    levels: dict[str, MostFrequentLevel]
     """{sensor: most frequent level}; empty if no target is present at the start of the
     recording."""
     steps: dict[str, FloatArray]
@@ -109,7 +109,7 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
 
 
 def _level_of(recorder: BlockRecorder, departed_at: float | None,
-              learnt: tuple[float, FloatArray] | None) -> tuple[QuietLevel | None, bool]:
+              learnt: tuple[float, FloatArray] | None) -> tuple[MostFrequentLevel | None, bool]:
     """Return (most frequent level or None, whether a target was present until `departed_at` [s]).
 
     If a target was present, only later readings determine the level. If the field later returns to
@@ -143,7 +143,7 @@ def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
                 learnt[name] = elapsed_s, learner.background(name)
 
 
-def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: QuietLevel,
+def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: MostFrequentLevel,
                     recorder: BlockRecorder, settings: CalibrateSettings) -> bool:
     """Whether the initial background was learnt early and equals the most frequent level.
 

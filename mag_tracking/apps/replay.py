@@ -304,7 +304,7 @@ def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline
 
 def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
     """Create the entry `delay` of a track: speed and heading, or why both are missing."""
-    motion = correlated_motion(PassData.of_frames(network, log.stamp_ns, log.measured, log.noise))
+    motion = correlated_motion(PassData.from_frames(network, log.stamp_ns, log.measured, log.noise))
     if motion.reason:
         return {'reason': motion.reason}
     k = log.most_certain()

@@ -6,7 +6,7 @@ from typing import Any
 from mag_tracking.quantities import quantity
 from mag_tracking.report.page import NOTE, WARNING, Note
 from mag_tracking.stages.track.evidence import LOST
-from mag_tracking.stages.track.manager import ALONE, NO_SCALE
+from mag_tracking.stages.track.manager import NO_SCALE, NO_SCALE_FRAMES
 from mag_tracking.units import NS
 
 
@@ -63,7 +63,7 @@ def no_track_reason(counts: Mapping[str, int]) -> str | None:
     str or None
         Explanation; None if vehicles were tracked, or several sensors measured the target.
     """
-    if counts.get(NO_SCALE, 0) or counts.get(ALONE, 0) and not counts.get('tracks', 0):
+    if counts.get(NO_SCALE, 0) or counts.get(NO_SCALE_FRAMES, 0) and not counts.get('tracks', 0):
         return ('no track: the scale is not observable with a single sensor. Use `mag-tracking '
                 'events` to describe the passes without scale, or set track.single_sensor_prior: '
                 'true if the vehicles match the settings')

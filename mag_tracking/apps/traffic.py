@@ -200,6 +200,6 @@ class _TrafficCollector:
         if any(other[0].stamp_ns <= end and begin <= other[-1].stamp_ns
                for other_id, other in self._frames.items() if other_id != track_id):
             return CorrelatedMotion('another vehicle was near')
-        return correlated_motion(PassData.of_frames(
+        return correlated_motion(PassData.from_frames(
             self._network, [f.stamp_ns for f in frames], [f.field for f in frames],
             [f.covariance for f in frames], [f.time_offset for f in frames]))

@@ -16,7 +16,7 @@ KNOCK_THRESHOLD = 10.0
 MIN_CORRELATION = 0.7
 """Minimum correlation of two sensors that measured the same knocks."""
 
-MIN_RIVAL_RATIO = 0.9
+MAX_RIVAL_RATIO = 0.9
 """Correlation at a second lag, relative to the best lag, above which the lag is ambiguous."""
 
 CONTEXT_S = 5.0
@@ -214,7 +214,7 @@ def _coarse_lag(a: _Series, b: _Series, max_lag: float) -> tuple[float, float, s
         return lags[best], float(c[best]), (
             f'the two sensors did not measure the same knocks within {max_lag:g} s '
             f'(correlation {c[best]:.2f})')
-    rivals = [k for k in find_peaks(c)[0] if abs(k - best) > 2 and c[k] > MIN_RIVAL_RATIO * c[best]]
+    rivals = [k for k in find_peaks(c)[0] if abs(k - best) > 2 and c[k] > MAX_RIVAL_RATIO * c[best]]
     if rivals:
         return lags[best], float(c[best]), (
             f'lags of {lags[best]:.3f} and {lags[rivals[0]]:.3f} s fit equally well: knock again '

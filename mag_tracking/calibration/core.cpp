@@ -101,14 +101,14 @@ py::object pooled_covariance(Array scatter, Array n) {
 }
 
 void add_constants(py::module_& m) {
-    m.attr("RECENT") = RECENT;
+    m.attr("N_RECENT") = N_RECENT;
     m.attr("MAX_HELD") = MAX_HELD;
-    m.attr("COARSE") = COARSE;
+    m.attr("COARSE_FRACTION") = COARSE_FRACTION;
     m.attr("MIN_CHANGES") = MIN_CHANGES;
-    m.attr("SAME") = SAME;
+    m.attr("MAX_ROUNDING") = MAX_ROUNDING;
     m.attr("DITHERED") = DITHERED;
     m.attr("MIN_STD") = MIN_STD;
-    m.attr("TOGGLE") = TOGGLE;
+    m.attr("TOGGLE_TOLERANCE") = TOGGLE_TOLERANCE;
     m.attr("MAX_REST_NS") = MAX_REST_NS;
 #define CODE(name) m.attr(#name) = int(name)
     CODE(DONE), CODE(UNKNOWN_SENSOR), CODE(NO_AXIS), CODE(INFINITE), CODE(TOO_LARGE);

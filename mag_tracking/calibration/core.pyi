@@ -14,14 +14,14 @@ SENSOR: np.dtype[Any]
 LIMITS: np.dtype[Any]
 BATCH: np.dtype[Any]
 
-RECENT: int
+N_RECENT: int
 MAX_HELD: int
-COARSE: float
+COARSE_FRACTION: float
 MIN_CHANGES: float
-SAME: float
+MAX_ROUNDING: float
 DITHERED: float
 MIN_STD: float
-TOGGLE: float
+TOGGLE_TOLERANCE: float
 MAX_REST_NS: int
 
 DONE: int

@@ -37,7 +37,7 @@ BATCH_SIZE = 64
 
 
 @dataclass(frozen=True)
-class QuietLevel:
+class MostFrequentLevel:
     """The most frequent level of a sensor."""
 
     n_blocks: int
@@ -72,7 +72,8 @@ class QuietLevel:
         return not bool((np.abs(self.level - level) > MIN_LEVEL_DISTANCE * self.width).any())
 
 
-def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int) -> QuietLevel | None:
+def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int
+                        ) -> MostFrequentLevel | None:
     """Find the most frequent level of the blocks of a sensor.
 
     Parameters
@@ -86,7 +87,7 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int) -> Q
 
     Returns
     -------
-    QuietLevel or None
+    MostFrequentLevel or None
         None if no level has at least `MIN_BLOCKS` blocks, or the noise is unknown on all axes.
     """
     n = np.maximum(blocks.n, 1.0)
@@ -121,8 +122,8 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int) -> Q
         return None
     _, mean, _ = line_through(early)
     n_rival = len(_densest(other_means, width[is_used])) if len(other_means) else 0
-    return QuietLevel(len(chosen), n_rival, float(time[0]), float(time[-1]), mean, covariance,
-                      float(np.median(np.diff(blocks.time))), width)
+    return MostFrequentLevel(len(chosen), n_rival, float(time[0]), float(time[-1]), mean,
+                             covariance, float(np.median(np.diff(blocks.time))), width)
 
 
 def _densest(means: FloatArray, width: FloatArray) -> IntArray:

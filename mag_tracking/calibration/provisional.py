@@ -13,7 +13,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.blocks import Block, stacked
 from mag_tracking.calibration.frequent_level import (
     MIN_DURATION_RATIO,
-    QuietLevel,
+    MostFrequentLevel,
     most_frequent_level,
 )
 
@@ -41,7 +41,7 @@ MAD_TO_STD = 1.4826
 class FrequentLevel:
     """The most frequent level of the latest blocks."""
 
-    level: QuietLevel
+    level: MostFrequentLevel
     std: FloatArray
     """(3,) [T] Uncertainty of the level: median distance of all blocks from the level, scaled to a
     standard deviation. It is large for a level observed for less than half of the time. NaN for an

@@ -10,7 +10,7 @@ from mag_tracking.calibration.frequent_level import (
     LEVEL_WIDTH,
     MIN_BLOCKS,
     MIN_DURATION_RATIO,
-    QuietLevel,
+    MostFrequentLevel,
     most_frequent_level,
 )
 from mag_tracking.calibration.resolution import corrected_steps, raw_steps
@@ -42,7 +42,7 @@ class BlockRecorder(RunningBackground):
         self._blocks: list[Block] = []
         super().forget()
 
-    def quiet_level(self, since: float = 0.0) -> QuietLevel | None:
+    def quiet_level(self, since: float = 0.0) -> MostFrequentLevel | None:
         """Most frequent level of the collected blocks.
 
         Parameters
@@ -52,7 +52,7 @@ class BlockRecorder(RunningBackground):
 
         Returns
         -------
-        QuietLevel or None
+        MostFrequentLevel or None
             None if no level has at least `MIN_BLOCKS` blocks.
         """
         blocks = [block for block in self._blocks if block.time >= since]
@@ -63,7 +63,7 @@ class BlockRecorder(RunningBackground):
         return most_frequent_level(stacked(blocks[::stride]),
                                    np.where(np.isfinite(steps), steps, 0.0), self._max_blocks)
 
-    def is_known_level(self, initial: FloatArray, found: QuietLevel) -> bool:
+    def is_known_level(self, initial: FloatArray, found: MostFrequentLevel) -> bool:
         """Whether the initial level is the level of the background.
 
         True if the field drifts from the initial level to the most frequent level, or is at the
@@ -73,7 +73,7 @@ class BlockRecorder(RunningBackground):
         ----------
         initial : (3,) array, T
             Level at the start of the recording.
-        found : QuietLevel
+        found : MostFrequentLevel
             Most frequent level.
 
         Returns
@@ -96,14 +96,14 @@ class BlockRecorder(RunningBackground):
         is_near = not (np.abs(initial - found.level) > NEAR_STDS * noise).any()
         return (NEAR_DURATION_RATIO if is_near else MIN_DURATION_RATIO) * n > found.n_blocks
 
-    def has_returned(self, initial: FloatArray, found: QuietLevel, since: float) -> bool:
+    def has_returned(self, initial: FloatArray, found: MostFrequentLevel, since: float) -> bool:
         """Whether at least `MIN_BLOCKS` blocks after a time are at the initial level.
 
         Parameters
         ----------
         initial : (3,) array, T
             Level at the start of the recording.
-        found : QuietLevel
+        found : MostFrequentLevel
             Level whose width is used as the tolerance.
         since : float, s
             Start of the evaluated blocks.

@@ -10,14 +10,14 @@
 namespace mag_tracking {
 
 // Maximum relative difference of two values that is due to rounding (single precision).
-constexpr double SAME = 3e-7;
+constexpr double MAX_ROUNDING = 3e-7;
 // Minimum noise variance, in squared steps, at which readings cover several steps and averaging is
 // effective. A reading that toggles between two steps has a variance of at most 0.25.
 constexpr double DITHERED = 0.3;
 // [T] Maximum scatter of an axis that has not changed.
 constexpr double MIN_STD = 1e-11;
 // [steps] Tolerance of an axis at rest, which may toggle between two adjacent values.
-constexpr double TOGGLE = 1.2;
+constexpr double TOGGLE_TOLERANCE = 1.2;
 // Minimum number of repetitions per change of an axis whose steps are larger than its noise.
 constexpr double MIN_REPEATS = 0.2;
 // Maximum duration of a rest that counts as one measurement; a longer rest counts as several.
@@ -30,7 +30,7 @@ inline void note_step(Sensor& s, int64_t stamp, const double* raw) {
         const double value = raw[a];
         if (std::isnan(value)) continue;
         const double change = std::abs(value - s.raw[a]);
-        if (change <= SAME * std::abs(value) && stamp >= s.rest_since_ns[a]) {
+        if (change <= MAX_ROUNDING * std::abs(value) && stamp >= s.rest_since_ns[a]) {
             if (stamp - s.rest_since_ns[a] <= MAX_REST_NS) ++s.n_rest[a];
             continue;
         }
@@ -125,7 +125,7 @@ inline void apply_steps(Sensor& s, double freeze_std, double* limits) {
         s.step_variance[a] = is_coarse ? steps[a] * steps[a] / 12.0 : 0.0;
         s.noise_std[a] = std::sqrt(variance[a] + s.step_variance[a]);
         limits[a] = freeze_std * s.noise_std[a];
-        if (is_coarse) limits[a] = std::max(limits[a], TOGGLE * steps[a]);
+        if (is_coarse) limits[a] = std::max(limits[a], TOGGLE_TOLERANCE * steps[a]);
     }
 }
 

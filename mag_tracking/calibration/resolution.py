@@ -11,13 +11,13 @@ from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration import core
 from mag_tracking.records import plain
 
-MAX_ROUNDING = core.SAME
+MAX_ROUNDING = core.MAX_ROUNDING
 """Maximum relative difference of two values that is due to rounding (single precision)."""
 
 MIN_STD = core.MIN_STD
 """[T] Maximum standard deviation of the readings of an axis that has not changed."""
 
-TOGGLE_TOLERANCE = core.TOGGLE
+TOGGLE_TOLERANCE = core.TOGGLE_TOLERANCE
 """[steps] Tolerance of an axis at rest, which may toggle between two adjacent values."""
 
 

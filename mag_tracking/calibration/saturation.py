@@ -3,7 +3,7 @@
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.calibration.screening import COARSE
+from mag_tracking.calibration.screening import COARSE_FRACTION
 
 MIN_RUN = 3
 """Minimum number of consecutive equal readings at the limit of a saturated axis."""
@@ -81,7 +81,7 @@ def saturated_readings(values: FloatArray) -> BoolArray:
     for extreme in (v.min(), v.max()):
         is_extreme = v == extreme
         if extreme == level \
-                and np.mean(jumps[~(is_extreme[1:] & is_extreme[:-1])] == 0.0) >= COARSE:
+                and np.mean(jumps[~(is_extreme[1:] & is_extreme[:-1])] == 0.0) >= COARSE_FRACTION:
             # An axis with coarse steps is at rest at its median.
             continue
         edges = np.flatnonzero(np.diff(np.concatenate([[False], is_extreme, [False]])))

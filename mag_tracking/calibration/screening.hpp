@@ -24,12 +24,12 @@ constexpr int MIN_RUN = 4;
 // Fraction of repeated readings above which the steps of a sensor are coarse: at rest, it may
 // repeat a reading indefinitely. With a noise of one step or more on three axes, the fraction is
 // lower.
-constexpr double COARSE = 0.05;
+constexpr double COARSE_FRACTION = 0.05;
 // Minimum ratio of a spike to the largest recent difference; larger if the rate is low.
 constexpr double MIN_RATIO = 8.0;
 // [1/s] Maximum speed of a target relative to its distance: 30 m/s at one metre.
 constexpr double MAX_RATE = 30.0;
-// Mean of the largest of `RECENT` differences between readings of white noise, in its standard
+// Mean of the largest of `N_RECENT` differences between readings of white noise, in its standard
 // deviations.
 constexpr double MAX_OF_RECENT = 2.4;
 // If a dipole moves by the fraction s > 0.4 of its distance between two readings, the ratio of
@@ -50,7 +50,7 @@ enum Verdict { PASSES, HELD, SPIKE, RELEASED };
 inline bool is_too_long(const Sensor& s) {
     if (s.run < MIN_RUN || s.changes < MIN_CHANGES) return false;
     const double usual = (s.repeats + 1.0) / (s.repeats + s.changes + 2.0);
-    return usual < COARSE && double(s.run) * std::log(usual) < MIN_LOG_PROBABILITY;
+    return usual < COARSE_FRACTION && double(s.run) * std::log(usual) < MIN_LOG_PROBABILITY;
 }
 
 // Records a reading `field` (3) [T], NaN for a missing axis. Returns whether it has been repeated for
@@ -144,7 +144,7 @@ inline void hold(Sensor& s, const Reading& reading, const double* steps) {
 
 // Record a reading that passes, for comparison with the next reading. `steps` may be nullptr.
 inline void pass(Sensor& s, const Reading& reading, const double* steps) {
-    double* slot = s.steps[s.n_steps % RECENT];
+    double* slot = s.steps[s.n_steps % N_RECENT];
     for (int a = 0; a < 3; ++a) {
         s.before[a] = reading.field[a];
         if (steps != nullptr) slot[a] = steps[a];
@@ -196,7 +196,7 @@ inline Verdict screen_spike(Sensor& s, double threshold, const Reading& reading)
         pass(s, reading, nullptr);
         return RELEASED;
     }
-    if (s.n_steps >= RECENT && is_off(s, threshold, reading.stamp, steps)) {
+    if (s.n_steps >= N_RECENT && is_off(s, threshold, reading.stamp, steps)) {
         hold(s, reading, steps);
         return HELD;
     }

@@ -11,7 +11,7 @@ from mag_tracking.units import NEVER
 MIN_CHANGES = core.MIN_CHANGES
 """Minimum number of changes before a sensor can be stuck; with fewer changes, its steps may be so
 coarse that long repetitions are normal."""
-COARSE = core.COARSE
+COARSE_FRACTION = core.COARSE_FRACTION
 """Fraction of repeated readings above which the steps of a sensor are coarse: at rest, it may
 repeat a reading indefinitely. With a noise of one step or more on three axes, the fraction is
 lower."""

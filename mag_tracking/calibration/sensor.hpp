@@ -9,7 +9,7 @@
 namespace mag_tracking {
 
 // Number of differences between consecutive readings that a spike is compared with.
-constexpr int RECENT = 8;
+constexpr int N_RECENT = 8;
 // Maximum number of readings of a spike; a longer change is a step.
 constexpr int MAX_HELD = 3;
 
@@ -48,7 +48,7 @@ struct Sensor {
     int64_t before_ns;
     double before[3];
     int64_t n_steps;
-    double steps[RECENT][3];
+    double steps[N_RECENT][3];
     int64_t n_held, n_released, held_ns[MAX_HELD + 1];
     double held_field[MAX_HELD + 1][3], held_steps[MAX_HELD + 1][3];
     int64_t held_own[MAX_HELD + 1];

@@ -9,7 +9,7 @@ from mag_tracking.arrays import StructArray
 from mag_tracking.calibration import core
 from mag_tracking.units import NEVER
 
-N_RECENT = core.RECENT
+N_RECENT = core.N_RECENT
 """Number of differences between consecutive readings that a spike is compared with."""
 MAX_HELD = core.MAX_HELD
 """Maximum number of readings of a spike; a longer change is a step."""

@@ -217,7 +217,7 @@ def _print_magnet(g: NetworkGeometry, has_unknown_poses: bool) -> None:
 def _row(survey: GeometrySurvey, j: int) -> str:
     """Format the row of sensor `j` in the table."""
     g = survey.geometry
-    shift = 1e3 * np.linalg.norm(survey.network.positions[j] - survey.stated.positions[j])
+    shift = 1e3 * np.linalg.norm(survey.network.positions[j] - survey.nominal.positions[j])
     shift_std, rotation_std = (np.sqrt(np.square(v[j]).mean())
                                for v in (1e3 * g.position_std, np.rad2deg(g.rotation_std)))
     bias = ' '.join(f'{1e6 * b:+8.2f}' for b in g.bias[j])

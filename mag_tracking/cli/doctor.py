@@ -84,7 +84,7 @@ def _report(args: argparse.Namespace, doctor: Doctor, further_findings: list[Fin
         print(f'{name:11s} {_row(health)}')
     findings = sorted(further_findings + doctor.findings(), key=lambda f: not f.serious)
     for finding in findings:
-        print(f'{"ERROR" if finding.serious else "note "} {finding.subject}: {finding.what}\n'
+        print(f'{"ERROR" if finding.serious else "note "} {finding.subject}: {finding.fault}\n'
               f'      {finding.advice}')
     if not findings:
         print('no faults found')

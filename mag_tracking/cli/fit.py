@@ -160,7 +160,7 @@ def _print_pass(fitted_pass: FittedPass) -> None:
         print(f' {mark}   {fit.n_dipoles}  {cost}  {fit.reason or _numbers(fit)}')
         if fit.bearing is not None:
             _print_bearing(fit.bearing)
-        if fit.reason and fit is fitted_pass.known:
+        if fit.reason and fit is fitted_pass.reported:
             print(f'        still reliable: {_trusted_values(fit)}')
         if not fit.reason and fit.is_poor_mixture:
             print('        ambiguous: the joint fit of the vehicles is poor')

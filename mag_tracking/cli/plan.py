@@ -121,10 +121,13 @@ def _write(p: Plan, out: Path) -> None:
     """Write the figures and `plan.json`."""
     content = {
         'x': p.x.tolist(), 'y': p.y.tolist(), 'position_std': p.position_std.tolist(),
-        'detection': p.detection.tolist(), 'with_one_more': p.with_one_more.tolist(),
-        'without': p.without, 'best_place': list(p.best_place),
-        'bounds_at_closest': {k: v.tolist() for k, v in p.blocks.items()},
-        'unobservable': list(p.observability.unobservable), 'missed': p.missed.tolist(),
+        'detection': p.detection.tolist(),
+        'std_with_added_sensor': p.std_with_added_sensor.tolist(),
+        'std_without_added_sensor': p.std_without_added_sensor,
+        'best_position': list(p.best_position),
+        'bounds_at_closest': {k: v.tolist() for k, v in p.bounds_at_closest.items()},
+        'unobservable': list(p.observability.unobservable),
+        'miss_probability': p.miss_probability.tolist(),
         'lanes': [{'name': lane.name, 'along': lane.along.tolist(),
                    'filter_std': lane.filter_std.tolist(), 'pass_std': lane.pass_std.tolist(),
                    'detection': lane.detection.tolist()} for lane in p.lanes]}

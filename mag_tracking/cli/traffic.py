@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps.fleet import Fleet, induction_of, pass_of
+from mag_tracking.apps.fleet import Fleet, earth_field_strength, pass_of
 from mag_tracking.apps.traffic import CountedVehicle, TrafficResult, count_traffic
 from mag_tracking.cli.options import (
     Commands,
@@ -140,7 +140,7 @@ def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
             raise SettingsError('--enrol requires a fleet file: add --fleet FILE')
         if args.enrol.strip() in ('', UNKNOWN):
             raise SettingsError(f'--enrol: {args.enrol!r} is not a valid name of a vehicle')
-        induction_of(network)
+        earth_field_strength(network)
         check_writable(args.fleet)
         return None
     return None if args.fleet is None else Fleet(read_fleet(args.fleet), network)

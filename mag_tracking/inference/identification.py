@@ -40,7 +40,7 @@ class EnrolledVehicle:
     covariance: FloatArray
     """Covariance of `moment`, (3, 3) A² m⁴; NaN if `iron` is known."""
 
-    def moment_at(self, heading: float, heading_std: float, induction: FloatArray
+    def moment_at(self, heading: float, heading_std: float, field_strength: FloatArray
                   ) -> tuple[FloatArray, FloatArray] | None:
         """Predict the moment of a pass at a given heading.
 
@@ -49,7 +49,7 @@ class EnrolledVehicle:
         heading : float, rad, world frame
         heading_std : float, rad
             Standard deviation of the heading.
-        induction : (3,) array, A/m, world frame
+        field_strength : (3,) array, A/m, world frame
             B0/mu0.
 
         Returns
@@ -70,8 +70,8 @@ class EnrolledVehicle:
         c, s = np.cos(heading), np.sin(heading)
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         slope = np.array([[-s, -c, 0.0], [c, -s, 0.0], [0.0, 0.0, 0.0]]) @ self.iron.hard
-        A = np.hstack([R, induction[:, None]])
-        return (R @ self.iron.hard + self.iron.soft * induction,
+        A = np.hstack([R, field_strength[:, None]])
+        return (R @ self.iron.hard + self.iron.soft * field_strength,
                 A @ self.iron.covariance @ A.T + heading_std**2 * np.outer(slope, slope)
                 + pass_to_pass)
 
@@ -92,7 +92,7 @@ class Identification:
 
 
 def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: FloatArray,
-          induction: FloatArray) -> EnrolledVehicle:
+          field_strength: FloatArray) -> EnrolledVehicle:
     """Enrol a vehicle from its passes at known headings.
 
     Parameters
@@ -104,7 +104,7 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
     covariances : (n, 3, 3) array, A² m⁴
         Covariances of the fits; the variance between passes is added.
     headings : (n,) array, rad, world frame
-    induction : (3,) array, A/m, world frame
+    field_strength : (3,) array, A/m, world frame
         B0/mu0.
 
     Returns
@@ -123,7 +123,7 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
     total_covariances = np.asarray(covariances, dtype=float) + PASS_TO_PASS_STD**2 * np.eye(3)
     separation = np.abs(_wrapped(headings[:, None] - headings)).max()
     if separation >= MIN_HEADING_SEPARATION:
-        iron = hard_and_soft_iron(moments, headings, induction, total_covariances)
+        iron = hard_and_soft_iron(moments, headings, field_strength, total_covariances)
         return EnrolledVehicle(name, iron, np.nan, np.full(3, np.nan), np.full((3, 3), np.nan))
     if not np.isfinite(moments).all() or separation > HEADING_TOLERANCE:
         raise ValueError(f'{name}: expected finite moments at one heading, or at headings at least '
@@ -137,7 +137,7 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
 
 
 def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance: FloatArray,
-             heading: float, heading_std: float, induction: FloatArray) -> Identification:
+             heading: float, heading_std: float, field_strength: FloatArray) -> Identification:
     """Identify the enrolled vehicle that made a pass.
 
     Parameters
@@ -151,7 +151,7 @@ def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance
     heading : float, rad, world frame
     heading_std : float, rad
         Standard deviation of the heading.
-    induction : (3,) array, A/m, world frame
+    field_strength : (3,) array, A/m, world frame
         B0/mu0.
 
     Returns
@@ -160,7 +160,7 @@ def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance
     """
     log_p, distances, skipped = {}, {}, []
     for vehicle in vehicles:
-        predicted = vehicle.moment_at(heading, heading_std, induction)
+        predicted = vehicle.moment_at(heading, heading_std, field_strength)
         if predicted is None:
             skipped.append(vehicle.name)
             continue

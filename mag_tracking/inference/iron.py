@@ -25,9 +25,9 @@ class Iron:
     are correct. NaN without covariances."""
 
 
-def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: ArrayLike,
+def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, field_strength: ArrayLike,
                        covariances: ArrayLike | None = None) -> Iron:
-    """Estimate m0 and D in m = Rz(heading) m0 + D induction by least squares.
+    """Estimate m0 and D in m = Rz(heading) m0 + D field_strength by least squares.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: Array
         Fitted moments of the passes.
     headings : (n,) array, rad, world frame
         Angle from x, anticlockwise when viewed from above.
-    induction : (3,) array, A/m, world frame
+    field_strength : (3,) array, A/m, world frame
         B0/mu0. With 3 B0/mu0, the result is D as defined in T10.
     covariances : (n, 3, 3) array, A² m⁴, optional
         Covariances of the moments. Default: all moments have equal weight, and the covariance of
@@ -57,19 +57,19 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, induction: Array
     [TSP14]_ section VI.E; [T10]_ eq. (6.16).
     """
     moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
-    induction = np.asarray(induction, dtype=float)
+    field_strength = np.asarray(field_strength, dtype=float)
     n = len(headings)
-    if moments.shape != (n, 3) or headings.shape != (n,) or induction.shape != (3,):
-        raise ValueError(f'expected moments (n, 3), headings (n,) and induction (3,), got '
-                         f'{moments.shape}, {headings.shape}, {induction.shape}')
+    if moments.shape != (n, 3) or headings.shape != (n,) or field_strength.shape != (3,):
+        raise ValueError(f'expected moments (n, 3), headings (n,) and field_strength (3,), got '
+                         f'{moments.shape}, {headings.shape}, {field_strength.shape}')
     if not (np.isfinite(moments).all() and np.isfinite(headings).all()
-            and np.isfinite(induction).all()):
-        raise ValueError('moments, headings and induction must be finite')
+            and np.isfinite(field_strength).all()):
+        raise ValueError('moments, headings and field_strength must be finite')
     A = np.zeros((n, 3, 4))
     c, s = np.cos(headings), np.sin(headings)
     A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = c, -s, s, c
     A[:, 2, 2] = 1.0
-    A[:, :, 3] = induction
+    A[:, :, 3] = field_strength
     W = _whitening_matrices(covariances, n)
     whitened = (W @ A).reshape(3 * n, 4)
     # The units of m0 and D differ, so the columns are normalised first.

@@ -16,7 +16,7 @@ namespace mag_tracking {
 // Stopping criteria of a search and tolerances of its pseudo-inverses, as in least_squares.py.
 struct SearchLimits {
     int n_steps;
-    double tolerance, most_damping, full_rank, linear_rank, rank;
+    double tolerance, max_damping, full_rank, linear_rank, rank;
 };
 
 // Matrix (n, k) with rows padded by zeros to a multiple of eight.
@@ -96,7 +96,7 @@ class SeparableFit {
             done |= better && here.cost - trial.cost <= limits_.tolerance * here.cost;
             damping *= better ? 0.2 : 5.0;
             if (better) std::swap(here, trial);
-            if (done || !(damping < limits_.most_damping)) break;
+            if (done || !(damping < limits_.max_damping)) break;
         }
         set_information(here, 0.0, A.data());
         steps_.invert(A.data(), covariance);

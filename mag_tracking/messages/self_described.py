@@ -21,7 +21,7 @@ _STAMPS = ('stamp', 'timestamp')
 _SECONDS = ('sec', 'secs', 'seconds')
 _NANOSECONDS = ('nanosec', 'nsec', 'nsecs', 'nanos')
 
-SCHEMAS = ('jsonschema', 'protobuf')
+SUPPORTED_ENCODINGS = ('jsonschema', 'protobuf')
 """Supported schema encodings."""
 
 
@@ -38,7 +38,7 @@ def type_of(schema: Schema) -> str:
         The type sensor_msgs/msg/MagneticField if the schema has a magnetic field; otherwise the
         name of the schema.
     """
-    is_field = schema.encoding in SCHEMAS and b'magnetic_field' in schema.data
+    is_field = schema.encoding in SUPPORTED_ENCODINGS and b'magnetic_field' in schema.data
     return MAGNETIC_FIELD if is_field else schema.name
 
 

@@ -17,7 +17,7 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import reading_of, readings_of
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
-from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.middleware import init_ros
 from mag_tracking.nodes.sensor_graph import no_message_finding, topic_findings
 from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import SENSOR_QOS, STREAM_QOS, make_executor, spin
@@ -120,7 +120,7 @@ def listening(network: SensorNetwork, settings: Settings, seconds: float,
     ------
     DoctorResult
     """
-    begin(list(ros_arguments))
+    init_ros(list(ros_arguments))
     executor = make_executor()
     node = DoctorNode(network, settings)
     result = DoctorResult(node.doctor, [])

@@ -23,7 +23,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from mag_tracking.errors import GraphError
 from mag_tracking.nodes.convert import message_class
-from mag_tracking.nodes.middleware import RCLError, begin
+from mag_tracking.nodes.middleware import RCLError, init_ros
 from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import make_executor, spin
 
@@ -152,7 +152,7 @@ def observer(ros_arguments: Sequence[str] = ()) -> Iterator[Observer]:
     ------
     Observer
     """
-    begin(list(ros_arguments))
+    init_ros(list(ros_arguments))
     executor, node = make_executor(), Node('mag_tracking_observer', start_parameter_services=False)
     executor.add_node(node)
     status = 1

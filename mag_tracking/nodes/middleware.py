@@ -24,7 +24,7 @@ WORKING_FOLDER_PROFILE = 'DEFAULT_FASTRTPS_PROFILES.xml'
 ROS_ARGUMENTS, PARAMETER_FILE = '--ros-args', '--params-file'
 
 
-def begin(arguments: list[str] | None = None) -> None:
+def init_ros(arguments: list[str] | None = None) -> None:
     """Call `rclpy.init` with the Fast DDS profile of this package, unless the user selects another.
 
     Other middlewares ignore the profile. No signal handlers are installed, because the handlers of

@@ -23,14 +23,14 @@ from mag_tracking.messages.frame import frame_of
 from mag_tracking.messages.markers import SENSOR_NAMESPACES
 from mag_tracking.messages.types import NETWORK_FRAME
 from mag_tracking.nodes.convert import track_of
-from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.middleware import init_ros
 from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import LATCHED_QOS, RESULT_QOS, STREAM_QOS, make_executor, spin
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.quantities import quantity
 from mag_tracking.report.page import ERROR, WARNING, Note, Table
 from mag_tracking.web.live_scene import LiveScene
-from mag_tracking.web.page_server import TICK_S, PageServer
+from mag_tracking.web.page_server import UPDATE_INTERVAL_S, PageServer
 
 NICENESS = 10
 """Scheduling niceness of the process, which must not delay the nodes."""
@@ -90,7 +90,7 @@ class PageNode(Node):
                                  raw=True)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._receive_diagnostics,
                                  STREAM_QOS)
-        steady_timer(self, TICK_S, self._tick)
+        steady_timer(self, UPDATE_INTERVAL_S, self._tick)
         steady_timer(self, 1.0, self._update_health)
 
     def _subscribe_to_tracker(self, tracks: str) -> None:
@@ -240,7 +240,7 @@ def watch(host: str, port: int, report: Callable[[str], object],
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals, \
             PageServer(scene, host, port) as server:
         report(f'live page: {server.url}')
-        begin(list(ros_arguments))
+        init_ros(list(ros_arguments))
         executor, node, status = make_executor(), PageNode(scene), 1
         executor.add_node(node)
         try:

@@ -23,7 +23,7 @@ from mag_tracking.messages.types import (
 )
 from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.definitions import definition_of
-from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.middleware import init_ros
 from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.recording.recorder import Recorder
 from mag_tracking.recording.writer import offered_qos
@@ -277,7 +277,7 @@ def run(selection: Selection, out: Path, split_bytes: int = 10**9,
     with recorded_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as signals:
         try:
             with Recorder(out, split_bytes, split_ns, report=log) as recorder:
-                begin(list(ros_arguments))
+                init_ros(list(ros_arguments))
                 node = RecordNode(recorder, selection, log)
                 log(f'recording to {out}; press Ctrl-C to stop')
                 _record(node, lambda: bool(signals))

@@ -34,7 +34,7 @@ from mag_tracking.nodes.stage_node import STREAM_QOS
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 
-TICK_S = 0.005
+UPDATE_INTERVAL_S = 0.005
 """[s] Interval between checks for due messages."""
 MAX_STEP_S = 0.02
 """[s] Maximum advance of one tick (at rate 1); playback does not catch up after a longer stall."""
@@ -93,7 +93,7 @@ class ReplayNode(ManagedNode):
         paced_service(self, Trigger, '~/pause', self._pause)
         paced_service(self, Trigger, '~/resume', self._resume)
         paced_service(self, Seek, '~/seek', self._seek_service)
-        self.create_timer(TICK_S, self._tick)
+        self.create_timer(UPDATE_INTERVAL_S, self._tick)
         self.start_automatically()
 
     def prepare(self) -> None:

@@ -21,7 +21,7 @@ from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.detection_node import DetectionNode
 from mag_tracking.nodes.driver_node import DriverNode
-from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.middleware import init_ros
 from mag_tracking.nodes.replay_node import ReplayNode
 from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import STREAM_QOS, StageNode, freeze, make_executor, spin
@@ -217,7 +217,7 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
         # The driver node is created last, so that its first messages have subscribers.
         sources = [partial(driver_node, drivers, network_path, batches)] if drivers else []
-        begin(list(ros_arguments))
+        init_ros(list(ros_arguments))
         return _run_until(lambda: bool(signals), network_path, settings, recording, rate, loop,
                           observers, sources)
 

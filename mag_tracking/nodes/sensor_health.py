@@ -184,7 +184,7 @@ class HealthDiagnostics:
             self._node, name, self._topics[name])
         if not silent_s <= SILENCE_TIMEOUT_S:
             return [*graph_findings, *self._silence_findings(name, silent_s)]
-        findings = {f.what: f for f in (*graph_findings, *self._network_findings[name],
+        findings = {f.fault: f for f in (*graph_findings, *self._network_findings[name],
                                         *self._clock_findings(name))}
         # A background that is being learnt is not a fault until the timeout.
         timeout_s = 5.0 + LEARNING_TIMEOUT_FACTOR * self._settings.calibrate.learn_s
@@ -192,16 +192,16 @@ class HealthDiagnostics:
             self._unready_since.pop(name, None)
         since = self._unready_since.setdefault(name, time.monotonic())
         if calibrate.backgrounds()[name].ready or time.monotonic() - since > timeout_s:
-            findings.update({f.what: f for f in background_findings(
+            findings.update({f.fault: f for f in background_findings(
                 name, calibrate, self._frozen_since_ns.get(name), self._relearnt_counts[0][name])})
-        findings.update({f.what: f for f in covariance_findings(
+        findings.update({f.fault: f for f in covariance_findings(
             name, self._topics[name], calibrate)})
         for health in (self._previous_window[name], self._current_window[name]):
             if health is not None and health.counts['readings']:
                 for f in health.findings(name, self._network.noise_std[j],
                                          self._settings.calibrate.max_field,
                                          not self._is_replayed):
-                    findings.setdefault(f.what, f)
+                    findings.setdefault(f.fault, f)
         return sorted(findings.values(), key=lambda f: not f.serious)
 
     def _silence_findings(self, name: str, silent_s: float) -> list[Finding]:
@@ -283,11 +283,11 @@ class HealthDiagnostics:
             'backgrounds relearnt': background.n_relearnt}
         return DiagnosticStatus(
             level=level, name=f'{node}: {name}', hardware_id=name,
-            message=f'{findings[0].what}; {findings[0].advice}' if findings else
+            message=f'{findings[0].fault}; {findings[0].advice}' if findings else
             f'waiting for {self._topics[name]}' if self.is_awaited(name) else 'running',
             values=[KeyValue(key=k, value=v if isinstance(v, str) else _number(v))
                     for k, v in values.items()]
-            + [KeyValue(key='also', value=f.what) for f in findings[1:]])
+            + [KeyValue(key='also', value=f.fault) for f in findings[1:]])
 
 
 def _number(value: float) -> str:

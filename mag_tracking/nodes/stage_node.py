@@ -25,7 +25,7 @@ from mag_tracking.interrupts import recorded_signals
 from mag_tracking.messages.schema import readings_of, stamp_ns
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.flow import Flow, SubscriberMonitor
-from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.middleware import init_ros
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.sensor_graph import node_of, shortened
 from mag_tracking.nodes.shutdown import limit_exit_time, shut_down
@@ -461,7 +461,7 @@ def _run_until(signals: list[int], node_class: Callable[[], Node],
                arguments: list[str] | None) -> int:
     """Run a node until `signals` contains a received signal."""
     try:
-        begin(arguments)
+        init_ros(arguments)
     except SettingsError as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
         return 1

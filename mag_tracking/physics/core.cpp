@@ -147,14 +147,14 @@ void check_vehicles(const Array& x, int n_dipoles) {
         throw py::value_error("x: too few states for " + std::to_string(n_dipoles) + " dipoles");
 }
 
-py::tuple row_dipoles(const Array& x, int n_dipoles, const Array& induction) {
+py::tuple row_dipoles(const Array& x, int n_dipoles, const Array& field_strength) {
     check_vehicles(x, n_dipoles);
     const Size n = x.shape(0), n_x = x.shape(1), d = n_dipoles;
     const double* x_ = input_of(x, "x", {n, n_x});
-    const double* h = input_of(induction, "induction", {3});
+    const double* h = input_of(field_strength, "field_strength", {3});
     RowVehicle vehicle{};
     vehicle.n_states = int(n_x), vehicle.n_dipoles = n_dipoles;
-    std::copy(h, h + 3, vehicle.induction);
+    std::copy(h, h + 3, vehicle.field_strength);
     Array r({n, d, Size(3)}), m({n, d, Size(3)});
     Array dr_dx({n, d, Size(3), n_x}), dm_dx({n, d, Size(3), n_x});
     double *r_ = r.mutable_data(), *m_ = m.mutable_data();
@@ -169,7 +169,7 @@ py::tuple row_dipoles(const Array& x, int n_dipoles, const Array& induction) {
 
 // Writes the process noise of the hard iron moments to Q (n, n_x, n_x): `walk` (3 d, 3 d) times
 // the squared magnitude of the iron.
-void set_moment_noise(const Array& x, const Array& walk, double induction2, Array Q) {
+void set_moment_noise(const Array& x, const Array& walk, double field_strength2, Array Q) {
     const Size k = length_of(walk, "walk", 2);
     if (k % 3) throw py::value_error("walk: length must be a multiple of 3");
     check_vehicles(x, int(k / 3));
@@ -177,7 +177,7 @@ void set_moment_noise(const Array& x, const Array& walk, double induction2, Arra
     const double *x_ = input_of(x, "x", {n, n_x}), *walk_ = input_of(walk, "walk", {k, k});
     double* out = data_of(Q, "Q", {n, n_x, n_x});
     for (Size p = 0; p < n; ++p, x_ += n_x, out += n_x * n_x) {
-        const double size2 = iron_size2(x_, int(k / 3), induction2);
+        const double size2 = iron_size2(x_, int(k / 3), field_strength2);
         for (Size i = 0; i < k; ++i)
             for (Size j = 0; j < k; ++j) out[(6 + i) * n_x + 6 + j] = size2 * walk_[i * k + j];
     }
@@ -189,15 +189,15 @@ Samples samples_of(const Array& t, const Array& positions, const Array& M) {
             input_of(M, "M", {n, 3, 3})};
 }
 
-Row row_of(const Array& places) {
-    const Size d = length_of(places, "places", 1);
-    return {int(d), input_of(places, "places", {d})};
+Row row_of(const Array& offsets) {
+    const Size d = length_of(offsets, "offsets", 1);
+    return {int(d), input_of(offsets, "offsets", {d})};
 }
 
-Array row_bases(const Array& theta, const Array& places, const Array& t, const Array& positions,
+Array row_bases(const Array& theta, const Array& offsets, const Array& t, const Array& positions,
                 const Array& M) {
     const Samples samples = samples_of(t, positions, M);
-    const Row row = row_of(places);
+    const Row row = row_of(offsets);
     const Size n = length_of(theta, "theta", 2), n_theta = row.n > 1 ? 7 : 6;
     const double* theta_ = input_of(theta, "theta", {n, n_theta});
     Array A({n, 3 * samples.n, Size(3 * row.n)});
@@ -209,10 +209,10 @@ Array row_bases(const Array& theta, const Array& places, const Array& t, const A
     return A;
 }
 
-Array row_derivatives(const Array& theta, const Array& moments, const Array& places,
+Array row_derivatives(const Array& theta, const Array& moments, const Array& offsets,
                       const Array& t, const Array& positions, const Array& M) {
     const Samples samples = samples_of(t, positions, M);
-    const Row row = row_of(places);
+    const Row row = row_of(offsets);
     const Size n = length_of(theta, "theta", 2), n_theta = row.n > 1 ? 7 : 6;
     const double* theta_ = input_of(theta, "theta", {n, n_theta});
     const double* m = input_of(moments, "moments", {n, 3 * row.n});
@@ -236,10 +236,10 @@ const std::int64_t* clocks_of(const Integers& clock, Size n, const Array& theta)
     return clocks;
 }
 
-Array steady_bases(const Array& theta, const Array& places, const Array& t, const Array& positions,
+Array steady_bases(const Array& theta, const Array& offsets, const Array& t, const Array& positions,
                    const Array& M, const Integers& clock) {
     const Samples samples = samples_of(t, positions, M);
-    const Row row = row_of(places);
+    const Row row = row_of(offsets);
     const std::int64_t* clocks = clocks_of(clock, samples.n, theta);
     const Size n = theta.shape(0), n_theta = theta.shape(1);
     const double* theta_ = input_of(theta, "theta", {n, n_theta});
@@ -252,11 +252,11 @@ Array steady_bases(const Array& theta, const Array& places, const Array& t, cons
     return A;
 }
 
-Array steady_derivatives(const Array& theta, const Array& moments, const Array& places,
+Array steady_derivatives(const Array& theta, const Array& moments, const Array& offsets,
                          const Array& t, const Array& positions, const Array& M,
                          const Integers& clock) {
     const Samples samples = samples_of(t, positions, M);
-    const Row row = row_of(places);
+    const Row row = row_of(offsets);
     const std::int64_t* clocks = clocks_of(clock, samples.n, theta);
     const Size n = theta.shape(0), n_theta = theta.shape(1);
     const double* theta_ = input_of(theta, "theta", {n, n_theta});
@@ -293,14 +293,15 @@ PYBIND11_MODULE(core, module) {
     module.def("multipoles", &multipoles, IN(d), IN(moments));
     module.def("rotated_fields", &mounted_fields, IN(h), IN(H), IN(angles));
     module.def("turned", &turned, IN(x), py::arg("dt"), py::arg("mean"), py::arg("fading"));
-    module.def("row_dipoles", &row_dipoles, IN(x), IN(n_dipoles), IN(induction));
-    module.def("set_moment_noise", &set_moment_noise, IN(x), IN(walk), py::arg("induction2"), IN(Q));
-    module.def("row_bases", &row_bases, IN(theta), IN(places), IN(t), IN(positions), IN(M));
-    module.def("row_derivatives", &row_derivatives, IN(theta), IN(moments), IN(places), IN(t),
+    module.def("row_dipoles", &row_dipoles, IN(x), IN(n_dipoles), IN(field_strength));
+    module.def("set_moment_noise", &set_moment_noise, IN(x), IN(walk), py::arg("field_strength2"),
+               IN(Q));
+    module.def("row_bases", &row_bases, IN(theta), IN(offsets), IN(t), IN(positions), IN(M));
+    module.def("row_derivatives", &row_derivatives, IN(theta), IN(moments), IN(offsets), IN(t),
                IN(positions), IN(M));
-    module.def("steady_bases", &steady_bases, IN(theta), IN(places), IN(t), IN(positions), IN(M),
+    module.def("steady_bases", &steady_bases, IN(theta), IN(offsets), IN(t), IN(positions), IN(M),
                IN(clock));
-    module.def("steady_derivatives", &steady_derivatives, IN(theta), IN(moments), IN(places),
+    module.def("steady_derivatives", &steady_derivatives, IN(theta), IN(moments), IN(offsets),
                IN(t), IN(positions), IN(M), IN(clock));
     module.def("anderson_residual", &residual, IN(t), IN(y), py::arg("time"), py::arg("scale"));
 }

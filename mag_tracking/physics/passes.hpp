@@ -18,7 +18,7 @@ struct Samples {
 // Dipoles of a row, from tail to head.
 struct Row {
     int n;
-    const double* places;  // (n) positions along the row, in row lengths from the centre.
+    const double* offsets;  // (n) positions along the row, in row lengths from the centre.
 };
 
 // A row on a straight path with parameters `theta`: 6, or 7 for two or more dipoles.
@@ -38,7 +38,7 @@ class StraightPath {
     INLINE void basis(const Samples& samples, long s, double* A) const {
         const double *position = samples.positions + 3 * s, *M = samples.M + 9 * s;
         for (int i = 0; i < row_.n; ++i) {
-            const double ahead = samples.t[s] + row_.places[i] * stretch_;
+            const double ahead = samples.t[s] + row_.offsets[i] * stretch_;
             double d[3];
             for (int a = 0; a < 3; ++a) d[a] = position[a] - r_[a] - ahead * v_[a];
             set_unit_fields(d, M, A + 3 * i, 3 * row_.n);
@@ -53,7 +53,7 @@ class StraightPath {
         const double t = samples.t[s];
         double by_place[3][3] = {}, by_turn[3][3] = {}, by_length[3] = {};
         for (int i = 0; i < row_.n; ++i) {
-            const double ahead = row_.places[i] * length_;
+            const double ahead = row_.offsets[i] * length_;
             double d[3];
             for (int a = 0; a < 3; ++a)
                 d[a] = position[a] - r_[a] - t * v_[a] - ahead * u_[a];
@@ -68,7 +68,7 @@ class StraightPath {
                 const double turn = ahead * slowness_;
                 const double along = -(g[0] * u_[0] + g[1] * u_[1] + g[2] * u_[2]);
                 for (int b = 0; b < 3; ++b) by_turn[a][b] -= turn * (g[b] + along * u_[b]);
-                by_length[a] += row_.places[i] * along;
+                by_length[a] += row_.offsets[i] * along;
             }
         }
         for (int a = 0; a < 3; ++a) {

@@ -93,7 +93,7 @@ INLINE void steady_basis(const double* theta, const Row& row, const Samples& sam
     const double u_x = std::cos(at.heading), u_y = std::sin(at.heading);
     const double* p = samples.positions + 3 * s;
     for (int i = 0; i < row.n; ++i) {
-        const double q = row.places[i] * theta[LENGTH];
+        const double q = row.offsets[i] * theta[LENGTH];
         set_unit_fields({p[0] - at.position[0] - q * u_x, p[1] - at.position[1] - q * u_y,
                          p[2] - at.position[2]}, samples.M + 9 * s, A + 3 * i, 3 * row.n);
     }
@@ -109,7 +109,7 @@ INLINE void steady_derivative(const double* theta, int n, const double* moments,
     const double *p = samples.positions + 3 * s, *M = samples.M + 9 * s;
     double by_place[3][3] = {}, by_heading[3] = {}, by_length[3] = {};
     for (int i = 0; i < row.n; ++i) {
-        const double q = row.places[i] * theta[LENGTH];
+        const double q = row.offsets[i] * theta[LENGTH];
         const double* m = moments + 3 * i;
         const Dipole dipole({p[0] - at.position[0] - q * u_x, p[1] - at.position[1] - q * u_y,
                              p[2] - at.position[2]}, {m[0], m[1], m[2]});
@@ -118,7 +118,7 @@ INLINE void steady_derivative(const double* theta, int n, const double* moments,
             dipole.rows(M + 3 * a, g, by_moment);
             for (int b = 0; b < 3; ++b) by_place[a][b] -= g[b];
             by_heading[a] -= q * (g[1] * u_x - g[0] * u_y);
-            by_length[a] -= row.places[i] * (g[0] * u_x + g[1] * u_y);
+            by_length[a] -= row.offsets[i] * (g[0] * u_x + g[1] * u_y);
         }
     }
     for (int a = 0; a < 3; ++a) {

@@ -51,7 +51,7 @@ class SteadyPass:
     `free` are ignored."""
     n_dipoles: int
     """Number of dipoles of the row."""
-    places: FloatArray = field(init=False)
+    offsets: FloatArray = field(init=False)
     """Offsets of the dipoles from the centre of the row, (d,), relative to its length."""
     combinations: FloatArray = field(init=False)
     """Orthogonal matrix, (d, d), that converts the linear parameters of a component to moments."""
@@ -59,17 +59,17 @@ class SteadyPass:
     def __post_init__(self) -> None:
         """Compute the positions of the dipoles and the combinations of their moments."""
         d = self.n_dipoles
-        places = np.linspace(-0.5, 0.5, d) if d > 1 else np.zeros(1)
-        object.__setattr__(self, 'places', places)
+        offsets = np.linspace(-0.5, 0.5, d) if d > 1 else np.zeros(1)
+        object.__setattr__(self, 'offsets', offsets)
         object.__setattr__(self, 'combinations',
-                           np.linalg.qr(np.vander(places, increasing=True))[0])
+                           np.linalg.qr(np.vander(offsets, increasing=True))[0])
 
     @cached_property
     def _moment_transform(self) -> FloatArray:
         """Matrix, (3 d, 3 d), that converts linear parameters to moments of the row."""
         return np.kron(self.combinations, np.eye(3)).astype(np.float64)
 
-    def whole(self, theta: FloatArray) -> FloatArray:
+    def all_parameters(self, theta: FloatArray) -> FloatArray:
         """Combine free and fixed parameters.
 
         Parameters
@@ -99,8 +99,8 @@ class SteadyPass:
         (n_paths, 3 n, 3 n_dipoles) array
             NaN where a dipole is at a sensor.
         """
-        A = core.steady_bases(self.whole(theta), self.places, self.t, self.positions, self.M,
-                              self.clock)
+        A = core.steady_bases(self.all_parameters(theta), self.offsets, self.t, self.positions,
+                              self.M, self.clock)
         return A @ self._moment_transform
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
@@ -119,7 +119,7 @@ class SteadyPass:
             Derivative of basis(theta) p with respect to theta.
         """
         D = core.steady_derivatives(
-            self.whole(theta), p @ self._moment_transform.T, self.places, self.t,
+            self.all_parameters(theta), p @ self._moment_transform.T, self.offsets, self.t,
             self.positions, self.M, self.clock)
         free: FloatArray = D[:, :, self.free]
         return free

@@ -11,14 +11,14 @@
 namespace mag_tracking {
 
 // Squared magnitude of the iron of a state [A^2 m^4]: hard iron moment, plus soft iron times
-// |B0/mu0| per axis. `induction2` is |B0/mu0|^2 [A^2/m^2].
-INLINE double iron_size2(const double* x, int n_dipoles, double induction2) {
+// |B0/mu0| per axis. `field_strength2` is |B0/mu0|^2 [A^2/m^2].
+INLINE double iron_size2(const double* x, int n_dipoles, double field_strength2) {
     const int soft = 6 + 3 * n_dipoles;
     double size2 = 0.0;
     for (int a = 0; a < 3; ++a) {
         double moment = 0.0;
         for (int k = 6 + a; k < soft; k += 3) moment += x[k];
-        size2 += moment * moment + x[soft + a] * x[soft + a] * induction2 / 3.0;
+        size2 += moment * moment + x[soft + a] * x[soft + a] * field_strength2 / 3.0;
     }
     return size2;
 }
@@ -31,14 +31,14 @@ struct Induced {
     double x, y;             // [A m^2] horizontal induced moment, world frame.
     double by_x, by_y;       // Its derivative by the heading.
 
-    INLINE Induced(const double* state, int n_dipoles, const double* induction) {
+    INLINE Induced(const double* state, int n_dipoles, const double* field_strength) {
         const double* v = state + 3;
         const double* soft = state + 6 + 3 * n_dipoles;
         const double speed = std::sqrt(v[0] * v[0] + v[1] * v[1]);
         slowness = speed > 0.0 ? 1.0 / speed : 0.0;
         c = speed > 0.0 ? v[0] * slowness : 1.0, s = v[1] * slowness;
-        const double h_x = induction[0] / n_dipoles, h_y = induction[1] / n_dipoles;
-        ahead = c * h_x + s * h_y, left = c * h_y - s * h_x, up = induction[2] / n_dipoles;
+        const double h_x = field_strength[0] / n_dipoles, h_y = field_strength[1] / n_dipoles;
+        ahead = c * h_x + s * h_y, left = c * h_y - s * h_x, up = field_strength[2] / n_dipoles;
         const double m_ahead = soft[0] * ahead, m_left = soft[1] * left;
         // In the frame of a body that rotates anticlockwise, the field rotates clockwise.
         const double dm_ahead = soft[0] * left - m_left, dm_left = m_ahead - soft[1] * ahead;
@@ -50,7 +50,7 @@ struct Induced {
 // A row of dipoles along the heading: RowVehicle of vehicles.py.
 struct RowVehicle {
     int n_states, n_dipoles;
-    double density[3], induction[3];  // Acceleration density [m^2/s^3]; B0/mu0 [A/m].
+    double density[3], field_strength[3];  // Acceleration density [m^2/s^3]; B0/mu0 [A/m].
     double moment_drift, difference_drift, turn_acceleration, turn_time, max_turn_rate;
 
     INLINE int n() const { return n_states; }
@@ -83,9 +83,9 @@ struct RowVehicle {
                       double* Q) const {
         const int n = n_states, d = n_dipoles;
         for (int a = 0; a < 3; ++a) integrator_noise(Q, wide, a, 3 + a, density[a], dt);
-        double induction2 = 0.0;
-        for (int a = 0; a < 3; ++a) induction2 += induction[a] * induction[a];
-        const double size2 = iron_size2(x, d, induction2);
+        double field_strength2 = 0.0;
+        for (int a = 0; a < 3; ++a) field_strength2 += field_strength[a] * field_strength[a];
+        const double size2 = iron_size2(x, d, field_strength2);
         const double whole = dt * size2 * moment_drift * moment_drift / d;
         const double difference = dt * size2 * difference_drift * difference_drift;
         const double between = (whole - difference) / d;
@@ -108,7 +108,7 @@ struct RowVehicle {
     // derivatives (d, 3, n) by the state, which must be zero on entry.
     INLINE void dipoles(const double* x, double* r, double* m, double* dr, double* dm) const {
         const int n = n_states, d = n_dipoles, soft = 6 + 3 * d, length = 9 + 3 * d;
-        const Induced iron(x, d, induction);
+        const Induced iron(x, d, field_strength);
         const double c = iron.c, s = iron.s;
         // d(heading)/dv = [-sin, cos]/|v|
         const double turn_x = -s * iron.slowness, turn_y = c * iron.slowness;
@@ -143,7 +143,7 @@ struct RowVehicle {
     INLINE double field(const double* x, const double* position, const double* R, double* field,
                         double* H, int stride) const {
         const int d = n_dipoles, soft = 6 + 3 * d, length = 9 + 3 * d;
-        const Induced iron(x, d, induction);
+        const Induced iron(x, d, field_strength);
         const double c = iron.c, s = iron.s;
         for (int a = 0; a < 3; ++a) {
             field[a] = 0.0;

@@ -76,7 +76,7 @@ class RowVehicle:
                 *(('w',) if self.turn_acceleration else ()))
 
     @cached_property
-    def induction(self) -> FloatArray:
+    def field_strength(self) -> FloatArray:
         """Magnetic field strength B0/mu0 of the Earth, (3,) A/m, world frame."""
         return np.asarray(self.earth_field, dtype=float) / MU0
 
@@ -112,7 +112,7 @@ class RowVehicle:
             raise ValueError(f'{self.n_dipoles} dipoles need {len(self.state_names)} states, '
                              f'got an array of shape {x.shape}')
         return Dipoles(*core.row_dipoles(np.ascontiguousarray(x, dtype=float), self.n_dipoles,
-                                         self.induction))
+                                         self.field_strength))
 
     def propagate(self, x: FloatArray, dt: float, P: FloatArray | None = None
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -144,7 +144,7 @@ class RowVehicle:
         Q = np.zeros((len(x), n, n))
         Q[:, :6, :6] = integrator_noise(dt, self.acceleration_density)
         core.set_moment_noise(np.ascontiguousarray(x, dtype=float), abs(dt) * self._moment_walk,
-                              float(self.induction @ self.induction), Q)
+                              float(self.field_strength @ self.field_strength), Q)
         if not self.turn_acceleration:
             F = np.eye(n)
             F[:6, :6] = constant_velocity(dt)

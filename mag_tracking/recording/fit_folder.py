@@ -51,7 +51,7 @@ class _FittedPass(Protocol):
     @property
     def notes(self) -> Sequence[str]: ...
     @property
-    def known(self) -> PassFit | None: ...
+    def reported(self) -> PassFit | None: ...
     @property
     def correlated(self) -> CorrelatedMotion: ...
     @property
@@ -129,7 +129,7 @@ def pass_rows(fitted_pass: _FittedPass) -> list[dict[str, Any]]:
     list of dict
         Values by `FIT_COLUMNS`.
     """
-    chosen, known, c = fitted_pass.chosen, fitted_pass.known, fitted_pass.correlated
+    chosen, known, c = fitted_pass.chosen, fitted_pass.reported, fitted_pass.correlated
     delay = {'delay_speed': c.speed, 'sd_delay_speed': c.speed_std,
              'delay_heading_deg': math.degrees(c.heading),
              'sd_delay_heading_deg': math.degrees(c.heading_std), 'no_delay': c.reason}

@@ -8,7 +8,7 @@ import numpy as np
 from mcap.records import Schema
 
 from mag_tracking.arrays import IntArray
-from mag_tracking.messages.self_described import SCHEMAS, cdr_of, type_of
+from mag_tracking.messages.self_described import SUPPORTED_ENCODINGS, cdr_of, type_of
 from mag_tracking.messages.types import schema_of
 from mag_tracking.recording.raw_message import RawMessage
 
@@ -38,7 +38,7 @@ class ChannelKind(NamedTuple):
         -------
         ChannelKind
         """
-        kind = type_of(schema) if schema.encoding in SCHEMAS else schema.name
+        kind = type_of(schema) if schema.encoding in SUPPORTED_ENCODINGS else schema.name
         return cls(topic, kind, schema, kind == schema.name)
 
 

@@ -58,7 +58,7 @@ class _Survey(Protocol):
     """Attributes of a `GeometrySurvey` that the figures use."""
 
     @property
-    def stated(self) -> _Network: ...
+    def nominal(self) -> _Network: ...
 
     @property
     def network(self) -> _Network: ...
@@ -97,7 +97,7 @@ def geometry_figure(survey: _Survey) -> Figure:
     _plot_pose_residuals(poses, survey)
     rows = right.subplots(4, 1, sharex=True)
     indices = np.arange(n)
-    displacement = survey.network.positions - survey.stated.positions
+    displacement = survey.network.positions - survey.nominal.positions
     _plot_corrections(rows[0], indices, 1e3 * np.linalg.norm(displacement, axis=1),
                       1e3 * g.position_std, 'displacement [mm]')
     _plot_corrections(rows[1], indices, np.rad2deg(survey.rotation_angle),
@@ -117,7 +117,7 @@ def geometry_figure(survey: _Survey) -> Figure:
 
 def _plot_displacements(figure: SubFigure, axes: Axes, survey: _Survey, suspect: BoolArray) -> None:
     """Plot the board, viewed along its thinnest axis, with magnified arrows for displacements."""
-    positions = survey.stated.positions
+    positions = survey.nominal.positions
     a, b = _widest_axes(positions)
     c = 3 - a - b
     shift = 1e3 * (survey.network.positions - positions)

@@ -93,7 +93,7 @@ def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str
             'colorbar': {'title': {'text': title, 'side': 'right'}}}
 
 
-def places(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
+def sensor_trace(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
     """Create the trace of the sensors on a map.
 
     Parameters

@@ -66,19 +66,19 @@ class _Plan(Protocol):
     def detection(self) -> FloatArray: ...
 
     @property
-    def with_one_more(self) -> FloatArray: ...
+    def std_with_added_sensor(self) -> FloatArray: ...
 
     @property
-    def missed(self) -> FloatArray: ...
+    def miss_probability(self) -> FloatArray: ...
 
     @property
     def lanes(self) -> Sequence[_Lane]: ...
 
     @property
-    def without(self) -> float: ...
+    def std_without_added_sensor(self) -> float: ...
 
     @property
-    def best_place(self) -> tuple[float, float]: ...
+    def best_position(self) -> tuple[float, float]: ...
 
 
 def _draw_map(plan: _Plan, title: str) -> tuple[Figure, Axes, float, str]:
@@ -174,21 +174,21 @@ def sensor_figure(plan: _Plan) -> Figure:
     -------
     Figure
     """
-    gain = 1.0 - plan.with_one_more / plan.without
+    gain = 1.0 - plan.std_with_added_sensor / plan.std_without_added_sensor
     possible = np.isfinite(gain).any()
     figure, axes, f, unit = _draw_map(
         plan, f'Improvement by one additional sensor; median bound near the sensors without it: '
-        f'{length_text(plan.without)}')
+        f'{length_text(plan.std_without_added_sensor)}')
     ny, nx = gain.shape
     x, y = np.linspace(plan.x[0], plan.x[-1], nx), np.linspace(plan.y[0], plan.y[-1], ny)
     mesh = axes.pcolormesh(f * x, f * y, 100.0 * gain, cmap='cividis', shading='nearest',
                            rasterized=True)
     if not possible:
         return figure
-    best = plan.best_place
+    best = plan.best_position
     axes.plot(f * best[0], f * best[1], 'r*', ms=15, mec='w', clip_on=False, zorder=6,
               label=f'best: ({f * best[0]:.3g}, {f * best[1]:.3g}) {unit}, bound '
-              f'{length_text(np.nanmin(plan.with_one_more))}')
+              f'{length_text(np.nanmin(plan.std_with_added_sensor))}')
     axes.legend(fontsize=9, loc='upper right')
     figure.colorbar(mesh, ax=axes, label='reduction of the bound [%]')
     return figure
@@ -262,9 +262,9 @@ def lane_figure(plan: _Plan) -> Figure:
     middle.set_ylabel('P(detection by one frame)')
     middle.set_xlabel(f'distance along the lane [{unit}]')
     legend_beside(middle)
-    drawn_rows = plan.missed[plan.missed[:, 1] >= MIN_MISSED]
+    drawn_rows = plan.miss_probability[plan.miss_probability[:, 1] >= MIN_MISSED]
     bottom.semilogy(f * drawn_rows[:, 0], drawn_rows[:, 1], '.-', color='k')
-    bottom.set_xlim(f * plan.missed[0, 0], 1.02 * f * plan.missed[-1, 0])
+    bottom.set_xlim(f * plan.miss_probability[0, 0], 1.02 * f * plan.miss_probability[-1, 0])
     bottom.set_ylim(0.5 * MIN_MISSED, 2.0)
     bottom.set_xlabel(f'lateral distance of a pass from the centre of the sensors [{unit}]')
     bottom.set_ylabel('P(missed pass)')

@@ -23,7 +23,7 @@ from mag_tracking.report.page import live_html
 
 LOOPBACK = '127.0.0.1'
 DEFAULT_PORT = 8765
-TICK_S = 0.05
+UPDATE_INTERVAL_S = 0.05
 """[s] Interval between messages. A target at 50 km/h moves 0.7 m in this time."""
 MAX_BUFFERED = 1_000_000
 """[bytes] Maximum size of a viewer's send buffer. A viewer that exceeds it receives no messages
@@ -146,7 +146,7 @@ class PageServer:
             while not self._stop.is_set():
                 self._send_updates()
                 try:
-                    await asyncio.wait_for(self._stop.wait(), TICK_S)
+                    await asyncio.wait_for(self._stop.wait(), UPDATE_INTERVAL_S)
                 except asyncio.TimeoutError:
                     continue
 

@@ -169,4 +169,4 @@ def test_no_fit_of_a_turn_is_trusted(name, road_network):
     job = RecordingFit(Recording(vehicle_path(name)), road_network, settings_for('vehicle'),
                        (1, 2, 3, 4))
     (fitted_pass,) = job.passes()
-    assert fitted_pass.chosen is None and fitted_pass.known is None
+    assert fitted_pass.chosen is None and fitted_pass.reported is None

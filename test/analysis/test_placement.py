@@ -149,12 +149,15 @@ def test_a_plan_is_consistent(road_plan):
     assert lane.detection[np.argmin(np.abs(lane.along))] > 0.999
     # The road and the two sensors are symmetric.
     np.testing.assert_allclose(p.position_std, p.position_std[::-1], rtol=0.2)
-    assert np.nanmin(p.with_one_more) < p.without
-    assert (np.nan_to_num(p.with_one_more) <= p.without * (1.0 + 1e-9)).all()
-    assert abs(p.best_place[1]) >= 2.0 and np.isnan(p.with_one_more).any()
-    assert (np.diff(p.missed[:, 1]) > -1e-6).all() and p.missed[0, 1] < 1e-6 < p.missed[-1, 1]
+    assert np.nanmin(p.std_with_added_sensor) < p.std_without_added_sensor
+    assert (np.nan_to_num(p.std_with_added_sensor)
+            <= p.std_without_added_sensor * (1.0 + 1e-9)).all()
+    assert abs(p.best_position[1]) >= 2.0 and np.isnan(p.std_with_added_sensor).any()
+    missed = p.miss_probability[:, 1]
+    assert (np.diff(missed) > -1e-6).all() and missed[0] < 1e-6 < missed[-1]
     assert p.observability.kernel_dimension == 0
-    assert (p.blocks['with prior'] <= p.blocks['without prior'] * (1.0 + 1e-9)).all()
+    bounds = p.bounds_at_closest
+    assert (bounds['with prior'] <= bounds['without prior'] * (1.0 + 1e-9)).all()
 
 
 def test_plan_writes_all_its_files(tmp_path, capsys):
@@ -221,9 +224,9 @@ def test_the_additional_sensor_has_the_clearance_from_each_lane():
     p = compute_plan(ROAD, CAR, Sampling(0.08, 4e-9, 0.04, 1e-8),
                      [('a', 0.0, 2.0), ('b', 0.0, -3.0)], (-12.0, -12.0, 12.0, 12.0),
                      settings_for('vehicle'), clearance=1.5, n_grid=13)
-    y = np.linspace(-12.0, 12.0, p.with_one_more.shape[0])
+    y = np.linspace(-12.0, 12.0, p.std_with_added_sensor.shape[0])
     is_clear = (np.abs(y - 2.0) >= 1.5) & (np.abs(y + 3.0) >= 1.5)
-    assert np.array_equal(np.isfinite(p.with_one_more).all(axis=1), is_clear)
+    assert np.array_equal(np.isfinite(p.std_with_added_sensor).all(axis=1), is_clear)
 
 
 def test_the_summary_states_on_which_side_of_the_centre_detection_begins(road_plan):

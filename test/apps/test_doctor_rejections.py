@@ -116,5 +116,5 @@ def test_the_doctor_gives_the_advice():
     doctor = Doctor(network, settings_for('vehicle'))
     for sample in changed(quiet(510, network), 499, field=np.full(3, 2e-4)):
         doctor.feed(one(sample))
-    assert any('1 reading rejected: spike' in f.what
+    assert any('1 reading rejected: spike' in f.fault
                and f.advice == ADVICE[RejectionCause.SPIKES] for f in doctor.findings())

@@ -43,9 +43,9 @@ def run_node(role):
     from mag_tracking_msgs.msg import FieldReadings
 
     from mag_tracking.interrupts import recorded_signals
-    from mag_tracking.nodes.middleware import begin
+    from mag_tracking.nodes.middleware import init_ros
     from mag_tracking.nodes.stage_node import STREAM_QOS, make_executor, spin
-    begin()
+    init_ros()
     node, executor, count = rclpy.create_node(f'chain_{role}'), make_executor(), [0]
     out = {'last': 'pose', 'second': 'c', 'first': 'b', 'source': 'a'}[role]
     kind = PoseWithCovarianceStamped if role == 'last' else FieldReadings
@@ -79,9 +79,9 @@ def main():
     import rclpy
     from geometry_msgs.msg import PoseWithCovarianceStamped
 
-    from mag_tracking.nodes.middleware import begin
+    from mag_tracking.nodes.middleware import init_ros
     from mag_tracking.nodes.stage_node import STREAM_QOS, make_executor, spin
-    begin()
+    init_ros()
     node, executor, delays = rclpy.create_node('chain'), make_executor(), []
     executor.add_node(node)
     node.create_subscription(

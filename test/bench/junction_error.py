@@ -86,7 +86,7 @@ def magnetic_centre(network, row):
     (data, _), = passes
     body_position, R = true_motion(data, next(iter(replay_recording(network, {}).truth.values())))
     y = np.einsum('nij,nj->ni', network.R_ws[data.sensor], data.field).ravel() / NOISE
-    induction = network.earth_field / MU0
+    field_strength = network.earth_field / MU0
     backgrounds = np.kron(np.eye(len(network))[data.sensor], np.eye(3))
 
     def linear(p):
@@ -94,7 +94,7 @@ def magnetic_centre(network, row):
         for offset in row:
             r = data.positions - body_position - R @ (p[:3] + [offset * p[3], 0.0, 0.0])
             columns += [dipole_field(r, m).ravel() / NOISE for m in (
-                *np.moveaxis(R, 2, 0), np.broadcast_to(induction, r.shape))]
+                *np.moveaxis(R, 2, 0), np.broadcast_to(field_strength, r.shape))]
         A = np.column_stack([*columns, backgrounds])
         scale = np.linalg.norm(A, axis=0)
         theta = np.linalg.lstsq(A / scale, y, rcond=None)[0]
@@ -102,7 +102,7 @@ def magnetic_centre(network, row):
 
     found = least_squares(lambda p: linear(p)[0], [0.0, 0.0, 0.5, 1.3])
     iron = linear(found.x)[1][:4 * len(row)].reshape(-1, 4)
-    moments = np.linalg.norm(iron[:, :3] + iron[:, 3:] * induction, axis=1)
+    moments = np.linalg.norm(iron[:, :3] + iron[:, 3:] * field_strength, axis=1)
     unknowns = (4 if len(row) > 1 else 3) + 4 * len(row) + 3 * len(network)
     return found.x[:3], found.x[3], moments, 2.0 * found.cost / (len(y) - unknowns)
 

@@ -59,13 +59,13 @@ def test_covariance_agrees_with_the_errors(stated):
         assert np.isnan(costs).all()
 
 
-@pytest.mark.parametrize('headings, induction', [
+@pytest.mark.parametrize('headings, field_strength', [
     ([0.3], INDUCTION), ([0.3, 0.3, 0.3 + 2.0 * np.pi], INDUCTION),
     ([0.3, 1.3, 2.3], [0.0, 0.0, -39.0]), ([0.3, 1.3, 2.3], np.zeros(3))])
-def test_inseparable_hard_and_soft_iron_is_rejected(headings, induction):
+def test_inseparable_hard_and_soft_iron_is_rejected(headings, field_strength):
     headings = np.array(headings)
     with pytest.raises(ValueError, match='cannot be separated'):
-        hard_and_soft_iron(moments_at(headings), headings, induction)
+        hard_and_soft_iron(moments_at(headings), headings, field_strength)
 
 
 def test_invalid_arguments_raise_value_error():

@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 
 from mag_tracking.errors import SettingsError
 from mag_tracking.nodes.calibration_node import CalibrationNode
-from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.middleware import init_ros
 from mag_tracking.recording.background_file import write_backgrounds
 from support.bundled import NETWORK_FILE, vehicle_path
 from support.node_processes import MAX_S, start, stop
@@ -197,7 +197,7 @@ def test_a_file_outside_the_folder_is_refused_at_start(folders, parameter, name,
 
 def create_node(network_folder, parameter, name):
     """Create and destroy a calibration node with a file name as the value of a parameter."""
-    begin()
+    init_ros()
     try:
         node = CalibrationNode(parameter_overrides=[
             Parameter('network', value=str(network_folder / 'network.yaml')),

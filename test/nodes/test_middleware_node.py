@@ -28,9 +28,9 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import MagneticField
-from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.middleware import init_ros
 from mag_tracking.nodes.stage_node import STREAM_QOS
-begin()
+init_ros()
 node, received = Node('listener'), Future()
 executor = EventsExecutor()
 executor.add_node(node)
@@ -59,7 +59,7 @@ def init_calls(monkeypatch, tmp_path):
 
 
 def test_the_profile_of_the_package_is_the_default(init_calls):
-    middleware.begin(['--ros-args'])
+    middleware.init_ros(['--ros-args'])
     assert init_calls[0]['args'] == ['--ros-args']
     assert os.environ[middleware.PROFILE_VARIABLE] == str(middleware.PROFILE)
     assert middleware.PROFILE.exists()
@@ -70,7 +70,7 @@ def test_the_profile_of_the_package_is_the_default(init_calls):
 def test_a_profile_of_the_user_is_kept(init_calls, capfd, own, is_reported):
     """An empty value means no profile; a missing file is reported."""
     os.environ[middleware.PROFILE_VARIABLE] = own
-    middleware.begin()
+    middleware.init_ros()
     assert os.environ[middleware.PROFILE_VARIABLE] == own and len(init_calls) == 1
     errors = capfd.readouterr().err
     assert ('/somewhere/else.xml does not exist' in errors) == is_reported == bool(errors)
@@ -78,7 +78,7 @@ def test_a_profile_of_the_user_is_kept(init_calls, capfd, own, is_reported):
 
 def test_a_profile_in_the_working_folder_is_kept(init_calls, tmp_path):
     (tmp_path / middleware.WORKING_FOLDER_PROFILE).write_text('<dds/>')
-    middleware.begin()
+    middleware.init_ros()
     assert middleware.PROFILE_VARIABLE not in os.environ and len(init_calls) == 1
 
 

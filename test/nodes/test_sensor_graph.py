@@ -29,7 +29,7 @@ def test_several_publishers_are_a_fault_even_if_their_nodes_are_unknown():
             ([endpoint('b', '/n'), UNKNOWN_ENDPOINT, endpoint('a')], '/a, /n/b')):
         graph = SimpleNamespace(get_publishers_info_by_topic=lambda _, found=publishers: found)
         (finding,) = topic_findings(graph, 'mag_1', '/mag_1/imu/mag')
-        assert finding.what == f'{len(publishers)} publishers of /mag_1/imu/mag: {nodes}'
+        assert finding.fault == f'{len(publishers)} publishers of /mag_1/imu/mag: {nodes}'
 
 
 def test_many_names_are_shortened():

@@ -142,7 +142,7 @@ def start_s(monkeypatch):
 
     with RosDomain() as domain:
         monkeypatch.setenv('ROS_DOMAIN_ID', str(domain.number))
-        middleware.begin()
+        middleware.init_ros()
         observer = Node('observer')
         yield measure
         observer.destroy_node()

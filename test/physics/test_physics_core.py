@@ -15,7 +15,7 @@ def normal(*shape):
     return RNG.standard_normal(shape)
 
 
-PASS = {'places': np.linspace(-0.5, 0.5, DIPOLES), 't': normal(SAMPLES),
+PASS = {'offsets': np.linspace(-0.5, 0.5, DIPOLES), 't': normal(SAMPLES),
         'positions': normal(SAMPLES, 3), 'M': normal(SAMPLES, 3, 3)}
 MOMENTS = normal(HYPOTHESES, 3 * DIPOLES)
 CLOCK = np.array([-1, 0, 1, -1, 0])
@@ -34,9 +34,9 @@ CALLS = {
         'angles': normal(HYPOTHESES, SENSORS, 3)},
     'turned': {'x': normal(HYPOTHESES, STATES), 'dt': 0.1, 'mean': 1.0, 'fading': 1.0},
     'row_dipoles': {'x': normal(HYPOTHESES, STATES), 'n_dipoles': DIPOLES,
-                    'induction': normal(3)},
+                    'field_strength': normal(3)},
     'set_moment_noise': {'x': normal(HYPOTHESES, STATES), 'walk': normal(9, 9),
-                         'induction2': 1.0, 'Q': np.zeros((HYPOTHESES, STATES, STATES))},
+                         'field_strength2': 1.0, 'Q': np.zeros((HYPOTHESES, STATES, STATES))},
     'row_bases': {'theta': normal(HYPOTHESES, 7), **PASS},
     'row_derivatives': {'theta': normal(HYPOTHESES, 7), 'moments': MOMENTS, **PASS},
     'steady_bases': {'theta': CURVED_PATHS, **PASS, 'clock': CLOCK},
@@ -46,8 +46,8 @@ CALLS = {
 INDEPENDENT_AXES = {
     ('rotated_fields', 'H', 3), ('turned', 'x', 0), ('turned', 'x', 1),
     ('row_dipoles', 'x', 0), ('row_dipoles', 'x', 1), ('row_bases', 'theta', 0),
-    ('row_bases', 'places', 0), ('steady_bases', 'theta', 0), ('steady_bases', 'theta', 1),
-    ('steady_bases', 'places', 0), ('steady_derivatives', 'theta', 1),
+    ('row_bases', 'offsets', 0), ('steady_bases', 'theta', 0), ('steady_bases', 'theta', 1),
+    ('steady_bases', 'offsets', 0), ('steady_derivatives', 'theta', 1),
     ('anderson_residual', 'y', 1)}
 """Axes (function, argument, axis) whose length does not depend on the other arguments."""
 

@@ -71,5 +71,5 @@ def test_parameters_that_are_not_free_keep_their_fixed_values():
     theta = np.array([[1.5, 8.0, 0.3]])
     expected = fixed.copy()
     expected[[0, 3, 10]] = theta[0]
-    np.testing.assert_array_equal(partial.whole(theta), expected[None])
+    np.testing.assert_array_equal(partial.all_parameters(theta), expected[None])
     np.testing.assert_array_equal(partial.basis(theta), model(N_PATH + 2).basis(expected[None]))

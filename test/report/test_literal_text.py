@@ -75,7 +75,7 @@ def geometry():
         position_std=np.ones((3, 3)), rotation_std=np.ones((3, 3)), gain=np.ones(3),
         gain_std=np.ones(3), sensor_residual=np.ones(3), pose_residual=ONES,
         suspect_sensors=NAMES[:1], poses=(np.ones((4, 3)), np.ones((4, 3))))
-    return SimpleNamespace(stated=NETWORK, network=NETWORK, geometry=found, rows=np.arange(4),
+    return SimpleNamespace(nominal=NETWORK, network=NETWORK, geometry=found, rows=np.arange(4),
                            suspect_rows=(), rotation_angle=np.ones(3))
 
 

@@ -16,7 +16,7 @@ from sensor_msgs.msg import MagneticField
 
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.convert import track_of
-from mag_tracking.nodes.middleware import begin
+from mag_tracking.nodes.middleware import init_ros
 from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS, make_executor
 from mag_tracking.simulation.scenario import point_body
 from support.bundled import NETWORK_FILE, POINT
@@ -238,7 +238,7 @@ def world(folder):
     with Broker(folder) as broker, Broker(
             own, *password_lines(own, 'somebody', 'secret')) as guarded, Roadside(
             read_network(network_file(folder)), BODY, broker.port, line) as roadside:
-        begin()
+        init_ros()
         running_world = World(folder, broker, guarded, roadside, line)
         try:
             running_world.use('mqtt')

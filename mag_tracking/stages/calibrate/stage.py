@@ -11,7 +11,7 @@ from mag_tracking.calibration import core
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted
-from mag_tracking.calibration.frequent_level import QuietLevel
+from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.level_change import SharedChanges
 from mag_tracking.calibration.screening import clear_spikes
 from mag_tracking.calibration.sensor_state import new_sensors
@@ -293,12 +293,13 @@ class Calibrate:
                      int(self._sensors[i]['n_held']))
         clear_spikes(self._sensors[i])
 
-    def start_from(self, levels: Mapping[str, QuietLevel], steps: Mapping[str, FloatArray]) -> None:
+    def start_from(self, levels: Mapping[str, MostFrequentLevel],
+                   steps: Mapping[str, FloatArray]) -> None:
         """Initialise the stage with the results of a first pass over the readings.
 
         Parameters
         ----------
-        levels : mapping of str to QuietLevel
+        levels : mapping of str to MostFrequentLevel
             Background of each sensor that is not quiet at the start.
         steps : mapping of str to (3,) array, T
             Resolution of the axes of each sensor.

@@ -12,7 +12,7 @@ import numpy as np
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
-from mag_tracking.calibration.screening import COARSE, MIN_CHANGES
+from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
 from mag_tracking.quantities import occurrences
 from mag_tracking.stages.health.window import median_field, quantiles, sample_noise_std
 from mag_tracking.units import NEVER, NS
@@ -49,11 +49,11 @@ class Finding:
     """True if the fault makes results wrong, false if it only makes them less accurate."""
     subject: str
     """Name of the sensor or stage."""
-    what: str
+    fault: str
     advice: str
 
     def __str__(self) -> str:
-        return f'{self.subject}: {self.what}; {self.advice}'
+        return f'{self.subject}: {self.fault}; {self.advice}'
 
 
 class SensorHealth:
@@ -241,7 +241,7 @@ class SensorHealth:
     def is_coarse(self) -> bool:
         """Whether the sensor repeats readings at rest, or readings changed too rarely to decide."""
         return self._n_changed < MIN_CHANGES \
-            or self._n_repeated >= COARSE * (self._n_repeated + self._n_changed)
+            or self._n_repeated >= COARSE_FRACTION * (self._n_repeated + self._n_changed)
 
     @property
     def unchanged_since_ns(self) -> int | None:

@@ -25,10 +25,10 @@ struct Advanced {
 // Parameters and outputs of `run_along`.
 struct Along {
     bool first_is_updated;
-    double strange;
+    double max_nis;
     int iterations, passes;
     double step;
-    double *paths, *log_likelihood, *unsettled, *covariances;
+    double *paths, *log_likelihood, *max_shift, *covariances;
     bool* used;
 };
 
@@ -98,11 +98,11 @@ INLINE void run_along_all(const Target& target, const Sensors& sensors, const Si
             std::copy(bank.x + p * n_x, bank.x + (p + 1) * n_x, x.data());
             to_wide(bank.P + p * square, n, P.data());
             along.log_likelihood[p] = filter.run(
-                frames, along.first_is_updated, along.strange, along.iterations,
+                frames, along.first_is_updated, along.max_nis, along.iterations,
                 bank.lengths(p), at, x.data(), P.data(), path);
             if (!filter.smooth(frames, path, smoothed.data(), std.data()))
                 along.log_likelihood[p] = -std::numeric_limits<double>::infinity();
-            along.unsettled[p] = farthest(smoothed.data(), at, std.data(), frames.n, n_x);
+            along.max_shift[p] = farthest(smoothed.data(), at, std.data(), frames.n, n_x);
             for (int i = 0; i < frames.n * n_x; ++i)
                 at[i] = std::isnan(at[i]) ? smoothed[i]
                                           : at[i] + along.step * (smoothed[i] - at[i]);

@@ -33,7 +33,7 @@ class PathResult(NamedTuple):
     log_likelihood: FloatArray
     """Log-likelihood of the frames used for updates, (n_hyp,); -inf if a dipole is at a sensor or a
     variance is negative."""
-    unsettled: FloatArray
+    max_shift: FloatArray
     """Largest distance of the smoothed positions from the path in the last pass, (n_hyp,), in
     standard deviations of the position."""
     used: BoolArray
@@ -61,7 +61,7 @@ def compiled_filter(model: SourceModel, observation: Observation
         create = partial(core.RowVehicleFilter, *sensors) if observation.n_targets == 1 \
             else partial(core.VehiclesFilter, *sensors, observation.n_targets)
         return create(len(model.state_names), model.n_dipoles, list(model.acceleration_density),
-                      list(model.induction), model.moment_drift, model.difference_drift,
+                      list(model.field_strength), model.moment_drift, model.difference_drift,
                       model.turn_acceleration, model.turn_time, MAX_TURN_RATE)
     assert isinstance(model, Magnet) and observation.n_targets == 1
     return core.MagnetFilter(*sensors, list(model.acceleration_density), model.angular_density)
@@ -211,12 +211,12 @@ class BankFilter:
         new_x, new_P = np.empty_like(bank.x), np.empty_like(bank.P)
         self._compiled.run_along(
             **self._frames(frames, intervals), first_is_updated=first_is_updated,
-            strange=self._settings.end_nis if rejects_outliers else np.inf,
+            max_nis=self._settings.end_nis if rejects_outliers else np.inf,
             iterations=self._settings.iterations, passes=passes, step=step,
             field_error=self._settings.field_error,
             near_field_length=self._lengths(bank.kind), x=bank.x, P=bank.P,
             new_x=new_x, new_P=new_P, paths=paths, log_likelihood=out.log_likelihood,
-            unsettled=out.unsettled, covariances=out.covariances, used=out.used)
+            max_shift=out.max_shift, covariances=out.covariances, used=out.used)
         bank.x, bank.P = new_x, new_P
         return out
 

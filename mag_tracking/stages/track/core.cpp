@@ -64,10 +64,10 @@ class CompiledFilter {
     }
 
     void run_along(Array field, Array covariance, Array offset, Array dt, Array decay,
-                   Array variance, bool first_is_updated, double strange, int iterations,
+                   Array variance, bool first_is_updated, double max_nis, int iterations,
                    int passes, double step,
                    double field_error, Array near_field_length, Array x, Array P, Array new_x,
-                   Array new_P, Array paths, Array log_likelihood, Array unsettled,
+                   Array new_P, Array paths, Array log_likelihood, Array max_shift,
                    Array covariances, ArrayOf<bool> used) const {
         const Sizes n = sizes();
         const Size n_hyp = length_of(near_field_length, "near_field_length", 2);
@@ -90,10 +90,10 @@ class CompiledFilter {
                            data_of(new_P, "new_P", {n_hyp, n_x, n_x}), nullptr, nullptr, nullptr};
         const bool wants_covariances = covariances.size() > 0;
         const Along along{
-            first_is_updated, strange, iterations, passes, step,
+            first_is_updated, max_nis, iterations, passes, step,
             data_of(paths, "paths", {n_hyp, n_frames, n_x}),
             data_of(log_likelihood, "log_likelihood", {n_hyp}),
-            data_of(unsettled, "unsettled", {n_hyp}),
+            data_of(max_shift, "max_shift", {n_hyp}),
             wants_covariances ? data_of(covariances, "covariances", {n_hyp, n_frames, n_x, n_x})
                               : nullptr,
             data_of(used, "used", {n_hyp, n_frames})};
@@ -137,18 +137,18 @@ void add_filter(py::module_& module, const char* name, Target (*target)(Numbers.
              IN(variance), IN(moves), IN(iterations), IN(field_error), IN(near_field_length),
              IN(x), IN(P), IN(new_x), IN(new_P), IN(predicted), IN(log_likelihood), IN(nis))
         .def("run_along", &Class::run_along, IN(field), IN(covariance), IN(offset), IN(dt),
-             IN(decay), IN(variance), IN(first_is_updated), IN(strange), IN(iterations),
+             IN(decay), IN(variance), IN(first_is_updated), IN(max_nis), IN(iterations),
              IN(passes), IN(step),
              IN(field_error), IN(near_field_length), IN(x), IN(P), IN(new_x), IN(new_P),
-             IN(paths), IN(log_likelihood), IN(unsettled), IN(covariances), IN(used));
+             IN(paths), IN(log_likelihood), IN(max_shift), IN(covariances), IN(used));
 }
 
 void fit_steady_pass(Array theta, Array cost, Array covariance, Integers free, Array fixed,
-                     Array places, Array combinations, Array t, Array positions, Array M,
+                     Array offsets, Array combinations, Array t, Array positions, Array M,
                      Integers clock, Array y, Array nuisance, int n_steps, double tolerance,
-                     double most_damping, double full_rank, double linear_rank, double rank) {
+                     double max_damping, double full_rank, double linear_rank, double rank) {
     const Size n = length_of(theta, "theta", 2), k = length_of(free, "free", 1);
-    const Size n_t = length_of(t, "t", 1), d = length_of(places, "places", 1);
+    const Size n_t = length_of(t, "t", 1), d = length_of(offsets, "offsets", 1);
     const Size n_whole = length_of(fixed, "fixed", 1), q = (length_of(nuisance, "nuisance", 2),
                                                             nuisance.shape(1));
     const std::int64_t *clocks = input_of(clock, "clock", {n_t}), *columns = free.data();
@@ -161,7 +161,7 @@ void fit_steady_pass(Array theta, Array cost, Array covariance, Integers free, A
             throw py::value_error("free: index out of range");
     const Samples samples{n_t, t.data(), input_of(positions, "positions", {n_t, 3}),
                           input_of(M, "M", {n_t, 3, 3})};
-    SteadyModel model({int(d), places.data()}, input_of(combinations, "combinations", {d, d}),
+    SteadyModel model({int(d), offsets.data()}, input_of(combinations, "combinations", {d, d}),
                       samples, clocks, fixed.data(), int(n_whole), columns, int(k));
     const double* values = input_of(y, "y", {3 * n_t});
     const double* projected = input_of(nuisance, "nuisance", {3 * n_t, q});
@@ -172,28 +172,28 @@ void fit_steady_pass(Array theta, Array cost, Array covariance, Integers free, A
     double* C = data_of(covariance, "covariance", {n, k, k});
     py::gil_scoped_release release;
     fit_steady(model, values, rows,
-               {n_steps, tolerance, most_damping, full_rank, linear_rank, rank}, n, found, costs,
+               {n_steps, tolerance, max_damping, full_rank, linear_rank, rank}, n, found, costs,
                C);
 }
 
 using Vector = std::array<double, 3>;
 
-RowVehicle row_vehicle(int n_states, int n_dipoles, Vector density, Vector induction,
+RowVehicle row_vehicle(int n_states, int n_dipoles, Vector density, Vector field_strength,
                        double moment_drift, double difference_drift, double turn_acceleration,
                        double turn_time, double max_turn_rate) {
     if (n_dipoles < 1 || n_states != 9 + 3 * n_dipoles + (n_dipoles > 1) + (turn_acceleration != 0.0))
         throw py::value_error("n_states: does not match the number of dipoles");
     return {n_states, n_dipoles, {density[0], density[1], density[2]},
-            {induction[0], induction[1], induction[2]}, moment_drift, difference_drift,
-            turn_acceleration, turn_time, max_turn_rate};
+            {field_strength[0], field_strength[1], field_strength[2]}, moment_drift,
+            difference_drift, turn_acceleration, turn_time, max_turn_rate};
 }
 
-Vehicles vehicles(int count, int n_states, int n_dipoles, Vector density, Vector induction,
+Vehicles vehicles(int count, int n_states, int n_dipoles, Vector density, Vector field_strength,
                   double moment_drift, double difference_drift, double turn_acceleration,
                   double turn_time, double max_turn_rate) {
     if (count < 1 || count > MAX_TARGETS)
         throw py::value_error("count: from 1 to " + std::to_string(MAX_TARGETS));
-    return {row_vehicle(n_states, n_dipoles, density, induction, moment_drift, difference_drift,
+    return {row_vehicle(n_states, n_dipoles, density, field_strength, moment_drift, difference_drift,
                         turn_acceleration, turn_time, max_turn_rate), count};
 }
 
@@ -213,7 +213,7 @@ PYBIND11_MODULE(core, module) {
     add_filter(module, "MagnetFilter", magnet);
     module.attr("MAX_TARGETS") = MAX_TARGETS;
     module.def("fit_steady_pass", &fit_steady_pass, IN(theta), IN(cost), IN(covariance), IN(free),
-               IN(fixed), IN(places), IN(combinations), IN(t), IN(positions), IN(M), IN(clock),
-               IN(y), IN(nuisance), IN(n_steps), IN(tolerance), IN(most_damping), IN(full_rank),
+               IN(fixed), IN(offsets), IN(combinations), IN(t), IN(positions), IN(M), IN(clock),
+               IN(y), IN(nuisance), IN(n_steps), IN(tolerance), IN(max_damping), IN(full_rank),
                IN(linear_rank), IN(rank));
 }

@@ -18,15 +18,15 @@ class _Filter:
                 log_likelihood: FloatArray, nis: FloatArray) -> None: ...
     def run_along(self, *, field: FloatArray, covariance: FloatArray, offset: FloatArray,
                   dt: FloatArray, decay: FloatArray, variance: FloatArray, first_is_updated: bool,
-                  strange: float, iterations: int, passes: int, step: float, field_error: float,
+                  max_nis: float, iterations: int, passes: int, step: float, field_error: float,
                   near_field_length: FloatArray, x: FloatArray, P: FloatArray, new_x: FloatArray,
                   new_P: FloatArray, paths: FloatArray, log_likelihood: FloatArray,
-                  unsettled: FloatArray, covariances: FloatArray, used: BoolArray) -> None: ...
+                  max_shift: FloatArray, covariances: FloatArray, used: BoolArray) -> None: ...
 
 class RowVehicleFilter(_Filter):
     def __init__(self, positions: FloatArray, R_sw: FloatArray, n_angles: int, n_errors: int,
                  n_states: int, n_dipoles: int, density: Sequence[float],
-                 induction: Sequence[float], moment_drift: float, difference_drift: float,
+                 field_strength: Sequence[float], moment_drift: float, difference_drift: float,
                  turn_acceleration: float, turn_time: float, max_turn_rate: float) -> None: ...
 
 class VehiclesFilter(_Filter):
@@ -34,7 +34,7 @@ class VehiclesFilter(_Filter):
 
     def __init__(self, positions: FloatArray, R_sw: FloatArray, n_angles: int, n_errors: int,
                  count: int, n_states: int, n_dipoles: int, density: Sequence[float],
-                 induction: Sequence[float], moment_drift: float, difference_drift: float,
+                 field_strength: Sequence[float], moment_drift: float, difference_drift: float,
                  turn_acceleration: float, turn_time: float, max_turn_rate: float) -> None: ...
 
 class MagnetFilter(_Filter):
@@ -42,9 +42,9 @@ class MagnetFilter(_Filter):
                  density: Sequence[float], angular_density: float) -> None: ...
 
 def fit_steady_pass(*, theta: FloatArray, cost: FloatArray, covariance: FloatArray, free: IntArray,
-                    fixed: FloatArray, places: FloatArray, combinations: FloatArray, t: FloatArray,
+                    fixed: FloatArray, offsets: FloatArray, combinations: FloatArray, t: FloatArray,
                     positions: FloatArray, M: FloatArray, clock: IntArray, y: FloatArray,
-                    nuisance: FloatArray, n_steps: int, tolerance: float, most_damping: float,
+                    nuisance: FloatArray, n_steps: int, tolerance: float, max_damping: float,
                     full_rank: float, linear_rank: float, rank: float) -> None:
     """Fit a `SteadyPass` from each start by the method of `least_squares.refine`.
 

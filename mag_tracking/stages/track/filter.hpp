@@ -117,13 +117,13 @@ class Filter {
     // Filters a hypothesis, `x` (wide) and `P` (n_x, wide), through all frames; returns the
     // log-likelihood. The linearisation points are `path` (n, n_x). NaN linearises at the
     // prediction, and repeats the update at its own result, `iterations` times in total. A frame
-    // whose normalised innovation squared exceeds `strange` per axis is not used for an update.
-    INLINE double run(const Frames& frames, bool first_is_updated, double strange, int iterations,
+    // whose normalised innovation squared exceeds `max_nis` per axis is not used for an update.
+    INLINE double run(const Frames& frames, bool first_is_updated, double max_nis, int iterations,
                       const double* near_field_length, const double* path, double* x, double* P,
                       Path& out) {
         double total = 0.0;
         std::vector<double> nis(n_.n_sensors);
-        const bool leaves_out = std::isfinite(strange), goes_back = leaves_out || iterations > 1;
+        const bool leaves_out = std::isfinite(max_nis), goes_back = leaves_out || iterations > 1;
         Numbers prior_x(n_.wide), prior_P(goes_back ? n_.square() : 0);
         for (int k = 0; k < frames.n; ++k) {
             const Frame frame = frames.at(k, n_);
@@ -139,7 +139,7 @@ class Filter {
                     of_frame = update(frame, x_lin, near_field_length, x, P, out.gains(k, n_),
                                       nis.data());
                 }
-                if (leaves_out && is_implausible(frame.field, nis, strange)) {
+                if (leaves_out && is_implausible(frame.field, nis, max_nis)) {
                     copy(prior_x.data(), prior_P.data(), x, P);
                     out.used[k] = false;
                 } else {
@@ -221,14 +221,14 @@ class Filter {
     }
 
     INLINE bool is_implausible(const double* y, const std::vector<double>& nis,
-                           double strange) const {
+                           double max_nis) const {
         double total = 0.0;
         int axes = 0;
         for (int j = 0; j < n_.n_sensors; ++j) {
             if (!std::isnan(nis[j])) total += nis[j];
             for (int a = 0; a < 3; ++a) axes += !std::isnan(y[3 * j + a]);
         }
-        return total > strange * axes;
+        return total > max_nis * axes;
     }
 
     // Computes the fields h_, their derivative `H` and inflation_ at the state `x`; returns false

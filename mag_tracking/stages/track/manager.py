@@ -27,7 +27,7 @@ from mag_tracking.stages.track.target import target_of
 from mag_tracking.units import NS
 
 NO_SCALE = 'detections not tracked (scale not observable with one sensor)'
-ALONE = 'frames in which no track could start (scale not observable with one sensor)'
+NO_SCALE_FRAMES = 'frames in which no track could start (scale not observable with one sensor)'
 
 DISTURBANCE_TRACKS = 'tracks explained by a disturbance'
 
@@ -274,7 +274,7 @@ class TrackManager:
         recent = [f for f in self._recent if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
         if not (s.single_sensor_prior or self._target.starts_anywhere) \
                 and _n_sensors(frame, *recent) < 2:
-            self.counts[ALONE] += 1
+            self.counts[NO_SCALE_FRAMES] += 1
             self._store_frame(frame)
             return []
         later_sensors = self._sensors_at(frame, s.max_sensors)

@@ -161,13 +161,13 @@ class PassSamples:
         cost, P = np.empty(n), np.empty((n, n_free, n_free))
         core.fit_steady_pass(
             theta=theta, cost=cost, covariance=P, free=plain(free, np.int64), fixed=model.fixed,
-            places=model.places, combinations=model.combinations, t=self.t,
+            offsets=model.offsets, combinations=model.combinations, t=self.t,
             positions=self.positions, M=self.M, clock=self.clock, y=y, nuisance=nuisance,
-            n_steps=N_STEPS, tolerance=TOLERANCE, most_damping=MAX_DAMPING,
+            n_steps=N_STEPS, tolerance=TOLERANCE, max_damping=MAX_DAMPING,
             full_rank=MIN_PIVOT_ROOT, linear_rank=LINEAR_RANK_TOLERANCE,
             rank=PSEUDO_INVERSE_TOLERANCE)
         k = int(np.argmin(cost))
-        return model.whole(theta[k:k + 1])[0], float(cost[k]), P[k]
+        return model.all_parameters(theta[k:k + 1])[0], float(cost[k]), P[k]
 
     def straight_model(self, n_dipoles: int) -> SteadyPass:
         """Row of dipoles on a straight path at constant speed, without clock offsets.

@@ -215,7 +215,7 @@ class Relinearisation:
                            out=np.full(len(rows), -np.inf))
         self._gain = dict(zip(anchor.origin[rows[is_finite]].tolist(), gain[is_finite].tolist(),
                               strict=True))
-        converged = path_result.unsettled <= CONVERGED
+        converged = path_result.max_shift <= CONVERGED
         is_accepted = is_finite & converged & (
             (gain >= 0.0) | ~bank_filter.are_long(bank.kind[leading]))
         _replace_states(bank, leading[is_accepted], relinearised.x[is_accepted],

@@ -109,7 +109,8 @@ class VehicleState:
         is_point = s.length_stds[kind] == 0.0
         dipole_moments = np.tile(moments.sum(axis=0) / d, (d, 1)) if is_point \
             else _resampled(ordered, d)
-        x[:, 6:6 + 3 * d] = (dipole_moments @ R - soft_D * self._model.induction @ R / d).ravel()
+        induced = soft_D * self._model.field_strength
+        x[:, 6:6 + 3 * d] = (dipole_moments @ R - induced @ R / d).ravel()
         x[:, 6 + 3 * d:9 + 3 * d] = soft_D
         if d > 1:
             x[:, 9 + 3 * d] = s.lengths[kind] if is_point else abs(length)

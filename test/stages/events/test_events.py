@@ -18,7 +18,7 @@ from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.events.single_sensor_pass import closest_point
 from mag_tracking.stages.events.stage import Events
-from mag_tracking.stages.track.manager import ALONE
+from mag_tracking.stages.track.manager import NO_SCALE_FRAMES
 from mag_tracking.units import NS
 from support import spoiler
 from support.bundled import LINEARISED_ONCE, NETWORK_FILE, VEHICLES, vehicle_path
@@ -185,7 +185,7 @@ def test_a_network_with_a_single_active_sensor_tracks_only_with_a_prior():
     readings = spoiler.only_sensor('mag_2')(recorded('straight_car_right').readings)
     result = mt.track(readings, NETWORK)
     assert len(result.detections) and not len(result.poses)
-    assert result.counts['track'][ALONE] > 10
+    assert result.counts['track'][NO_SCALE_FRAMES] > 10
     result = mt.track(readings, NETWORK, settings={'track.single_sensor_prior': True})
     assert len(result.poses) and result.poses['ambiguous'].all()
 
@@ -197,7 +197,7 @@ def test_a_track_that_begins_when_a_sensor_returns_is_ambiguous():
     begin_ns = mt.track(readings, NETWORK, settings=LINEARISED_ONCE).poses['stamp_ns'][0]
     assert begin_ns < readings.stamp_ns[silent].max(), 'no track begins during the dropout'
     result = mt.track(readings.part(~silent), NETWORK, settings=LINEARISED_ONCE)
-    assert result.counts['track'][ALONE] > 0
+    assert result.counts['track'][NO_SCALE_FRAMES] > 0
     assert len(result.poses) and result.poses['ambiguous'].all()
     assert result.poses['stamp_ns'][0] > readings.stamp_ns[silent].max() - 0.1 * NS
 

@@ -132,7 +132,7 @@ def test_filtering_and_smoothing_along_paths_matches_numpy(
     assert np.abs(difference).max() <= 1e-6
     np.testing.assert_array_equal(got.used, expected.used)
     np.testing.assert_allclose(got.log_likelihood, expected.log_likelihood, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(got.unsettled, expected.unsettled, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(got.max_shift, expected.max_shift, rtol=1e-5, atol=1e-6)
 
 
 def test_a_hypothesis_at_a_sensor_is_ruled_out_and_the_others_are_not():
@@ -216,7 +216,7 @@ def test_an_invalid_hypothesis_does_not_affect_the_others(name):
         path_result = compiled.run_along(b, frames, intervals, p, passes=3, step=0.5,
                                          first_is_updated=False, wants_covariances=True)
         found.append((b.x[1:], b.P[1:], p[1:], path_result.covariances[1:],
-                      path_result.log_likelihood[1:], path_result.unsettled[1:]))
+                      path_result.log_likelihood[1:], path_result.max_shift[1:]))
     assert path_result.log_likelihood[0] == -np.inf
     for expected, got in zip(*found, strict=True):
         np.testing.assert_array_equal(got, expected)
@@ -228,7 +228,7 @@ def test_a_path_through_infinity_has_not_converged():
     paths[0, 2] = np.inf
     path_result = compiled.run_along(bank, frames, intervals, paths, passes=1, step=0.5,
                                      first_is_updated=False)
-    assert np.isnan(path_result.unsettled[0]) and np.isfinite(path_result.unsettled[1])
+    assert np.isnan(path_result.max_shift[0]) and np.isfinite(path_result.max_shift[1])
 
 
 def test_the_number_of_vehicles_that_share_a_state_is_bounded():

@@ -98,10 +98,10 @@ def test_the_fit_of_almost_coincident_dipoles_matches_numpy(length):
     nuisance = np.linalg.qr(data.backgrounds)[0]
     cost, P = np.empty(1), np.empty((1, 2, 2))
     core.fit_steady_pass(
-        theta=theta.copy(), cost=cost, covariance=P, free=free, fixed=fixed, places=model.places,
+        theta=theta.copy(), cost=cost, covariance=P, free=free, fixed=fixed, offsets=model.offsets,
         combinations=model.combinations, t=data.t, positions=data.positions, M=data.M,
         clock=data.clock, y=data.y - nuisance @ (nuisance.T @ data.y), nuisance=nuisance,
-        n_steps=0, tolerance=0.0, most_damping=1e12, full_rank=1e-3,
+        n_steps=0, tolerance=0.0, max_damping=1e12, full_rank=1e-3,
         linear_rank=LINEAR_RANK_TOLERANCE, rank=PSEUDO_INVERSE_TOLERANCE)
     residual, J = problem.residual_and_jacobian(theta)
     assert cost[0] == pytest.approx(float(residual[0] @ residual[0]), rel=1e-6)
@@ -123,10 +123,10 @@ def test_the_fit_of_almost_coincident_dipoles_matches_numpy(length):
 def test_invalid_arrays_are_rejected(name, value, error):
     arguments = {
         'theta': np.zeros((1, 2)), 'cost': np.zeros(1), 'covariance': np.zeros((1, 2, 2)),
-        'free': np.arange(2), 'fixed': np.zeros(N_PATH + 1), 'places': np.zeros(1),
+        'free': np.arange(2), 'fixed': np.zeros(N_PATH + 1), 'offsets': np.zeros(1),
         'combinations': np.eye(1), 't': np.arange(4.0), 'positions': np.ones((4, 3)),
         'M': np.tile(np.eye(3), (4, 1, 1)), 'clock': np.full(4, -1), 'y': np.zeros(12),
-        'nuisance': np.zeros((12, 2)), 'n_steps': 1, 'tolerance': 0.0, 'most_damping': 1e12,
+        'nuisance': np.zeros((12, 2)), 'n_steps': 1, 'tolerance': 0.0, 'max_damping': 1e12,
         'full_rank': 1e-3, 'linear_rank': 1e-11, 'rank': 1e-15}
     core.fit_steady_pass(**arguments)
     with pytest.raises(ValueError, match=error):
