@@ -183,7 +183,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     median_bound[allowed] = with_sensor
     report_part(1)
     best_index = int(np.nanargmin(median_bound)) if allowed.any() else 0
-    lane_observability, blocks = _closest_point_bounds(network, target, sampling,
+    lane_observability, bounds = _closest_point_bounds(network, target, sampling,
                                                        planned_lanes[0], half_length)
     shape = len(coarse_y), len(coarse_x)
     return Plan(
@@ -192,14 +192,14 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
         probability.mean(axis=1).reshape(len(y), len(x)), planned_lanes,
         median_bound.reshape(shape), without,
         (float(coarse_x[best_index % shape[1]]), float(coarse_y[best_index // shape[1]])),
-        lane_observability, blocks,
+        lane_observability, bounds,
         _miss_probabilities(network, target, sampling, planned_lanes[0], area, settings))
 
 
 def _closest_point_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                           lane: Lane, distance_scale: float,
                           ) -> tuple[Observability, dict[str, FloatArray]]:
-    """Compute `Plan.observability` and `Plan.blocks`; `distance_scale` [m] scales positions."""
+    """Compute `Plan.observability` and `Plan.bounds_at_closest`; `distance_scale` [m] scales positions."""
     closest = lane.points[np.argmin(np.abs(lane.along))][None]
     J = pass_information(network.positions, network.R_sw, target, sampling, closest,
                          lane.heading)[0].sum(axis=1)
