@@ -199,7 +199,10 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
 def _closest_point_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                           lane: Lane, distance_scale: float,
                           ) -> tuple[Observability, dict[str, FloatArray]]:
-    """Compute `Plan.observability` and `Plan.bounds_at_closest`; `distance_scale` [m] scales positions."""
+    """Compute `Plan.observability` and `Plan.bounds_at_closest`.
+
+    `distance_scale` [m] is the unit of the positions for the observability.
+    """
     closest = lane.points[np.argmin(np.abs(lane.along))][None]
     J = pass_information(network.positions, network.R_sw, target, sampling, closest,
                          lane.heading)[0].sum(axis=1)
