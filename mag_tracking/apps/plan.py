@@ -183,8 +183,8 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     median_bound[allowed] = with_sensor
     report_part(1)
     best_index = int(np.nanargmin(median_bound)) if allowed.any() else 0
-    lane_observability, bounds = _closest_point_bounds(network, target, sampling,
-                                                       planned_lanes[0], half_length)
+    lane_observability, closest_bounds = _closest_point_bounds(network, target, sampling,
+                                                               planned_lanes[0], half_length)
     shape = len(coarse_y), len(coarse_x)
     return Plan(
         network, target, sampling, x, y,
@@ -192,7 +192,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
         probability.mean(axis=1).reshape(len(y), len(x)), planned_lanes,
         median_bound.reshape(shape), without,
         (float(coarse_x[best_index % shape[1]]), float(coarse_y[best_index // shape[1]])),
-        lane_observability, bounds,
+        lane_observability, closest_bounds,
         _miss_probabilities(network, target, sampling, planned_lanes[0], area, settings))
 
 
