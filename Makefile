@@ -60,7 +60,7 @@ config: $(STAMP)  ## write the generated files of config/ from the settings and 
 	$(BIN)/python tools/generate_policies.py
 	$(BIN)/python tools/generate_viewers.py
 
-test: $(STAMP)  ## check style, floors, types, behaviour and documentation
+test: $(STAMP)  ## check style, layers, types, behaviour and documentation
 	@sh tools/check_program.sh mosquitto mosquitto 'the tests of MQTT'
 	@sh tools/check_program.sh chromium chromium 'the tests of reports and live pages'
 	$(BIN)/ruff check .

@@ -13,39 +13,39 @@ from support.bundled import ROOT
 
 PACKAGE = ROOT / 'mag_tracking'
 FILES = sorted(PACKAGE.rglob('*.py'))
-MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_ROOM_FRACTION = 350, 40, 0.2
+MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_PACKAGE_FRACTION = 350, 40, 0.2
 """Maximum lines of a file and of a function, without docstrings; maximum fraction of all lines in
-one room."""
+one package."""
 
 
-def checked_floors():
-    """Rooms of each floor, highest floor first, from the contracts of `lint-imports`."""
+def checked_layers():
+    """Packages of each layer, highest layer first, from the contracts of `lint-imports`."""
     contracts = api.read_configuration(str(ROOT / 'pyproject.toml'))['contracts_options']
     rows = next(c['layers'] for c in contracts if c['type'] == 'layers')
     return [set(re.split(r'\s*[|:]\s*', row)) for row in rows]
 
 
-def documented_floors():
-    """Rooms of each floor, highest floor first, from docs/contributing/architecture.md."""
+def documented_layers():
+    """Packages of each layer, highest layer first, from docs/contributing/architecture.md."""
     text = (ROOT / 'docs' / 'contributing' / 'architecture.md').read_text()
     rows = re.findall(r'^\| (\d) \| ([^|]+)\|', text, re.M)
     assert [int(n) for n, _ in rows] == list(range(len(rows), 0, -1))
-    return [{room.removesuffix('.py').rstrip('/') for room in re.findall(r'`([^`]+)`', rooms)}
-            for _, rooms in rows]
+    return [{name.removesuffix('.py').rstrip('/') for name in re.findall(r'`([^`]+)`', packages)}
+            for _, packages in rows]
 
 
-def test_import_contracts_match_the_documented_floors():
-    assert checked_floors() == documented_floors()
+def test_import_contracts_match_the_documented_layers():
+    assert checked_layers() == documented_layers()
 
 
 def test_every_module_has_a_floor():
-    rooms = {p.stem if p.is_file() else p.name for p in PACKAGE.iterdir()
+    packages = {p.stem if p.is_file() else p.name for p in PACKAGE.iterdir()
              if p.name != '__pycache__' and (p.suffix == '.py' or p.is_dir())}
-    assert rooms - {'__init__'} == set.union(*checked_floors())
+    assert packages - {'__init__'} == set.union(*checked_layers())
 
 
-def test_compiled_sources_include_only_headers_of_lower_floors():
-    floor = {room: -k for k, rooms in enumerate(checked_floors()) for room in rooms}
+def test_compiled_sources_include_only_headers_of_lower_layers():
+    layer = {package: -k for k, packages in enumerate(checked_layers()) for package in packages}
     sources = [*PACKAGE.rglob('*.hpp'), *PACKAGE.rglob('*.cpp')]
     assert sources
     for source in sources:
@@ -56,9 +56,9 @@ def test_compiled_sources_include_only_headers_of_lower_floors():
             own, other = (p.relative_to(PACKAGE).parts[0].removesuffix('.hpp')
                           for p in (source, included))
             assert included.is_file(), (source, name)
-            # A header outside the rooms belongs to the lowest floor.
-            assert own == other or floor.get(other, -len(checked_floors())) < floor.get(
-                own, -len(checked_floors()) + 1), (source, name)
+            # A header outside the packages belongs to the lowest layer.
+            assert own == other or layer.get(other, -len(checked_layers())) < layer.get(
+                own, -len(checked_layers()) + 1), (source, name)
 
 
 def test_the_import_graph_has_no_cycle():
@@ -94,12 +94,13 @@ def test_no_file_exceeds_the_maximum_length():
             if n_lines(p) > MAX_FILE_LINES} == {}
 
 
-def test_no_room_exceeds_the_maximum_fraction_of_all_lines():
-    rooms = Counter()
+def test_no_package_exceeds_the_maximum_fraction_of_all_lines():
+    packages = Counter()
     for path in FILES:
-        rooms[path.relative_to(PACKAGE).parts[0]] += n_lines(path)
-    largest, n = rooms.most_common(1)[0]
-    assert n <= MAX_ROOM_FRACTION * rooms.total(), f'{largest}: {n} of {rooms.total()} lines'
+        packages[path.relative_to(PACKAGE).parts[0]] += n_lines(path)
+    largest, n = packages.most_common(1)[0]
+    total = packages.total()
+    assert n <= MAX_PACKAGE_FRACTION * total, f'{largest}: {n} of {total} lines'
 
 
 def definitions(path):
@@ -149,7 +150,7 @@ def test_tests_use_no_private_names(path):
 
 
 def test_the_tests_mirror_the_package():
-    """Every folder of tests, with the listed exceptions, is a room of the package."""
+    """Every folder of tests, with the listed exceptions, is a subpackage."""
     exceptions = {'data', 'support', 'system', 'bench', '__pycache__'}
     folders = [p.relative_to(ROOT / 'test') for p in (ROOT / 'test').rglob('*')
                if p.is_dir() and not set(p.relative_to(ROOT / 'test').parts) & exceptions]
@@ -168,7 +169,7 @@ def paths_in_documents():
 
 
 def test_files_named_in_documents_exist():
-    """Paths are relative to the project, the package, a room of it, or the tests."""
-    rooms = [ROOT, PACKAGE, *(p for p in PACKAGE.rglob('*') if p.is_dir()), ROOT / 'test']
+    """Paths are relative to the project, the package, a subpackage, or the tests."""
+    folders = [ROOT, PACKAGE, *(p for p in PACKAGE.rglob('*') if p.is_dir()), ROOT / 'test']
     assert [(d, name) for d, name in paths_in_documents()
-            if not any((room / name).exists() for room in rooms)] == []
+            if not any((folder / name).exists() for folder in folders)] == []

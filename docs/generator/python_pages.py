@@ -30,14 +30,14 @@ def python_pages():
     """{file name: Markdown}: overview, public interface, base modules, one page per folder."""
     pages = {'python/index.md': overview(), 'python/interface.md': interface(),
              'python/base.md': page('Base modules', BASE, base_modules())}
-    for room in rooms():
-        for folder, modules in folders_of(room).items():
+    for package in packages():
+        for folder, modules in folders_of(package).items():
             pages[f'python/{folder.replace("/", "_")}.md'] = page(
                 folder.replace('/', '.'), description_of(folder), modules)
     return pages
 
 
-def rooms():
+def packages():
     """Top-level folders of the package that have pages."""
     return sorted(p.parent.name for p in PACKAGE.glob('*/__init__.py')
                   if p.parent.name not in ELSEWHERE)
@@ -49,10 +49,10 @@ def base_modules():
             if p.stem not in (*PRIVATE, '__init__')]
 
 
-def folders_of(room):
+def folders_of(package):
     """{folder: [module]} of a top-level folder and its subfolders, without empty modules."""
     found = {}
-    for path in sorted((PACKAGE / room).rglob('*.py')):
+    for path in sorted((PACKAGE / package).rglob('*.py')):
         if path.stem in PRIVATE or (path.stem == '__init__' and not is_documented(path)):
             continue
         parts = path.relative_to(PACKAGE).with_suffix('').parts
@@ -100,8 +100,8 @@ def overview():
     rows = [('interface', 'What `import mag_tracking` exports: start here.'),
             ('base', BASE)]
     names = ['interface', 'base']
-    for room in rooms():
-        for folder in folders_of(room):
+    for package in packages():
+        for folder in folders_of(package):
             names.append(folder.replace('/', '_'))
             rows.append((names[-1], description_of(folder)))
     return '\n'.join([
