@@ -253,7 +253,7 @@ class _SmoothedPair:
     """[T] Noise standard deviation of the difference between two readings."""
 
     def at(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Interpolate field and slope (n, k) of the first series at times `t` (n,)."""
+        """Interpolate the first field and its slope, (n, k) each, at times `t` (n,)."""
         field, slope = (np.stack([np.interp(t, self.t, v) for v in values.T], axis=1)
                         for values in (self.first, self.slope))
         return field, slope
@@ -355,7 +355,7 @@ def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]
 
 
 def _delay_std(t: FloatArray, J: FloatArray, residuals: FloatArray, prior: FloatArray) -> float:
-    """Standard deviation [s] of the delay, including the unexplained difference of the fields."""
+    """Standard deviation [s] of the delay, including the effect of model errors."""
     covariance: FloatArray = np.linalg.inv(J.T @ J + prior).astype(np.float64)
     shape = len(t), len(residuals) // len(t)
     covariance += model_error_covariance([t], [J.reshape(*shape, -1)], [residuals.reshape(shape)],
@@ -365,7 +365,10 @@ def _delay_std(t: FloatArray, J: FloatArray, residuals: FloatArray, prior: Float
 
 def _residuals(pair: _SmoothedPair, t: FloatArray, y: FloatArray,
                theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Residuals (n k,) [T], and derivatives (n k, n_theta) of the model with respect to theta."""
+    """Residuals (n k,) [T] of the second field `y`, and derivatives of its model.
+
+    The derivatives (n k, n_theta) are with respect to `theta`.
+    """
     k = y.shape[1]
     tau, background, angles, gain = theta[0], theta[1:1 + k], theta[1 + k:4 + k], theta[4 + k:]
     field, slope = pair.at(t - tau)

@@ -79,7 +79,7 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
 
 def _initial_poses(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
                    high: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Locate the magnet in each reading; return index, position and axis of the k valid poses."""
+    """Locate the magnet in each reading; return rows, positions and axes of the valid poses."""
     if field.ndim != 3 or field.shape[1:] != (len(network), 3):
         raise ValueError(f'expected field (K, {len(network)}, 3), got {field.shape}')
     median = np.zeros(field.shape[1:])

@@ -33,7 +33,7 @@ class Bearing:
     """Observable quantities of a pass at a single sensor, relative to the sensor.
 
     The distance is not observable. A path and its reflection through the sensor have the same
-    field, so the sign of the path is not observable either.
+    field and cannot be distinguished.
     """
 
     cpa_direction: FloatArray
