@@ -234,7 +234,10 @@ def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
 
 
 def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwork:
-    """Return `network` with `noise_std` [T] for sensors without a noise; None changes nothing."""
+    """Return `network` with the noise `noise_std` [T] for sensors whose noise is unknown.
+
+    If `noise_std` is None, the network is not changed.
+    """
     if noise_std is None:
         return network
     return replace(network, noise_std=tuple(

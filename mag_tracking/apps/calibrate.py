@@ -130,7 +130,10 @@ def _survey_recording(recording: Recording, network: SensorNetwork, settings: Se
 def _track_passes(recording: Recording, network: SensorNetwork, settings: Settings,
                   progress: Callable[[int], object] | None, stopped: Callable[[], bool] | None,
                   ) -> tuple[list[Track], bool]:
-    """Track the targets; return (last unambiguous pose of each used track, interrupted)."""
+    """Track the targets; return (last unambiguous pose of each track, interrupted).
+
+    Tracks with fewer than `MIN_POSES` unambiguous poses are excluded.
+    """
     reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
     poses: dict[int, tuple[int, Track]] = {}
     interrupted = False
@@ -152,7 +155,10 @@ def _track_passes(recording: Recording, network: SensorNetwork, settings: Settin
 
 def _with_pass_records(network: SensorNetwork, surveyed: SensorNetwork, date: str,
                        n_tracks: int) -> SensorNetwork:
-    """Return `network` with the records of `surveyed`, plus the date and number of passes."""
+    """Return `network` with the calibration records of `surveyed`.
+
+    The date and the number of passes are added to each record.
+    """
     passes = quantity(n_tracks, 'pass', 'passes')
     return replace(network, calibrated=tuple(
         surveyed.calibration_record(j, date, f'nominal orientation; {passes}') if record is None

@@ -98,10 +98,10 @@ class Plan:
 
 def detection_range(target: PlannedTarget, noise_std: float, n_axes: int,
                     false_alarm: float) -> float:
-    """Compute the approximate range at which a frame of one sensor detects half of the targets.
+    """Compute the approximate range at which one sensor detects half of the targets in one frame.
 
-    The mean signal energy over all directions of the moment is used. It is twice the energy
-    perpendicular to the axis of the dipole.
+    The signal energy is averaged over all directions of the moment. The average is twice the energy
+    at a point perpendicular to the axis of the dipole.
 
     Parameters
     ----------
@@ -263,7 +263,7 @@ def _lane(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, nam
 
 def _filter_bound(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                   points: FloatArray, heading: float, settings: Settings) -> FloatArray:
-    """Path bound (n,) [m] of a filter that follows a lane from its beginning.
+    """Position bound (n,) [m], at each point of a lane, of a filter that starts at the first point.
 
     The filter uses the motion model of the tracker and estimates the backgrounds. The bound is the
     median over the directions of the moment.
@@ -331,7 +331,10 @@ def _added_sensor_bounds(network: SensorNetwork, target: PlannedTarget, sampling
 
 def _miss_probabilities(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                         lane: Lane, area: Area, settings: Settings) -> FloatArray:
-    """Compute `Plan.miss_probability`; `detect.onset_frames` consecutive frames are a detection."""
+    """Compute `Plan.miss_probability`.
+
+    A pass is missed unless `detect.onset_frames` consecutive frames detect the target.
+    """
     half_length = 0.5 * max(area[2] - area[0], area[3] - area[1])
     offsets = np.linspace(0.0, 2.0 * half_length, 25)
     u = np.array([np.cos(lane.heading), np.sin(lane.heading)])
