@@ -177,7 +177,10 @@ def _explanations(j: int, suspects: Sequence[int], names: Sequence[str], fields:
 
 def _partial_explanation(y: FloatArray, R_ws: FloatArray, std: FloatArray,
                          B0: FloatArray) -> tuple[str, ...]:
-    """Describe the simplest change of axes that explains most of a difference; () if none does."""
+    """Describe the simplest change of axes that explains most of the difference from `B0`.
+
+    Empty if there is no such change, or if it is not unique.
+    """
     original = _remaining_difference(y, R_ws, std, B0)
     for changes in _axis_changes():
         remainders = sorted(
@@ -200,9 +203,9 @@ def _remaining_difference(y: FloatArray, R_ws: FloatArray, std: FloatArray,
 
 
 def _headings(std: FloatArray, B0: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Tested heading errors (n,) [rad] of a sensor, and the Earth's field rotated by each.
+    """Tested heading errors (n,) [rad] of a sensor, and the Earth's fields (n, 3) [T].
 
-    The field (n, 3) is in [T].
+    Each field is rotated by the corresponding heading error.
     """
     max_error = min(np.pi, MAX_HEADING_STDS * std[2])
     yaw = np.linspace(-max_error, max_error, 1 + 2 * max(1, round(max_error / YAW_STEP)))
