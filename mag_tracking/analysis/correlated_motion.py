@@ -90,7 +90,7 @@ class CorrelatedMotion:
     """Velocity estimated from the delays between sensors, or a reason why there is no estimate."""
 
     reason: str = 'not evaluated'
-    """Empty if there is an estimate."""
+    """Reason why there is no estimate; empty if there is an estimate."""
     speed: float = np.nan
     """Speed [m/s]."""
     speed_std: float = np.nan
@@ -126,16 +126,16 @@ def correlated_motion(data: PassData) -> CorrelatedMotion:
         return CorrelatedMotion('no pair of separate sensors has simultaneous readings of a '
                                 'varying field on a common axis')
     best_similarity = max(d.similarity for d in delays)
-    similar = tuple(d for d in delays if d.similarity >= MIN_CORRELATION)
-    if not similar:
+    similar_pairs = tuple(d for d in delays if d.similarity >= MIN_CORRELATION)
+    if not similar_pairs:
         return CorrelatedMotion(f'the sensors measure different fields (similarity '
                                 f'{max(best_similarity, 0.0):.0%}): the target did not pass them '
                                 'one after the other at the same distance',
                                 similarity=best_similarity)
-    if all(abs(d.delay) < MIN_DELAY * d.delay_std for d in similar):
+    if all(abs(d.delay) < MIN_DELAY * d.delay_std for d in similar_pairs):
         return CorrelatedMotion('the sensors measure the same field at the same time',
-                                similarity=best_similarity, pairs=similar)
-    return _fit_velocity(data, similar, best_similarity)
+                                similarity=best_similarity, pairs=similar_pairs)
+    return _fit_velocity(data, similar_pairs, best_similarity)
 
 
 def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
@@ -240,13 +240,13 @@ class _SmoothedPair:
     """Smoothed fields of two sensors at common times. Smoothing does not change the delay."""
 
     t: FloatArray
-    """(n,) [s]"""
+    """(n,) [s] Common times."""
     first: FloatArray
-    """(n, k) [T]"""
+    """(n, k) [T] Field of the first sensor."""
     slope: FloatArray
     """(n, k) [T/s] Derivative of `first`."""
     second: FloatArray
-    """(n, k) [T]"""
+    """(n, k) [T] Field of the second sensor."""
     width: float
     """[s] Width of the smoothing kernel."""
     noise: float

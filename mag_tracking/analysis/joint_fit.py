@@ -133,21 +133,21 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
     paths = propagated_path(paths, (data.stamp_ns - begin_ns) / NS)
     initial_paths = np.vstack([paths.ravel(), _initial_paths(averaged, n_targets, ground)])
     fits = _JointFits(data, averaged, initial_paths, ground, errors)
-    selected = [min(orders, key=lambda n: (abs(n - 2), n))] * n_targets
+    selected_orders = [min(orders, key=lambda n: (abs(n - 2), n))] * n_targets
     for _ in range(MAX_ROUNDS):
-        previous = list(selected)
+        previous_orders = list(selected_orders)
         for k in range(n_targets):
             if stopped is not None and stopped():
                 return ()
-            criteria = order_criteria(fits.of_target(k, selected, orders))
+            criteria = order_criteria(fits.of_target(k, selected_orders, orders))
             if np.isfinite(criteria).any():
-                selected[k] = orders[int(np.argmin(criteria))]
-        if selected == previous:
+                selected_orders[k] = orders[int(np.argmin(criteria))]
+        if selected_orders == previous_orders:
             break
     shifted = [_shift_to_peak(
-        _check_against_track(fits.of_target(k, selected, orders), orders.index(selected[k]),
-                             paths[k]),
-        orders.index(selected[k])) for k in range(n_targets)]
+        _check_against_track(fits.of_target(k, selected_orders, orders),
+                             orders.index(selected_orders[k]), paths[k]),
+        orders.index(selected_orders[k])) for k in range(n_targets)]
     return tuple(target_fits for _, target_fits in sorted(shifted, key=lambda pair: pair[0]))
 
 

@@ -20,7 +20,7 @@ COARSE_ERROR = 0.1
 """Assumed error relative to the field in the first stage, while the poses are inaccurate."""
 
 INITIAL_POSE_SETTINGS = PoseSettings(field_error=COARSE_ERROR, ambient_std=1e-6)
-"""Settings of the search for the initial poses, with inaccurate biases."""
+"""Settings of the search for the initial poses, while the biases are inaccurate."""
 
 
 def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: float,

@@ -304,7 +304,7 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
         if stopped is not None and stopped():
             break
     damage = [Finding(True, recording.path.name, f'{cause}: {n}', 'the recording is damaged; '
-                      'mag-tracking repair writes a missing index and ends a truncated file, but '
+                      'mag-tracking repair adds the missing index of a truncated file, but '
                       'cannot restore lost data') for cause, n in recording.losses.items()]
     damage += [Finding(False, 'recording', f'{cause}: {n}', 'the recording is damaged, or '
                        'a message type is unsupported') for cause, n in reader.rejected.items()]

@@ -175,16 +175,16 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
                   for lane in planned_lanes]
     coarse_x, coarse_y = _grid(area, max(11, n_grid // 2))
     candidates = np.stack(np.meshgrid(coarse_x, coarse_y), axis=-1).reshape(-1, 2)
-    allowed = np.all([_lane_distances(lane, candidates) >= clearance for lane in planned_lanes],
-                     axis=0)
+    is_allowed = np.all([_lane_distances(lane, candidates) >= clearance for lane in planned_lanes],
+                        axis=0)
     median_bound = np.full(len(candidates), np.nan)
     without, with_sensor = _added_sensor_bounds(network, target, sampling, near_lanes,
-                                                candidates[allowed])
-    median_bound[allowed] = with_sensor
+                                                candidates[is_allowed])
+    median_bound[is_allowed] = with_sensor
     report_part(1)
-    best_index = int(np.nanargmin(median_bound)) if allowed.any() else 0
-    lane_observability, bounds = _closest_point_bounds(network, target, sampling,
-                                                       planned_lanes[0], half_length)
+    best_index = int(np.nanargmin(median_bound)) if is_allowed.any() else 0
+    lane_observability, closest_bounds = _closest_point_bounds(network, target, sampling,
+                                                               planned_lanes[0], half_length)
     shape = len(coarse_y), len(coarse_x)
     return Plan(
         network, target, sampling, x, y,
@@ -192,7 +192,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
         probability.mean(axis=1).reshape(len(y), len(x)), planned_lanes,
         median_bound.reshape(shape), without,
         (float(coarse_x[best_index % shape[1]]), float(coarse_y[best_index // shape[1]])),
-        lane_observability, bounds,
+        lane_observability, closest_bounds,
         _miss_probabilities(network, target, sampling, planned_lanes[0], area, settings))
 
 
@@ -319,10 +319,10 @@ def _added_sensor_bounds(network: SensorNetwork, target: PlannedTarget, sampling
         J = pass_information(network.positions, network.R_sw, target, sampling, points,
                              heading).sum(axis=2)
         bounds_without.append(bounds_of(J, prior)[..., 0].ravel())
-        added = pass_information(candidate_positions, upright, target, added_sampling, points,
-                                 heading)
-        bounds_with.append(
-            bounds_of(J[:, :, None] + added, prior)[..., 0].reshape(-1, len(candidates)))
+        added_information = pass_information(candidate_positions, upright, target, added_sampling,
+                                             points, heading)
+        bounds_with.append(bounds_of(J[:, :, None] + added_information, prior)[..., 0].reshape(
+            -1, len(candidates)))
     if not bounds_without:
         return float('nan'), np.zeros(0)
     return (float(np.median(np.concatenate(bounds_without))),

@@ -406,8 +406,8 @@ class RunningBackground:
         self._is_resumed = False
         line = line_of(blocks)
         assert self._level.noise is not None
-        is_young = MIN_DURATION_RATIO * self._observed_s < self._relearn
-        self._is_steep = is_young and is_steep(
+        is_briefly_observed = MIN_DURATION_RATIO * self._observed_s < self._relearn
+        self._is_steep = is_briefly_observed and is_steep(
             blocks, line[2], self._level.noise.diagonal() + self._state['step_variance'])
         self._level.set_uncertainty(np.abs(line[2]) * self._learn if self._is_steep else 0.0)
         noise = pooled_covariance(blocks) if self._known_noise is None else None
