@@ -88,7 +88,10 @@ def bearing_of(fit: PassFit, sensor_position: FloatArray) -> Bearing:
 
 
 def _direction_std(x: FloatArray, P: FloatArray) -> float:
-    """Largest std [rad] of the direction of x (3,) with covariance P; inf if P is not finite."""
+    """Largest standard deviation [rad] of the direction of x (3,) with covariance P (3, 3).
+
+    Infinite if P is not finite.
+    """
     if not np.isfinite(P).all():
         return np.inf
     u = x / np.linalg.norm(x)

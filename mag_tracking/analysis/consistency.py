@@ -112,7 +112,10 @@ def _motion_model(t: FloatArray, acceleration: FloatArray, moment_walk: float, l
 
 def _prior_covariance(network: SensorNetwork, true_path: FloatArray, t: FloatArray, log: TrackLog,
                       truth_rows: IntArray, background_std: float) -> FloatArray:
-    """Prior covariance (n_x, n_x) of the first pose, from the extent and speed of the path."""
+    """Prior covariance (n_x, n_x) of the first state, diagonal.
+
+    The extent and the speed of the path are the standard deviations of position and velocity.
+    """
     extent = max(np.ptp(true_path, axis=0).max(), np.ptp(network.positions, axis=0).max())
     speed = max(np.linalg.norm(np.diff(true_path, axis=0), axis=1).max()
                 / np.diff(t).min(), MIN_VELOCITY_STD)

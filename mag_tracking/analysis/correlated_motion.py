@@ -90,7 +90,7 @@ class CorrelatedMotion:
     """Velocity estimated from the delays between sensors, or a reason why there is no estimate."""
 
     reason: str = 'not evaluated'
-    """Empty if there is an estimate."""
+    """Reason why there is no estimate; empty if there is an estimate."""
     speed: float = np.nan
     """Speed [m/s]."""
     speed_std: float = np.nan
@@ -126,16 +126,16 @@ def correlated_motion(data: PassData) -> CorrelatedMotion:
         return CorrelatedMotion('no pair of separate sensors has simultaneous readings of a '
                                 'varying field on a common axis')
     best_similarity = max(d.similarity for d in delays)
-    similar = tuple(d for d in delays if d.similarity >= MIN_CORRELATION)
-    if not similar:
+    similar_pairs = tuple(d for d in delays if d.similarity >= MIN_CORRELATION)
+    if not similar_pairs:
         return CorrelatedMotion(f'the sensors measure different fields (similarity '
                                 f'{max(best_similarity, 0.0):.0%}): the target did not pass them '
                                 'one after the other at the same distance',
                                 similarity=best_similarity)
-    if all(abs(d.delay) < MIN_DELAY * d.delay_std for d in similar):
+    if all(abs(d.delay) < MIN_DELAY * d.delay_std for d in similar_pairs):
         return CorrelatedMotion('the sensors measure the same field at the same time',
-                                similarity=best_similarity, pairs=similar)
-    return _fit_velocity(data, similar, best_similarity)
+                                similarity=best_similarity, pairs=similar_pairs)
+    return _fit_velocity(data, similar_pairs, best_similarity)
 
 
 def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
@@ -240,20 +240,20 @@ class _SmoothedPair:
     """Smoothed fields of two sensors at common times. Smoothing does not change the delay."""
 
     t: FloatArray
-    """(n,) [s]"""
+    """(n,) [s] Common times."""
     first: FloatArray
-    """(n, k) [T]"""
+    """(n, k) [T] Field of the first sensor."""
     slope: FloatArray
     """(n, k) [T/s] Derivative of `first`."""
     second: FloatArray
-    """(n, k) [T]"""
+    """(n, k) [T] Field of the second sensor."""
     width: float
     """[s] Width of the smoothing kernel."""
     noise: float
     """[T] Noise standard deviation of the difference between two readings."""
 
     def at(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Interpolate field and slope (n, k) of the first series at times `t` (n,)."""
+        """Interpolate the first field and its slope, (n, k) each, at times `t` (n,)."""
         field, slope = (np.stack([np.interp(t, self.t, v) for v in values.T], axis=1)
                         for values in (self.first, self.slope))
         return field, slope
@@ -355,7 +355,7 @@ def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]
 
 
 def _delay_std(t: FloatArray, J: FloatArray, residuals: FloatArray, prior: FloatArray) -> float:
-    """Standard deviation [s] of the delay, including the unexplained difference of the fields."""
+    """Standard deviation [s] of the delay, including the effect of model errors."""
     covariance: FloatArray = np.linalg.inv(J.T @ J + prior).astype(np.float64)
     shape = len(t), len(residuals) // len(t)
     covariance += model_error_covariance([t], [J.reshape(*shape, -1)], [residuals.reshape(shape)],
@@ -365,7 +365,10 @@ def _delay_std(t: FloatArray, J: FloatArray, residuals: FloatArray, prior: Float
 
 def _residuals(pair: _SmoothedPair, t: FloatArray, y: FloatArray,
                theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Residuals (n k,) [T], and derivatives (n k, n_theta) of the model with respect to theta."""
+    """Residuals (n k,) [T] of the second field `y`, and derivatives of its model.
+
+    The derivatives (n k, n_theta) are with respect to `theta`.
+    """
     k = y.shape[1]
     tau, background, angles, gain = theta[0], theta[1:1 + k], theta[1 + k:4 + k], theta[4 + k:]
     field, slope = pair.at(t - tau)

@@ -133,26 +133,26 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
     paths = propagated_path(paths, (data.stamp_ns - begin_ns) / NS)
     initial_paths = np.vstack([paths.ravel(), _initial_paths(averaged, n_targets, ground)])
     fits = _JointFits(data, averaged, initial_paths, ground, errors)
-    selected = [min(orders, key=lambda n: (abs(n - 2), n))] * n_targets
+    selected_orders = [min(orders, key=lambda n: (abs(n - 2), n))] * n_targets
     for _ in range(MAX_ROUNDS):
-        previous = list(selected)
+        previous_orders = list(selected_orders)
         for k in range(n_targets):
             if stopped is not None and stopped():
                 return ()
-            criteria = order_criteria(fits.of_target(k, selected, orders))
+            criteria = order_criteria(fits.of_target(k, selected_orders, orders))
             if np.isfinite(criteria).any():
-                selected[k] = orders[int(np.argmin(criteria))]
-        if selected == previous:
+                selected_orders[k] = orders[int(np.argmin(criteria))]
+        if selected_orders == previous_orders:
             break
     shifted = [_shift_to_peak(
-        _check_against_track(fits.of_target(k, selected, orders), orders.index(selected[k]),
-                             paths[k]),
-        orders.index(selected[k])) for k in range(n_targets)]
+        _check_against_track(fits.of_target(k, selected_orders, orders),
+                             orders.index(selected_orders[k]), paths[k]),
+        orders.index(selected_orders[k])) for k in range(n_targets)]
     return tuple(target_fits for _, target_fits in sorted(shifted, key=lambda pair: pair[0]))
 
 
 def _initial_paths(averaged: PassData, n_targets: int, ground: GroundPrior) -> FloatArray:
-    """Search for the best paths (n, 6 n_targets) of point targets in averaged data."""
+    """Search for the solutions (n, 6 n_targets) with point targets that fit averaged data best."""
     paths: FloatArray = np.zeros((1, 0))
     residuals = [averaged]
     for n in range(1, n_targets + 1):
@@ -178,8 +178,9 @@ def _initial_paths(averaged: PassData, n_targets: int, ground: GroundPrior) -> F
 class _JointFits:
     """Cached joint fits of several targets, for any combination of their numbers of dipoles.
 
-    Each fit starts at the point solutions `initial_paths` (n, 6 K), and at any available fit with
-    another number of dipoles of one target. The first point solution is the tracked paths.
+    Each fit starts at the solutions with point targets, `initial_paths` (n, 6 K), the first of
+    which contains the tracked paths. It also starts at the fit of the current combination, if
+    available, which differs in the number of dipoles of one target.
     """
 
     def __init__(self, data: PassData, averaged: PassData, initial_paths: FloatArray,
@@ -193,7 +194,10 @@ class _JointFits:
 
     def of_target(self, k: int, orders: Sequence[int],
                   candidates: Sequence[int]) -> tuple[PassFit, ...]:
-        """Fits of target `k` with each of the `candidates`; the other targets have `orders`."""
+        """Fits of target `k` with each number of dipoles in `candidates`.
+
+        The other targets have the numbers of dipoles in `orders`.
+        """
         previous, fits = self._cache.get(tuple(orders)), []
         for n in candidates:
             combination = (*orders[:k], n, *orders[k + 1:])
@@ -207,8 +211,8 @@ class _JointFits:
                         previous: Sequence[PassFit] | None) -> FloatArray:
         """Starting paths (n, n_theta) for given numbers of dipoles.
 
-        `previous` contains the fits with another number of dipoles of target `k`; None if there are
-        no such fits.
+        `previous` contains one fit per target from a joint fit, which may differ in the number of
+        dipoles of target `k`; None if there is no such joint fit.
         """
         starts = [_with_orders(paths, orders) for paths in self._initial_paths]
         if previous is not None and all(len(fit.x) for fit in previous):
@@ -247,7 +251,7 @@ class _JointFits:
 def _exclude_solutions(cost: FloatArray, is_allowed: BoolArray, max_ratio: float) -> FloatArray:
     """Return the costs (n,), with infinity for solutions that are not allowed.
 
-    Return them unchanged if no allowed cost is within `max_ratio` times the lowest cost.
+    Return the costs unchanged if each allowed cost exceeds `max_ratio` times the lowest cost.
     """
     has_allowed = (cost[is_allowed] <= max_ratio * cost.min()).any()
     return np.where(is_allowed, cost, np.inf) if has_allowed else cost
@@ -299,7 +303,10 @@ def path_from(data: PassData, fit: PassFit) -> FloatArray:
 
 
 def _with_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[FloatArray]:
-    """Convert paths (6 or 7,) to numbers of dipoles; a point becomes a row of `INITIAL_LENGTH`."""
+    """Convert paths (6 or 7,) to points or rows of dipoles, according to `orders`.
+
+    A point that becomes a row has the length `INITIAL_LENGTH`.
+    """
     return [np.concatenate([path[:6], path[6:] if len(path) > 6 else [INITIAL_LENGTH]])
             if n > 1 else path[:6] for path, n in zip(paths, orders, strict=True)]
 

@@ -117,7 +117,10 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
 
 def _residual_function(network: SensorNetwork, field: FloatArray, std: FloatArray,
                        is_measured: BoolArray, moment: float, ambient_std: float) -> _Problem:
-    """Create the residual function of x = [position, unnormalised axis, ambient field over std]."""
+    """Create the residual function of x = [position, axis, ambient field].
+
+    The axis is not normalised; the ambient field is in units of `ambient_std` [T].
+    """
     y = (field / std)[is_measured]
     ambient_jacobian = (network.R_sw * ambient_std / std[:, :, None])[is_measured]
     prior = np.hstack([np.zeros((3, 6)), np.eye(3)])

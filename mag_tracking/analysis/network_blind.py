@@ -20,7 +20,7 @@ COARSE_ERROR = 0.1
 """Assumed error relative to the field in the first stage, while the poses are inaccurate."""
 
 INITIAL_POSE_SETTINGS = PoseSettings(field_error=COARSE_ERROR, ambient_std=1e-6)
-"""Settings of the search for the initial poses, with inaccurate biases."""
+"""Settings of the search for the initial poses, while the biases are inaccurate."""
 
 
 def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: float,
@@ -79,7 +79,7 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
 
 def _initial_poses(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
                    high: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Locate the magnet in each reading; return index, position and axis of the k valid poses."""
+    """Locate the magnet in each reading; return rows, positions and axes of the valid poses."""
     if field.ndim != 3 or field.shape[1:] != (len(network), 3):
         raise ValueError(f'expected field (K, {len(network)}, 3), got {field.shape}')
     median = np.zeros(field.shape[1:])

@@ -178,8 +178,8 @@ class GeometryProblem:
             Number of measured axes.
         variance : (n, K, 3) array, T²
         """
-        signal2 = np.einsum('nki,nki->nk', signal, signal)[:, :, None]
-        variance = self.variance + self.settings.field_error**2 * signal2
+        squared_signal = np.einsum('nki,nki->nk', signal, signal)[:, :, None]
+        variance = self.variance + self.settings.field_error**2 * squared_signal
         e2 = np.square(self.field - f) / variance
         return np.nan_to_num(e2), (~np.isnan(e2)).sum(axis=2), variance
 
@@ -246,7 +246,7 @@ class GeometryProblem:
 
 
 def median_ratio(d2: FloatArray, count: IntArray) -> FloatArray:
-    """Ratio of sums of squared residuals to their median for pure noise.
+    """Ratio of each sum of squared residuals to the median of such a sum for pure noise.
 
     Parameters
     ----------

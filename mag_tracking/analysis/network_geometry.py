@@ -32,33 +32,43 @@ from mag_tracking.settings import param
 
 @dataclass(frozen=True)
 class GeometrySettings:
-    """Prior standard deviations, where zero means exactly known, and limits of the fit."""
+    """Prior standard deviations and limits of the fit; zero means exactly known."""
 
-    gain_std: float = param(0.03, 'Gain of a sensor.', '', (0.0, 1.0))
-    rotation_std_deg: float = param(2.0, 'Orientation of a sensor, per axis.', 'deg',
-                                    (0.0, 45.0))
-    position_std: float = param(1e-3, 'Position of a sensor, per axis.', 'm', (0.0, 100.0))
-    moment_std: float = param(0.0, 'Moment of the magnet, relative to its magnitude.', '',
-                              (0.0, 1.0))
+    gain_std: float = param(0.03, 'Standard deviation of the gain of a sensor.', '',
+                            (0.0, 1.0))
+    rotation_std_deg: float = param(
+        2.0, 'Standard deviation of the orientation of a sensor, per axis.', 'deg', (0.0, 45.0))
+    position_std: float = param(
+        1e-3, 'Standard deviation of the position of a sensor, per axis.', 'm', (0.0, 100.0))
+    moment_std: float = param(
+        0.0, 'Standard deviation of the moment of the magnet, relative to its magnitude.', '',
+        (0.0, 1.0))
     board_shift_std: float = param(
-        0.01, 'Position of the network relative to the tracker, per axis.', 'm', (0.0, 100.0))
+        0.01, 'Standard deviation of the position of the network relative to the tracker, per '
+        'axis.', 'm', (0.0, 100.0))
     board_rotation_std_deg: float = param(
-        2.0, 'Orientation of the network relative to the tracker, per axis.', 'deg', (0.0, 45.0))
+        2.0, 'Standard deviation of the orientation of the network relative to the tracker, per '
+        'axis.', 'deg', (0.0, 45.0))
     tool_offset_std: float = param(
-        0.01, 'Offset of the magnet from the tracked point, per axis.', 'm', (0.0, 100.0))
+        0.01, 'Standard deviation of the offset of the magnet from the tracked point, per axis.',
+        'm', (0.0, 100.0))
     tool_tilt_std_deg: float = param(
-        3.0, 'Tilt of the magnet from the tracked axis, per axis.', 'deg', (0.0, 45.0))
+        3.0, 'Standard deviation of the tilt of the magnet from the tracked axis, per axis.',
+        'deg', (0.0, 45.0))
     tracker_position_std: float = param(
-        3e-4, 'Position of the tracker at one pose, per axis.', 'm', (0.0, 100.0))
+        3e-4, 'Standard deviation of the tracked position of one pose, per axis.', 'm',
+        (0.0, 100.0))
     tracker_tilt_std_deg: float = param(
-        0.2, 'Tilt of the tracker at one pose, per axis.', 'deg', (0.0, 45.0))
+        0.2, 'Standard deviation of the tracked tilt of one pose, per axis.', 'deg', (0.0, 45.0))
     start_position_std: float = param(
-        0.1, 'Starting position of an untracked magnet, per axis.', 'm', (0.0, 100.0))
+        0.1, 'Standard deviation of the starting position of an untracked magnet, per axis.', 'm',
+        (0.0, 100.0))
     start_tilt_std_deg: float = param(
-        30.0, 'Starting tilt of an untracked magnet, per axis.', 'deg', (0.0, 60.0))
+        30.0, 'Standard deviation of the starting tilt of an untracked magnet, per axis.', 'deg',
+        (0.0, 60.0))
     ambient_std: float = param(
-        1e-7, 'Change of the ambient field from pose to pose, per axis; the same at all sensors.',
-        'T', (0.0, 1e-3))
+        1e-7, 'Standard deviation of the change of the ambient field from pose to pose, per axis; '
+        'the change is the same at all sensors.', 'T', (0.0, 1e-3))
     field_error: float = param(
         0.01, 'Error of the dipole model relative to the field.', '', (0.0, 1.0))
     iterations: int = param(60, 'Maximum number of steps.', '', (1, 10000))
@@ -159,7 +169,10 @@ class NetworkGeometry:
 
     @property
     def tool_offset(self) -> tuple[FloatArray, FloatArray]:
-        """Offset of the magnet from the tracked point and its std, (3,) m each, tool frame."""
+        """Offset of the magnet from the tracked point, and its standard deviations.
+
+        Each is (3,) m, tool frame.
+        """
         return self.shared[6:9], self.shared_std[6:9]
 
     @property
@@ -311,7 +324,7 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
 
 def _normalised_cost(problem: GeometryProblem, x: Unknowns, predicted: Prediction, W: FloatArray,
                      robust_weights: FloatArray, prior_weights: Unknowns) -> float:
-    """Weighted sum of squared residuals per degree of freedom; NaN without a degree of freedom."""
+    """Weighted sum of squared residuals per degree of freedom; NaN below one degree of freedom."""
     P, P_pose = NormalEquations(problem, x, predicted, W, prior_weights).covariance()
     e2, count, _ = problem.squared_residuals(predicted[0], predicted[1])
     n_from_priors = np.append(prior_weights[0].ravel(), prior_weights[1]) @ np.diagonal(P)
@@ -323,7 +336,10 @@ def _normalised_cost(problem: GeometryProblem, x: Unknowns, predicted: Predictio
 
 def _sensor_and_pose_residuals(problem: GeometryProblem,
                                predicted: Prediction) -> tuple[FloatArray, FloatArray]:
-    """RMS residual (n,) of each sensor over consistent poses, and median residual (K,) per pose."""
+    """Normalised residuals: RMS (n,) of each sensor over consistent poses, median (K,) per pose.
+
+    The medians are relative to the median for pure noise.
+    """
     e2, count, _ = problem.squared_residuals(predicted[0], predicted[1])
     e2 = e2.sum(axis=2)
     pose_residual = np.sqrt([np.median(median_ratio(d2, c)[c > 0])

@@ -35,7 +35,8 @@ def tool_rotations(axes: FloatArray) -> FloatArray:
     """Minimal rotations from the tool frame to the tracker frame.
 
     The roll about a tracked axis is not measured. The minimal rotation is exact if the tool is
-    tilted without roll. Otherwise, vectors in the tool frame are wrong perpendicular to the axis.
+    tilted without roll. Otherwise, a rotated vector has a wrong component perpendicular to the
+    axis.
 
     Parameters
     ----------

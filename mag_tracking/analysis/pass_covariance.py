@@ -63,8 +63,8 @@ def _sensor_error_covariance(data: PassData, whitened: FloatArray, target: Float
     R_sw = data.network.R_sw
     for j in data.sensors:
         sensor_mask = data.sensor == j
-        configured = data.network.orientation_std[j]
-        std = np.full(3, errors.rotation_std) if configured is None else configured
+        configured_std = data.network.orientation_std[j]
+        std = np.full(3, errors.rotation_std) if configured_std is None else configured_std
         rotation_covariance = R_sw[j] @ np.diag(np.square(std)) @ R_sw[j].T
         field = target[sensor_mask]
         G = np.concatenate([np.stack([np.cross(axis, field) for axis in np.eye(3)], axis=2),
@@ -81,8 +81,8 @@ def velocity_change(data: PassData, whitened: FloatArray, residuals: FloatArray,
                     velocity: FloatArray, duration_s: float) -> tuple[float, float]:
     """Estimate the relative change of the velocity while the target is observed.
 
-    A constant horizontal acceleration is added to the unknowns, followed by one Gauss-Newton step
-    from the minimum. The derivatives with respect to the acceleration are t²/2 times the
+    A constant horizontal acceleration is added to the unknowns and estimated by one Gauss-Newton
+    step from the minimum. The derivatives with respect to the acceleration are t²/2 times the
     derivatives with respect to x and y.
 
     Parameters
@@ -113,8 +113,8 @@ def velocity_change(data: PassData, whitened: FloatArray, residuals: FloatArray,
     norm[norm == 0.0] = 1.0
     inverse = np.linalg.pinv(flat / norm, rcond=1e-8) / norm[:, None]
     step, covariance = inverse @ residuals.ravel(), inverse @ inverse.T
-    remaining = (residuals.ravel() - flat @ step).reshape(residuals.shape)
-    robust = covariance + model_error_covariance(*_split_by_sensor(data, extended, remaining),
+    new_residuals = (residuals.ravel() - flat @ step).reshape(residuals.shape)
+    robust = covariance + model_error_covariance(*_split_by_sensor(data, extended, new_residuals),
                                                  covariance)
     scale = duration_s / np.linalg.norm(velocity)
     return (float(np.linalg.norm(step[-2:]) * scale),

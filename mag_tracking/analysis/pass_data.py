@@ -46,8 +46,10 @@ class PassData:
         ----------
         network : SensorNetwork
         stamps_ns : sequence of n int, ns
-        fields : sequence of n (n_sensors, 3) array, T
-        covariances : sequence of n (n_sensors, 3, 3) array, T²
+        fields : sequence of n (n_sensors, 3) array, T, sensor frame
+            Field of each frame; NaN for axes that were not measured.
+        covariances : sequence of n (n_sensors, 3, 3) array, T², sensor frame
+            Noise covariances of each frame.
         offsets : sequence of n (n_sensors,) array, s, optional
             Sampling time of each sensor relative to the timestamp of the frame.
 
@@ -120,9 +122,9 @@ class PassData:
         zero.
         """
         W = np.zeros((len(self.t), 3, 3))
-        present = ~np.isnan(self.field)
-        for axes in np.unique(present, axis=0):
-            rows = (present == axes).all(axis=1)
+        is_measured = ~np.isnan(self.field)
+        for axes in np.unique(is_measured, axis=0):
+            rows = (is_measured == axes).all(axis=1)
             if axes.any():
                 block = np.ix_(rows, axes, axes)
                 W[block] = np.linalg.inv(np.linalg.cholesky(self.covariance[block]))
@@ -213,6 +215,7 @@ def background_columns(data: PassData, W: FloatArray) -> FloatArray:
     Returns
     -------
     (3 n, q) array
+        One column for each of the q measured axes of the sensors.
     """
     columns = np.zeros((len(data.t), 3, len(data.network), 3))
     columns[np.arange(len(data.t)), :, data.sensor] = W

@@ -66,9 +66,9 @@ def fits_at_minimum(data: PassData, orders: Sequence[int], minimum: Minimum, p: 
     linear = _LinearisedFit.about(data, orders, minimum.theta, p)
     J = information(linear.whitened)
     if path_std is not None:
-        of_paths = np.concatenate([indices[:len(path)] for indices, path in zip(
+        path_indices = np.concatenate([indices[:len(path)] for indices, path in zip(
             linear.target_indices, linear.theta, strict=True)])
-        J[of_paths, of_paths] += 1.0 / np.square(path_std)
+        J[path_indices, path_indices] += 1.0 / np.square(path_std)
     fits = _partial_fits(linear, minimum, explained, errors, bound(J))
     ends = np.cumsum([len(path) for path in linear.theta])[:-1]
     rivals = [([paths[i] for i in assignment(linear.theta, paths)], cost)
@@ -140,8 +140,8 @@ class _LinearisedFit:
         """Linearise a fit at the paths `theta` (n_theta,) and the linear parameters `p` (k,)."""
         model = SuperposedPasses.from_orders(orders, data.t, data.positions,
                                              data.network.R_sw[data.sensor])
-        measured = ~np.isnan(data.field)
-        columns = background_columns(data, measured[:, :, None] * np.eye(3))
+        is_measured = ~np.isnan(data.field)
+        columns = background_columns(data, is_measured[:, :, None] * np.eye(3))
         D, A, W = model.derivative(theta[None], p[None])[0], model.basis(theta[None])[0], \
             data.whitening
         fields = np.stack([(A[:, m] @ p[m]).reshape(-1, 3) for m in model.moment_slices])
@@ -161,7 +161,7 @@ class _LinearisedFit:
             names += [*row.names, *row.moment_names]
             begin = end
         names += [f'B {data.network.names[j]} {"xyz"[a]}' for j in data.sensors
-                  for a in np.flatnonzero(measured[data.sensor == j].any(axis=0))]
+                  for a in np.flatnonzero(is_measured[data.sensor == j].any(axis=0))]
         background = (columns @ backgrounds).reshape(-1, 3)
         residuals = np.nan_to_num(data.field - fields.sum(axis=0) - background)
         x = np.concatenate([*(part for path, m in zip(model.path_slices, model.moment_slices,
@@ -245,7 +245,7 @@ def _select_rivals(fit: PassFit, minima: Iterable[tuple[FloatArray, float]]) -> 
 
 
 def _duration_s(data: PassData) -> float:
-    """Duration [s] that contains 96 % of the energy of the target."""
+    """Duration [s] of the interval that contains the central 96 % of the target's energy."""
     energy = np.square(np.linalg.norm(data.field_change, axis=1))
     order = np.argsort(data.t)
     fraction = np.cumsum(energy[order]) / energy.sum()

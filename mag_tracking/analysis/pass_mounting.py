@@ -97,7 +97,10 @@ def _remove_negative_eigenvalues(information: FloatArray) -> FloatArray:
 
 def _track_scatter(gains: Sequence[FloatArray], information_vectors: Sequence[FloatArray],
                    rotation: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Chi-square per degree of freedom (n_sensors,) of the tracks relative to the fused angles."""
+    """Scatter (n_sensors,) of the angles of single tracks about the fused angles.
+
+    Chi-square per degree of freedom; NaN for a sensor without degrees of freedom.
+    """
     squares, freedom = np.zeros(len(rotation)), np.zeros(len(rotation))
     for gain, information_vector in zip(gains, information_vectors, strict=True):
         residual = information_vector - np.einsum('jik,jk->ji', gain, rotation)

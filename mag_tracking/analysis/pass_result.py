@@ -33,7 +33,7 @@ class Bearing:
     """Observable quantities of a pass at a single sensor, relative to the sensor.
 
     The distance is not observable. A path and its reflection through the sensor have the same
-    field, so the sign of the path is not observable either.
+    field and cannot be distinguished.
     """
 
     cpa_direction: FloatArray
@@ -86,7 +86,7 @@ class PassFit:
     explained: float = np.nan
     """Fraction of the whitened energy, without backgrounds and noise, that the fit explains."""
     duration_s: float = np.nan
-    """[s] Duration that contains 96 % of the energy of the target."""
+    """[s] Duration of the interval that contains the central 96 % of the target's energy."""
     velocity_change: float = np.nan
     """Apparent relative change of the velocity during the pass."""
     velocity_change_std: float = np.nan
@@ -141,7 +141,7 @@ class PassFit:
                     and MIN_LENGTH_FRACTION * travelled_distance <= length <= travelled_distance)
 
     @property
-    def is_poor_mixture(self) -> bool:
+    def is_poor_joint_fit(self) -> bool:
         """Whether this is a joint fit with a normalised cost above `MAX_NORMALISED_COST`."""
         return self.n_other_unknowns > 0 and bool(self.normalised_cost > MAX_NORMALISED_COST)
 
@@ -151,7 +151,7 @@ class PassFit:
 
         A poor joint fit is ambiguous because the residual cannot be assigned to a target.
         """
-        if self.is_poor_mixture:
+        if self.is_poor_joint_fit:
             return True
         P = self.robust_covariance[:6, :6]
         for d, path in self.rivals:

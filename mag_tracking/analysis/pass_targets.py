@@ -78,12 +78,12 @@ def fit_targets(data: PassData, single_fits: Sequence[PassFit], paths: FloatArra
 
 
 def _best_fit(fits: Sequence[PassFit]) -> PassFit:
-    """Return the fit with the smallest criterion, or the first fit if none is determined."""
+    """Return the fit with the smallest BIC, or the first fit if none is determined."""
     return fits[int(np.argmin(order_criteria(fits)))]
 
 
 def _are_parts(data: PassData, fits: Sequence[PassFit]) -> bool:
-    """Whether targets overlap and have almost equal velocities."""
+    """Whether targets are parts of one vehicle: they overlap at almost equal velocities."""
     velocity = np.array([fit.velocity for fit in fits])
     mean = velocity.mean(axis=0)
     return bool((np.linalg.norm(velocity - mean, axis=1)

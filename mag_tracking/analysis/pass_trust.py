@@ -59,7 +59,7 @@ over the speed."""
 
 
 def reach(n_dipoles: int, length: float) -> float:
-    """Maximum distance of the iron of a vehicle from the dipoles of its row.
+    """Maximum distance between the iron of a vehicle and the dipoles that model it.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], residuals: Flo
 
 
 def _plausible_residual_fraction(data: PassData, row: FittedRow) -> FloatArray:
-    """Maximum plausible unexplained fraction (n,) of the energy of a target in each sample."""
+    """Fraction (n,) of a target's energy in each sample that may plausibly be unexplained."""
     n_dipoles, theta, _ = row
     v = theta[3:6]
     offsets = np.linspace(-0.5, 0.5, n_dipoles) * theta[6] if n_dipoles > 1 else np.zeros(1)
@@ -178,8 +178,8 @@ def trusted_quantities(fit: PassFit) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        Subset of speed, direction and time (of the CPA). Empty for a single-sensor fit, a fit that
-        did not converge, or a pass that was not one target at constant velocity.
+        Subset of speed, direction and time (of the CPA). Empty if the fit uses a single sensor, did
+        not converge, or shows that the pass is not one target at constant velocity.
     """
     if _invalid_pass_reason(fit) or fit.bearing is not None:
         return ()
@@ -197,7 +197,7 @@ def trusted_quantities(fit: PassFit) -> tuple[str, ...]:
 
 
 def _invalid_pass_reason(fit: PassFit) -> str:
-    """Reason why a fit is not a pass of one target at constant velocity; empty if it is."""
+    """Reason why a fit does not show one target at constant velocity; empty if it does."""
     if not fit.converged:
         return 'the fit did not converge'
     if not has_plausible_residual(fit):

@@ -152,7 +152,7 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
 
 def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
                      sampling: Sampling, points: FloatArray, heading: float) -> FloatArray:
-    """Fisher information of each sensor about [r, v, m] with the target at a point.
+    """Fisher information of each sensor about [r, v, m] when the target is at each point.
 
     The backgrounds are eliminated; their prior is taken into account.
 
@@ -223,7 +223,7 @@ def bounds_of(information: FloatArray, prior: FloatArray) -> FloatArray:
 def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
                             sampling: Sampling, points: FloatArray, false_alarm: float,
                             background_std: float = 0.0) -> FloatArray:
-    """Probability of detection in one frame with the target at a point.
+    """Probability of detection in one frame when the target is at each point.
 
     Parameters
     ----------

@@ -131,7 +131,7 @@ def _axis_features(axis: FloatArray, energy_fraction: float, max_magnitude: floa
 
 
 def _n_maxima(values: FloatArray) -> int:
-    """Number of maxima with a prominence of at least `MIN_PROMINENCE` times the range."""
+    """Number of maxima whose prominence is at least `MIN_PROMINENCE` of the value range."""
     # Deferred: the import takes 0.25 s.
     from scipy.signal import find_peaks
 

@@ -320,10 +320,10 @@ def evaluate(model: SignatureModel, x: FloatArray, labels: Sequence[str]) -> Eva
     LabelsError
         If a label is not a class of the model.
     """
-    missing = sorted(set(labels) - set(model.classes))
-    if missing:
+    labels_without_class = sorted(set(labels) - set(model.classes))
+    if labels_without_class:
         raise LabelsError('the model has no classes for the labels '
-                          f'{", ".join(map(repr, missing))}; '
+                          f'{", ".join(map(repr, labels_without_class))}; '
                           f'its classes are {", ".join(model.classes)}')
     return _evaluate_parts([(model, x, np.array(labels))])
 

@@ -85,6 +85,6 @@ class HealthRows:
 
 
 def _axis_columns(name: str, values: FloatArray) -> dict[str, float | None]:
-    """Columns for the three axes of a vector; None replaces NaN."""
+    """Columns `name_x`, `name_y` and `name_z` of a vector; None replaces NaN."""
     return {f'{name}_{axis}': None if np.isnan(v) else float(v)
             for axis, v in zip('xyz', values, strict=True)}

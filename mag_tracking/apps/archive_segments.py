@@ -68,7 +68,7 @@ class FrameChunk:
         frame : FieldFrame
             Frame with its detection result.
         doubts : Doubts or None
-            Doubtful times if they change with this frame, otherwise None.
+            Doubtful times of each sensor if they change with this frame, otherwise None.
         """
         for k in range(len(self.stamp_ns)):
             yield FieldFrame(

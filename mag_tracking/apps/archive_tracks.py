@@ -148,7 +148,7 @@ class SegmentTables:
                 'length': _nullable(pose.length), 'ambiguous': pose.ambiguous}
 
     def _add_track_row(self, log: TrackLog) -> None:
-        """Write the row of a track that has ended and discard its history."""
+        """Write the row of a track that has ended, and discard the history of the track."""
         del self._collector.logs[log.id]
         smoothed = self._collector.smoothed.pop(log.id, None)
         self.n_tracks += 1

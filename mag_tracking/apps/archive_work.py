@@ -107,7 +107,7 @@ class ClockComparisonHistory(ClockComparison):
         ----------
         found : RigidPass
         rows : (n,) int array
-            Indices, in the network, of the sensors of the pass.
+            Index, in the network, of each sensor of the pass.
         """
         super().add(found, rows)
         self.passes.append((found, rows))
@@ -156,16 +156,16 @@ def _atomic_folder(final: Path) -> Iterator[Path]:
     Another process may run the same task: a worker considered lost, or a worker of a killed run.
     The first result is kept; all results are equal.
     """
-    draft = final.with_name(f'.{secrets.token_hex(8)}.{final.name}')
+    temporary = final.with_name(f'.{secrets.token_hex(8)}.{final.name}')
     with _output_errors(final):
-        draft.mkdir()
+        temporary.mkdir()
     try:
-        yield draft
+        yield temporary
         if not final.exists():
             with _output_errors(final):
-                draft.rename(final)
+                temporary.rename(final)
     finally:
-        shutil.rmtree(draft, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextmanager
@@ -194,21 +194,21 @@ class _Segmenter:
         self._n_passes = 0
 
     def read(self) -> dict[str, Any]:
-        """Write the segments and the health table; return the columns of the recording."""
+        """Write the segments and the health table; return columns of the table `recordings`."""
         for readings in self._reader.readings():
             self._add_passes(self._passes.feed(readings))
         self._add_passes(self._passes.flush())
         self._writer.close()
         if self._last_ns is not None:
             self._add_health(self._health.rows(self._last_ns, self._passes.calibrate))
-        missing = self._reader.missing_topics()
+        missing_topics = self._reader.missing_topics()
         return {
             **common_columns(self._path, self._first_ns), 'end_ns': self._last_ns,
             'frames': self._writer.n_frames, 'segments': self._writer.n_segments,
             'size': self._recording.size, 'lost': _format_counts(self._recording.losses),
             'rejected': _format_counts(self._reader.rejected + Counter(self._passes.rejected)),
-            'missing_topics': ' '.join(missing),
-            'no_detection_reason': self._passes.no_detection_reason(missing) or ''}
+            'missing_topics': ' '.join(missing_topics),
+            'no_detection_reason': self._passes.no_detection_reason(missing_topics) or ''}
 
     def _add_frame(self, frame: FieldFrame) -> None:
         """Write a frame with its detection result, and the health rows that are due."""
@@ -288,16 +288,16 @@ def join(job: Job) -> dict[str, Any]:
             folder = job.segment_folder(k)
             result = _read_result(folder)
             evidence.passes = []
-            combined = copy.deepcopy(evidence)
+            combined_evidence = copy.deepcopy(evidence)
             for rigid_pass in result.evidence.passes:
-                combined.add(*rigid_pass)
-            if k and (combined.clocks_differed or result.evidence.clocks_differed):
+                combined_evidence.add(*rigid_pass)
+            if k and (combined_evidence.clocks_differed or result.evidence.clocks_differed):
                 folder = Path(repeat_folder) / f'segment-{k}'
                 folder.mkdir()
                 _track_into(folder, job, k, evidence)
                 result = _read_result(folder)
-                combined = result.evidence
-            evidence = combined
+                combined_evidence = result.evidence
+            evidence = combined_evidence
             folders.append(folder)
             id_offsets.append(n_tracks)
             n_tracks += result.n_tracks

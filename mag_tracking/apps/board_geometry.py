@@ -132,8 +132,8 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
     if readings.shape[1] != len(network):
         raise RecordingError(f'{table}: readings of {quantity(readings.shape[1], "sensor")}, but '
                              f'the network has {len(network)}')
-    configured = _with_noise(network, noise_std)
-    nominal = _with_noise(configured, ASSUMED_NOISE)
+    network_with_noise = _with_noise(network, noise_std)
+    nominal = _with_noise(network_with_noise, ASSUMED_NOISE)
     field = corrected(nominal, readings)
     # Poses without readings are removed here or, for unknown poses, by the estimation.
     pose_indices = np.arange(len(field)) if box is not None else np.flatnonzero(
@@ -150,7 +150,7 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
     method = f'magnet, {len(geometry.rows)} {"unknown" if box is not None else "tracked"} poses'
     suspects = tuple(int(pose_indices[k]) + FIRST_ROW for k in geometry.suspect_poses)
     return GeometrySurvey(
-        nominal, calibrated_network(configured, geometry, date, method), geometry,
+        nominal, calibrated_network(network_with_noise, geometry, date, method), geometry,
         pose_indices[geometry.rows] + FIRST_ROW, suspects, len(field),
         tuple(_silent_axes(nominal, field)))
 
@@ -168,16 +168,16 @@ def corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
     (K, n, 3) array, T, sensor frame
         Corrected readings, including the background.
     """
-    out = np.array(readings, dtype=float)
+    corrected_readings = np.array(readings, dtype=float)
     for j, (offset, C) in enumerate(zip(network.offset, network.correction, strict=True)):
         if offset is not None:
-            out[:, j] -= offset
+            corrected_readings[:, j] -= offset
         if C is not None:
-            missing = np.isnan(out[:, j])
-            field = np.where(missing, 0.0, out[:, j]) @ C.T
+            is_missing = np.isnan(corrected_readings[:, j])
+            field = np.where(is_missing, 0.0, corrected_readings[:, j]) @ C.T
             # A corrected axis is missing if any axis that contributes to it is missing.
-            out[:, j] = np.where(missing @ (C != 0.0).T, np.nan, field)
-    return out
+            corrected_readings[:, j] = np.where(is_missing @ (C != 0.0).T, np.nan, field)
+    return corrected_readings
 
 
 def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: str,
@@ -202,16 +202,17 @@ def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: 
     -------
     SensorNetwork
     """
-    estimated = geometry.network
+    estimated_network = geometry.network
     columns = {name: list(getattr(network, name)) for name in (
         'noise_std', 'background', 'correction', 'orientation_std', 'calibrated')}
     for j, gain in enumerate(geometry.gain):
         if np.isnan(geometry.bias[j]).all():
             continue
-        previous = network.correction[j]
-        columns['correction'][j] = (np.eye(3) if previous is None else previous) / gain
-        columns['background'][j] = (None if estimated.background[j] is None
-                                    else estimated.background[j] / gain)
+        previous_correction = network.correction[j]
+        columns['correction'][j] = (np.eye(3) if previous_correction is None
+                                    else previous_correction) / gain
+        columns['background'][j] = (None if estimated_network.background[j] is None
+                                    else estimated_network.background[j] / gain)
         if network.noise_std[j] is not None:
             columns['noise_std'][j] = network.noise_std[j] / abs(gain)
         std = _world_std(geometry, j)
@@ -221,7 +222,8 @@ def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: 
         columns['calibrated'][j] = network.calibration_record(
             j, date, method, np.nan if record is None else record.clock_offset_std)
     changes: dict[str, Any] = {name: tuple(column) for name, column in columns.items()}
-    return replace(network, positions=estimated.positions, R_ws=estimated.R_ws, **changes)
+    return replace(network, positions=estimated_network.positions, R_ws=estimated_network.R_ws,
+                   **changes)
 
 
 def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
@@ -234,7 +236,10 @@ def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
 
 
 def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwork:
-    """Return `network` with `noise_std` [T] for sensors without a noise; None changes nothing."""
+    """Return `network` with the noise `noise_std` [T] for sensors whose noise is unknown.
+
+    If `noise_std` is None, the network is not changed.
+    """
     if noise_std is None:
         return network
     return replace(network, noise_std=tuple(

@@ -81,21 +81,23 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
         recording, network, settings, date, progress, stopped)
     if not stage.counts.total():
         raise RecordingError(f'{recording.path}: no samples from the sensors of the network')
-    estimated = with_measured_noise(survey.network, stage)
+    calibrated_network = with_measured_noise(survey.network, stage)
     evidence = None
     # A faulty sensor would bias the orientations of the other sensors.
     if passes and not interrupted and settings.track.mounting_std_deg \
             and not survey.disagreements:
-        tracks, interrupted = _track_passes(recording, estimated, settings, progress, stopped)
+        tracks, interrupted = _track_passes(recording, calibrated_network, settings, progress,
+                                            stopped)
         if tracks:
             prior = np.array([
                 np.full(3, np.deg2rad(settings.track.mounting_std_deg)) if s is None else s
-                for s in estimated.orientation_std])
-            evidence = fuse_mounting(estimated, prior, tracks)
-            estimated = _with_pass_records(with_pass_mounting(estimated, evidence), estimated, date,
-                                           evidence.n_tracks)
+                for s in calibrated_network.orientation_std])
+            evidence = fuse_mounting(calibrated_network, prior, tracks)
+            calibrated_network = _with_pass_records(
+                with_pass_mounting(calibrated_network, evidence), calibrated_network, date,
+                evidence.n_tracks)
     without_background = tuple(name for name in network.names if name not in levels)
-    return Calibration(estimated, survey, evidence, levels, rejected(stage.counts),
+    return Calibration(calibrated_network, survey, evidence, levels, rejected(stage.counts),
                        without_background, interrupted)
 
 
@@ -130,7 +132,10 @@ def _survey_recording(recording: Recording, network: SensorNetwork, settings: Se
 def _track_passes(recording: Recording, network: SensorNetwork, settings: Settings,
                   progress: Callable[[int], object] | None, stopped: Callable[[], bool] | None,
                   ) -> tuple[list[Track], bool]:
-    """Track the targets; return (last unambiguous pose of each used track, interrupted)."""
+    """Track the targets; return (last unambiguous pose of each track, interrupted).
+
+    Tracks with fewer than `MIN_POSES` unambiguous poses are excluded.
+    """
     reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
     poses: dict[int, tuple[int, Track]] = {}
     interrupted = False
@@ -152,7 +157,10 @@ def _track_passes(recording: Recording, network: SensorNetwork, settings: Settin
 
 def _with_pass_records(network: SensorNetwork, surveyed: SensorNetwork, date: str,
                        n_tracks: int) -> SensorNetwork:
-    """Return `network` with the records of `surveyed`, plus the date and number of passes."""
+    """Return `network` with the calibration records of `surveyed`.
+
+    The date and the number of passes are added to each record.
+    """
     passes = quantity(n_tracks, 'pass', 'passes')
     return replace(network, calibrated=tuple(
         surveyed.calibration_record(j, date, f'nominal orientation; {passes}') if record is None

@@ -82,8 +82,8 @@ def _knocks(calibration: Calibration) -> list[Chart]:
         for k, (name, (t, acceleration)) in enumerate(shocks.items()):
             offset = calibration.network.clock_offset[calibration.network.index(name)] \
                 if is_corrected else 0.0
-            near = np.abs(t - offset - first) < KNOCK_MARGIN_S
-            traces.append(curve(t[near] - offset - first, acceleration[near], name, k,
+            is_near = np.abs(t - offset - first) < KNOCK_MARGIN_S
+            traces.append(curve(t[is_near] - offset - first, acceleration[is_near], name, k,
                                 'lines+markers'))
         charts.append(Chart(title, traces, axes('time [s]',
                                                 'acceleration relative to rest [m/s²]')))

@@ -73,7 +73,7 @@ def examples_of(signatures: list[Signature]) -> Examples:
         raise LabelsError('the input contains no signatures')
     x, rows, reasons = feature_table(signatures)
     if not len(rows):
-        raise LabelsError(f'no signature is usable; the first reason is: {reasons[0]}')
+        raise LabelsError(f'no signature is usable; reason for the first: {reasons[0]}')
     usable = [signatures[i] for i in rows.tolist()]
     return Examples(x, tuple(s.label for s in usable), tuple(s.source for s in usable),
                     tuple(s.group for s in usable), usable[0].axes, usable[0].unit, tuple(reasons))
@@ -125,27 +125,27 @@ def _interval_signatures(path: Path, labels: str | PathLike[str], network: Senso
         if interval.sensor and interval.sensor not in network.names:
             raise LabelsError(f'{labels}: row {interval.row}: the network has no sensor '
                               f'{interval.sensor!r}; its sensors are {", ".join(network.names)}')
-        found = list(_signatures(path, readings, names, interval))
-        if not found:
+        signatures = list(_signatures(path, readings, names, interval))
+        if not signatures:
             raise LabelsError(f'{labels}: row {interval.row}: the interval contains no readings')
-        yield from found
+        yield from signatures
 
 
 def _signatures(path: Path, readings: Readings, names: Any,
                 interval: LabelledInterval) -> Iterator[Signature]:
     """Extract the signatures of one interval, one per sensor with readings in the interval."""
-    inside = (interval.begin_ns <= readings.stamp_ns) & (readings.stamp_ns <= interval.end_ns)
+    is_inside = (interval.begin_ns <= readings.stamp_ns) & (readings.stamp_ns <= interval.end_ns)
     for name in readings.names:
-        selected = inside & (names == name)
+        selected = is_inside & (names == name)
         if interval.sensor not in ('', name) or not selected.any():
             continue
         field = readings.field[selected]
         has_axis = ~np.isnan(field).all(axis=0)
         field = field[:, has_axis]
-        complete = ~np.isnan(field).any(axis=1)
-        if has_axis.any() and complete.any():
-            yield Signature((readings.stamp_ns[selected][complete] - interval.begin_ns) / 1e9,
-                            field[complete], interval.label,
+        is_complete = ~np.isnan(field).any(axis=1)
+        if has_axis.any() and is_complete.any():
+            yield Signature((readings.stamp_ns[selected][is_complete] - interval.begin_ns) / 1e9,
+                            field[is_complete], interval.label,
                             f'{path.name}: {name}, row {interval.row}',
                             tuple(np.array(list('xyz'))[has_axis].tolist()), 'T',
                             f'row {interval.row}')

@@ -73,23 +73,23 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
     -------
     list of Finding
     """
-    found = list(_clock_findings(network, sensors))
+    findings = list(_clock_findings(network, sensors))
     levels = np.array([level_of(calibrate, name, sensors[name]) for name in network.names])
     # Rounded levels stay equal during small changes, so that no new comparison is needed.
     levels = LEVEL_STEP * np.round(levels / LEVEL_STEP)
     std = np.array([np.full(3, np.deg2rad(survey.stated_std_deg)) if s is None else s
                     for s in network.orientation_std])
-    earth = network.earth_field
-    if earth is None:
+    earth_field = network.earth_field
+    if earth_field is None:
         try:
-            earth = consensus(levels, network.R_ws)
+            earth_field = consensus(levels, network.R_ws)
         except ValueError as error:
-            return [*found, Finding(False, 'network', f'sensors were not compared: {error}',
-                                    'add earth_field or site to the network file')]
-    return found + [
+            return [*findings, Finding(False, 'network', f'sensors were not compared: {error}',
+                                       'add earth_field or site to the network file')]
+    return findings + [
         Finding(True, d.sensor, str(d).removeprefix(f'{d.sensor} '),
                 'fix the sensor, or its orientation in the network file')
-        for d in disagreements(network.names, levels, network.R_ws, std, earth,
+        for d in disagreements(network.names, levels, network.R_ws, std, earth_field,
                                survey.compass_bias_std)]
 
 
@@ -230,7 +230,7 @@ class Doctor:
         ----------
         readings : Readings
         received_ns : int, ns, optional
-            Time of reception.
+            Time of reception of the message; None if unknown.
         """
         names, stamps = readings.sensor_names(), readings.stamp_ns.tolist()
         for name, stamp, field in zip(names, stamps, readings.field, strict=True):
@@ -304,7 +304,7 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
         if stopped is not None and stopped():
             break
     damage = [Finding(True, recording.path.name, f'{cause}: {n}', 'the recording is damaged; '
-                      'mag-tracking repair writes a missing index and ends a truncated file, but '
+                      'mag-tracking repair adds the missing index of a truncated file, but '
                       'cannot restore lost data') for cause, n in recording.losses.items()]
     damage += [Finding(False, 'recording', f'{cause}: {n}', 'the recording is damaged, or '
                        'a message type is unsupported') for cause, n in reader.rejected.items()]

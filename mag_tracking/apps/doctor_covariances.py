@@ -60,14 +60,15 @@ def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator
     advice = (f'the measured noise replaced {quantity(n, "covariance")}; configure the driver to '
               'publish the variance in T^2, or zeros if it is unknown '
               '(calibrate.trust_covariances: true uses the covariances unchecked)')
-    valid = (declared > 0.0) & np.isfinite(declared) & (measured > 0.0)
-    if not valid.any() or np.abs(np.log(declared[valid] / measured[valid])).max() < np.log(2.0):
+    is_valid = (declared > 0.0) & np.isfinite(declared) & (measured > 0.0)
+    if not is_valid.any() \
+            or np.abs(np.log(declared[is_valid] / measured[is_valid])).max() < np.log(2.0):
         yield Finding(False, name, f'the covariances on {topic} contradict the quiet readings '
                       '(not positive definite, not finite, or with errors correlated between axes)',
                       advice)
         return
     log_ratio = np.full(3, -1.0)
-    log_ratio[valid] = np.abs(np.log(declared[valid] / measured[valid]))
+    log_ratio[is_valid] = np.abs(np.log(declared[is_valid] / measured[is_valid]))
     axis = int(np.argmax(log_ratio))
     yield Finding(
         False, name, f'the messages on {topic} state a noise of {1e9 * declared[axis]:.3g} nT, but '

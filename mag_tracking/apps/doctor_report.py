@@ -50,9 +50,9 @@ def doctor_page(doctor: Doctor, findings: Sequence[Finding], subject: str) -> Pa
     """
     notes = [Note(ERROR if f.serious else NOTE, str(f))
              for f in findings] or [Note(NOTE, 'no faults found')]
-    serious = sum(f.serious for f in findings)
-    numbers = (f'{quantity(serious, "serious finding")}, '
-               f'{quantity(len(findings) - serious, "note")}')
+    n_serious = sum(f.serious for f in findings)
+    numbers = (f'{quantity(n_serious, "serious finding")}, '
+               f'{quantity(len(findings) - n_serious, "note")}')
     return Page(f'Health of {subject}', numbers, notes, None, [_noise(doctor), _rates(doctor)],
                 [_table(doctor)])
 

@@ -102,7 +102,7 @@ def _poor_fits(passes: Sequence[FittedPass]) -> list[str]:
 
 
 def _peaks_ns(passes: Sequence[FittedPass]) -> list[int]:
-    """Return each pass's time of strongest field on the time axis of the page [ns]."""
+    """Return the time [ns] of the strongest field of each pass, on the time axis of the page."""
     peaks: list[int] = []
     recording, shift, end = '', 0, 0
     for fitted in passes:

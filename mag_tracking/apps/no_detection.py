@@ -69,10 +69,11 @@ def _likely_cause(network: SensorNetwork, settings: Settings, calibrate: Calibra
         return f'{", ".join(unready)} had no background and could not be used'
     for name, noise in zip(network.names, network.noise_std, strict=True):
         scatter = calibrate.backgrounds()[name].scatter_std
-        valid = ~np.isnan(scatter)
-        if noise is not None and valid.any() and (noise / scatter)[valid].max() > MAX_NOISE_RATIO:
+        is_valid = ~np.isnan(scatter)
+        if noise is not None and is_valid.any() \
+                and (noise / scatter)[is_valid].max() > MAX_NOISE_RATIO:
             return (f'noise_std of {name} in the network file is '
-                    f'{(noise / scatter)[valid].max():.2g} times the scatter of its readings')
+                    f'{(noise / scatter)[is_valid].max():.2g} times the scatter of its readings')
     if detect.largest_excursion > 1.0:
         frames = quantity(detect.max_consecutive_above, 'consecutive frame')
         return (f'it lasted for {frames}, but detect.onset_frames is '

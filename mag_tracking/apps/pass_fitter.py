@@ -65,10 +65,10 @@ class FittedPass:
         """
         if self.chosen is not None:
             return self.chosen
-        usable = [f for f in self.fits if f.converged and f.trusted]
-        if not usable or any(contradicts_straight_pass(f) for f in self.fits if f.converged):
+        usable_fits = [f for f in self.fits if f.converged and f.trusted]
+        if not usable_fits or any(contradicts_straight_pass(f) for f in self.fits if f.converged):
             return None
-        return min(usable, key=lambda f: f.normalised_cost)
+        return min(usable_fits, key=lambda f: f.normalised_cost)
 
     @property
     def disagreement(self) -> tuple[float, float]:

@@ -90,9 +90,8 @@ class PassTracks:
     def _poses_of_smallest_variance(self, end_ns: int) -> list[_Pose]:
         """Return the pose with the smallest variance up to `end_ns` [ns] for each track.
 
-        The other poses up to `end_ns` are dropped.
-        Vehicles that are still approaching are omitted: their latest pose has the smallest
-        variance.
+        The other poses up to `end_ns` are dropped. Vehicles that are still approaching are omitted:
+        their latest pose has the smallest variance.
         """
         selected = []
         for track, poses in list(self._poses.items()):
@@ -112,7 +111,7 @@ class PassTracks:
 
 
 def ground_prior(settings: TrackSettings) -> GroundPrior:
-    """Compute the prior of vehicle height and climb rate from the settings of a tracker.
+    """Compute the prior of the height and vertical speed of vehicles from tracker settings.
 
     Parameters
     ----------

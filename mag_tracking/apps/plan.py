@@ -98,10 +98,10 @@ class Plan:
 
 def detection_range(target: PlannedTarget, noise_std: float, n_axes: int,
                     false_alarm: float) -> float:
-    """Compute the approximate range at which a frame of one sensor detects half of the targets.
+    """Compute the approximate range at which one sensor detects half of the targets in one frame.
 
-    The mean signal energy over all directions of the moment is used. It is twice the energy
-    perpendicular to the axis of the dipole.
+    The signal energy is averaged over all directions of the moment. The average is twice the energy
+    at a point perpendicular to the axis of the dipole.
 
     Parameters
     ----------
@@ -175,14 +175,14 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
                   for lane in planned_lanes]
     coarse_x, coarse_y = _grid(area, max(11, n_grid // 2))
     candidates = np.stack(np.meshgrid(coarse_x, coarse_y), axis=-1).reshape(-1, 2)
-    allowed = np.all([_lane_distances(lane, candidates) >= clearance for lane in planned_lanes],
-                     axis=0)
+    is_allowed = np.all([_lane_distances(lane, candidates) >= clearance for lane in planned_lanes],
+                        axis=0)
     median_bound = np.full(len(candidates), np.nan)
     without, with_sensor = _added_sensor_bounds(network, target, sampling, near_lanes,
-                                                candidates[allowed])
-    median_bound[allowed] = with_sensor
+                                                candidates[is_allowed])
+    median_bound[is_allowed] = with_sensor
     report_part(1)
-    best_index = int(np.nanargmin(median_bound)) if allowed.any() else 0
+    best_index = int(np.nanargmin(median_bound)) if is_allowed.any() else 0
     lane_observability, closest_bounds = _closest_point_bounds(network, target, sampling,
                                                                planned_lanes[0], half_length)
     shape = len(coarse_y), len(coarse_x)
@@ -263,7 +263,7 @@ def _lane(network: SensorNetwork, target: PlannedTarget, sampling: Sampling, nam
 
 def _filter_bound(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                   points: FloatArray, heading: float, settings: Settings) -> FloatArray:
-    """Path bound (n,) [m] of a filter that follows a lane from its beginning.
+    """Position bound (n,) [m], at each point of a lane, of a filter that starts at the first point.
 
     The filter uses the motion model of the tracker and estimates the backgrounds. The bound is the
     median over the directions of the moment.
@@ -319,10 +319,10 @@ def _added_sensor_bounds(network: SensorNetwork, target: PlannedTarget, sampling
         J = pass_information(network.positions, network.R_sw, target, sampling, points,
                              heading).sum(axis=2)
         bounds_without.append(bounds_of(J, prior)[..., 0].ravel())
-        added = pass_information(candidate_positions, upright, target, added_sampling, points,
-                                 heading)
-        bounds_with.append(
-            bounds_of(J[:, :, None] + added, prior)[..., 0].reshape(-1, len(candidates)))
+        added_information = pass_information(candidate_positions, upright, target, added_sampling,
+                                             points, heading)
+        bounds_with.append(bounds_of(J[:, :, None] + added_information, prior)[..., 0].reshape(
+            -1, len(candidates)))
     if not bounds_without:
         return float('nan'), np.zeros(0)
     return (float(np.median(np.concatenate(bounds_without))),
@@ -331,7 +331,10 @@ def _added_sensor_bounds(network: SensorNetwork, target: PlannedTarget, sampling
 
 def _miss_probabilities(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                         lane: Lane, area: Area, settings: Settings) -> FloatArray:
-    """Compute `Plan.miss_probability`; `detect.onset_frames` consecutive frames are a detection."""
+    """Compute `Plan.miss_probability`.
+
+    A pass is missed unless `detect.onset_frames` consecutive frames detect the target.
+    """
     half_length = 0.5 * max(area[2] - area[0], area[3] - area[1])
     offsets = np.linspace(0.0, 2.0 * half_length, 25)
     u = np.array([np.cos(lane.heading), np.sin(lane.heading)])

@@ -256,7 +256,7 @@ def _sampling(network: SensorNetwork, settings: Settings, noise_std: float | Non
 
 
 def _area(network: SensorNetwork, range_m: float, area: Sequence[float] | None) -> Area:
-    """Return the checked `area`; default: the box of the sensors extended by `range_m` [m]."""
+    """Return the checked `area`; default: the sensors' bounding box extended by `range_m` [m]."""
     low, high = network.positions[:, :2].min(axis=0), network.positions[:, :2].max(axis=0)
     if area is not None and len(area) != 4:
         raise SettingsError(f'area: expected X0, Y0, X1, Y1, got {area}')

@@ -78,10 +78,10 @@ def summary_lines(p: Plan) -> list[str]:
                      f'{GOOD_PD:.0%} {first_text}; position bound at the centre '
                      f'{length_text(lane.filter_std[closest])} (filter), '
                      f'{length_text(lane.pass_std[closest, 0])} (whole pass)')
-    detected = p.miss_probability[p.miss_probability[:, 1] < 0.01, 0]
+    detected_offsets = p.miss_probability[p.miss_probability[:, 1] < 0.01, 0]
     lines.append(
-        f'99% of passes are detected up to {detected.max():.3g} m from the centre'
-        if len(detected) else 'the detection probability of a pass is below 99% everywhere')
+        f'99% of passes are detected up to {detected_offsets.max():.3g} m from the centre'
+        if len(detected_offsets) else 'the detection probability of a pass is below 99% everywhere')
     lines.append('(bounds for a point target; errors with real vehicles are several times larger)')
     if not np.isfinite(p.std_with_added_sensor).any():
         lines.append('additional sensor: no position in the area is far enough from the lanes')
@@ -89,8 +89,8 @@ def summary_lines(p: Plan) -> list[str]:
         lines.append('additional sensor: no improvement anywhere in the area')
     else:
         x, y = p.best_position
-        edge = ' (on the edge of the area)' if x in p.x[[0, -1]] or y in p.y[[0, -1]] else ''
-        lines.append(f'additional sensor: best at ({x:.2f}, {y:.2f}) m{edge}, where the median '
+        remark = ' (on the edge of the area)' if x in p.x[[0, -1]] or y in p.y[[0, -1]] else ''
+        lines.append(f'additional sensor: best at ({x:.2f}, {y:.2f}) m{remark}, where the median '
                      'bound near the sensors is '
                      f'{length_text(np.nanmin(p.std_with_added_sensor))} instead of '
                      f'{length_text(p.std_without_added_sensor)}')
@@ -161,9 +161,9 @@ def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:
     low, high = (plan.x[0], plan.y[0]), (plan.x[-1], plan.y[-1])
     traces = []
     for lane in plan.lanes:
-        inside = f * lane.points[((lane.points >= low) & (lane.points <= high)).all(axis=1)]
-        traces.append({'type': 'scatter', 'mode': 'lines', 'x': inside[:, 0].tolist(),
-                       'y': inside[:, 1].tolist(), 'hoverinfo': 'skip', 'showlegend': False,
+        points_inside = f * lane.points[((lane.points >= low) & (lane.points <= high)).all(axis=1)]
+        traces.append({'type': 'scatter', 'mode': 'lines', 'x': points_inside[:, 0].tolist(),
+                       'y': points_inside[:, 1].tolist(), 'hoverinfo': 'skip', 'showlegend': False,
                        'line': {'color': '#ffffff', 'dash': 'dash', 'width': 1.5}})
     return [*traces, sensor_trace(f * plan.network.positions, plan.network.names)]
 
@@ -177,12 +177,12 @@ def _lanes(plan: Plan) -> list[Chart]:
         bounds += [curve(along, f * lane.filter_std, f'{name}: filter so far', 2 * k),
                    curve(along, f * lane.pass_std[:, 0], f'{name}: whole pass', 2 * k + 1)]
         detection.append(curve(along, lane.detection, name, k))
-    missed = plan.miss_probability[plan.miss_probability[:, 1] >= MIN_MISSED]
+    missed_passes = plan.miss_probability[plan.miss_probability[:, 1] >= MIN_MISSED]
     label = f'distance along the lane from the point nearest to the centre [{unit}]'
     return [Chart('Position bound along the lanes', bounds,
                   axes(label, f'standard deviation [{unit}]', log_y=True)),
             Chart('Detection along the lanes', detection, axes(label, 'probability per frame')),
-            Chart('Missed passes', [curve(f * missed[:, 0], missed[:, 1], '', 0,
+            Chart('Missed passes', [curve(f * missed_passes[:, 0], missed_passes[:, 1], '', 0,
                                           'lines+markers')],
                   axes(f'lateral distance from the centre of the sensors [{unit}]',
                        'probability of a miss', log_y=True))]

@@ -79,9 +79,9 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
     Prescan
         Empty if the network file contains all backgrounds, or `look_ahead_s` is 0.
     """
-    unknown = [name for name, level in zip(network.names, network.background, strict=True)
-               if level is None]
-    if not unknown or not settings.look_ahead_s:
+    without_background = [name for name, level in zip(network.names, network.background,
+                                                      strict=True) if level is None]
+    if not without_background or not settings.look_ahead_s:
         return Prescan({}, {})
     recorder, learner = Calibrate(network, settings, BlockRecorder), Calibrate(network, settings)
     first_ns: dict[str, int] = {}
@@ -96,8 +96,9 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
     for name, background in recorder.backgrounds().items():
         assert isinstance(background, BlockRecorder)
         steps[name] = background.steps
-        level, had_target = _level_of(background, learner.backgrounds()[name].departed_at,
-                                      learnt.get(name)) if name in unknown else (None, False)
+        level, had_target = _level_of(
+            background, learner.backgrounds()[name].departed_at,
+            learnt.get(name)) if name in without_background else (None, False)
         if level is not None \
                 and level.n_blocks * level.block_s >= MIN_LEVEL_FRACTION * settings.learn_s:
             levels[name] = level
@@ -110,10 +111,10 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
 
 def _level_of(recorder: BlockRecorder, departed_at: float | None,
               learnt: tuple[float, FloatArray] | None) -> tuple[MostFrequentLevel | None, bool]:
-    """Return (most frequent level or None, whether a target was present until `departed_at` [s]).
+    """Return (most frequent level or None, whether a target was present at the start).
 
-    If a target was present, only later readings determine the level. If the field later returns to
-    the level `learnt` at the start, no target was present.
+    A target that was present had left by `departed_at` [s]; only later readings then determine the
+    level. If the field later returns to the level `learnt` at the start, no target was present.
     """
     level = recorder.quiet_level()
     if level is None or departed_at is None or learnt is None \

@@ -95,7 +95,7 @@ def read_recording(path: str | PathLike[str],
 
 def recorded_readings(recording: Recording, reader: SampleReader,
                       readings: Readings) -> RecordedReadings:
-    """Combine readings with the ground truth and the counts of a reader.
+    """Combine readings with the ground truth, losses and rejections of a recording.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def _with_nan(values: ArrayLike) -> NDArray[Any]:
 
 
 def checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
-    """Convert readings to the array types that the stages expect.
+    """Check readings and convert them to the array types that the stages expect.
 
     Parameters
     ----------
@@ -203,8 +203,8 @@ def _to_standard_types(readings: Readings) -> Readings:
                             f'{-LATEST_NS} .. {LATEST_NS}; expected nanoseconds since 1970')
     sensor = np.asarray(readings.sensor, dtype=np.int64)
     if n and not 0 <= sensor.min() <= sensor.max() < len(readings.names):
-        raise ReadingsError(f'sensor: {sensor.min()} .. {sensor.max()} is outside 0 .. '
-                            f'{len(readings.names) - 1}, the indices of names')
+        raise ReadingsError('sensor: expected indices into names (0 .. '
+                            f'{len(readings.names) - 1}), got {sensor.min()} .. {sensor.max()}')
     C = readings.covariance
     return Readings(tuple(readings.names), sensor, np.asarray(readings.stamp_ns, dtype=np.int64),
                     np.asarray(readings.field, dtype=float),

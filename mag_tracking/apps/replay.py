@@ -126,11 +126,11 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
         except ReadingStopped:
             interrupted = True
         collector.add(pipeline.flush())
-        arrays = reader.truth_arrays() if table is None else table
-        summary = summarise(recording, reader, pipeline, collector, arrays, prescan)
+        truth_arrays = reader.truth_arrays() if table is None else table
+        summary = summarise(recording, reader, pipeline, collector, truth_arrays, prescan)
         summary['interrupted'] = interrupted
         results.write_summary(summary)
-    return Run(summary, collector.logs, collector.smoothed, arrays)
+    return Run(summary, collector.logs, collector.smoothed, truth_arrays)
 
 
 class Results(Protocol):
@@ -303,7 +303,7 @@ def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline
 
 
 def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
-    """Create the entry `delay` of a track: speed and heading, or why both are missing."""
+    """Create the entry `delay` of a track: speed and heading, or a reason for their absence."""
     motion = correlated_motion(PassData.from_frames(network, log.stamp_ns, log.measured, log.noise))
     if motion.reason:
         return {'reason': motion.reason}
@@ -341,8 +341,8 @@ def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Configured,
         Entry `truth` of a track in `summary.json`; None if no ground truth covers the track.
     """
     best_match: tuple[float, dict[str, Any]] | None = None
-    for name, arrays in truth.items():
-        errors = _errors_of(log, pipeline, arrays)
+    for name, truth_arrays in truth.items():
+        errors = _errors_of(log, pipeline, truth_arrays)
         if errors is not None and (best_match is None or errors[0] < best_match[0]):
             best_match = errors[0], {'name': name, **errors[1]}
     return None if best_match is None else best_match[1]
@@ -350,7 +350,10 @@ def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Configured,
 
 def _errors_of(log: TrackLog | SmoothedLog, pipeline: Configured,
                truth: Truth) -> tuple[float, dict[str, Any]] | None:
-    """Compute (error [m] by which targets are compared, all errors); None without overlap."""
+    """Return (error [m] for the selection of the best-matching target, all errors).
+
+    None if the ground truth does not cover the track.
+    """
     if pipeline.settings.track.target == 'magnet':
         magnet = magnet_errors(log, truth, pipeline.settings.track.magnet.axis)
         return (magnet['position_mean'], {**magnet}) if magnet else None
@@ -359,7 +362,7 @@ def _errors_of(log: TrackLog | SmoothedLog, pipeline: Configured,
 
 
 def _bound_ratio(log: TrackLog, pipeline: Pipeline, truth: Truth) -> float | None:
-    """Ratio of the error of a track to its path bound; None if the ratio cannot be computed."""
+    """Ratio of the error of a track to its Cramér-Rao bound; None if it cannot be computed."""
     track = pipeline.settings.track
     if track.target == 'magnet':
         # Between two poses, the magnet may have rotated arbitrarily.

@@ -38,7 +38,8 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(WARNING, f'{cause}: {n}')
     stuck = [name for name, s in sensors.items() if s['stuck']]
     if stuck:
-        yield Note(WARNING, f'{", ".join(stuck)}: an axis is constant (run mag-tracking doctor)')
+        yield Note(WARNING, f'{", ".join(stuck)}: the readings of an axis are constant '
+                   '(run mag-tracking doctor)')
     unready = [name for name, s in sensors.items() if not s['ready'] and not s['stuck']]
     if unready:
         yield Note(WARNING, f'no background was learnt for {", ".join(unready)}: the quiet '

@@ -159,10 +159,10 @@ class TrackingResult:
         UnknownTrackError
             If there is no such track.
         """
-        return errors_against_truth(self._log(track_id), self, self.truth)
+        return errors_against_truth(self._track_log(track_id), self, self.truth)
 
     def map_figure(self, track_id: int | None = None) -> 'Figure':
-        """Draw the hypotheses with 90% ellipses, smoothed track, sensors and ground truth.
+        """Draw a map: hypotheses with 90% ellipses, smoothed track, sensors and ground truth.
 
         Parameters
         ----------
@@ -181,7 +181,7 @@ class TrackingResult:
         # Imported here, as in the other figures, because it loads matplotlib.
         from mag_tracking.report.figures import map_figure
 
-        log, errors = self._log(track_id), self.errors(track_id)
+        log, errors = self._track_log(track_id), self.errors(track_id)
         truth = None if errors is None else interpolate_truth(self.truth[errors['name']],
                                                               log.stamp_ns)
         smoothed = self.smoothed[(self.smoothed['track_id'] == log.id) & self.smoothed['complete']]
@@ -206,7 +206,7 @@ class TrackingResult:
         """
         from mag_tracking.report.figures import weights_figure
 
-        return weights_figure(self._log(track_id))
+        return weights_figure(self._track_log(track_id))
 
     def field_figure(self, track_id: int | None = None) -> 'Figure':
         """Draw the measured and predicted field of each sensor.
@@ -227,9 +227,9 @@ class TrackingResult:
         """
         from mag_tracking.report.figures import field_figure
 
-        return field_figure(self._log(track_id), self.network)
+        return field_figure(self._track_log(track_id), self.network)
 
-    def _log(self, track_id: int | None) -> TrackLog:
+    def _track_log(self, track_id: int | None) -> TrackLog:
         """Return the history of a track; None selects the first track."""
         if not self.tracks:
             raise UnknownTrackError('the result contains no tracks')
@@ -321,14 +321,14 @@ class _Results:
         self.disturbances[disturbance.id] = disturbance
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Ignore a frame, because the history of each track contains its frames."""
+        """Ignore a frame, because frames are stored in the history of each track."""
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
         """Add a smoothed pose."""
         self.smoothed.append(pose)
 
     def add_track(self, track: Track) -> None:
-        """Add a pose without its hypotheses, which are large and in the history of the track."""
+        """Add a pose; omit its hypotheses, which are stored in the history of the track."""
         self.poses.append(replace(track, hypotheses=()))
 
 

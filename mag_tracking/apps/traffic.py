@@ -182,7 +182,7 @@ class _TrafficCollector:
                 self.summaries.append(record)
 
     def _drop_old(self, now_ns: int) -> None:
-        """Drop the frames of tracks that ended long ago, or before the time jumped back."""
+        """Drop frames of tracks that ended before a time jump, or more than `RETENTION_S` ago."""
         old_ids = self._tracks_before_jump or {track_id for track_id, frames in self._frames.items()
                                                if now_ns - frames[-1].stamp_ns > RETENTION_S * NS}
         for track_id in old_ids:

@@ -80,7 +80,7 @@ def _batches(messages: Iterable[tuple[Readings, int]]) -> Iterator[tuple[Reading
 
 
 def _add_records(scene: LiveScene, records: Iterable[Output]) -> None:
-    """Add frames, tracks and completely smoothed tracks to the scene."""
+    """Add frames, poses and tracks smoothed over their whole length to the scene."""
     smoothed: dict[int, list[FloatArray]] = {}
     for record in records:
         if isinstance(record, FieldFrame):

@@ -112,12 +112,12 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     B0 = np.asarray(earth_field, dtype=float)
     suspects = [j for j in range(len(names))
                 if not _is_consistent(fields[j], R_ws[j], orientation_std[j], B0, bias_std)]
-    out = []
+    inconsistencies = []
     for j in suspects:
-        size = np.sqrt(np.nansum((fields[j] - R_ws[j].T @ B0)**2))
-        out.append(FieldInconsistency(names[j], float(size), _explanations(
+        magnitude = np.sqrt(np.nansum((fields[j] - R_ws[j].T @ B0)**2))
+        inconsistencies.append(FieldInconsistency(names[j], float(magnitude), _explanations(
             j, suspects, names, fields, R_ws, orientation_std, B0, bias_std)))
-    return out
+    return inconsistencies
 
 
 def _is_consistent(y: FloatArray, R_ws: FloatArray, std: FloatArray, B0: FloatArray,
@@ -139,16 +139,16 @@ def _is_consistent_cached(field: tuple[float, ...], orientation: tuple[float, ..
     """Compute `_is_consistent` from tuples, which are hashable, and cache the result."""
     y, R_ws, std = (np.array(field), np.array(orientation).reshape(3, 3),
                     np.array(orientation_std))
-    reported = ~np.isnan(y)
-    if not reported.any():
+    is_reported = ~np.isnan(y)
+    if not is_reported.any():
         return True
     # Heading errors may be large, so a grid is tested; tilts are small and are linearised.
     yaw, B = _headings(std, np.array(B0))
     tilt_effect = (R_ws.T @ np.cross(np.eye(3), np.array(B0)).T * std)[:, :2]
-    S = (bias_std**2 * np.eye(3) + tilt_effect @ tilt_effect.T)[np.ix_(reported, reported)]
-    r = (y - B @ R_ws)[:, reported]
+    S = (bias_std**2 * np.eye(3) + tilt_effect @ tilt_effect.T)[np.ix_(is_reported, is_reported)]
+    r = (y - B @ R_ws)[:, is_reported]
     energy = np.einsum('ni,ij,nj->n', r, np.linalg.inv(S), r) + (yaw / std[2])**2
-    return bool(energy.min() <= chi2.isf(FALSE_ALARM_PROBABILITY, np.count_nonzero(reported)))
+    return bool(energy.min() <= chi2.isf(FALSE_ALARM_PROBABILITY, np.count_nonzero(is_reported)))
 
 
 def _explanations(j: int, suspects: Sequence[int], names: Sequence[str], fields: FloatArray,
@@ -177,14 +177,17 @@ def _explanations(j: int, suspects: Sequence[int], names: Sequence[str], fields:
 
 def _partial_explanation(y: FloatArray, R_ws: FloatArray, std: FloatArray,
                          B0: FloatArray) -> tuple[str, ...]:
-    """Describe the simplest change of axes that explains most of a difference; () if none does."""
-    original = _remaining_difference(y, R_ws, std, B0)
+    """Describe the simplest change of axes that explains most of the difference from `B0`.
+
+    Empty if there is no such change, or if it is not unique.
+    """
+    original_difference = _remaining_difference(y, R_ws, std, B0)
     for changes in _axis_changes():
         remainders = sorted(
             (_remaining_difference(signs * y[list(order)], R_ws, std, B0), description)
             for description, order, signs in changes)
         # If two changes explain the difference equally well, neither is reported.
-        if remainders[0][0] < MAX_REMAINING_FRACTION * original and not (
+        if remainders[0][0] < MAX_REMAINING_FRACTION * original_difference and not (
                 len(remainders) > 1 and remainders[1][0] < remainders[0][0] / MAX_RATIO_TO_NEXT):
             return (f'{remainders[0][1]}, and {remainders[0][0] * 1e6:.2g} uT remain (due to '
                     'nearby iron or the bias of the sensor)',)
@@ -194,15 +197,15 @@ def _partial_explanation(y: FloatArray, R_ws: FloatArray, std: FloatArray,
 def _remaining_difference(y: FloatArray, R_ws: FloatArray, std: FloatArray,
                           B0: FloatArray) -> float:
     """Magnitude [T] of a measured field minus the Earth's field, at the best heading."""
-    reported = ~np.isnan(y)
+    is_reported = ~np.isnan(y)
     _, B = _headings(std, B0)
-    return float(np.linalg.norm((y - B @ R_ws)[:, reported], axis=1).min())
+    return float(np.linalg.norm((y - B @ R_ws)[:, is_reported], axis=1).min())
 
 
 def _headings(std: FloatArray, B0: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Tested heading errors (n,) [rad] of a sensor, and the Earth's field rotated by each.
+    """Tested heading errors (n,) [rad] of a sensor, and the Earth's fields (n, 3) [T].
 
-    The field (n, 3) is in [T].
+    Each field is rotated by the corresponding heading error.
     """
     max_error = min(np.pi, MAX_HEADING_STDS * std[2])
     yaw = np.linspace(-max_error, max_error, 1 + 2 * max(1, round(max_error / YAW_STEP)))

@@ -48,8 +48,9 @@ class RunningBackground:
         deviations of the noise.
     relearn : float, s
         Duration of another steady level after which that level becomes the background. The
-        duration is shorter if the background was observed only briefly, or contains a target that
-        has left. 0 disables the replacement, except of a background set by `resume`.
+        duration is shorter if the background was observed only briefly, or if it contains the field
+        of a target that has left. 0 disables the replacement, except of a background set by
+        `resume`.
     background : (3,) array, T, optional
         Background, if it is known in advance.
     noise_std : (3,) array, T, optional
@@ -166,7 +167,7 @@ class RunningBackground:
 
     @property
     def departed_at(self) -> float | None:
-        """Time [s] by which a vehicle present at the start had left; None if undetected."""
+        """Time [s] by which a vehicle present at the start had left; None if none was detected."""
         return self._departure.departed_at
 
     @property
@@ -184,7 +185,7 @@ class RunningBackground:
 
     @property
     def drift(self) -> FloatArray:
-        """Drift, (3,) T/s; NaN before the background is ready and for an axis not reported."""
+        """Drift, (3,) T/s; NaN before the background is ready, and for unreported axes."""
         return self._level.drift
 
     def level(self, time: float) -> FloatArray:
@@ -207,7 +208,10 @@ class RunningBackground:
 
     @property
     def scatter_std(self) -> FloatArray:
-        """Standard deviation of the quiet readings, (3,) T, with quantisation; NaN if unknown."""
+        """Standard deviation of quiet readings, (3,) T; NaN if unknown.
+
+        Includes the quantisation error of the sensor.
+        """
         variance = self._quiet.scatter() + self._state['step_variance']
         return np.where(variance > 0.0, np.sqrt(variance), np.nan)
 
@@ -244,7 +248,10 @@ class RunningBackground:
             self._start_provisionally(block)
 
     def _start_provisionally(self, block: Block) -> None:
-        """Add a block; if a frequent level exists, adopt it or the given background."""
+        """Add a block; adopt the given background or a frequent level once such a level exists.
+
+        An uncertain frequent level is adopted provisionally.
+        """
         self._provisional.collect(block)
         frequent = self._provisional.frequent_level(corrected_steps(self._sensors))
         if frequent is not None and self._known_background is not None:
@@ -399,8 +406,8 @@ class RunningBackground:
         self._is_resumed = False
         line = line_of(blocks)
         assert self._level.noise is not None
-        is_young = MIN_DURATION_RATIO * self._observed_s < self._relearn
-        self._is_steep = is_young and is_steep(
+        is_briefly_observed = MIN_DURATION_RATIO * self._observed_s < self._relearn
+        self._is_steep = is_briefly_observed and is_steep(
             blocks, line[2], self._level.noise.diagonal() + self._state['step_variance'])
         self._level.set_uncertainty(np.abs(line[2]) * self._learn if self._is_steep else 0.0)
         noise = pooled_covariance(blocks) if self._known_noise is None else None

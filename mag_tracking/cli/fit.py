@@ -162,7 +162,7 @@ def _print_pass(fitted_pass: FittedPass) -> None:
             _print_bearing(fit.bearing)
         if fit.reason and fit is fitted_pass.reported:
             print(f'        still reliable: {_trusted_values(fit)}')
-        if not fit.reason and fit.is_poor_mixture:
+        if not fit.reason and fit.is_poor_joint_fit:
             print('        ambiguous: the joint fit of the vehicles is poor')
         elif not fit.reason and fit.ambiguous:
             chi_square, path = min(fit.rivals, key=lambda rival: rival[0])
