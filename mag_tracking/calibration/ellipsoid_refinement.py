@@ -95,7 +95,7 @@ def _symmetric(theta: FloatArray) -> FloatArray:
 
 
 def _model(theta: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Corrected readings (n, 3), residuals of their magnitudes (n,), and Jacobian of these (n, 9)."""
+    """Corrected readings (n, 3), their magnitudes minus one (n,), and Jacobian of these (n, 9)."""
     C = _symmetric(theta)
     y = z - theta[:3]
     q = y @ C

@@ -134,7 +134,7 @@ def _fit(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace, network: SensorNetwork) -> None:
-    """Check the options; raise SettingsError or OutputError."""
+    """Check the options; raise SettingsError or OutputError if one is invalid."""
     distinct_names(args.recordings)
     check_orders('--orders', args.orders)
     check_cpa_range('--cpa-range', args.cpa_range, network)
@@ -157,7 +157,7 @@ def _print_pass(fitted_pass: FittedPass) -> None:
     for fit in fitted_pass.fits:
         mark = '*' if fit is fitted_pass.chosen else ' '
         cost = f'{fit.normalised_cost:8.2f}' if len(fit.x) else ' ' * 8
-        print(f' {mark}   {fit.n_dipoles}  {cost}  {fit.reason or _numbers(fit)}')
+        print(f' {mark}   {fit.n_dipoles}  {cost}  {fit.reason or _formatted_estimates(fit)}')
         if fit.bearing is not None:
             _print_bearing(fit.bearing)
         if fit.reason and fit is fitted_pass.reported:
@@ -187,7 +187,7 @@ def _print_pass(fitted_pass: FittedPass) -> None:
 
 
 def _trusted_values(fit: PassFit) -> str:
-    """Format those of speed, direction and time that are reliable although the fit is rejected."""
+    """Format speed, direction and time of a rejected fit, as far as they are reliable."""
     speed, speed_std = fit.speed
     heading, heading_std = np.degrees(fit.heading)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
@@ -208,14 +208,14 @@ def _print_delay(fitted_pass: FittedPass) -> None:
     line = ' (assumed along the line of the sensors)' if np.isnan(c.heading_std) else ''
     print(f'  velocity from the delay between sensors: {c.speed:.2f}({c.speed_std:.2f}) m/s, '
           f'heading {np.degrees(c.heading):.0f} deg{line}')
-    best = fitted_pass.chosen
-    if best is not None and contradicts_delays(best.speed, best.heading, c):
+    chosen_fit = fitted_pass.chosen
+    if chosen_fit is not None and contradicts_delays(chosen_fit.speed, chosen_fit.heading, c):
         print('  warning: the velocities of the fit and from the delay contradict each other; rely '
               'on neither. Check clock offsets, positions in the network file, and whether the '
               'target turned')
 
 
-def _numbers(fit: PassFit) -> str:
+def _formatted_estimates(fit: PassFit) -> str:
     """Format the estimates of a fit, with standard deviations in parentheses."""
     sd = np.sqrt(np.diagonal(fit.robust_covariance))[:3]
     position = ' '.join(f'{v:6.2f}({s:.2f})' for v, s in zip(fit.position, sd, strict=True))
@@ -229,7 +229,7 @@ def _numbers(fit: PassFit) -> str:
 
 
 def _print_bearing(b: Bearing) -> None:
-    """Print the directions, the time and the rate that are observable with a single sensor."""
+    """Print what a single sensor observes: directions, time, and speed relative to range."""
     def direction_text(k: int, direction: FloatArray) -> str:
         if not np.isfinite(direction).all():
             return 'unknown'
@@ -245,10 +245,10 @@ def _print_bearing(b: Bearing) -> None:
 
 def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any] | None:
     """Estimate and print hard and soft iron; return them as a dict for JSON, or None on failure."""
-    simultaneous = [p for p in passes if p.n_vehicles > 1]
-    if simultaneous:
+    simultaneous_passes = [p for p in passes if p.n_vehicles > 1]
+    if simultaneous_passes:
         print('--same-vehicle: vehicles not used because they passed simultaneously with others: '
-              f'{len(simultaneous)}')
+              f'{len(simultaneous_passes)}')
     fits = [p.chosen for p in passes if p.chosen is not None and p.n_vehicles == 1]
     try:
         if not fits:

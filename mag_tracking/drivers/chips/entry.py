@@ -53,7 +53,7 @@ def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor
 
 
 def _conflict(one: ChipLocation, other: ChipLocation) -> bool:
-    """Whether both chips would answer; a chip directly on the bus answers on every channel."""
+    """Whether both chips would answer one request; a chip directly on the bus always answers."""
     return one.address == other.address and (
         one == other or None in (one.multiplexer, other.multiplexer))
 
