@@ -108,8 +108,8 @@ class BackgroundLevel:
             NaN for a constant axis whose steps are unknown or too fine to be observed.
         """
         steps = corrected_steps(self._sensors)
-        is_dead = (covariance.diagonal() <= MIN_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
-        return np.where(is_dead[:, None] | is_dead, np.nan, covariance)
+        is_unknown = (covariance.diagonal() <= MIN_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
+        return np.where(is_unknown[:, None] | is_unknown, np.nan, covariance)
 
     def set_uncertainty(self, std: FloatArray | float = 0.0, is_provisional: bool = False) -> None:
         """Set the uncertainty of the background level.

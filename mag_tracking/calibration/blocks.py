@@ -18,7 +18,7 @@ coarse steps cause much lower ratios."""
 
 @dataclass(frozen=True)
 class Block:
-    """Summary of the readings of a short interval."""
+    """Time, mean and scatter of the readings in a short interval."""
 
     time: float
     """[s] Mean time of the readings."""

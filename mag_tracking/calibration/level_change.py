@@ -54,7 +54,7 @@ class LevelChange:
     """A change from one steady level to another."""
 
     since: float
-    """[s] Start of the later level."""
+    """[s] Start of the later level, in the time common to all sensors."""
     size: float
     """Magnitude of the change in standard deviations of one reading."""
     has_departed: bool | None

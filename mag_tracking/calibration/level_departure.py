@@ -1,4 +1,4 @@
-"""Interval in which a sensor departs from its background, and the level at its end."""
+"""Departure of a sensor from its background, and the level at the end of the departure."""
 
 from collections import deque
 from collections.abc import Iterable

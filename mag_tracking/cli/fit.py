@@ -166,7 +166,8 @@ def _print_pass(fitted_pass: FittedPass) -> None:
             print('        ambiguous: the joint fit of the vehicles is poor')
         elif not fit.reason and fit.ambiguous:
             chi_square, path = min(fit.rivals, key=lambda rival: rival[0])
-            print(f'        ambiguous: {np.exp(-0.5 * chi_square):.2f} times as likely at position '
+            print('        ambiguous: another solution is '
+                  f'{np.exp(-0.5 * chi_square):.2f} times as likely: position '
                   f'({", ".join(f"{v:.2f}" for v in path[:3])}) m'
                   + (f' and length {abs(path[6]):.1f} m' if len(path) > 6 else ''))
     _print_delay(fitted_pass)
@@ -298,7 +299,7 @@ def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
 
 
 def _draw(fitted_pass: FittedPass, out: Path) -> None:
-    """Draw the chosen fit; if no fit is chosen, draw the fit with the most dipoles."""
+    """Draw the chosen fit of a pass; if there is none, draw its fit with the most dipoles."""
     fit = fitted_pass.chosen or next((f for f in reversed(fitted_pass.fits) if len(f.x)), None)
     if fit is None:
         return

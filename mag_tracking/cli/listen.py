@@ -77,7 +77,7 @@ class _ReadingPrinter:
             self._samples[a.sensor].append((a.stamp_ns, None))
 
     def stop(self) -> None:
-        """Stop the thread, which closes the device."""
+        """Stop the thread; it closes the device when it ends."""
         self._stop.set()
         self._thread.join(10.0)
 

@@ -49,7 +49,7 @@ def add(commands: Commands) -> None:
     p.add_argument('--sensor', nargs='+', default=[], metavar='NAME',
                    help='sensors that were rotated (default: all)')
     p.add_argument('--field-size', type=float, metavar='TESLA',
-                   help='magnitude of the ambient field (default: unknown; the mean gain is not '
+                   help='magnitude of the ambient field (if it is not given, the mean gain is not '
                    'calibrated)')
     p.add_argument('--out', required=True, type=Path, metavar='FILE',
                    help='network file to write')

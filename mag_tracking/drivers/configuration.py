@@ -167,7 +167,7 @@ def driver_of(name: object, entry: object) -> Driver:
 
 
 def _class_defaults(settings: Settings, device: Device, name: str) -> Settings:
-    """Return `settings`, overridden by the device's mapping `name` (`CLOCK` or `DRIVER`), if any."""
+    """Return `settings`, overridden by the device's mapping `name` (CLOCK or DRIVER), if any."""
     return replace(settings, getattr(device, name, {}))
 
 

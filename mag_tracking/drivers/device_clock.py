@@ -3,7 +3,7 @@
 A message arrives after a fixed minimum delay plus a random, non-negative delay. All points
 (device time, arrival - device time) therefore lie above a line whose slope is the drift of the
 device's oscillator. The estimate is the line under all points of the window that is closest to
-them on average: the edge of their lower convex hull over their mean abscissa.
+them on average: the edge of their lower convex hull that contains their mean abscissa.
 
 Source: Moon, Skelly & Towsley, 'Estimation and removal of clock skew from network delay
 measurements', IEEE INFOCOM 1999. Differences: only the lowest point of each short block of device

@@ -25,6 +25,7 @@ def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor
     Parameters
     ----------
     entries : sequence of str
+        Each as name:chip:address[@multiplexer.channel].
     known : collection of str
         Names of the supported chips; any other chip must be a module.Class.
 
@@ -64,6 +65,7 @@ def parse_sensor(entry: str, known: Collection[str]) -> Sensor:
     Parameters
     ----------
     entry : str
+        As name:chip:address[@multiplexer.channel].
     known : collection of str
         Names of the supported chips.
 

@@ -45,7 +45,7 @@ class BinarySettings:
     checksum: str = param(
         'none', 'Checksum after the payload: none, ' + ', '.join(CHECKSUMS) + '.')
     checksum_from: str = param(
-        'payload', 'First part of the frame that the checksum covers: sync or payload.')
+        'payload', 'Part of the frame at which the checksum begins: sync or payload.')
     tail: str = param('', 'Bytes at the end of a frame, hexadecimal; empty if there is no tail.')
 
 
