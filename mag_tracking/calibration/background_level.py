@@ -1,4 +1,4 @@
-"""Background line and noise of one sensor, in arrays that compiled code can read."""
+"""Linear trend and noise of the background of one sensor, in arrays for compiled code."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -13,30 +13,32 @@ from mag_tracking.calibration.resolution import MIN_STD, completed_steps, correc
 from mag_tracking.records import plain
 
 _Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
-"""Centre [s], mean (3,) [T], slope (3,) [T/s], and horizon [s], after which the line is
+"""Centre [s], mean (3,) [T], slope (3,) [T/s], and horizon [s], after which the trend is
 constant."""
 
 
 class BackgroundLevel:
-    """Line and noise of the background, stored in the state of its sensor.
+    """Linear trend and noise of the background, stored in the state of its sensor.
 
     Parameters
     ----------
     sensors : (1,) SENSOR array
         State of the sensor.
     freeze_std : float
-        Number of standard deviations beyond which the mean of a block departs from the background.
+        Threshold of the difference between the mean of a block and the background, in standard
+        deviations of the noise.
 
     Attributes
     ----------
     line : (float, (3,), (3,), float) or None
-        Centre [s], mean [T], slope [T/s] and horizon [s].
+        Linear trend: centre [s], mean [T], slope [T/s], and horizon [s], after which the trend is
+        constant. None if unknown.
     noise : (3, 3) array or None, T²
         Noise covariance of one reading, without the quantisation variance.
     limits : (3,) array, T
         Maximum difference between the mean of a block and the background.
     is_provisional : bool
-        Whether the line is a preliminary level that may differ from the background.
+        Whether the trend is preliminary and may differ from the background.
     """
 
     def __init__(self, sensors: StructArray, freeze_std: float) -> None:
@@ -48,16 +50,16 @@ class BackgroundLevel:
 
     @property
     def is_ready(self) -> bool:
-        """Whether both line and noise are known."""
+        """Whether both the trend and the noise are known."""
         return self.line is not None and self.noise is not None
 
     def set(self, line: _Line | None, noise: FloatArray | None) -> None:
-        """Set line and noise, and copy them to the sensor state that compiled code reads.
+        """Set trend and noise, and copy them to the sensor state that compiled code reads.
 
         Parameters
         ----------
         line : (float, (3,), (3,), float) or None
-            Centre [s], mean [T], slope [T/s] and horizon [s].
+            Linear trend: centre [s], mean [T], slope [T/s] and horizon [s].
         noise : (3, 3) array or None, T²
             Noise covariance of one reading, without the quantisation variance.
         """
@@ -70,7 +72,7 @@ class BackgroundLevel:
         self.apply_steps()
 
     def apply_steps(self) -> None:
-        """Update the noise and `limits` with the current quantisation variance of the sensor."""
+        """Update the quantisation variance of the sensor, its total noise and `limits`."""
         core.apply_steps(self._sensors, self._freeze_std, self.limits)
 
     def without_dead_axes(self, noise: FloatArray) -> FloatArray:
@@ -79,6 +81,7 @@ class BackgroundLevel:
         Parameters
         ----------
         noise : (3, 3) array, T²
+            Noise covariance of one reading.
 
         Returns
         -------
@@ -105,18 +108,18 @@ class BackgroundLevel:
             NaN for a constant axis whose steps are unknown or too fine to be observed.
         """
         steps = corrected_steps(self._sensors)
-        is_dead = (covariance.diagonal() <= MIN_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
-        return np.where(is_dead[:, None] | is_dead, np.nan, covariance)
+        is_unknown = (covariance.diagonal() <= MIN_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
+        return np.where(is_unknown[:, None] | is_unknown, np.nan, covariance)
 
     def set_uncertainty(self, std: FloatArray | float = 0.0, is_provisional: bool = False) -> None:
-        """Set the uncertainty of the line.
+        """Set the uncertainty of the background level.
 
         Parameters
         ----------
         std : (3,) array or float, T
             Standard deviation; NaN for an unreported axis.
         is_provisional : bool
-            Whether the line is a preliminary level that may differ from the background.
+            Whether the trend is preliminary and may differ from the background.
         """
         self.is_provisional = is_provisional
         self._state['level_variance'] = np.where(np.isnan(std), 0.0, np.square(std))
@@ -134,7 +137,7 @@ class BackgroundLevel:
 
     @property
     def drift(self) -> FloatArray:
-        """Drift, (3,) T/s; NaN before the background is ready and for an axis not reported."""
+        """Drift of the background, (3,) T/s; NaN while unknown and for an unreported axis."""
         return np.full(3, np.nan) if self.line is None else self.line[2]
 
     def at(self, time: float) -> FloatArray:

@@ -18,7 +18,7 @@ coarse steps cause much lower ratios."""
 
 @dataclass(frozen=True)
 class Block:
-    """Summary of the readings of a short interval."""
+    """Time, mean and scatter of the readings in a short interval."""
 
     time: float
     """[s] Mean time of the readings."""
@@ -45,7 +45,7 @@ def block_of(sensors: StructArray) -> Block:
 
 
 class Blocks(NamedTuple):
-    """`Block` as arrays: time (k,) [s], mean (k, 3) [T], scatter (k, 3, 3) [T²], n (k, 3)."""
+    """k blocks as arrays: time (k,) [s], mean (k, 3) [T], scatter (k, 3, 3) [T²], n (k, 3)."""
 
     time: FloatArray
     mean: FloatArray
@@ -107,6 +107,7 @@ def line_through(blocks: Blocks) -> tuple[float, FloatArray, FloatArray]:
     Returns
     -------
     centre : float, s
+        Mean time of the blocks.
     mean : (3,) array, T
         Value at the centre; NaN for an axis that no block reports.
     slope : (3,) array, T/s
@@ -147,8 +148,9 @@ def has_noisy_block(blocks: Blocks, step_variance: FloatArray) -> bool:
     n = blocks.n
     variance = np.where(n > 1, np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1, 1), np.nan)
     variance = np.maximum(variance, step_variance)
-    known = variance[:, ~np.isnan(variance).all(axis=0)]
-    return bool((np.nanmax(known, axis=0) > MAX_VARIANCE_RATIO * np.nanmin(known, axis=0)).any())
+    reported = variance[:, ~np.isnan(variance).all(axis=0)]
+    return bool((np.nanmax(reported, axis=0)
+                 > MAX_VARIANCE_RATIO * np.nanmin(reported, axis=0)).any())
 
 
 def pooled_covariance(blocks: Blocks) -> FloatArray | None:

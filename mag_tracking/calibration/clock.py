@@ -17,7 +17,8 @@ MIN_CORRELATION = 0.7
 """Minimum correlation of two sensors that measured the same knocks."""
 
 MAX_RIVAL_RATIO = 0.9
-"""Correlation at a second lag, relative to the best lag, above which the lag is ambiguous."""
+"""Correlation at a second lag, relative to that at the best lag, above which the lag is
+ambiguous."""
 
 CONTEXT_S = 5.0
 """[s] Interval before the first and after the last knock that is compared in a long recording, so
@@ -45,7 +46,7 @@ class Lag:
 
 
 def _no_lag(reason: str, correlation: float = float('nan')) -> Lag:
-    """Create a `Lag` with an unknown offset, and with the reason."""
+    """Create a `Lag` with an unknown offset and the reason for it."""
     return Lag(float('nan'), float('nan'), correlation, reason)
 
 
@@ -59,6 +60,7 @@ def shock(acceleration: FloatArray) -> FloatArray:
     Returns
     -------
     (n,) array, m/s²
+        Distance from the median acceleration, minus the median of all distances.
     """
     a = np.asarray(acceleration, dtype=float)
     magnitude = np.linalg.norm(a - np.nanmedian(a, axis=0), axis=1)
@@ -190,14 +192,14 @@ def _knock_times(t: FloatArray, s: FloatArray) -> tuple[float, float]:
 
 
 def _sampling_interval(t: FloatArray, s: FloatArray) -> float:
-    """Median sampling interval [s] around the knocks; infinite for fewer than three readings."""
+    """Median sampling interval [s] near the knocks; infinite for fewer than three readings."""
     first, last = _knock_times(t, s)
     is_near = (t >= first - MARGIN_S) & (t <= last + MARGIN_S)
     return float(np.median(np.diff(t[is_near]))) if np.count_nonzero(is_near) > 2 else float('inf')
 
 
 def _coarse_lag(a: _Series, b: _Series, max_lag: float) -> tuple[float, float, str]:
-    """Lag [s] with the largest correlation, the correlation, and the reason for rejection or ''."""
+    """Lag [s] with the largest correlation, this correlation, and the rejection reason or ''."""
     step = 0.5 * min(_sampling_interval(*a), _sampling_interval(*b))
     if not np.isfinite(step):
         return float('nan'), float('nan'), 'the knock is shorter than the sampling interval'
@@ -223,7 +225,7 @@ def _coarse_lag(a: _Series, b: _Series, max_lag: float) -> tuple[float, float, s
 
 
 def _refined_lag(a: _Series, b: _Series, lag: float) -> tuple[float, float]:
-    """Least-squares lag [s] of `b` relative to an interpolation of `a`, and the lag's std [s]."""
+    """Refine the `lag` of `b` relative to `a` by least squares; return the lag and its std [s]."""
     offset, std = _fitted_lag(a, b, lag, PchipInterpolator(*a, extrapolate=False))
     # The signal between two readings is unknown; a second interpolation estimates its effect.
     other_offset, _ = _fitted_lag(a, b, lag, CubicSpline(*a, extrapolate=False))

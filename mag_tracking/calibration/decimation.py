@@ -85,8 +85,8 @@ class Decimator:
         Returns
         -------
         list of (int, (3,) array)
-            Timestamp [ns] of the centre of the filter and field [T]; NaN if an axis is missing in
-            any sample of the filter.
+            Timestamp [ns] of the centre of the filter and field [T]; NaN for an axis that any
+            sample of the filter lacks.
         """
         if self._window and self._is_gap(stamp_ns):
             self.reset()
@@ -100,7 +100,7 @@ class Decimator:
 
     @property
     def n_waiting(self) -> int:
-        """Number of samples stored to measure the rate; 0 once it is known."""
+        """Number of samples stored to measure the rate; 0 once the rate is known."""
         return len(self._window) if self.factor is None else 0
 
     def noise_gain(self) -> float:
@@ -126,16 +126,16 @@ class Decimator:
             interval - self._interval) > GAP_TOLERANCE * self._interval)
 
     def _measure_rate(self) -> list[tuple[int, FloatArray]]:
-        """Determine the factor if enough samples are stored; return the resulting outputs."""
+        """Measure the rate if enough samples are stored; return the outputs of these samples."""
         if len(self._window) < RATE_SAMPLES:
             return []
         stamps = np.array([s for s, _ in self._window], dtype=np.int64)
         self._interval = float(np.median(np.diff(stamps)))
         self.factor = max(1, round(1e9 / self._interval / self._rate))
         self._taps = lowpass(self.factor) if self.factor > 1 else None
-        stored = list(self._window)
+        stored_samples = list(self._window)
         self.reset()
-        return [out for stamp, field in stored for out in self.feed(stamp, field)]
+        return [out for stamp, field in stored_samples for out in self.feed(stamp, field)]
 
     def _filter(self, factor: int, taps: FloatArray) -> list[tuple[int, FloatArray]]:
         """Return the output of the filter as a list; empty if no output is due."""

@@ -69,8 +69,8 @@ def even_weights(q: FloatArray) -> FloatArray:
     Returns
     -------
     (n,) array
-        0 to 1. The total weight of a cell is at most `MAX_CELL_WEIGHT` times the median number
-        of directions in the cells that are not empty.
+        Weight of each vector, 0 to 1. The total weight of a cell is at most `MAX_CELL_WEIGHT`
+        times the median number of directions in the cells that are not empty.
     """
     _, cell, n = binned(q)
     return np.minimum(1.0, MAX_CELL_WEIGHT * np.median(n[n > 0]) / n[cell])
@@ -102,7 +102,7 @@ def coverage(u: FloatArray, w: FloatArray) -> float:
 
 
 def empty_octants(u: FloatArray, w: FloatArray) -> tuple[str, ...]:
-    """Find the octants with a weight below `EMPTY_OCTANT`, i.e. with few or no readings.
+    """Find the octants with few or no readings: those below `EMPTY_OCTANT` of the mean weight.
 
     Parameters
     ----------

@@ -20,6 +20,7 @@ def updated(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool,
     stamp_ns : int, ns
         Timestamp from which the state applies.
     is_doubtful : bool
+        Whether the background is doubtful from then on.
     max_intervals : int
         Maximum number of intervals; the oldest intervals are removed.
 

@@ -27,17 +27,17 @@ MIN_SLOPE_STDS = 4.0
 
 @dataclass(frozen=True)
 class FormerLevel:
-    """The level that was the background before the present background."""
+    """Level of the previous background."""
 
     until: float
-    """[s] End of the level."""
+    """[s] Time at which the level ceased to be the background."""
     level: FloatArray
     """(3,) [T] Field of the level."""
     observed_s: float
     """[s] Duration for which the level was observed."""
 
     def is_at(self, block: Block, limits: FloatArray) -> bool:
-        """Whether a block is at this level, and the level ended at most `MAX_AGE_S` ago.
+        """Whether a block is at this level, at most `MAX_AGE_S` after the end of the level.
 
         Parameters
         ----------

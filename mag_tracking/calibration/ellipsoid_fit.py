@@ -119,10 +119,12 @@ class EllipsoidFit:
         Parameters
         ----------
         readings : (n, 3) array
+            Uncorrected readings, in the unit of `offset`.
 
         Returns
         -------
         (n, 3) array
+            Corrected field, in the unit of `field_magnitude`.
         """
         field: FloatArray = (np.asarray(readings, dtype=float) - self.offset) @ self.correction
         return field
@@ -208,12 +210,12 @@ def fit_ellipsoid(readings: FloatArray, field_magnitude: float | None = None) ->
                              f'{axes[2]:.2g}, maximum 1 to {MAX_AXIS_RATIO:g}; {POSSIBLE_CAUSES}',
                              counts, notes)
     counts['n_outliers'] += quality['n_outliers']
-    out = _in_units(o, C, P, centre, scale, field_magnitude)
+    parameters = _in_units(o, C, P, centre, scale, field_magnitude)
     residual = _relative_spread(np.linalg.norm(
-        (readings[present] - out['offset']) @ out['correction'], axis=1))
+        (readings[present] - parameters['offset']) @ parameters['correction'], axis=1))
     outlier_fraction = counts['n_outliers'] / (len(valid) + glitches.sum())
     reason = _rejection_reason(C, P, quality, outlier_fraction)
-    return EllipsoidFit(**out, **counts, residual=residual, coverage=quality['coverage'],
+    return EllipsoidFit(**parameters, **counts, residual=residual, coverage=quality['coverage'],
                         empty_octants=quality['empty'], converged=not reason, reason=reason,
                         warnings=notes + _notes_on_fit(residual, quality, outlier_fraction))
 
@@ -223,9 +225,10 @@ def _validated(readings: FloatArray, field_magnitude: float | None) -> FloatArra
     readings = np.asarray(readings, dtype=float)
     if readings.ndim != 2 or readings.shape[1] != 3:
         raise ValueError(f'readings must have the shape (n, 3), got {readings.shape}')
-    infinite = np.isinf(readings).any(axis=1)
-    if infinite.any():
-        raise ValueError(f'reading {infinite.argmax()} is infinite: {readings[infinite.argmax()]}')
+    is_infinite = np.isinf(readings).any(axis=1)
+    if is_infinite.any():
+        raise ValueError(f'reading {is_infinite.argmax()} is infinite: '
+                         f'{readings[is_infinite.argmax()]}')
     if field_magnitude is not None and not 0.0 < field_magnitude < np.inf:
         raise ValueError(f'field_magnitude must be positive and finite, got {field_magnitude}')
     return readings
@@ -249,7 +252,7 @@ def _notes_on_input(counts: _Counts, is_saturated: BoolArray) -> tuple[str, ...]
 
 
 def _glitches(y: FloatArray) -> BoolArray:
-    """Flag readings (n,) far from the median, unless they are too many to be glitches."""
+    """Flags (n,) of readings far from the median, unless these are too many to be glitches."""
     distance = np.linalg.norm(y - np.median(y, axis=0), axis=1) if len(y) else np.zeros(0)
     is_far = distance > MIN_GLITCH_DISTANCE * np.median(distance) if len(y) \
         else np.zeros(0, dtype=bool)
@@ -258,7 +261,7 @@ def _glitches(y: FloatArray) -> BoolArray:
 
 
 def _insufficient_data(y: FloatArray) -> str:
-    """Reason for which no quadric can be fitted to the readings; empty if a fit is possible."""
+    """Reason why no quadric can be fitted to the readings; empty if a fit is possible."""
     if len(y) < MIN_READINGS:
         return f'{len(y)} valid readings, minimum {MIN_READINGS}'
     largest = np.abs(y - y[0]).max()
@@ -326,7 +329,7 @@ def _notes_on_fit(residual: float, quality: Quality,
 
 
 def _rejected_fit(reason: str, counts: _Counts, notes: tuple[str, ...]) -> EllipsoidFit:
-    """Create a rejected fit, with a reason and without results."""
+    """Create the result of a rejected fit: the reason, the counts, and NaN for all estimates."""
     nan = float('nan')
     return EllipsoidFit(
         offset=np.full(3, nan), correction=np.full((3, 3), nan), field_magnitude=nan, residual=nan,

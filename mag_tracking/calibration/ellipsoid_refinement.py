@@ -90,12 +90,12 @@ def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
 
 
 def _symmetric(theta: FloatArray) -> FloatArray:
-    """Correction (3, 3) from the parameters (9,)."""
+    """Symmetric correction matrix (3, 3) from the parameters (9,) of the ellipsoid."""
     return np.asarray(np.tensordot(theta[3:], BASIS, 1), dtype=np.float64)
 
 
 def _model(theta: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Corrected readings (n, 3), their magnitudes minus one (n,), and the Jacobian (n, 9)."""
+    """Corrected readings (n, 3), their magnitudes minus one (n,), and Jacobian of these (n, 9)."""
     C = _symmetric(theta)
     y = z - theta[:3]
     q = y @ C
@@ -105,7 +105,7 @@ def _model(theta: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, Fl
 
 
 def _loss(square: FloatArray, w: FloatArray) -> FloatArray:
-    """Weighted soft-L1 loss and its two derivatives, as `scipy.optimize` requires them."""
+    """Weighted soft-L1 loss with its first two derivatives, as `scipy.optimize` requires."""
     root = np.sqrt(1.0 + square)
     return w * np.stack([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3])
 
@@ -120,9 +120,9 @@ def _covariance(f: FloatArray, J: FloatArray, w: FloatArray) -> FloatArray:
     starts = np.arange(n_blocks) * len(f) // n_blocks
     scores = np.add.reduceat((w * f / np.sqrt(1.0 + f * f))[:, None] * J, starts)
     K = np.sqrt(w * (1.0 + f * f)**-1.5)[:, None] * J
-    parts = np.stack([k.T @ k for k in np.split(K, starts[1:])])
+    hessians = np.stack([k.T @ k for k in np.split(K, starts[1:])])
     try:
-        steps = np.linalg.solve(parts.sum(axis=0) - parts, scores[:, :, None])[:, :, 0]
+        steps = np.linalg.solve(hessians.sum(axis=0) - hessians, scores[:, :, None])[:, :, 0]
     except np.linalg.LinAlgError:
         return np.full((9, 9), np.inf)
     return (n_blocks - 1) / n_blocks * steps.T @ steps

@@ -41,15 +41,15 @@ class MostFrequentLevel:
     """The most frequent level of a sensor."""
 
     n_blocks: int
-    """Number of blocks of the level."""
+    """Number of blocks at the level."""
     n_rival: int
-    """Number of blocks of the second most frequent level."""
+    """Number of blocks at the second most frequent level."""
     begin: float
-    """[s] Time of the first block of the level."""
+    """[s] Time of the first block at the level."""
     end: float
-    """[s] Time of the last block of the level."""
+    """[s] Time of the last block at the level."""
     level: FloatArray
-    """(3,) [T] Level of the earliest blocks; NaN for an unreported axis."""
+    """(3,) [T] Mean of the earliest blocks at the level; NaN for an unreported axis."""
     covariance: FloatArray
     """(3, 3) [T²] Covariance of the readings within blocks; NaN for an unreported axis."""
     block_s: float
@@ -104,25 +104,26 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int
     width = np.full(3, np.nan)
     width[is_used] = np.maximum(LEVEL_WIDTH * np.sqrt(quietest / np.median(n[:, is_used], axis=0)),
                                 np.maximum(TOGGLE_TOLERANCE * steps[is_used], MIN_WIDTH))
-    rows = np.flatnonzero(is_calm)
-    if len(rows) < MIN_BLOCKS:
+    calm_rows = np.flatnonzero(is_calm)
+    if len(calm_rows) < MIN_BLOCKS:
         return None
-    means = blocks.mean[rows][:, is_used]
+    means = blocks.mean[calm_rows][:, is_used]
     densest = _densest(means, width[is_used])
-    chosen = rows[densest]
-    if len(chosen) < MIN_BLOCKS:
+    level_rows = calm_rows[densest]
+    if len(level_rows) < MIN_BLOCKS:
         return None
     centre = np.median(means[densest], axis=0)
     other_means = means[(np.abs(means - centre) > MIN_LEVEL_DISTANCE * width[is_used]).any(axis=1)]
-    time = blocks.time[chosen]
-    first = chosen[time <= time[0] + (time[-1] - time[0]) * max_blocks / len(chosen)][:max_blocks]
-    early = Blocks(*(values[first] for values in blocks))
-    covariance = pooled_covariance(Blocks(*(values[chosen] for values in blocks)))
+    time = blocks.time[level_rows]
+    early_rows = level_rows[
+        time <= time[0] + (time[-1] - time[0]) * max_blocks / len(level_rows)][:max_blocks]
+    early_blocks = Blocks(*(values[early_rows] for values in blocks))
+    covariance = pooled_covariance(Blocks(*(values[level_rows] for values in blocks)))
     if covariance is None:
         return None
-    _, mean, _ = line_through(early)
+    _, mean, _ = line_through(early_blocks)
     n_rival = len(_densest(other_means, width[is_used])) if len(other_means) else 0
-    return MostFrequentLevel(len(chosen), n_rival, float(time[0]), float(time[-1]), mean,
+    return MostFrequentLevel(len(level_rows), n_rival, float(time[0]), float(time[-1]), mean,
                              covariance, float(np.median(np.diff(blocks.time))), width)
 
 

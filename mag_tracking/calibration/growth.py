@@ -2,8 +2,8 @@
 
 The field of a vehicle that approaches at constant speed grows with the inverse cube of its
 distance; its relative growth accelerates. The change due to a vehicle that starts or stops grows
-with the distance travelled, the square of time; its relative growth decelerates. The test is an
-addition of this package.
+with the distance travelled, and so with the square of time; its relative growth decelerates. The
+test is an addition of this package.
 """
 
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ unknown."""
 
 @dataclass(frozen=True)
 class Growth:
-    """Duration of the growth of a change from one magnitude to another, in quarters.
+    """Durations of the four quarters in which the magnitude of a change grows between two values.
 
-    Let q be the ratio of the two magnitudes. If the magnitude grows with the inverse cube of a
+    Let q be the ratio of the two values. If the magnitude grows with the inverse cube of a
     distance, each quarter takes q**(1/12) times as long as the next quarter. If it grows with the
     square of time, each quarter takes q**(1/8) times as long as the previous quarter.
     """
@@ -47,7 +47,7 @@ class Growth:
 
 
 def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> Growth | None:
-    """Measure the duration of the growth of a change from one magnitude to another.
+    """Measure the time in which the magnitude of a change grows from `low` to `high`.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ class LearningWindow:
     length : float, s
         Length of a block.
     max_blocks : int
-        Maximum number of stored constant blocks.
+        Maximum number of stored blocks whose readings are all equal.
     """
 
     def __init__(self, learn: float, length: float, max_blocks: int) -> None:

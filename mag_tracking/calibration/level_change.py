@@ -54,7 +54,7 @@ class LevelChange:
     """A change from one steady level to another."""
 
     since: float
-    """[s] Start of the later level."""
+    """[s] Start of the later level, in the time common to all sensors."""
     size: float
     """Magnitude of the change in standard deviations of one reading."""
     has_departed: bool | None
@@ -93,12 +93,12 @@ def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: F
         _magnitude((blocks.mean - level) / noise_std) for level in (before, after))
     size = float(_magnitude((after - before[-1]) / noise_std))
     n_axes, n_readings = np.count_nonzero(~np.isnan(after)), np.median(blocks.n[blocks.n > 0.0])
-    detectable = DETECTION_STDS * float(np.sqrt(n_axes / n_readings))
-    end = int(np.flatnonzero(distance_after > detectable).max(initial=-1)) + 1
+    detection_limit = DETECTION_STDS * float(np.sqrt(n_axes / n_readings))
+    end = int(np.flatnonzero(distance_after > detection_limit).max(initial=-1)) + 1
     since = origin + float(blocks.time[min(end, len(blocks.time) - 1)])
     # If the latest blocks still approach the level, the change is not complete.
-    is_complete = not (distance_after[-n_steady:] > detectable).any()
-    asymmetry = _asymmetry(blocks.time, distance_before, distance_after, detectable,
+    is_complete = not (distance_after[-n_steady:] > detection_limit).any()
+    asymmetry = _asymmetry(blocks.time, distance_before, distance_after, detection_limit,
                            MAX_SMALL_FRACTION * size) if is_complete else 0.0
     return LevelChange(since, size, None if abs(asymmetry) < MIN_ASYMMETRY else asymmetry > 0.0)
 
@@ -110,28 +110,28 @@ def _magnitude(difference: FloatArray) -> FloatArray:
 
 
 def _asymmetry(time: FloatArray, distance_before: FloatArray, distance_after: FloatArray,
-               detectable: float, largest: float) -> float:
-    """Binary logarithm of the asymmetry of a change; positive for a departure.
+               detection_limit: float, largest: float) -> float:
+    """Binary logarithm of the asymmetry between the ends of a change; positive for a departure.
 
     Zero if the growth stalls at one end, for example because a second vehicle stops behind the
     first one. Zero also if neither end matches a starting or stopping vehicle. The arguments
     `distance_before` and `distance_after` (k,) are the distances from the two levels in standard
-    deviations of a reading. The ends are evaluated from `detectable` to `largest`.
+    deviations of a reading. The ends are evaluated from `detection_limit` to `largest`.
     """
-    length = float(np.median(np.diff(time)))
-    first = growth_of(time, distance_before, detectable, largest)
-    last = growth_of(-time[::-1], distance_after[::-1], detectable, largest)
-    if largest < MIN_GROWTH * detectable or first is None or last is None \
-            or max(first.duration, last.duration) < MIN_BLOCKS * length \
-            or any(max(end.quarters) > MAX_QUARTER_FRACTION * end.duration + length
+    block_length = float(np.median(np.diff(time)))
+    first = growth_of(time, distance_before, detection_limit, largest)
+    last = growth_of(-time[::-1], distance_after[::-1], detection_limit, largest)
+    if largest < MIN_GROWTH * detection_limit or first is None or last is None \
+            or max(first.duration, last.duration) < MIN_BLOCKS * block_length \
+            or any(max(end.quarters) > MAX_QUARTER_FRACTION * end.duration + block_length
                    for end in (first, last)):
         return 0.0
     # The position of an end within a block is unknown.
-    longer = (last.duration + 0.5 * length) / (first.duration + 0.5 * length)
-    rise, fall = ((end.early + 0.25 * length) / (end.late + 0.25 * length)
+    duration_ratio = (last.duration + 0.5 * block_length) / (first.duration + 0.5 * block_length)
+    rise, fall = ((end.early + 0.25 * block_length) / (end.late + 0.25 * block_length)
                   for end in (first, last))
-    starts_slowly = (rise if longer > 1.0 else fall) < MAX_START_RATIO
-    return float(np.log2(longer * fall / rise)) if starts_slowly else 0.0
+    starts_slowly = (rise if duration_ratio > 1.0 else fall) < MAX_START_RATIO
+    return float(np.log2(duration_ratio * fall / rise)) if starts_slowly else 0.0
 
 
 NO_CHANGE = LevelChange(np.nan, 0.0, None)

@@ -1,4 +1,4 @@
-"""Interval in which a sensor departs from its background, and the level at its end."""
+"""Departure of a sensor from its background, and the level at the end of the departure."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -51,7 +51,8 @@ class LevelDeparture:
         Whether the sensor stayed at another steady level for the required duration during the
         departure.
     departed_at : float or None, s
-        Time by which a vehicle present at the start had departed; None if undetected.
+        Time by which a vehicle that was part of the first background had departed; None if no such
+        departure was detected.
     """
 
     def __init__(self, learn: float, relearn: float, state: Record, level: BackgroundLevel,
@@ -82,7 +83,8 @@ class LevelDeparture:
         ----------
         block : Block
         before : iterable of Block
-            Blocks immediately before the departure; used only when its first block is added.
+            Blocks immediately before the departure; used only with the first block of the
+            departure.
         """
         if not self.blocks:
             self._blocks_before = list(before)
@@ -104,7 +106,7 @@ class LevelDeparture:
         Returns
         -------
         deque of Block or None
-            None if the latest blocks are not steady.
+            None if the latest blocks are not steady for the required duration.
         """
         new_blocks = self._level.steady_end(self.blocks, ratio * self._learn)
         self.was_steady |= new_blocks is not None

@@ -137,21 +137,22 @@ def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatAr
     Raises
     ------
     ValueError
-        If the heading is not observable: the field is vertical, or no measured axis is across it.
+        If the heading is not observable: the field is vertical, or no reported axis has a component
+        across the horizontal field.
 
     References
     ----------
     [T10]_ section 6.3.1, eq. (6.2)-(6.9). The standard deviations are an addition of this package.
     """
     y, B0 = np.asarray(field, dtype=float), np.asarray(earth_field, dtype=float)
-    reported = ~np.isnan(y)
+    is_reported = ~np.isnan(y)
     R_level = rotation_from_quaternion(quaternion_between(up.direction, [0.0, 0.0, 1.0]))
     across = np.cross([0.0, 0.0, 1.0], B0)
 
     def fit(yaw: float) -> tuple[FloatArray, FloatArray]:
-        """Residual of the reported axes [T], and derivative of the field by the yaw [T/rad]."""
+        """Residuals of the reported axes [T], and derivatives of their fields by yaw [T/rad]."""
         R_sw = (rotation_about_z(yaw) @ R_level).T
-        return (y - R_sw @ B0)[reported], -(R_sw @ across)[reported]
+        return (y - R_sw @ B0)[is_reported], -(R_sw @ across)[is_reported]
 
     yaws = [_refined_yaw(fit, start) for start in np.deg2rad(np.arange(0.0, 360.0, 30.0))]
     costs = np.array([np.sum(fit(yaw)[0]**2) for yaw in yaws]) / bias_std**2
@@ -258,10 +259,11 @@ def with_stated_heading(orientation: Orientation, stated: FloatArray, stated_std
         None if the difference exceeds the limit.
     """
     difference = yaw_between(orientation.R_ws, stated)
-    compass = orientation.std[2]
-    if abs(difference) > limit * np.hypot(compass, stated_std):
+    compass_std = orientation.std[2]
+    if abs(difference) > limit * np.hypot(compass_std, stated_std):
         return None
-    weight_of_stated = compass**2 / (compass**2 + stated_std**2)
-    std = np.append(orientation.std[:2], compass * stated_std / np.hypot(compass, stated_std))
-    return Orientation(rotation_about_z(weight_of_stated * difference) @ orientation.R_ws, std,
+    stated_weight = compass_std**2 / (compass_std**2 + stated_std**2)
+    std = np.append(orientation.std[:2],
+                    compass_std * stated_std / np.hypot(compass_std, stated_std))
+    return Orientation(rotation_about_z(stated_weight * difference) @ orientation.R_ws, std,
                        orientation.bias, orientation.rival)

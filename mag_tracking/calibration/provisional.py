@@ -30,7 +30,7 @@ SEARCH_GROWTH = 1.1
 """Factor by which the number of blocks must grow before the level is determined again."""
 
 MIN_OBSERVED_S = 10.0
-"""[s] Minimum total duration of a certain level. The duration must also be at least
+"""[s] Minimum total duration of a level that is considered certain. It must also be at least
 `MIN_DURATION_RATIO` times the duration of any other level."""
 
 MAD_TO_STD = 1.4826
@@ -103,13 +103,13 @@ class ProvisionalLevel:
                 or blocks[-1].time - blocks[0].time < self._min_duration_s:
             return None
         self._n_new, self._n_required = 0, max(1, int((SEARCH_GROWTH - 1.0) * len(blocks)))
-        stored = stacked(blocks)
-        level = most_frequent_level(stored, np.where(np.isfinite(steps), steps, 0.0), MAX_BLOCKS)
+        arrays = stacked(blocks)
+        level = most_frequent_level(arrays, np.where(np.isfinite(steps), steps, 0.0), MAX_BLOCKS)
         if level is None:
             return None
         distance, is_known = np.full(3, np.nan), ~np.isnan(level.level)
         distance[is_known] = np.nanmedian(
-            np.abs(stored.mean[:, is_known] - level.level[is_known]), axis=0)
+            np.abs(arrays.mean[:, is_known] - level.level[is_known]), axis=0)
         is_certain = level.n_blocks * level.block_s >= MIN_OBSERVED_S \
             and level.n_blocks >= MIN_DURATION_RATIO * level.n_rival
         return FrequentLevel(level, MAD_TO_STD * distance, is_certain)

@@ -69,7 +69,7 @@ def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
 
 
 def robust_std(d: FloatArray, w: FloatArray) -> float:
-    """Robust standard deviation of residuals, from the weighted median of the magnitudes.
+    """Robust standard deviation of residuals, from the weighted median of their magnitudes.
 
     Parameters
     ----------
@@ -84,6 +84,6 @@ def robust_std(d: FloatArray, w: FloatArray) -> float:
         At least `MIN_SCALE`.
     """
     order = np.argsort(np.abs(d))
-    total = np.cumsum(w[order])
-    middle = np.abs(d)[order][np.searchsorted(total, 0.5 * total[-1])]
-    return max(1.4826 * float(middle), MIN_SCALE)
+    cumulative_weight = np.cumsum(w[order])
+    median = np.abs(d)[order][np.searchsorted(cumulative_weight, 0.5 * cumulative_weight[-1])]
+    return max(1.4826 * float(median), MIN_SCALE)

@@ -96,7 +96,7 @@ class QuietInterval:
 
 
 def line_of(blocks: Blocks) -> tuple[float, FloatArray, FloatArray, float]:
-    """Fit the line of a `BackgroundLevel` to blocks.
+    """Fit the linear trend of a `BackgroundLevel` to blocks.
 
     The drift is extrapolated for at most twice the duration of the blocks.
 
@@ -107,9 +107,12 @@ def line_of(blocks: Blocks) -> tuple[float, FloatArray, FloatArray, float]:
     Returns
     -------
     centre : float, s
+        Mean time of the blocks.
     mean : (3,) array, T
+        Value at the centre.
     slope : (3,) array, T/s
     horizon : float, s
+        Time after which the trend is constant.
     """
     first, last = float(blocks.time.min()), float(blocks.time.max())
     return *line_through(blocks), last + 2.0 * (last - first)

@@ -48,12 +48,12 @@ class BlockRecorder(RunningBackground):
         Parameters
         ----------
         since : float, s
-            Start of the evaluated blocks.
+            Time of the earliest block that is evaluated.
 
         Returns
         -------
         MostFrequentLevel or None
-            None if no level has at least `MIN_BLOCKS` blocks.
+            None if no level has at least `MIN_BLOCKS` blocks, or the noise is unknown.
         """
         blocks = [block for block in self._blocks if block.time >= since]
         if len(blocks) < MIN_BLOCKS:
@@ -92,12 +92,12 @@ class BlockRecorder(RunningBackground):
                     and not (np.abs(level - found.level) > found.width).any():
                 return True
         # An approaching target changes the level slightly; a stationary target changes it more.
-        noise = np.sqrt(found.covariance.diagonal() + (found.width / LEVEL_WIDTH)**2)
-        is_near = not (np.abs(initial - found.level) > NEAR_STDS * noise).any()
+        noise_std = np.sqrt(found.covariance.diagonal() + (found.width / LEVEL_WIDTH)**2)
+        is_near = not (np.abs(initial - found.level) > NEAR_STDS * noise_std).any()
         return (NEAR_DURATION_RATIO if is_near else MIN_DURATION_RATIO) * n > found.n_blocks
 
     def has_returned(self, initial: FloatArray, found: MostFrequentLevel, since: float) -> bool:
-        """Whether at least `MIN_BLOCKS` blocks after a time are at the initial level.
+        """Whether at least `MIN_BLOCKS` blocks from `since` on are at the initial level.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class BlockRecorder(RunningBackground):
         found : MostFrequentLevel
             Level whose width is used as the tolerance.
         since : float, s
-            Start of the evaluated blocks.
+            Time of the earliest block that is evaluated.
 
         Returns
         -------

@@ -15,7 +15,7 @@ MAX_ROUNDING = core.MAX_ROUNDING
 """Maximum relative difference of two values that is due to rounding (single precision)."""
 
 MIN_STD = core.MIN_STD
-"""[T] Maximum standard deviation of the readings of an axis that has not changed."""
+"""[T] Minimum standard deviation of the readings of an axis that is not constant."""
 
 TOGGLE_TOLERANCE = core.TOGGLE_TOLERANCE
 """[steps] Tolerance of an axis at rest, which may toggle between two adjacent values."""

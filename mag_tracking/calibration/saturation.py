@@ -23,7 +23,7 @@ differences between and next to these neighbours."""
 
 
 def isolated_readings(values: FloatArray) -> IntArray:
-    """Find single readings of one axis that differ from both neighbours, which agree.
+    """Find single readings of one axis that differ from two neighbours that agree with each other.
 
     Parameters
     ----------
@@ -39,12 +39,12 @@ def isolated_readings(values: FloatArray) -> IntArray:
         return np.zeros(0, dtype=np.int64)
     change = np.diff(values)
     change_before, change_after = change[1:-2], change[2:-1]
-    adjacent = np.maximum(np.abs(change[:-3]), np.abs(change[3:]))
-    adjacent = np.maximum(adjacent, np.abs(change_before + change_after))
+    adjacent_change = np.maximum(np.abs(change[:-3]), np.abs(change[3:]))
+    adjacent_change = np.maximum(adjacent_change, np.abs(change_before + change_after))
     height = np.minimum(np.abs(change_before), np.abs(change_after))
     smallest_change = np.min(np.abs(change[change != 0.0]), initial=np.inf)
     indices: IntArray = 2 + np.flatnonzero((change_before * change_after < 0.0) & (
-        height > MIN_ISOLATION * np.maximum(adjacent, smallest_change)))
+        height > MIN_ISOLATION * np.maximum(adjacent_change, smallest_change)))
     return indices
 
 
@@ -62,20 +62,21 @@ def saturated_readings(values: FloatArray) -> BoolArray:
     Returns
     -------
     (n,) bool array
+        True for a saturated reading, and for the `N_MARGIN` readings on both sides of it.
     """
     values = np.asarray(values, dtype=float)
-    out = np.zeros(len(values), dtype=bool)
-    present = np.flatnonzero(~np.isnan(values))
-    v = values[present]
+    is_saturated = np.zeros(len(values), dtype=bool)
+    present_indices = np.flatnonzero(~np.isnan(values))
+    v = values[present_indices]
     v = v.copy()
     outliers = isolated_readings(v)
     v[outliers] = v[outliers - 1]
     if max(np.count_nonzero(v == v.min(initial=np.inf)),
            np.count_nonzero(v == v.max(initial=-np.inf))) < MIN_RUN:
-        return out
+        return is_saturated
     jumps = np.abs(np.diff(v))
     if not (jumps > 0.0).any():
-        return out
+        return is_saturated
     step = jumps[jumps > 0.0].min()
     level = float(np.median(v))
     for extreme in (v.min(), v.max()):
@@ -89,6 +90,6 @@ def saturated_readings(values: FloatArray) -> BoolArray:
             edge_jumps = [jumps[i] for i in (first - 1, end - 1) if 0 <= i < len(jumps)]
             if end - first >= MIN_RUN and max(edge_jumps) >= MIN_JUMP * step:
                 nearby = np.flatnonzero(is_extreme)[:, None] + np.arange(-N_MARGIN, N_MARGIN + 1)
-                out[present[np.clip(nearby, 0, len(v) - 1)]] = True
+                is_saturated[present_indices[np.clip(nearby, 0, len(v) - 1)]] = True
                 break
-    return out
+    return is_saturated

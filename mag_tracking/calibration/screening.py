@@ -1,4 +1,4 @@
-"""Rejection of faulty readings of one sensor: spikes and stuck sensors.
+"""Rejection of faulty readings of one sensor: spikes, and repetitions by a stuck sensor.
 
 A suspect reading is held until the next readings permit a decision. Other readings pass
 immediately. The rules are compiled: `screening.hpp`.

@@ -64,8 +64,8 @@ def add(commands: Commands) -> None:
     p.add_argument('table', type=Path, metavar='TABLE', help='readings and poses (.csv)')
     geometry = p.add_mutually_exclusive_group(required=True)
     geometry.add_argument('--sensors', type=Path, metavar='FILE',
-                          help='nominal positions x,y,z [m] of all sensors (.csv); the sensors are '
-                          'aligned with the axes')
+                          help='nominal positions x,y,z [m] of all sensors (.csv); the axes of '
+                          'each sensor are nominally parallel to x, y and z')
     add_network(geometry, required=False, text='network file with the nominal geometry, sensors '
                 'in the order of the table')
     p.add_argument('--moment', required=True, type=float, metavar='A_M2',

@@ -107,7 +107,8 @@ def _print(result: Calibration, recording: Recording) -> None:
     if result.evidence is not None:
         scatter = result.evidence.scatter[~np.isnan(result.evidence.scatter)]
         print(f'passes used: {result.evidence.n_tracks}'
-              + (f'; largest scatter: {np.sqrt(scatter.max()):.1f} standard deviations'
+              + (f'; largest scatter between passes: {np.sqrt(scatter.max()):.1f} standard '
+                 'deviations'
                  if len(scatter) else ''))
     for warning in survey.warnings():
         print(f'  warning: {warning}')

@@ -66,7 +66,7 @@ def add(commands: Commands) -> None:
 
 def _add_action(actions: Commands, name: str, run: Callable[[argparse.Namespace], int],
                 description: str) -> None:
-    """Register `train`, `evaluate` or `predict`."""
+    """Register the action `train`, `evaluate` or `predict`."""
     p = actions.add_parser(name, help=description, description=description)
     p.set_defaults(run_command=run)
     p.add_argument('labelled', type=Path, metavar='LABELLED',
@@ -122,8 +122,8 @@ def _evaluate(args: argparse.Namespace) -> int:
     model = None if args.model is None else read_model(args.model)
     evaluation = evaluate_classes(examples, model, args.splits,
                                   partial(tqdm, desc='splits', disable=None, leave=False))
-    test = f'{quantity(args.splits, "split")} of 70/30' if model is None else f'{args.model}'
-    print(f'{quantity(len(examples.labels), "signature")}, {test}; {evaluation.n} tested')
+    test_method = f'{quantity(args.splits, "split")} of 70/30' if model is None else f'{args.model}'
+    print(f'{quantity(len(examples.labels), "signature")}, {test_method}; {evaluation.n} tested')
     _print_evaluation(evaluation)
     return 0
 
@@ -142,7 +142,7 @@ def _print_evaluation(evaluation: Evaluation) -> None:
 
 
 def _mean_fraction(values: 'np.ndarray[tuple[int, ...], np.dtype[np.float64]]') -> str:
-    """Format the mean and, for several values, the standard deviation; NaN is skipped."""
+    """Format the mean of fractions in percent, and their standard deviation; skip NaN values."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return 'no examples'

@@ -72,15 +72,16 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument('--version', action='version', version=f'mag_tracking {version(PACKAGE)}')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     arguments = list(arguments)
-    split = arguments.index(ROS_ARGUMENTS) if ROS_ARGUMENTS in arguments else len(arguments)
-    requested = _module_of(next((word for word in arguments[:split] if word[:1] != '-'), ''))
-    if requested is not None:
-        import_module(f'{PACKAGE}.cli.{requested}').add(commands)
+    ros_start = arguments.index(ROS_ARGUMENTS) if ROS_ARGUMENTS in arguments else len(arguments)
+    requested_module = _module_of(
+        next((word for word in arguments[:ros_start] if word[:1] != '-'), ''))
+    if requested_module is not None:
+        import_module(f'{PACKAGE}.cli.{requested_module}').add(commands)
     for name, command in COMMANDS.items():
-        if command.module != requested:
+        if command.module != requested_module:
             commands.add_parser(name, help=command.summary, aliases=command.aliases)
-    args = parser.parse_args(arguments[:split])
-    args.ros_arguments = arguments[split:]
+    args = parser.parse_args(arguments[:ros_start])
+    args.ros_arguments = arguments[ros_start:]
     if args.ros_arguments and args.command not in ROS_COMMANDS:
         parser.error(f'{ROS_ARGUMENTS}: {args.command} runs without ROS; ROS arguments are '
                      f'accepted by {", ".join(ROS_COMMANDS)}')

@@ -79,7 +79,7 @@ def _doctor(args: argparse.Namespace) -> int:
 
 def _report(args: argparse.Namespace, doctor: Doctor, further_findings: list[Finding],
             is_interrupted: bool) -> int:
-    """Print all findings, write the report, and return the exit status."""
+    """Print all sensors and findings, write the report, and return the exit status."""
     for name, health in doctor.sensors.items():
         print(f'{name:11s} {_row(health)}')
     findings = sorted(further_findings + doctor.findings(), key=lambda f: not f.serious)

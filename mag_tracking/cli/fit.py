@@ -134,7 +134,7 @@ def _fit(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace, network: SensorNetwork) -> None:
-    """Check the options; raise SettingsError or OutputError."""
+    """Check the options; raise SettingsError or OutputError if one is invalid."""
     distinct_names(args.recordings)
     check_orders('--orders', args.orders)
     check_cpa_range('--cpa-range', args.cpa_range, network)
@@ -157,7 +157,7 @@ def _print_pass(fitted_pass: FittedPass) -> None:
     for fit in fitted_pass.fits:
         mark = '*' if fit is fitted_pass.chosen else ' '
         cost = f'{fit.normalised_cost:8.2f}' if len(fit.x) else ' ' * 8
-        print(f' {mark}   {fit.n_dipoles}  {cost}  {fit.reason or _numbers(fit)}')
+        print(f' {mark}   {fit.n_dipoles}  {cost}  {fit.reason or _formatted_estimates(fit)}')
         if fit.bearing is not None:
             _print_bearing(fit.bearing)
         if fit.reason and fit is fitted_pass.reported:
@@ -166,7 +166,8 @@ def _print_pass(fitted_pass: FittedPass) -> None:
             print('        ambiguous: the joint fit of the vehicles is poor')
         elif not fit.reason and fit.ambiguous:
             chi_square, path = min(fit.rivals, key=lambda rival: rival[0])
-            print(f'        ambiguous: {np.exp(-0.5 * chi_square):.2f} times as likely at position '
+            print('        ambiguous: another solution is '
+                  f'{np.exp(-0.5 * chi_square):.2f} times as likely: position '
                   f'({", ".join(f"{v:.2f}" for v in path[:3])}) m'
                   + (f' and length {abs(path[6]):.1f} m' if len(path) > 6 else ''))
     _print_delay(fitted_pass)
@@ -187,7 +188,7 @@ def _print_pass(fitted_pass: FittedPass) -> None:
 
 
 def _trusted_values(fit: PassFit) -> str:
-    """Format those of speed, direction and time that are reliable although the fit is rejected."""
+    """Format speed, direction and time of a rejected fit, as far as they are reliable."""
     speed, speed_std = fit.speed
     heading, heading_std = np.degrees(fit.heading)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
@@ -208,14 +209,14 @@ def _print_delay(fitted_pass: FittedPass) -> None:
     line = ' (assumed along the line of the sensors)' if np.isnan(c.heading_std) else ''
     print(f'  velocity from the delay between sensors: {c.speed:.2f}({c.speed_std:.2f}) m/s, '
           f'heading {np.degrees(c.heading):.0f} deg{line}')
-    best = fitted_pass.chosen
-    if best is not None and contradicts_delays(best.speed, best.heading, c):
+    chosen_fit = fitted_pass.chosen
+    if chosen_fit is not None and contradicts_delays(chosen_fit.speed, chosen_fit.heading, c):
         print('  warning: the velocities of the fit and from the delay contradict each other; rely '
               'on neither. Check clock offsets, positions in the network file, and whether the '
               'target turned')
 
 
-def _numbers(fit: PassFit) -> str:
+def _formatted_estimates(fit: PassFit) -> str:
     """Format the estimates of a fit, with standard deviations in parentheses."""
     sd = np.sqrt(np.diagonal(fit.robust_covariance))[:3]
     position = ' '.join(f'{v:6.2f}({s:.2f})' for v, s in zip(fit.position, sd, strict=True))
@@ -229,7 +230,7 @@ def _numbers(fit: PassFit) -> str:
 
 
 def _print_bearing(b: Bearing) -> None:
-    """Print the directions, the time and the rate that are observable with a single sensor."""
+    """Print what a single sensor observes: directions, time, and speed relative to range."""
     def direction_text(k: int, direction: FloatArray) -> str:
         if not np.isfinite(direction).all():
             return 'unknown'
@@ -245,10 +246,10 @@ def _print_bearing(b: Bearing) -> None:
 
 def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any] | None:
     """Estimate and print hard and soft iron; return them as a dict for JSON, or None on failure."""
-    simultaneous = [p for p in passes if p.n_vehicles > 1]
-    if simultaneous:
+    simultaneous_passes = [p for p in passes if p.n_vehicles > 1]
+    if simultaneous_passes:
         print('--same-vehicle: vehicles not used because they passed simultaneously with others: '
-              f'{len(simultaneous)}')
+              f'{len(simultaneous_passes)}')
     fits = [p.chosen for p in passes if p.chosen is not None and p.n_vehicles == 1]
     try:
         if not fits:
@@ -298,7 +299,7 @@ def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
 
 
 def _draw(fitted_pass: FittedPass, out: Path) -> None:
-    """Draw the chosen fit; if no fit is chosen, draw the fit with the most dipoles."""
+    """Draw the chosen fit of a pass; if there is none, draw its fit with the most dipoles."""
     fit = fitted_pass.chosen or next((f for f in reversed(fitted_pass.fits) if len(f.x)), None)
     if fit is None:
         return

@@ -29,7 +29,8 @@ def add(commands: Commands) -> None:
     p.add_argument('--count', type=int, metavar='N', help='exit after N messages')
     p = add_command(commands, 'param', _param, _GRAPH_HELP)
     p.add_argument('node', metavar='NODE', help='name of the node')
-    p.add_argument('name', nargs='?', metavar='NAME', help='parameter (default: all parameters)')
+    p.add_argument('name', nargs='?', metavar='NAME',
+                   help='name of the parameter (default: all parameters)')
     p.add_argument('value', nargs='?', metavar='VALUE', help='new value of the parameter (YAML)')
     p = add_command(commands, 'lifecycle', _lifecycle, _GRAPH_HELP)
     p.add_argument('node', metavar='NODE', help='name of the node')

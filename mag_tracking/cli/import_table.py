@@ -46,7 +46,7 @@ def add(commands: Commands) -> None:
     p.add_argument('--time-unit', default='s', metavar='UNIT',
                    help='unit of the time: s, ms, us or ns (default: s)')
     p.add_argument('--background', type=Path, metavar='FILE.csv',
-                   help='background of each sensor, for a table of magnet poses')
+                   help='table with the background of each sensor, for a table of magnet poses')
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
     p.add_argument('--noise-std', type=float, default=1e-6, metavar='TESLA',
                    help='noise standard deviation of one reading in a table of magnet poses '

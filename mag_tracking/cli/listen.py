@@ -69,7 +69,7 @@ class _ReadingPrinter:
         self._thread.start()
 
     def _add(self, readings: Readings, accelerations: Iterable[AccelerationSample]) -> None:
-        """Store received samples."""
+        """Store received fields and accelerations by sensor."""
         for name, stamp, field in zip(readings.sensor_names(), readings.stamp_ns.tolist(),
                                       readings.field, strict=True):
             self._samples[name].append((stamp, field))
@@ -77,12 +77,12 @@ class _ReadingPrinter:
             self._samples[a.sensor].append((a.stamp_ns, None))
 
     def stop(self) -> None:
-        """Stop the thread, which closes the device."""
+        """Stop the thread; it closes the device when it ends."""
         self._stop.set()
         self._thread.join(10.0)
 
     def lines(self, elapsed_s: float) -> list[str]:
-        """Describe the state of the device and the samples received since the last call."""
+        """Describe the device state and the samples of the `elapsed_s` [s] since the last call."""
         counts = self.driver.counts()
         errors = ', '.join(f'{count}: {n}' for count, n in sorted(counts.items())
                            if not count.startswith('samples: '))
@@ -101,7 +101,7 @@ class _ReadingPrinter:
 
 
 def _sample_line(samples: Sequence[Sample], elapsed_s: float) -> str:
-    """Format rate, mean field and warnings of the samples of one sensor."""
+    """Format rate, mean field and warnings of one sensor's samples from `elapsed_s` [s]."""
     fields = np.array([field for _, field in samples if field is not None])
     if not len(fields):
         return f'{len(samples) / elapsed_s:7.1f} Hz of accelerations'

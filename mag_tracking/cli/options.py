@@ -99,7 +99,7 @@ def recorded_network(args: argparse.Namespace) -> SensorNetwork:
 
 
 def distinct_names(paths: Iterable[Path]) -> list[str]:
-    """Return the names under which the results of recordings are stored.
+    """Return the names under which the results of the recordings are stored.
 
     Parameters
     ----------
@@ -177,7 +177,8 @@ def check_report(args: argparse.Namespace, *others: Path | None) -> None:
     Raises
     ------
     OutputError
-        If the folder is missing, the name does not end in .html, or the file is one of `others`.
+        If the folder is missing, the path is a folder, the name ends in neither .html nor .htm,
+        or the file is one of `others`.
     """
     path = args.report
     if path is None:

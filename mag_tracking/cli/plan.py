@@ -51,8 +51,8 @@ def add(commands: Commands) -> None:
     p = add_command(commands, 'plan', _plan, _PLAN_HELP)
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
-    p.add_argument('--target', metavar='KIND', help='small, car or truck selects the moment and '
-                   'height of this kind of vehicle in the settings (default: car); magnet requires '
+    p.add_argument('--target', metavar='KIND', help='small, car or truck: a vehicle with the '
+                   'moment and height given in the settings (default: car); magnet requires '
                    '--moment and --height')
     p.add_argument('--moment', type=float, metavar='A_M2',
                    help='magnitude of the moment [A m^2]; requires --height')

@@ -62,7 +62,8 @@ def _record(args: argparse.Namespace) -> int:
     # Imported here because it needs ROS.
     from mag_tracking.nodes.record_node import run
 
-    imus = tuple(filter(None, network.imu_topics))
-    selection = Selection(tuple(network.topics), imus, tuple(args.topics), args.results, args.all)
+    imu_topics = tuple(filter(None, network.imu_topics))
+    selection = Selection(tuple(network.topics), imu_topics, tuple(args.topics), args.results,
+                          args.all)
     return run(selection, args.out, int(args.split_mb * 1e6), int(args.split_s * 1e9),
                args.ros_arguments)

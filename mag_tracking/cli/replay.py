@@ -149,7 +149,7 @@ def _print_summary(path: Path, summary: dict[str, Any], has_truth: bool) -> None
 
 
 def _overview(path: Path, summary: dict[str, Any]) -> str:
-    """Format the name of the recording, the number of tracks, and the number with each verdict."""
+    """Format the name of the recording and its numbers of tracks, in total and by verdict."""
     verdicts = Counter(t['verdict'] for t in summary['tracks'])
     counts = ', '.join(f'{n} {verdict}' for verdict, n in verdicts.most_common())
     return (f'{path.name}: {quantity(len(summary["tracks"]), "track")}'
@@ -157,7 +157,7 @@ def _overview(path: Path, summary: dict[str, Any]) -> str:
 
 
 def _print_track(t: dict[str, Any]) -> None:
-    """Print a track: overview, doubts, velocity from the delay, mounting and errors."""
+    """Print a track: overview, doubts, velocity from delays between sensors, mounting, errors."""
     print(f'  track {t["id"]}: {quantity(t["poses"], "pose")}'
           + (f', from {t["arrival"]} ({t["arrival_weights"][t["arrival"]]:.0%})'
              if t['arrival'] else '')

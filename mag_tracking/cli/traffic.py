@@ -177,13 +177,13 @@ def _print(name: str, result: TrafficResult, recording: Recording,
     for vehicle, identification in zip(result.vehicles, identifications, strict=True):
         identity = '' if identification is None else f', vehicle {identification.name}'
         print(f'{line_of(vehicle)}{identity}')
-    total = Counter((v.passage.line, DIRECTIONS[v.passage.forward], v.passage.vehicle_class)
+    counts = Counter((v.passage.line, DIRECTIONS[v.passage.forward], v.passage.vehicle_class)
                     for v in result.vehicles)
     print(f'{name}: {quantity(len(result.vehicles), "vehicle")}')
-    for (line, direction, vehicle_class), n in sorted(total.items()):
+    for (line, direction, vehicle_class), n in sorted(counts.items()):
         print(f'  {line}, {direction}, {vehicle_class}: {n}')
-    doubtful = sum(v.passage.ambiguous for v in result.vehicles)
-    warnings = {**({'ambiguous passages': doubtful} if doubtful else {}),
+    n_ambiguous = sum(v.passage.ambiguous for v in result.vehicles)
+    warnings = {**({'ambiguous passages': n_ambiguous} if n_ambiguous else {}),
                 **{cause: n for cause, n in result.counts.items() if n and cause != 'passages'},
                 **result.rejections, **recording.losses}
     for cause, n in warnings.items():

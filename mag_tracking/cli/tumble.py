@@ -49,7 +49,7 @@ def add(commands: Commands) -> None:
     p.add_argument('--sensor', nargs='+', default=[], metavar='NAME',
                    help='sensors that were rotated (default: all)')
     p.add_argument('--field-size', type=float, metavar='TESLA',
-                   help='magnitude of the ambient field (default: unknown; the mean gain is not '
+                   help='magnitude of the ambient field (if it is not given, the mean gain is not '
                    'calibrated)')
     p.add_argument('--out', required=True, type=Path, metavar='FILE',
                    help='network file to write')
@@ -73,17 +73,18 @@ def _tumble(args: argparse.Namespace) -> int:
         _print_fit(name, fit)
     for cause, n in recording.losses.items():
         print(f'  warning: {cause}: {n}')
-    converged = [name for name, fit in fits.items() if fit.converged]
-    if signals or not converged:
+    converged_names = [name for name, fit in fits.items() if fit.converged]
+    if signals or not converged_names:
         print('interrupted: nothing was written' if signals else 'nothing was written')
         return 130 if signals else 1
-    write_network(args.out, calibrated, f'{", ".join(converged)} tumbled in '
+    write_network(args.out, calibrated, f'{", ".join(converged_names)} tumbled in '
                   f'{args.recording.name}; based on {args.network.name}.')
     if args.figure is not None:
         from mag_tracking.report.calibration_figures import tumble_figure
         from mag_tracking.report.figure_file import save_figure
 
-        save_figure(tumble_figure({name: fits[name] for name in converged}, readings), args.figure)
+        save_figure(tumble_figure({name: fits[name] for name in converged_names}, readings),
+                    args.figure)
     print(f'network written to {args.out}')
     return 0
 

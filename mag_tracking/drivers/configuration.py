@@ -118,9 +118,10 @@ def load_class(role: str, name: object) -> Any:
     except Exception as error:
         raise SettingsError(
             f'{role}: {name} cannot be loaded: {type(error).__name__}: {error}') from error
-    missing = [member for member in ('SETTINGS', *METHODS[role]) if not hasattr(cls, member)]
-    if missing:
-        raise SettingsError(f'{role}: {name} is incomplete: it lacks {", ".join(missing)}')
+    missing_members = [member for member in ('SETTINGS', *METHODS[role])
+                       if not hasattr(cls, member)]
+    if missing_members:
+        raise SettingsError(f'{role}: {name} is incomplete: it lacks {", ".join(missing_members)}')
     return cls
 
 
@@ -166,7 +167,7 @@ def driver_of(name: object, entry: object) -> Driver:
 
 
 def _class_defaults(settings: Settings, device: Device, name: str) -> Settings:
-    """Return `settings` with the changes in the attribute `name` of the device, if it has one."""
+    """Return `settings`, overridden by the device's mapping `name` (CLOCK or DRIVER), if any."""
     return replace(settings, getattr(device, name, {}))
 
 
@@ -197,7 +198,7 @@ def _create_part(role: str, options: dict[str, Any], kinds: Collection[str]) -> 
 
 def _pop_group(options: dict[str, Any], name: str, settings: Any,
                kinds: Collection[str]) -> Mapping[str, Any]:
-    """Remove the group `name` from `options`; return its values, which belong to `settings`."""
+    """Remove and return the group `name` of `options`; raises SettingsError if it is invalid."""
     group = options.pop(name, {})
     if not isinstance(group, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {short_repr(group)}')
@@ -210,11 +211,11 @@ def _pop_group(options: dict[str, Any], name: str, settings: Any,
 
 def _check_unused_groups(options: Mapping[str, Any], kinds: Collection[str]) -> None:
     """Raise SettingsError if `options` still contains the group of a kind that is not used."""
-    unused = [name for name, value in options.items()
-              if isinstance(value, Mapping) and name in settings_by_kind()]
-    if unused:
-        raise SettingsError(f'{unused[0]} is not used by the device, which uses '
-                            f'{" and ".join(kinds)}; remove {unused[0]}, or change the kind')
+    unused_groups = [name for name, value in options.items()
+                     if isinstance(value, Mapping) and name in settings_by_kind()]
+    if unused_groups:
+        raise SettingsError(f'{unused_groups[0]} is not used by the device, which uses '
+                            f'{" and ".join(kinds)}; remove {unused_groups[0]}, or change the kind')
 
 
 def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:
@@ -238,13 +239,13 @@ def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:
             label = f'sensors: {key}' if key != '' else 'sensor'
             raise SettingsError(f'{label}: expected a sensor name (letters, digits, _ and '
                                 f'/), or - to ignore the sensor, got {short_repr(value)}')
-    out = {str(key): value for key, value in sensors.items()}
-    if len(out) < len(sensors):
+    network_names = {str(key): value for key, value in sensors.items()}
+    if len(network_names) < len(sensors):
         names = [str(key) for key in sensors]
         duplicate = next(name for name in names if names.count(name) > 1)
         raise SettingsError(f'sensors: the name {duplicate} at the device appears twice; remove '
                             'one')
-    return out
+    return network_names
 
 
 def _check_sensors(drivers: Iterable[Driver], network: SensorNetwork | None) -> None:
@@ -283,7 +284,7 @@ def _joined(groups: Collection[str]) -> str:
 
 def _check_places(names: Iterable[object], permitted: Collection[str],
                   kinds: Collection[str]) -> None:
-    """Raise SettingsError for a setting that is not permitted here but in another group."""
+    """Raise SettingsError if one of the `names` is not permitted here but in another group."""
     for name in names:
         groups = [] if name in permitted else _groups_of(name)
         if '' in groups:
@@ -321,8 +322,8 @@ def settings_by_kind() -> dict[str, Any]:
         The keys are the names of the groups in the drivers file; '' stands for the top level of a
         device.
     """
-    out = {'': DriverSettings(), 'clock': ClockSettings()}
+    settings = {'': DriverSettings(), 'clock': ClockSettings()}
     for role, kinds in KINDS.items():
         for name in kinds:
-            out[name] = load_class(role, name).SETTINGS()
-    return out
+            settings[name] = load_class(role, name).SETTINGS()
+    return settings

@@ -3,7 +3,7 @@
 A message arrives after a fixed minimum delay plus a random, non-negative delay. All points
 (device time, arrival - device time) therefore lie above a line whose slope is the drift of the
 device's oscillator. The estimate is the line under all points of the window that is closest to
-them on average: the edge of their lower convex hull over their mean abscissa.
+them on average: the edge of their lower convex hull that contains their mean abscissa.
 
 Source: Moon, Skelly & Towsley, 'Estimation and removal of clock skew from network delay
 measurements', IEEE INFOCOM 1999. Differences: only the lowest point of each short block of device
@@ -71,7 +71,7 @@ class ClockSettings:
 
 
 class ArrivalClock:
-    """Clock of a device without a counter, with the interface of `DeviceClock`.
+    """Clock that timestamps readings by their arrival, with the interface of `DeviceClock`.
 
     `drift_ppm`, `spread_s` and `stamp_std` are always NaN.
 
@@ -236,8 +236,8 @@ class DeviceClock:
             self._begin(ticks, arrival_ns)
         elapsed = arrival_ns - self._arrival_ns
         t = self._device_time(ticks, elapsed)
-        low = elapsed - t - self._slope * (t - self._middle)
-        delay = low - self._height
+        detrended = elapsed - t - self._slope * (t - self._middle)
+        delay = detrended - self._height
         fits = (delay <= self._max_delay_ns and t >= self._newest - self._tolerance_ns
                 and (delay >= 0.0 or -delay <= self._early_limit(t, arrival_ns)))
         if not fits or delay > self._tolerance_ns + self._drift_bound * t:
@@ -252,7 +252,8 @@ class DeviceClock:
                 return None
         elif self._candidate is not None and self._candidate.is_refuted():
             self._candidate = None
-        return arrival_ns - self._min_delay_ns - self._add_point(t, elapsed - t, low, arrival_ns)
+        return arrival_ns - self._min_delay_ns - self._add_point(
+            t, elapsed - t, detrended, arrival_ns)
 
     def _device_time(self, ticks: float, elapsed: int) -> float:
         """Nominal time since the first reading [ns]; the arrival time resolves counter wraps."""
@@ -262,17 +263,17 @@ class DeviceClock:
             count += round((t / self._tick_ns - count) / self._wrap) * self._wrap
         return count * self._tick_ns
 
-    def _add_point(self, t: float, offset: float, low: float, arrival_ns: int) -> int:
+    def _add_point(self, t: float, offset: float, detrended: float, arrival_ns: int) -> int:
         """Add a point that fits the clock; return its delay relative to the line [ns]."""
         if t >= self._block_end:
             self._close_block(t)
-            low = offset - self._slope * (t - self._middle)
-        if low < self._lowest:
-            self._lowest, self._lowest_point = low, (t, offset)
-        self._height = min(self._height, low)
+            detrended = offset - self._slope * (t - self._middle)
+        if detrended < self._lowest:
+            self._lowest, self._lowest_point = detrended, (t, offset)
+        self._height = min(self._height, detrended)
         self._newest, self._last_ns = max(self._newest, t), arrival_ns
-        self._delays.append(low - self._height)
-        return int(low - self._height + 0.5)
+        self._delays.append(detrended - self._height)
+        return int(detrended - self._height + 0.5)
 
     def _early_limit(self, t: float, arrival_ns: int) -> float:
         """Maximum distance below the line at which a message is accepted [ns]."""
@@ -338,8 +339,8 @@ class DeviceClock:
         """Estimate the height and slope of the line under the points, and the timestamp error."""
         self._middle = sum(t for t, _ in points) / len(points)
         if len(points) >= _MIN_POINTS and points[0][0] < points[-1][0]:
-            low, high = slope_range(points)
-            slope = min(max(self._slope, low), high)
+            min_slope, max_slope = slope_range(points)
+            slope = min(max(self._slope, min_slope), max_slope)
             self._slope = min(max(slope, -self._max_drift), self._max_drift)
             self.drift_ppm = self._slope * 1e6
         self._height = 0.0

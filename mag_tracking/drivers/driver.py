@@ -146,7 +146,7 @@ class Driver:
         return dict(self._clocks)
 
     def counts(self) -> Counter[str]:
-        """Numbers of samples, losses and suspect readings.
+        """Numbers of samples, losses, faults and suspect readings.
 
         Returns
         -------
@@ -322,7 +322,7 @@ class Driver:
         return sensor, self._stamp(reading, arrival)
 
     def _sensor_of(self, reported_name: str, source: str) -> str | None:
-        """Return a sensor's network name; None if it is ignored, or unknown and then counted."""
+        """Return a sensor's network name; None if ignored or unknown. Count unknown sensors."""
         sensor = next((self.sensors[name] for name in (reported_name, source)
                        if name and name in self.sensors), None)
         if sensor is None and '' in self.sensors and self._sole_source.accepts(

@@ -29,7 +29,7 @@ class FramedDevice:
 
     @property
     def counts(self) -> Counter[str]:
-        """Number of losses and rejections by cause."""
+        """Numbers of losses and rejections, by cause."""
         # Each counter is copied in one step, because the polling thread may add a cause meanwhile.
         total = self._rejected.copy()
         total.update(self._transport.counts.copy())

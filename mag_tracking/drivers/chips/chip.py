@@ -166,7 +166,7 @@ class Bus:
         self._selected = selection
 
     def invalidate_selection(self) -> None:
-        """Discard the stored state of the multiplexers, because a failure may have changed it."""
+        """Discard the stored selection; a failure may have changed the state of a multiplexer."""
         self._selected = None
 
 
@@ -314,8 +314,8 @@ class Chip(Identified, Protocol):
 class ChipClass(Identified, Protocol):
     """Interface of a chip class, which creates instances of `Chip`.
 
-    Creating an instance must not access the bus. The instance calls `count` with the cause of each
-    loss, which is a plural noun phrase.
+    Creating an instance must not access the bus. The instance calls `count` for each loss, with the
+    cause as a plural noun phrase.
     """
 
     NAME: str
@@ -376,7 +376,7 @@ def look_up_choice(name: str, value: Value, choices: Mapping[Value, Choice]) -> 
 
 
 def mask_overrange(values: Iterable[float], largest: float) -> Axes:
-    """Replace values whose magnitude exceeds the range by NaN.
+    """Replace values whose magnitude exceeds `largest` by NaN.
 
     Parameters
     ----------

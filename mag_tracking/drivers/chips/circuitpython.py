@@ -8,10 +8,9 @@ its property `magnetic`.
 If `chips/` has a module for the chip, that module is preferable, because the adapter has several
 limitations. The adapter does not distinguish an old conversion from a new one, and does not detect
 an axis over its range. Some drivers block while they wait for a conversion. The driver defines axes
-and scale (the MMC5603 driver 1.0.16 returns 2.4 % more than 16384 counts per gauss, the scale of
-the data sheet). The
-timestamp of a reading is the middle of the call, which is 0.5 to 1.5 periods late for a chip that
-measures continuously.
+and scale; for example, the fields of the MMC5603 driver 1.0.16 are 2.4 % larger than with the scale
+of the data sheet, 16384 counts per gauss. The timestamp of a reading is the middle of the call,
+which is 0.5 to 1.5 periods late for a chip that measures continuously.
 
 Source: the CircuitPython API reference, `busio.I2C`, and "CircuitPython design guide, sensor
 properties and units": `magnetic` is in microtesla.

@@ -25,6 +25,7 @@ def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor
     Parameters
     ----------
     entries : sequence of str
+        Each as name:chip:address[@multiplexer.channel].
     known : collection of str
         Names of the supported chips; any other chip must be a module.Class.
 
@@ -53,7 +54,7 @@ def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor
 
 
 def _conflict(one: ChipLocation, other: ChipLocation) -> bool:
-    """Whether both chips would answer; a chip directly on the bus answers on every channel."""
+    """Whether both chips would answer one request; a chip directly on the bus always answers."""
     return one.address == other.address and (
         one == other or None in (one.multiplexer, other.multiplexer))
 
@@ -64,6 +65,7 @@ def parse_sensor(entry: str, known: Collection[str]) -> Sensor:
     Parameters
     ----------
     entry : str
+        As name:chip:address[@multiplexer.channel].
     known : collection of str
         Names of the supported chips.
 

@@ -15,9 +15,8 @@ lasts twice `1 ms + 1.1 conversion`, plus about 1 ms on a bus of 400 kHz.
 
 Axes: the sensing directions after RESET are taken as positive, because they form a right-handed
 frame. After SET they are reversed, although the data sheet of the MMC5983MA calls the value after
-SET positive.
-Linux describes the MMC5603 and its relatives as "naturally aligned after RESET" (mmc5633.c). Rotate
-the board once in the Earth's field to verify the signs.
+SET positive. Linux describes the MMC5603 and its relatives as "naturally aligned after RESET"
+(mmc5633.c). Rotate the board once in the Earth's field to verify the signs.
 
 MMC5983MA: ±800 µT, 6.10 nT per count. Noise of 40, 60, 80, 120 nT rms for conversions of 8, 4, 2,
 0.5 ms; a pair has 0.7 times the noise.
@@ -44,7 +43,7 @@ from mag_tracking.settings import param
 
 COUNTS_PER_TESLA = 16384e4
 TAKE_MEASUREMENT, SET, RESET, SOFT_RESET = 0x01, 0x08, 0x10, 0x80
-SETTLE_S = 1e-3
+SETTLING_TIME_S = 1e-3
 """[s] Minimum time from a pulse to the next measurement."""
 
 
@@ -133,15 +132,15 @@ class Mmc5983ma:
 
         The result is None if a conversion is not finished in time.
         """
-        halves = []
+        conversions = []
         for pulse in (SET, RESET):
             self._registers.write(self.CONTROL_0, pulse)
-            yield SETTLE_S
+            yield SETTLING_TIME_S
             conversion = yield from self._convert()
             if conversion is None:
                 return None
-            halves.append(conversion)
-        (set_ns, after_set), (reset_ns, after_reset) = halves
+            conversions.append(conversion)
+        (set_ns, after_set), (reset_ns, after_reset) = conversions
         x, y, z = ((r + s) / 2 for r, s in zip(after_reset, after_set, strict=True))
         # An axis over its range has no offset, so the next measurement is a pair again.
         self._offset = None if any(map(math.isnan, (x, y, z))) else (x, y, z)
@@ -150,7 +149,7 @@ class Mmc5983ma:
         return _conversion((set_ns + reset_ns) // 2, (x, y, z))
 
     def _convert(self) -> Generator[float, None, tuple[int, Axes] | None]:
-        """Make one conversion; return (middle [ns], counts), or None if it is not finished."""
+        """Make one conversion; return (middle [ns], counts), or None if not finished in time."""
         self._registers.write(self.CONTROL_0, TAKE_MEASUREMENT)
         start_ns = self._registers.monotonic_ns()
         yield self._conversion_ns * 1e-9 * CONVERSION_MARGIN

@@ -22,7 +22,7 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
 _STRUCT_CODES = {'u8': 'B', 'i8': 'b', 'u16': 'H', 'i16': 'h', 'u24': '3s', 'i24': '3s', 'u32': 'I',
-          'i32': 'i', 'u64': 'Q', 'i64': 'q', 'f32': 'f', 'f64': 'd'}
+                 'i32': 'i', 'u64': 'Q', 'i64': 'q', 'f32': 'f', 'f64': 'd'}
 _ByteOrder: TypeAlias = Literal['little', 'big']
 _Converter: TypeAlias = Callable[[Any], object]
 
@@ -45,7 +45,7 @@ class BinarySettings:
     checksum: str = param(
         'none', 'Checksum after the payload: none, ' + ', '.join(CHECKSUMS) + '.')
     checksum_from: str = param(
-        'payload', 'First part of the frame that the checksum covers: sync or payload.')
+        'payload', 'Part of the frame at which the checksum begins: sync or payload.')
     tail: str = param('', 'Bytes at the end of a frame, hexadecimal; empty if there is no tail.')
 
 
@@ -166,8 +166,8 @@ class BinaryFraming:
         if not data.startswith(self._tail, start + self._checksum_end):
             return 'with a wrong tail'
         end = start + self._payload_end
-        sent = int.from_bytes(data[end:start + self._checksum_end], self._order)
-        if sent != self._checksum.compute(data[start + self._coverage_start:end]):
+        sent_checksum = int.from_bytes(data[end:start + self._checksum_end], self._order)
+        if sent_checksum != self._checksum.compute(data[start + self._coverage_start:end]):
             return 'with a wrong checksum'
         return ''
 
@@ -193,7 +193,7 @@ def _parse_bytes(setting: str, text: str) -> bytes:
 
 
 def _parse_fields(setting: str, fields: Sequence[str]) -> list[tuple[str, str]]:
-    """Parse fields such as x:i16 into [(name, type)]; raises SettingsError for a wrong type."""
+    """Parse fields such as x:i16 into [(name, type)]; raises SettingsError for an invalid type."""
     out = []
     for text in fields:
         name, _, kind = text.rpartition(':')
@@ -213,7 +213,7 @@ def _wrap(kind: str) -> int:
 
 
 def _converter(quantity: str, kind: str, order: _ByteOrder) -> _Converter:
-    """Function that converts an unpacked value of a field for `FieldLayout`."""
+    """Return the function that converts unpacked values of a quantity for `FieldLayout`."""
     if quantity == SKIP:
         return ignore_value
     convert: _Converter
