@@ -71,7 +71,7 @@ class Observability:
     """Basis of the unobservable subspace, (n_x, k), in the units of the states; its columns are
     orthonormal after division by the scale."""
     unobservable: tuple[str, ...]
-    """Names of the states that belong to the kernel."""
+    """Names of the states with a component in the kernel."""
 
     @property
     def kernel_dimension(self) -> int:

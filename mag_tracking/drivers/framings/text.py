@@ -35,8 +35,8 @@ class TextSettings:
     """Settings of the framing of text lines."""
 
     fields: tuple[str, ...] = param(
-        (), 'Values of a line in order: sensor, ticks, sequence, x, y, z, ax, ay, az, or - to skip '
-        'a value. x.A is an axis of sensor A, for lines with several sensors.')
+        (), 'Values of a line, in the order sent. Each is sensor, ticks, sequence, x, y, z, ax, '
+        'ay, az, or - to skip a value. x.A is an axis of sensor A, for lines with several sensors.')
     each: tuple[str, ...] = param(
         (), 'Axes of one sensor, for lines with several identical sensors. They are repeated '
         '`count` times after `fields`.')

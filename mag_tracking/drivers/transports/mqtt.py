@@ -272,7 +272,7 @@ class MqttTopics:
             self._changed.notify_all()
 
     def _rejection_cause(self, message: paho.MQTTMessage) -> tuple[str, str]:
-        """Return (cause of rejection, topic) of a message; the cause is empty if it is valid."""
+        """Return (cause of rejection, topic); the cause is empty for a valid message."""
         try:
             topic = message.topic
         except UnicodeDecodeError:

@@ -5,8 +5,8 @@ depend on when this process runs. The wall-clock time of the kernel is converted
 clock by the difference of the clocks. The difference is constant unless the wall clock is set,
 because fine adjustments by the system change the rate of both clocks. If the difference has changed
 since the queue was last empty, the wake-up time of the thread is used instead, and the datagram is
-counted. For a few milliseconds after the first socket of the machine has requested timestamps, the kernel returns
-the time of the read access instead of the arrival time.
+counted. For a few milliseconds after the first socket of the machine has requested timestamps, the
+kernel returns the time of the read access instead of the arrival time.
 
 The number of datagrams dropped by the kernel because of a full buffer is read from the counter of
 the socket (SO_MEMINFO). SO_RXQ_OVFL is not used, because it is delivered with the next datagram and
