@@ -216,19 +216,19 @@ class FilterBank:
         """
         return self.rows(np.array([i]))
 
-    def weight(self, rows: BoolArray) -> float:
+    def weight(self, mask: BoolArray) -> float:
         """Total weight of the selected hypotheses.
 
         Parameters
         ----------
-        rows : (n_hyp,) bool array
-            Mask of the hypotheses.
+        mask : (n_hyp,) bool array
+            True for the selected hypotheses.
 
         Returns
         -------
         float
         """
-        return float(np.exp(log_sum_exp(self.log_w[rows]))) if rows.any() else 0.0
+        return float(np.exp(log_sum_exp(self.log_w[mask]))) if mask.any() else 0.0
 
     def is_concentrated_in(self, n: int, fraction: float) -> bool:
         """Whether the `n` heaviest hypotheses have at least a given fraction of the weight.
