@@ -21,7 +21,7 @@ class PassEvent:
     number: int
     """Consecutive number of the event, counted from 1 for each sensor."""
     ended: bool
-    """True if the target has left the range of the sensor. False if the readings ended before."""
+    """True if the target has left the range of the sensor. False if the readings ended earlier."""
     onset_ns: int
     """Time of the onset, ns since 1970."""
     release_ns: int
@@ -55,7 +55,7 @@ class PassEvent:
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """A change of the field that started a track, but that no target explains."""
+    """A change of the field that no target explains, although it started a track."""
 
     stamp_ns: int
     """Time at which the disturbance was identified or, if `ended`, at which it ended, ns since
@@ -132,7 +132,7 @@ class VehiclePassage:
 
 @dataclass(frozen=True, slots=True)
 class TrafficCount:
-    """Number, mean speed and mean headway of vehicles of one direction and class in an interval."""
+    """Count, mean speed and mean headway for one direction and one class in an interval."""
 
     forward: bool
     """Whether the vehicles moved in the forward direction of the line."""

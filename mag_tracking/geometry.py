@@ -127,9 +127,9 @@ def left_jacobian(v: ArrayLike) -> FloatArray:
     half = np.sinc(0.5 * angle / np.pi)
     # (angle - sin(angle)) / angle^3, by its Taylor series where the subtraction would cancel.
     small = angle < 1e-2
-    third = np.where(small, (1.0 - square / 20.0) / 6.0,
-                     (1.0 - np.sinc(angle / np.pi)) / np.where(small, 1.0, square))
-    J: FloatArray = np.eye(3) + 0.5 * half**2 * K + third * K @ K
+    coefficient = np.where(small, (1.0 - square / 20.0) / 6.0,
+                           (1.0 - np.sinc(angle / np.pi)) / np.where(small, 1.0, square))
+    J: FloatArray = np.eye(3) + 0.5 * half**2 * K + coefficient * K @ K
     return J
 
 
@@ -282,12 +282,12 @@ def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, flo
 
 
 def propagated_path(path: FloatArray, seconds: float) -> FloatArray:
-    """Straight paths after a shift of the time origin.
+    """Shift the time origin of straight paths.
 
     Parameters
     ----------
     path : (..., n) array
-        Position [m], velocity [m/s] and n - 6 constant states.
+        Position [m] and velocity [m/s] at the previous origin, and n - 6 constant states.
     seconds : float, s
         New time origin relative to the previous one.
 
@@ -301,7 +301,7 @@ def propagated_path(path: FloatArray, seconds: float) -> FloatArray:
     return propagated
 
 
-def overlap(position: FloatArray, velocity: FloatArray, need: ArrayLike,
+def overlap(position: FloatArray, velocity: FloatArray, clearance: ArrayLike,
             width: float) -> FloatArray:
     """Length by which two bodies overlap along the heading of the second.
 
@@ -311,7 +311,7 @@ def overlap(position: FloatArray, velocity: FloatArray, need: ArrayLike,
         Centres of the two bodies.
     velocity : (2, n, 2 or 3) array, m/s
         Velocities of the two bodies.
-    need : float or (n,) array, m
+    clearance : float or (n,) array, m
         Minimum distance along the heading at which the bodies do not overlap.
     width : float, m
         Minimum distance across the heading at which the bodies do not overlap.
@@ -326,4 +326,4 @@ def overlap(position: FloatArray, velocity: FloatArray, need: ArrayLike,
     forward = velocity[1, :, :2] / speed[:, None]
     along = np.abs(np.einsum('ni,ni->n', offset, forward))
     across = np.abs(offset[:, 0] * forward[:, 1] - offset[:, 1] * forward[:, 0])
-    return np.where(across < width, np.maximum(need - along, 0.0), 0.0)
+    return np.where(across < width, np.maximum(clearance - along, 0.0), 0.0)

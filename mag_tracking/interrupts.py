@@ -46,7 +46,8 @@ def exit_on_signals(status: int, *signals: signal.Signals, message: str = '') ->
 
     This is intended for the imports at the start of a program, when there is nothing to clean up:
     an exception during an import may be suppressed or converted. Buffers are not flushed, and no
-    `finally` block runs. Ignored signals and other threads are handled as by `recorded_signals`.
+    `finally` block runs. As for `recorded_signals`, ignored signals remain ignored, and a call
+    outside the main thread has no effect.
 
     Parameters
     ----------
@@ -75,7 +76,7 @@ def exit_on_signals(status: int, *signals: signal.Signals, message: str = '') ->
 @contextmanager
 def _temporary_handler(handler: Callable[[int, FrameType | None], None],
                        signals: tuple[signal.Signals, ...]) -> Iterator[None]:
-    """Install `handler` temporarily for all `signals` that are not ignored."""
+    """Install `handler` for all `signals` that are not ignored, until the context ends."""
     old_handlers = {}
     if threading.current_thread() is threading.main_thread():
         old_handlers = {s: signal.getsignal(s) for s in signals}

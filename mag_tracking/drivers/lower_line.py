@@ -19,7 +19,7 @@ def lower_hull(points: Sequence[Point]) -> list[Point]:
     Parameters
     ----------
     points : sequence of Point
-        Points in ascending order.
+        Points in ascending order of x, then y.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def slope_range(points: Sequence[Point]) -> tuple[float, float]:
     Parameters
     ----------
     points : sequence of Point
-        At least three points in ascending order, with at least two different values of x.
+        At least three points in ascending order of x, then y, with at least two values of x.
 
     Returns
     -------

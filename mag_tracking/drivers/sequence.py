@@ -40,8 +40,9 @@ class SequenceCheck:
     def is_new(self, sequence: int, values: bytes) -> bool:
         """Record a reading; return whether it is new.
 
-        Skipped numbers are counted as lost; the count is corrected if they arrive late. A stored
-        number with different values is not a duplicate: it restarts the sequence.
+        Skipped numbers are counted as lost; the count is corrected if they arrive late. An older
+        number that is neither lost nor a duplicate (the same number and values) restarts the
+        sequence.
 
         Parameters
         ----------
@@ -90,7 +91,7 @@ class SequenceCheck:
         return distance
 
     def _record_gap(self, sequence: int, n: int) -> None:
-        """Count the `n` numbers before `sequence` as lost."""
+        """Count the `n` skipped numbers before `sequence` as lost."""
         if not n:
             return
         self.counts['lost'] += n

@@ -31,7 +31,7 @@ MAX_BACKLOG_S = 5.0
 
 @dataclass(frozen=True)
 class SimulatorSettings:
-    """Settings of the simulated roadside."""
+    """Settings of the simulated sensors and vehicles."""
 
     network: str = param('', 'Path of the network file that lists the sensors to simulate.')
     rate_hz: float = param(100.0, 'Sampling rate of each sensor.', 'Hz', (0.1, 10_000.0))
@@ -122,6 +122,7 @@ class SimulatedDevice:
         Returns
         -------
         list of Arrival
+            Empty if no reading is due in time.
 
         Raises
         ------
@@ -162,13 +163,13 @@ class SimulatedDevice:
         return index / self._settings.rate_hz + self._shift_s[j]
 
     def _n_due(self, elapsed: float) -> int:
-        """Number of readings due by `elapsed` [s]; rounding may omit some of the last interval."""
+        """Number of readings due by `elapsed` [s]; rounding may omit some of the latest period."""
         n_cycles = math.floor(elapsed * self._settings.rate_hz)
         return n_cycles * len(self._network) + bisect.bisect_right(
             self._shift_s, elapsed - n_cycles / self._settings.rate_hz)
 
     def _readings(self, table: FloatArray, first: int, end: int) -> list[Arrival]:
-        """Arrivals of the readings with the indices `first` .. `end` - 1."""
+        """Arrivals of readings `first` .. `end` - 1; `table` is the result of `_field_of_pass`."""
         index, j = np.divmod(np.arange(first, end), len(self._network))
         due_s = index / self._settings.rate_hz + np.array(self._shift_s)[j]
         # The table covers one pass; its last row, without a vehicle, is used until the next pass.
@@ -181,7 +182,10 @@ class SimulatedDevice:
                                       index.tolist(), j.tolist(), B.tolist(), strict=True)]
 
     def _field_of_pass(self) -> FloatArray:
-        """Field during a pass, (n, n_sensors, 3) T, sensor frames; no vehicle in the last row."""
+        """Field at each time of a pass, (n, n_sensors, 3) T, sensor frames.
+
+        The last row is the field without a vehicle.
+        """
         s, network = self._settings, self._network
         t = np.arange(0.0, self._passing_s, 1.0 / s.rate_hz)
         body = random_vehicle(np.random.default_rng(s.seed), length=s.length, moment=s.moment)

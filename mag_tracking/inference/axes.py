@@ -59,8 +59,8 @@ def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
     Returns
     -------
     (n,) array
-        Smallest pivot of the correlation matrix: the smallest fraction of the variance of one axis
-        that the axes before it do not explain. 1 for uncorrelated axes; NaN or at most 0 if the
+        Smallest pivot of the correlation matrix: the smallest fraction of an axis's variance that
+        the preceding axes do not explain. 1 for uncorrelated axes; NaN or at most 0 if the
         covariance is not positive definite.
 
     Raises

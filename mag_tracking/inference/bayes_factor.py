@@ -42,8 +42,8 @@ class TargetBayesFactor:
 
         Notes
         -----
-        After a value that is not finite, the Bayes factor remains unknown, and a target is never
-        favoured.
+        After a `log_ratio` that is not finite, the Bayes factor remains unknown, and a target is
+        never favoured.
         """
         if not np.isfinite(log_ratio):
             self._is_known = False
@@ -57,7 +57,7 @@ class TargetBayesFactor:
         self._recent_sum.add(stamp_ns, log_ratio)
 
     def would_be_favoured(self, log_ratio: float, ratio: float) -> bool:
-        """Whether a target would be favoured if its log-likelihood increased.
+        """Whether a target would be favoured after an assumed increase of its log-likelihood.
 
         Parameters
         ----------

@@ -10,7 +10,7 @@ from mag_tracking.arrays import FloatArray
 
 
 def inflated_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
-    """Inflate the covariance of a state until its horizontal position covers another estimate.
+    """Inflate the covariance of a state until it covers another estimate of the position.
 
     The standard deviation along the horizontal difference becomes at least the length of that
     difference. Each other component is inflated in proportion to its own difference; the added
@@ -41,6 +41,6 @@ def inflated_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
     square, variance = float(d @ d), float(d @ P[:2, :2] @ d)
     if not square > 0.0 or square**2 <= variance:
         return P
-    all_components = np.zeros(len(P))
-    all_components[:len(difference)] = difference
-    return P + (1.0 - variance / square**2) * np.outer(all_components, all_components)
+    padded_difference = np.zeros(len(P))
+    padded_difference[:len(difference)] = difference
+    return P + (1.0 - variance / square**2) * np.outer(padded_difference, padded_difference)

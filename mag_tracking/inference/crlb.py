@@ -39,7 +39,7 @@ def information(H: ArrayLike, C: ArrayLike | None = None) -> FloatArray:
     ----------
     H : (..., n_y, n_x) array
         Jacobians; n_y = 3 axes for a magnetometer, any leading axes (times, sensors). A row of NaN
-        is not measured.
+        is an axis that was not measured.
     C : (..., n_y, n_y) array, optional
         Noise covariance of each measurement; leading axes broadcast against `H`. Entries of missing
         axes are not read. Omit if `H` is whitened.
@@ -71,7 +71,7 @@ class Observability:
     """Basis of the unobservable subspace, (n_x, k), in the units of the states; its columns are
     orthonormal after division by the scale."""
     unobservable: tuple[str, ...]
-    """Names of the states that belong to the kernel."""
+    """Names of the states with a component in the kernel."""
 
     @property
     def kernel_dimension(self) -> int:
@@ -136,8 +136,8 @@ def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
     -------
     (n_x, n_x) array
         Inverse of the total information. If the total is singular, an unobservable state has
-        variance inf and covariances NaN; the other states have the limit for a vanishing prior. An
-        exactly known state has zeros.
+        variance inf and covariances NaN; the entries of the other states are the limits for a
+        vanishing prior. The entries of an exactly known state are zero.
 
     References
     ----------
@@ -338,7 +338,7 @@ def snr(h: ArrayLike, C: ArrayLike) -> FloatArray:
 
 def snr_at_distance(moment: float | FloatArray, noise_std: float | FloatArray,
                     distance: float | FloatArray) -> FloatArray:
-    """Signal-to-noise ratio of one sample of a dipole, perpendicular to its axis.
+    """Signal-to-noise ratio of one sample at a distance from a dipole, perpendicular to its axis.
 
     Along the axis of the dipole the ratio is four times larger.
 
@@ -368,7 +368,7 @@ def snr_at_distance(moment: float | FloatArray, noise_std: float | FloatArray,
 
 def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
               ratio: float | FloatArray) -> FloatArray:
-    """Distance at which `snr_at_distance` reaches a given ratio.
+    """Distance at which `snr_at_distance` has a given value.
 
     Along the axis of the dipole the distance is larger by a factor of 2^(1/3).
 

@@ -43,7 +43,7 @@ class FieldRotation(NamedTuple):
 
     @property
     def error_probability(self) -> float:
-        """Probability that the sign of the correlation is wrong; PHD15 Paper B eq. (17), (18)."""
+        """Probability that the sign of the correlation is wrong; [PHD15]_ B eq. (17), (18)."""
         return float(ndtr(-abs(self.correlation) / np.sqrt(self.variance)))
 
     @property
@@ -120,7 +120,10 @@ def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRo
 
 
 def _correlation(field: FloatArray, lag: int) -> float:
-    """Correlation [T²] of the horizontal axes at a lag, without both ends; PHD15 B eq. (5a)."""
+    """Correlation [T²] of the horizontal axes at a lag, excluding the first `lag` samples.
+
+    [PHD15]_ Paper B eq. (5a).
+    """
     current, delayed = field[lag:-lag], field[2 * lag:]
     return float(np.sum(current[:, 0] * delayed[:, 1] - current[:, 1] * delayed[:, 0])) / lag
 
@@ -140,12 +143,13 @@ def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
     max_lag : int
-        Maximum lag, which is the number of samples before and after the pass.
+        Maximum lag: the number of samples of the window before the pass, and after it.
 
     Returns
     -------
     int
-        Samples, from 1 to a quarter of the window; 0 if the field does not exceed the noise.
+        Samples, from 1 to the smaller of `max_lag` and a quarter of the window; 0 if the field does
+        not exceed the noise.
     """
     window = 1 + len(field) // 20
     energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(window), 'same')
@@ -246,7 +250,7 @@ def rotation_of_pass(field: FloatArray, noise_std: float, n_quiet: int) -> Field
     noise_std : float, T
         Noise standard deviation of one sample, per axis.
     n_quiet : int
-        Number of samples before and after the pass.
+        Number of samples of the window before the pass, and after it.
 
     Returns
     -------

@@ -33,7 +33,7 @@ def log_sum_exp(a: ArrayLike, axis: int | None = None) -> FloatArray:
     Returns
     -------
     (...) array
-        Is -inf if all elements are -inf.
+        Equals -inf if all elements are -inf.
     """
     a = np.asarray(a, dtype=float)
     top = np.max(a, axis=axis, keepdims=True)
@@ -62,7 +62,7 @@ class FilterBank:
     kind: IntArray
     """Assumed kind of target, (n_hyp,); for several targets (n_hyp, n_targets)."""
     origin: IntArray
-    """Index of each hypothesis at the creation of the bank, (n_hyp,)."""
+    """Index that each hypothesis had when the bank was created, (n_hyp,)."""
     nis: FloatArray
     """Normalised innovation squared of the latest measurement, (n_hyp, n_sensors); NaN before the
     first measurement and for missing sensors."""
@@ -73,7 +73,7 @@ class FilterBank:
                      kind: IntArray | None = None) -> 'FilterBank':
         """Create a bank with equal weights from target states.
 
-        Each sensor's own states and then three backgrounds per sensor are appended to the target
+        The own states of all sensors, then three backgrounds per sensor, are appended to the target
         states. All appended states are zero.
 
         Parameters
@@ -118,19 +118,19 @@ class FilterBank:
     def best(self) -> int:
         """Index of the hypothesis to publish.
 
+        The candidates are the hypotheses of the heaviest label and, within that label, of the
+        heaviest kind. The candidate at the maximum density of their mixture is selected, because
+        the heaviest hypothesis would be a random choice if many neighbours share the weight.
+
         Returns
         -------
         int
-            The candidates are the hypotheses of the heaviest label and, within that label, of the
-            heaviest kind. The best candidate is at the maximum density of their mixture, near the
-            mode of the posterior. If many neighbours share the weight, the heaviest hypothesis
-            would be a random choice.
         """
         return core.best(self.x, self.P, self.log_w, _class_indices(self.label),
                          _class_indices(self.kind), _NEGLIGIBLE_LOG_RATIO)
 
     def extract_target(self, i: int, n_one: int) -> 'FilterBank':
-        """Marginal bank of one target of a joint bank.
+        """Marginalise a joint bank to one target.
 
         Parameters
         ----------
@@ -154,7 +154,7 @@ class FilterBank:
                           self.label[:, i].copy(), self.kind[:, i].copy(), self.origin, self.nis)
 
     def without_target(self, i: int, n_one: int) -> 'FilterBank':
-        """Marginal bank of a joint bank without one target.
+        """Marginalise one target out of a joint bank.
 
         Parameters
         ----------
@@ -216,19 +216,19 @@ class FilterBank:
         """
         return self.rows(np.array([i]))
 
-    def weight(self, rows: BoolArray) -> float:
+    def weight(self, mask: BoolArray) -> float:
         """Total weight of the selected hypotheses.
 
         Parameters
         ----------
-        rows : (n_hyp,) bool array
-            Mask of the hypotheses.
+        mask : (n_hyp,) bool array
+            True for the selected hypotheses.
 
         Returns
         -------
         float
         """
-        return float(np.exp(log_sum_exp(self.log_w[rows]))) if rows.any() else 0.0
+        return float(np.exp(log_sum_exp(self.log_w[mask]))) if mask.any() else 0.0
 
     def is_concentrated_in(self, n: int, fraction: float) -> bool:
         """Whether the `n` heaviest hypotheses have at least a given fraction of the weight.

@@ -1,9 +1,9 @@
 """Kalman filters for vectors that change smoothly due to an unknown cause.
 
 Each component is an integrated random walk: its rate of change is a Wiener process. The strength of
-the process is unknown and may change: a bank of strengths is weighted by the data, and each
-strength switches to another strength at a constant rate. The states of different strengths are not
-mixed, because all states follow the same data.
+the process is unknown and may change: a bank of strengths is weighted by the data, and the
+strength switches at a constant mean rate. The states of different strengths are not mixed, because
+all states follow the same data.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ class GaussMarkovVectors:
     n : int
         Number of vectors.
     scale : (m,) array
-        Unit of `STRENGTHS` for each component; zero for constant components, which must come last.
+        Factor of `STRENGTHS` for each component; zero for constant components, which come last.
     std : float
         Initial standard deviation of each component.
 
@@ -75,7 +75,7 @@ class GaussMarkovVectors:
         Returns
         -------
         float, nats
-            Given the earlier measurements.
+            Log-density given the earlier measurements.
         """
         return core.step_vectors(self._x, self._P, self._log_w, self._densities,
                                  plain(vector, np.int64), plain(H), plain(y), plain(variance), dt,

@@ -44,7 +44,7 @@ class InnovationConsistency:
         Parameters
         ----------
         nis : (n_sensors,) array
-            Normalised innovation squared of each sensor; NaN if missing.
+            Normalised innovation squared of each sensor; NaN for a missing sensor.
         n_axes : (n_sensors,) array
             Number of axes measured by each sensor.
         stamp_ns : int, ns
@@ -69,11 +69,14 @@ class InnovationConsistency:
 
     @property
     def fails(self) -> bool:
-        """Whether the innovations of the whole track fail the test, for the network or a sensor."""
+        """Whether the innovations of the network or a sensor fail the test over the whole track."""
         return bool(self._fails(self._total).any())
 
     def _fails(self, values: FloatArray) -> FloatArray:
-        """Flag the sums of NIS (n_sensors + 1,) that exceed the chi-square threshold."""
+        """Flag the sums of NIS (n_sensors + 1,) that exceed the chi-square threshold.
+
+        `values` (2, n_sensors + 1) are the sums and their degrees of freedom.
+        """
         probability = np.append(np.full(self._n_sensors, FALSE_ALARM_PROBABILITY / self._n_sensors),
                                 FALSE_ALARM_PROBABILITY)
         nis, dof = values

@@ -90,7 +90,7 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, field_strength: 
 
 
 def _whitening_matrices(covariances: ArrayLike | None, n: int) -> FloatArray:
-    """Inverse Cholesky factors (n, 3, 3) of covariances; identity matrices if None.
+    """Inverse Cholesky factors (n, 3, 3) of `n` covariances; identity matrices if None.
 
     Raises ValueError for a wrong shape or a covariance that is not positive definite.
     """

@@ -35,14 +35,14 @@ def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iteration
     n_iterations : int
         Maximum number of iterations.
     tolerance : float
-        Relative decrease of the cost in one step at or below which a search has converged.
+        A search has converged if one step decreases the cost by at most this fraction.
 
     Returns
     -------
     x : (n, n_x) array
         Final points.
     cost : (n,) array
-        Sum of squared whitened residuals; infinite for an unusable starting point.
+        Sum of squared whitened residuals; infinite if the model is not finite at a starting point.
     covariance : (n, n_x, n_x) array
         Pseudo-inverse of the information at `x`.
     converged : (n,) bool array
@@ -136,7 +136,7 @@ position would otherwise cancel each other with unbounded moments."""
 
 
 def score_sum_covariance(scores: FloatArray, lag: int) -> FloatArray:
-    """Covariance of the sum of correlated scores (Newey-West, Bartlett weights).
+    """Covariance of a sum of correlated scores, by the Newey-West method with Bartlett weights.
 
     Parameters
     ----------

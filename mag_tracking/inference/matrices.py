@@ -80,7 +80,7 @@ def leading_broadcast(name: str, A: ArrayLike, shape: tuple[int, ...]) -> FloatA
     raise ValueError(f'{name} has shape {A.shape}, expected {shape}')
 
 
-def raise_for_invalid(name: str, fault: str, A: FloatArray,
+def raise_for_invalid(name: str, requirement: str, A: FloatArray,
                       is_invalid: BoolArray | np.bool_) -> None:
     """Raise ValueError for the first invalid matrix.
 
@@ -88,8 +88,8 @@ def raise_for_invalid(name: str, fault: str, A: FloatArray,
     ----------
     name : str
         Name of the argument, for the error message.
-    fault : str
-        Property that is violated, such as 'symmetric'.
+    requirement : str
+        Property that is required, such as 'symmetric'.
     A : (..., n, n) array
         Matrices.
     is_invalid : (...) bool array
@@ -101,7 +101,7 @@ def raise_for_invalid(name: str, fault: str, A: FloatArray,
         If any flag is set.
     """
     for index in np.argwhere(is_invalid).tolist():
-        raise ValueError(f'{name}{index or ""} is not {fault}: {A[tuple(index)].tolist()}')
+        raise ValueError(f'{name}{index or ""} is not {requirement}: {A[tuple(index)].tolist()}')
 
 
 def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -174,7 +174,7 @@ PSEUDO_INVERSE_TOLERANCE = 1e-15
 """Eigenvalue, relative to the largest, below which a direction is due to rounding errors."""
 
 
-def pseudo_inverse(A: FloatArray, rank: float = PSEUDO_INVERSE_TOLERANCE) -> FloatArray:
+def pseudo_inverse(A: FloatArray, tolerance: float = PSEUDO_INVERSE_TOLERANCE) -> FloatArray:
     """Pseudo-inverses of symmetric matrices.
 
     The matrices are scaled to unit diagonal first, because the units of the parameters differ by
@@ -184,7 +184,7 @@ def pseudo_inverse(A: FloatArray, rank: float = PSEUDO_INVERSE_TOLERANCE) -> Flo
     ----------
     A : (n, k, k) array
         Symmetric positive semidefinite matrices.
-    rank : float
+    tolerance : float
         Directions with an eigenvalue below this fraction of the largest are excluded.
 
     Returns
@@ -204,7 +204,7 @@ def pseudo_inverse(A: FloatArray, rank: float = PSEUDO_INVERSE_TOLERANCE) -> Flo
     scale = np.sqrt(np.einsum('nii->ni', A))
     scale = np.where(scale > 0.0, scale, 1.0)
     w, V = np.linalg.eigh(A / (scale[:, :, None] * scale[:, None, :]))
-    w = np.where(w > rank * w[:, -1:], w, np.inf)
+    w = np.where(w > tolerance * w[:, -1:], w, np.inf)
     V = V / scale[:, :, None]
     with ignoring_overflow():
         inverse = (V / w[:, None, :]) @ np.swapaxes(V, 1, 2)

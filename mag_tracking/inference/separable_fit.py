@@ -56,13 +56,14 @@ class SeparableProblem:
         Whitened measurements.
     nuisance : (n_y, q) array, optional
         Whitened linear terms that do not depend on theta, such as backgrounds.
-    prior : (mean, std) of (n_theta,) arrays, optional
-        Gaussian prior of theta; an infinite standard deviation means no prior.
+    prior : (mean, std), optional
+        Gaussian prior of theta, as (n_theta,) arrays. A parameter with an infinite standard
+        deviation has no prior.
 
     Attributes
     ----------
     energy : float
-        Sum of squares of the measurements after the fit of the nuisance terms alone.
+        Sum of the squared residuals of a fit of the nuisance terms alone.
 
     Notes
     -----
@@ -120,9 +121,9 @@ class SeparableProblem:
 
         Returns
         -------
-        residual : (n, n_y) array
-            Whitened; the residuals of the prior, if any, are appended.
-        jacobian : (n, n_y, n_theta) array
+        residual : (n, n_y + n_known) array
+            Whitened residuals of the measurements, then of the n_known parameters with a prior.
+        jacobian : (n, n_y + n_known, n_theta) array
             Derivative of the prediction with respect to theta.
         """
         A = self._without_nuisance(self._model.basis(theta))
@@ -154,7 +155,7 @@ class SeparableProblem:
 
 
 class _Prior:
-    """Gaussian prior as whitened measurements of theta."""
+    """Gaussian prior as whitened measurements of the n_known parameters that have a prior."""
 
     def __init__(self, mean: FloatArray, std: FloatArray) -> None:
         self._prior_indices = np.flatnonzero(np.isfinite(std))
@@ -200,8 +201,8 @@ def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparablePr
     min_difference : (n_theta,) array
         Difference in any parameter beyond which points are distinct.
     companions : callable, (n_theta,) array -> (n, n_theta) array, optional
-        Function of the best point of the coarse problem that returns points near minima that are
-        often confused with the best minimum. The search also starts from these points.
+        Function that maps the best minimum of the coarse problem to points near minima with which
+        it is often confused. The search also starts from these points.
 
     Returns
     -------
@@ -235,11 +236,11 @@ def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: Fl
     min_difference : (n_theta,) array
         Difference in any parameter beyond which points are distinct.
     n_refined : int
-        Number of starting points to refine.
+        Number of starting points to refine with the smooth problem.
     n_steps : int
         Number of Levenberg-Marquardt steps with the smooth problem.
     n_distinct : int
-        Maximum number of minima.
+        Maximum number of minima to return.
 
     Returns
     -------
@@ -265,13 +266,13 @@ def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray,
     fine : SeparableProblem
         Problem to be solved.
     theta : (n, n_theta) array
-        Starting points.
+        Possible starting points.
     cost : (n,) array
-        Costs by which the starting points are ranked.
+        Costs by which they are ranked.
     min_difference : (n_theta,) array
         Difference in any parameter beyond which points are distinct.
     n_best : int
-        Maximum number of distinct starting points.
+        Maximum number of distinct points from which the search starts.
 
     Returns
     -------

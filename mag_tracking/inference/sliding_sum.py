@@ -10,7 +10,7 @@ from mag_tracking.units import NS
 
 
 class SlidingSum:
-    """Sum of the values added within a window before the latest frame.
+    """Sum of the values in a sliding window that ends at the latest frame.
 
     Parameters
     ----------
@@ -38,6 +38,6 @@ class SlidingSum:
 
     @property
     def total(self) -> FloatArray:
-        """Sum of the values in the window, in the shape of one value; 0 before the first value."""
+        """Sum of the values in the window, with the shape of a value; 0 before the first value."""
         total: FloatArray = np.sum([value for _, value in self._frames], axis=0)
         return total

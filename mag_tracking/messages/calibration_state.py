@@ -80,7 +80,7 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
 
 
 def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
-    """Read the latest doubtful interval of each sensor's background from a CalibrationState.
+    """Read when the background of each sensor was last doubtful, from a CalibrationState.
 
     Parameters
     ----------

@@ -84,7 +84,7 @@ def frame_of(message: NetworkFrame, network: NamedSensors) -> FieldFrame:
 
 
 def _check_numbers(frame: FieldFrame) -> None:
-    """Raise RecordingError if a frame contains values that the alignment stage never outputs."""
+    """Raise RecordingError for an infinite field, a large time offset or an invalid covariance."""
     if np.isinf(frame.field).any():
         raise RecordingError('NetworkFrame: a field is infinite; expected finite values, or NaN '
                              'for a missing axis')

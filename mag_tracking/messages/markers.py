@@ -53,7 +53,7 @@ def track_markers(track: Track, frame: str) -> dict[str, Any]:
 
 
 def delete_markers(track: Track, frame: str) -> dict[str, Any]:
-    """Markers that delete the displayed markers of a `Track` that has ended.
+    """Markers that delete the displayed markers of an ended `Track`.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def _ellipsoid(track: Track, frame: str) -> dict[str, Any]:
 
 
 def _arrow(track: Track, frame: str) -> dict[str, Any]:
-    """Arrow marker along the moment; the length is three standard deviations of the position."""
+    """Arrow marker along the moment; its length is three times the RMS error of the position."""
     length = max(float(np.sqrt(np.trace(track.covariance[:3, :3]))), 1e-3) * 3.0
     tip = track.position + length * track.moment / np.linalg.norm(track.moment)
     return _marker(

@@ -119,11 +119,11 @@ class _StampedMessages:
         self.stamp_ns: IntArray = header['sec'].astype(np.int64) * 1_000_000_000 + header['nanosec']
 
     def _frames(self, rows: IntArray, length: int) -> NDArray[np.uint8]:
-        """Bytes (k, length) of the frame names of `rows` (k,), each of `length` bytes."""
+        """Bytes (k, length) of the frame names of messages `rows` (k,), which have this length."""
         return self._data[(self._begins[rows] + _HEADER_TYPE.itemsize)[:, None] + np.arange(length)]
 
     def have_ascii_frames(self, rows: IntArray) -> BoolArray:
-        """Flag the `rows` (k,) whose frame name is zero-terminated ASCII."""
+        """Flag which of the messages `rows` (k,) have a zero-terminated ASCII frame name."""
         out = np.zeros(len(rows), dtype=bool)
         for length in np.unique(self._name_length[rows]):
             same_length = np.flatnonzero(self._name_length[rows] == length)
@@ -132,7 +132,7 @@ class _StampedMessages:
         return out
 
     def have_frame(self, rows: IntArray, frame: str) -> BoolArray:
-        """Flag the `rows` (k,) whose message is in `frame`."""
+        """Flag which of the messages `rows` (k,) are in `frame`."""
         name = np.frombuffer(frame.encode() + b'\0', np.uint8)
         out: BoolArray = self._name_length[rows] == len(name)
         out[out] = (self._frames(rows[out], len(name)) == name).all(axis=1)

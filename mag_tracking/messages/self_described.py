@@ -35,8 +35,8 @@ def type_of(schema: Schema) -> str:
     Returns
     -------
     str
-        The type sensor_msgs/msg/MagneticField if the schema has a magnetic field; otherwise the
-        name of the schema.
+        The type sensor_msgs/msg/MagneticField if a schema in a supported encoding contains
+        `magnetic_field`; otherwise the name of the schema.
     """
     is_field = schema.encoding in SUPPORTED_ENCODINGS and b'magnetic_field' in schema.data
     return MAGNETIC_FIELD if is_field else schema.name
@@ -65,7 +65,7 @@ def cdr_of(schema: Schema, data: bytes) -> bytes:
 
 @functools.cache
 def decode_errors() -> tuple[type[Exception], ...]:
-    """Exceptions that a decoder of `field_decoder` raises for invalid message bytes.
+    """Exceptions that the result of `field_decoder` raises for invalid message bytes.
 
     Returns
     -------
@@ -111,7 +111,7 @@ def field_decoder(encoding: str, name: str, content: bytes) -> Callable[[bytes],
 
 
 def _field(message: Any) -> MessageDict:
-    """Convert a message to sensor_msgs/MagneticField; raise ValueError for an invalid message."""
+    """Convert a message to sensor_msgs/MagneticField; raises ValueError for an invalid message."""
     field = getattr(message, 'magnetic_field', None)
     header = getattr(message, 'header', message)
     stamp = next((s for name in _STAMPS for s in (getattr(header, name, None),
@@ -131,7 +131,10 @@ def _field(message: Any) -> MessageDict:
 
 
 def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
-    """First integer field among `names`; raise ValueError if missing or not in [0, limit)."""
+    """Value of the first of the fields `names` of `stamp` that is an integer.
+
+    Raises ValueError if there is no such field, or its value is not in [0, limit).
+    """
     for name in names:
         value = getattr(stamp, name, None)
         if isinstance(value, int) and not isinstance(value, bool):
@@ -142,7 +145,7 @@ def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
 
 
 def _axis_value(field: Any, axis: str) -> float:
-    """Field of one axis [T]; NaN for null. Raise ValueError for a missing or non-numeric axis."""
+    """Field of one axis [T]; NaN for null. Raises ValueError for a missing or non-numeric axis."""
     if not hasattr(field, axis):
         raise ValueError(f'magnetic_field.{axis} is missing')
     value = getattr(field, axis)

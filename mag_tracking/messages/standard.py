@@ -59,9 +59,9 @@ def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[Messag
 def detections_3d_dict(track: Track, frame: str) -> MessageDict:
     """Convert a `Track` to vision_msgs/Detection3DArray.
 
-    Each result is a kind of target with its probability and the pose of the track. The bounding box
-    has the length of the line of dipoles. The width and height of the box are not observable and
-    are 0.
+    Each result of a detection is a kind of target with its probability and the pose of the track.
+    The bounding box has the length of the line of dipoles. The width and height of the box are not
+    observable and are 0.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ _FIELD = re.compile(r'\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?P<array>(?:<=)
 
 
 def _full_name(kind: str, package: str) -> str:
-    """Full name of a type that a definition in `package` references as `kind`."""
+    """Full name of the type that is called `kind` in a definition of `package`."""
     owner, _, leaf = kind.rpartition('/')
     return f'{(owner or package).partition("/")[0]}/msg/{leaf}'
 
@@ -92,7 +92,7 @@ def _dependencies(type_name: str) -> list[str]:
 
 
 def definition(type_name: str) -> str:
-    """Definition of a type and of all contained types, in the format of a `ros2msg` schema.
+    """Definition of a type and of all types it contains, in the format of a `ros2msg` schema.
 
     Parameters
     ----------

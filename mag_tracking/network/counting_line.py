@@ -28,7 +28,7 @@ class CountingLine:
     """Name of the line."""
     point: FloatArray
     """Midpoint of the line, (2,) m, world frame."""
-    along: FloatArray
+    direction: FloatArray
     """Unit vector of the forward direction, perpendicular to the line, (2,), world frame."""
     half_width: float
     """Half of the length of the line, m."""
@@ -45,7 +45,7 @@ class CountingLine:
         float, m
             Positive beyond the line, negative before it.
         """
-        return float((position[:2] - self.point) @ self.along)
+        return float((position[:2] - self.point) @ self.direction)
 
     def lateral(self, position: FloatArray) -> float:
         """Lateral offset of a position from the midpoint of the line.
@@ -60,7 +60,7 @@ class CountingLine:
             Positive to the left, facing forward.
         """
         r = position[:2] - self.point
-        return float(self.along[0] * r[1] - self.along[1] * r[0])
+        return float(self.direction[0] * r[1] - self.direction[1] * r[0])
 
 
 def counting_lines(names: Sequence[str], headings_deg: Sequence[float], offsets: Sequence[float],
@@ -87,8 +87,8 @@ def counting_lines(names: Sequence[str], headings_deg: Sequence[float], offsets:
     out = []
     for name, heading, offset, half_width in zip(names, np.deg2rad(headings_deg), offsets,
                                                  half_widths, strict=True):
-        along = np.array([np.cos(heading), np.sin(heading)])
-        out.append(CountingLine(name, centre[:2] + offset * along, along, half_width))
+        direction = np.array([np.cos(heading), np.sin(heading)])
+        out.append(CountingLine(name, centre[:2] + offset * direction, direction, half_width))
     return out
 
 
@@ -108,7 +108,7 @@ class Crossing(NamedTuple):
 
 
 class CrossingDetector:
-    """Detector for the crossing of a line by one track.
+    """Detects the crossing of a line by one track.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class CrossingDetector:
         return self._first_pose is not None
 
     def add(self, pose: Pose) -> None:
-        """Add the next pose of the track.
+        """Add the next pose of the track, in chronological order.
 
         Parameters
         ----------
@@ -157,7 +157,7 @@ class CrossingDetector:
         Returns
         -------
         Crossing or None
-            None if there is no such crossing, or if it is beside the line segment.
+            None without a crossing, or if the crossing is beside the line segment.
         """
         if self._first_pose is None or self._last_pose is None:
             return None
@@ -178,9 +178,12 @@ class CrossingDetector:
                         distances[1] > distances[0], before if fraction < 0.5 else after, False)
 
     def _extrapolate(self, first: Pose, last: Pose) -> Crossing | None:
-        """Extrapolate a crossing before the first or after the last pose; None if it is too far."""
+        """Extrapolate a crossing from the first or the last pose.
+
+        None if the speed is below `MIN_SPEED` or the time exceeds `MAX_EXTRAPOLATION_S`.
+        """
         for pose, sign in ((first, -1.0), (last, 1.0)):
-            speed = float(pose.velocity[:2] @ self.line.along)
+            speed = float(pose.velocity[:2] @ self.line.direction)
             if abs(speed) < MIN_SPEED:
                 continue
             t = -self.line.forward(pose.position) / speed

@@ -62,7 +62,7 @@ def _check_keys(label: str, mapping: object, keys: Collection[str]) -> None:
 
 
 def _parse_sensor(name: str, entry: Any) -> dict[str, Any]:
-    """Parse the entry of a sensor; return the values of its `SensorNetwork` attributes by name."""
+    """Parse the entry of a sensor; return {attribute of `SensorNetwork`: value of this sensor}."""
     label = f'sensor {name}'
     _check_keys(label, entry, _SENSOR_KEYS)
     if 'position' not in entry:
@@ -91,7 +91,7 @@ def _parse_sensor(name: str, entry: Any) -> dict[str, Any]:
 
 
 def _parse_noise(label: str, noise: object) -> FloatArray | None:
-    """Parse the noise standard deviation (3,) [T] from one or three numbers."""
+    """Parse the noise standard deviation (3,) [T], one or three numbers; None if missing."""
     if noise is None:
         return None
     numbers = noise if isinstance(noise, list) else [noise]
@@ -103,7 +103,7 @@ def _parse_noise(label: str, noise: object) -> FloatArray | None:
 
 
 def _parse_field(label: str, key: str, value: object) -> FloatArray | None:
-    """Parse a field (3,) [T] of at most 0.1 T from three numbers."""
+    """Parse a field (3,) [T], three numbers of at most 0.1 T; None if missing."""
     if value is None:
         return None
     B = _parse_vector(f'{label}: {key}', value, (3,))
@@ -114,7 +114,7 @@ def _parse_field(label: str, key: str, value: object) -> FloatArray | None:
 
 
 def _parse_correction(label: str, value: object) -> FloatArray | None:
-    """Parse the correction matrix (3, 3) from nine numbers."""
+    """Parse the correction matrix (3, 3), nine numbers; None if missing."""
     if value is None:
         return None
     matrix = _parse_vector(f'{label}: correction', value, (9,)).reshape(3, 3)
@@ -126,7 +126,7 @@ def _parse_correction(label: str, value: object) -> FloatArray | None:
 
 
 def _parse_orientation_std(label: str, value: object) -> FloatArray | None:
-    """Parse the orientation standard deviation (3,) [rad] from one or three numbers [deg]."""
+    """Convert one or three orientation standard deviations [deg] to (3,) [rad]; None if missing."""
     if value is None:
         return None
     numbers = value if isinstance(value, list) else [value]
@@ -147,7 +147,7 @@ def _parse_clock_offset(label: str, value: object) -> float:
 
 
 def _parse_calibration(label: str, value: Any) -> CalibrationRecord | None:
-    """Parse the calibration record."""
+    """Parse the calibration record of a sensor; None if missing."""
     if value is None:
         return None
     label = f'{label}: calibrated'
@@ -170,7 +170,7 @@ def _parse_calibration(label: str, value: Any) -> CalibrationRecord | None:
 
 
 def _parse_rotation(label: str, q: FloatArray) -> FloatArray:
-    """Convert a quaternion to a rotation matrix (3, 3)."""
+    """Convert a quaternion to a rotation matrix (3, 3); raises NetworkError if it is invalid."""
     try:
         return rotation_from_quaternion(q)
     except ValueError as error:
@@ -232,7 +232,7 @@ def _parse_network(content: Any) -> SensorNetwork:
 
 
 def _parse_earth_field(content: dict[str, Any]) -> FloatArray | None:
-    """Field of the Earth (3,) [T] from the file or from the World Magnetic Model at the site.
+    """Parse the field of the Earth (3,) [T], or compute it by the World Magnetic Model.
 
     None if the file contains neither a field nor a site.
     """

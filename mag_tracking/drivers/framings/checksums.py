@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 
 class Checksum(NamedTuple):
-    """Length and function of a checksum."""
+    """Checksum algorithm: length of the checksum, and function that computes it."""
 
     size: int
     """Length in bytes."""
@@ -50,7 +50,10 @@ def xor8(data: bytes) -> int:
 
 
 def _forward_table(polynomial: int) -> tuple[int, ...]:
-    """Table of the 256 remainders of an 8-bit CRC, most significant bit first."""
+    """Table of the 8-bit CRC of each byte value, most significant bit first.
+
+    `polynomial` includes the term x^8.
+    """
     table = []
     for byte in range(256):
         for _ in range(8):
@@ -60,7 +63,10 @@ def _forward_table(polynomial: int) -> tuple[int, ...]:
 
 
 def _reflected_table(polynomial: int) -> tuple[int, ...]:
-    """Table of the 256 remainders of a reflected CRC, least significant bit first."""
+    """Table of the CRC of each byte value, least significant bit first.
+
+    The bit order of `polynomial` is reversed as well.
+    """
     table = []
     for byte in range(256):
         for _ in range(8):
@@ -105,7 +111,7 @@ def crc16_ccitt(data: bytes) -> int:
 
 
 def crc16_modbus(data: bytes) -> int:
-    """CRC-16/MODBUS: polynomial 0x8005 reflected, initial value 0xFFFF; check value 0x4B37.
+    """CRC-16/MODBUS: polynomial 0x8005, reflected, initial value 0xFFFF; check value 0x4B37.
 
     Parameters
     ----------

@@ -96,8 +96,8 @@ class FieldLayout:
         Returns
         -------
         list of Reading
-            All with the same ticks and sequence. In a frame with `sensor` and named sensors, the
-            names are joined by a dot ('board.A').
+            All with the same ticks and sequence. If a frame has the field `sensor` and its axes
+            also name sensors, both names are joined by a dot ('board.A').
         """
         v = [*values, math.nan, None]
         ticks, sequence = v[self._ticks], v[self._sequence]
@@ -111,20 +111,23 @@ class FieldLayout:
 
 
 def _split(name: str) -> tuple[str, str]:
-    """Split a field into (quantity, sensor)."""
+    """Split a field such as `x.A` into (quantity, sensor); the sensor may be empty."""
     quantity, _, sensor = name.partition('.')
     return quantity, sensor
 
 
 def _axes_getter(axes: Mapping[str, int], names: Sequence[str]) -> Callable[[Values], Any]:
-    """Function that selects three axes from a frame's values; it returns None if none is sent."""
+    """Create a function that selects three axes from the values of a frame.
+
+    It expects NaN and None after the values, and returns None if the frame has none of the axes.
+    """
     if not any(name in axes for name in names):
         return itemgetter(-1)
     return itemgetter(*(axes.get(name, -2) for name in names))
 
 
 def _expand(fields: tuple[str, ...], each: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """Return `fields`, followed by `each` for every sensor; raises SettingsError if invalid."""
+    """Return `fields`, then `each` for every sensor; raises SettingsError for invalid arguments."""
     for name in fields:
         quantity, sensor = _split(name)
         if quantity not in (AXES if '.' in name else (*FRAME_QUANTITIES, *AXES, SKIP)):
@@ -149,7 +152,7 @@ def _is_valid_name(name: str) -> bool:
 
 
 def axis_value(value: float | bytes) -> float:
-    """Convert an axis to float.
+    """Convert the value of an axis to float.
 
     Parameters
     ----------
@@ -213,7 +216,7 @@ def sequence_value(value: int) -> int:
         If `value` is outside -2^63 .. 2^64 - 1.
     """
     if not -2**63 <= value < 2**64:
-        raise Rejected('with a sequence of more than 64 bits')
+        raise Rejected('with a sequence number of more than 64 bits')
     return value
 
 
@@ -249,7 +252,7 @@ def ignore_value(value: object) -> None:
 
 
 def decode_escapes(setting: str, text: str) -> bytes:
-    r"""Encode a string with escape sequences as UTF-8 bytes.
+    r"""Replace the escape sequences of a string, and encode it as UTF-8.
 
     The sequences \n, \r, \t, \0, \\ and \xhh are recognised, so that both kinds of YAML quotes
     have the same effect.

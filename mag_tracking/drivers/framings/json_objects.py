@@ -88,7 +88,10 @@ class JsonFraming:
         self._layout = FieldLayout(names)
 
     def _axis_paths(self, name: str, paths: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the paths of three axes; the path of a list is expanded and added to `_lists`."""
+        """Return the paths of the three axes of setting `name`; raises SettingsError if invalid.
+
+        The path of a list is expanded to the paths of its values, and added to `_lists`.
+        """
         if len(paths) == 1 and paths[0]:
             self._lists.append((paths[0], _split_path(name, paths[0])))
             return tuple(f'{paths[0]}.{i}' for i in range(3))
@@ -158,7 +161,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _split_path(name: str, path: str) -> _Keys:
-    """Split a path into its keys: ((key, list index or None), ...)."""
+    """Split a path into ((key, list index or None), ...); raises SettingsError for an empty key."""
     keys = path.split('.')
     if not all(keys):
         raise SettingsError(f'{name}: {path!r} has an empty key')
@@ -185,7 +188,7 @@ def _number(value: object, path: str) -> int | float:
 
 
 def _axis(value: object, path: str) -> float:
-    """Convert an axis, NaN for null; raises Rejected if it is infinite or not a number."""
+    """Convert an axis to float, null to NaN; raises Rejected for an infinite or other value."""
     return float('nan') if value is None else axis_value(_number(value, path))
 
 
@@ -195,7 +198,10 @@ def _ticks(value: object, path: str) -> float:
 
 
 def _sequence(value: object, path: str) -> int:
-    """Convert a sequence number, such as 12 or 12.0; raises Rejected if it is not an integer."""
+    """Convert a sequence number, such as 12 or 12.0, to int.
+
+    Raises Rejected if the value is not an integer of at most 64 bits.
+    """
     value = _number(value, path)
     if isinstance(value, float):
         if not value.is_integer():
@@ -205,7 +211,7 @@ def _sequence(value: object, path: str) -> int:
 
 
 def _sensor(value: object, path: str) -> str:
-    """Convert a sensor name, a string or an integer; raises Rejected for any other value."""
+    """Convert a name (string or integer) to str; raises Rejected if it is not a sensor name."""
     if isinstance(value, int) and not isinstance(value, bool):
         value = str(value)
     if not isinstance(value, str):

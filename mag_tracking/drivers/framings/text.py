@@ -35,8 +35,8 @@ class TextSettings:
     """Settings of the framing of text lines."""
 
     fields: tuple[str, ...] = param(
-        (), 'Values of a line in order: sensor, ticks, sequence, x, y, z, ax, ay, az, or - to skip '
-        'a value. x.A is an axis of sensor A, for lines with several sensors.')
+        (), 'Values of a line, in the order sent. Each is sensor, ticks, sequence, x, y, z, ax, '
+        'ay, az, or - to skip a value. x.A is an axis of sensor A, for lines with several sensors.')
     each: tuple[str, ...] = param(
         (), 'Axes of one sensor, for lines with several identical sensors. They are repeated '
         '`count` times after `fields`.')
@@ -66,6 +66,7 @@ class Lines:
     Attributes
     ----------
     end : bytes
+        Line terminator.
     max_length : int, bytes
 
     Raises
@@ -178,7 +179,7 @@ class TextFraming:
         self._check_settings(separator)
 
     def _check_settings(self, separator: bytes) -> None:
-        """Raise SettingsError if no line can be read with these settings."""
+        """Raise SettingsError if separator, prefix or comment prefix prevents correct parsing."""
         if not separator or re.search(rb'[0-9A-Za-z+.-]', separator):
             raise SettingsError(f'separator: {separator!r} is empty or can be part of a number')
         if self._lines.end in separator:
@@ -231,7 +232,7 @@ def _strip_checksum(line: bytes) -> bytes:
 
 
 def _converter(quantity: str) -> Callable[[bytes], object]:
-    """Function that parses the bytes of a field for `FieldLayout`."""
+    """Function that converts the bytes of a quantity to a value for `FieldLayout.readings`."""
     if quantity in AXES:
         return _axis
     converters: dict[str, Callable[[bytes], object]] = {
@@ -259,7 +260,7 @@ def _sequence(text: bytes) -> int:
     """Parse a sequence number; raises Rejected if it is not an integer of at most 64 bits."""
     text = text.strip(b' \t')
     if not _INTEGER(text):
-        raise Rejected('with a sequence that is not an integer')
+        raise Rejected('with a sequence number that is not an integer')
     return sequence_value(int(text))
 
 

@@ -65,7 +65,7 @@ class XsensSettings:
 
 
 class _Message(NamedTuple):
-    """Type and position of a message in a window; the message may end after the window."""
+    """Type and position of a message in a window of bytes; it may end after the window."""
 
     mid: int
     begin: int
@@ -95,7 +95,10 @@ def _is_from_device(mid: int) -> bool:
 
 
 def _message_at(window: bytes, index: int, longest: int) -> _Message | None:
-    """Message that may begin at `index`; None if no message can begin there."""
+    """Message that may begin at `index` of `window`; None if no message can begin there.
+
+    Its DATA may have at most `longest` bytes.
+    """
     # While the header is incomplete, MID is -1 and the end is one byte after the window.
     header = window[index:index + 6]
     if not header.startswith(_START[:len(header)]):
@@ -207,7 +210,10 @@ class XsensFraming:
 
     def _search_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
                        more: bool) -> _ParseStep | None:
-        """Return a step that rejects `outer` or waits, if it may contain data; None otherwise."""
+        """Search `outer` for another data message; None if it contains none.
+
+        Otherwise, return a step that rejects `outer`, or that waits for more bytes.
+        """
         rejection = _REJECT_STEP._replace(causes=('messages that contain the start of another',))
         index = 0
         while True:
@@ -232,7 +238,7 @@ class XsensFraming:
     def _next_start(window: bytes, index: int, end: int, complete: bool) -> int:
         """Index of the next message start from `index` on; -1 if there is none before `end`.
 
-        Both bytes of the start must be before `end` if `complete` is set, otherwise the first byte.
+        Both bytes of the start must be before `end` if `complete` is set, otherwise only the first.
         """
         found = window.find(_START, index, end if complete else end + 1)
         if found < 0 and not complete and end == len(window) and window.endswith(_PREAMBLE, index):
@@ -249,7 +255,7 @@ class XsensFraming:
         return None
 
     def _cause(self, window: bytes, message: _Message) -> str:
-        """Return the name of the count for a message without a reading."""
+        """Cause under which a message without a reading is counted."""
         if message.mid == _MTDATA:
             if self._layout is None:
                 return 'MTData messages, although mtdata is none'

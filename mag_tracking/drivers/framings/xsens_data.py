@@ -48,7 +48,7 @@ _Triple: TypeAlias = tuple[float, float, float]
 
 
 class DecodedMessage(NamedTuple):
-    """Reading of a data message, and the causes to count for ignored data."""
+    """Reading of a data message, and the causes for which data were ignored."""
 
     reading: Reading | None
     """None if the message has neither field nor acceleration."""
@@ -57,7 +57,7 @@ class DecodedMessage(NamedTuple):
 
 
 def _three_reals(data: bytes, precision: int) -> _Triple | None:
-    """Decode three real numbers; None if the length of `data` is wrong."""
+    """Decode three real numbers; None if the length of `data` does not match `precision`."""
     layout = _TRIPLE_FORMATS[precision]
     if len(data) != layout.size:
         return None
@@ -127,18 +127,21 @@ def read_mtdata2(data: bytes) -> DecodedMessage | None:
             causes.append(f'duplicate packets in a message: 0x{identifier:04X}')
             continue
         values[name] = value
-    return _message_of(values, causes)
+    return _decoded_message(values, causes)
 
 
-def _message_of(values: Mapping[str, Any], causes: Sequence[str]) -> DecodedMessage:
-    """Create a message; the reading is None if `values` has neither field nor acceleration."""
+def _decoded_message(values: Mapping[str, Any], causes: Sequence[str]) -> DecodedMessage:
+    """Create a `DecodedMessage` from the values {attribute of `Reading`: value}.
+
+    Its reading is None if `values` has neither field nor acceleration.
+    """
     if 'field' in values or 'acceleration' in values:
         return DecodedMessage(Reading(**values), tuple(causes))
     return DecodedMessage(None, (*causes, 'messages without field or acceleration'))
 
 
 class MTDataLayout:
-    """Layout of MTData messages, which is known only from the settings.
+    """Layout of MTData messages. The messages do not describe it, so it must be configured.
 
     Parameters
     ----------
@@ -156,8 +159,8 @@ class MTDataLayout:
     Raises
     ------
     SettingsError
-        If a block is unknown or out of order, if there is a second orientation, if there is
-        neither 'acc' nor 'mag', or if the number format is unknown.
+        If a block is unknown or out of order, if there are several orientations, if there
+        is neither 'acc' nor 'mag', or if the number format is unknown.
     """
 
     def __init__(self, blocks: Sequence[str], number_format: str) -> None:
@@ -201,4 +204,4 @@ class MTDataLayout:
                 values[name] = _three_reals(data[begin:begin + 12], self._precision)
         if 'counter' in self._begin:
             values['sequence'] = int.from_bytes(data[self._begin['counter']:], 'big')
-        return _message_of(values, ())
+        return _decoded_message(values, ())

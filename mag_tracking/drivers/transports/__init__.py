@@ -1,1 +1,1 @@
-"""Transports that receive bytes, and the polled I2C bus, with one module per protocol."""
+"""Transports, which receive bytes, and the polled I2C bus; one module per protocol."""

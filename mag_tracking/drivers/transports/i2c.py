@@ -52,7 +52,7 @@ CLOSE_WAIT_S = 0.1
 _CLASSES: tuple[ChipClass, ...] = (Mmc5983ma, Mmc5603, Hmc5883l, Hmc5983, Rm3100, Lis3mdl)
 CHIPS = {cls.NAME: cls for cls in _CLASSES}
 """Supported chips by name."""
-NO_ANSWER = (errno.EREMOTEIO, errno.ENXIO)
+NO_ANSWER_ERRNOS = (errno.EREMOTEIO, errno.ENXIO)
 
 
 @dataclass(frozen=True)
@@ -185,8 +185,8 @@ class I2cDevice(Closable):
             check_identity(chip, registers)
             chip.set_up()
         except DeviceError as error:
-            known = [] if sensor.chip not in CHIPS else self._matching_chips(registers)
-            hint = f'; it is identified as {known[0]}' if known else ''
+            matching = [] if sensor.chip not in CHIPS else self._matching_chips(registers)
+            hint = f'; it is identified as {matching[0]}' if matching else ''
             raise DeviceError(f'{label}: {error}{hint}') from error
         except OSError as error:
             raise DeviceError(f'{label}: {self._fault(error)}') from error
@@ -204,7 +204,7 @@ class I2cDevice(Closable):
 
     def _fault(self, error: OSError) -> str:
         """Explanation of a bus error, with the remedy."""
-        if error.errno in NO_ANSWER:
+        if error.errno in NO_ANSWER_ERRNOS:
             return ('no answer; check wiring, power supply, and the address with i2cdetect -y '
                     f'{self._settings.bus}')
         if isinstance(error, TimeoutError):
@@ -246,7 +246,10 @@ class I2cDevice(Closable):
                     return sorted(arrivals, key=lambda a: a.arrival_ns)
 
     def _wait(self, end_ns: int) -> bool:
-        """Wait for a cycle until `end_ns`; count missed cycles; return whether a cycle is due."""
+        """Wait for the next polling cycle, at most until `end_ns`; return whether it is due.
+
+        Missed cycles are counted.
+        """
         while not self._closing:
             now_ns = self._monotonic_ns()
             n_missed = (now_ns - self._due_ns) // self._period_ns
@@ -265,15 +268,15 @@ class I2cDevice(Closable):
     def _run_cycle(self, bus: Bus) -> list[Arrival]:
         """Measure once with all chips concurrently; return the arrivals."""
         arrivals: list[Arrival] = []
-        running = {name: chip.measure() for name, chip in self._chips.items()}
-        wake_ns = dict.fromkeys(running, self._monotonic_ns())
+        measurements = {name: chip.measure() for name, chip in self._chips.items()}
+        wake_ns = dict.fromkeys(measurements, self._monotonic_ns())
         while wake_ns:
             name = min(wake_ns, key=wake_ns.__getitem__)
             wait_ns = wake_ns[name] - self._monotonic_ns()
             if wait_ns > 0:
                 self._sleep(wait_ns * 1e-9)
             try:
-                wait_s = next(running[name])
+                wait_s = next(measurements[name])
                 wake_ns[name] = self._monotonic_ns() + math.ceil(wait_s * 1e9)
                 continue
             except StopIteration as stop:
@@ -289,7 +292,10 @@ class I2cDevice(Closable):
         return arrivals
 
     def _arrivals(self, name: str, conversion: Conversion | None) -> list[Arrival]:
-        """Return a list of the arrival; count a missing conversion and detect a silent chip."""
+        """Return a list with the arrival of a conversion; empty if the conversion is missing.
+
+        A missing conversion is counted; too many in succession mark the device as lost.
+        """
         self._n_failed[name] = 0
         if conversion is None:
             self._count('polling cycles without a new conversion', name)

@@ -58,8 +58,8 @@ class MqttSettings:
         10, 'Keep-alive interval. The connection is closed if the broker does not answer for twice '
         'this interval.', 's', (1, 65535))
     connect_timeout_s: float = param(
-        5.0, "Timeout for connecting to the broker. The broker's acknowledgements must arrive "
-        'within the same time after that.', 's', (0.1, 600.0))
+        5.0, "Timeout for connecting to the broker. The broker must acknowledge the connection "
+        'and the subscriptions within the same time again.', 's', (0.1, 600.0))
     queue: int = param(
         10000, 'Maximum number of messages in the queue. If the queue is full, its oldest message '
         'is dropped.', '', (1, 10_000_000))
@@ -113,7 +113,7 @@ class MqttTopics:
         # Guards all attributes below; notifies the reader of messages and of a lost connection.
         self._changed = threading.Condition()
         self._queue: deque[Chunk] = deque()
-        self._pending_counts: Counter[str] = Counter()
+        self._thread_counts: Counter[str] = Counter()
         self._thread: threading.Thread | None = None
         self._is_ready = self._closing = False
         self._loss = f'{self._name}: not open'
@@ -135,7 +135,7 @@ class MqttTopics:
         self.close()
         client = self._client()
         with self._changed:
-            self._add_pending_counts()
+            self._add_thread_counts()
             self._is_ready = self._closing = False
         self._connect(client)
         with self._changed:
@@ -154,7 +154,7 @@ class MqttTopics:
                               f'{self._settings.connect_timeout_s:g} s; is it an MQTT broker?')
 
     def _client(self) -> paho.Client:
-        """Create a client; raises DeviceError if a file cannot be read."""
+        """Create a client; raises DeviceError if a configured file cannot be read."""
         s = self._settings
         client = paho.Client(
             CallbackAPIVersion.VERSION2, s.client_id or f'mag_tracking_{secrets.token_hex(4)}',
@@ -260,19 +260,19 @@ class MqttTopics:
         arrival_ns = time.monotonic_ns()
         with self._changed:
             if message.dup:
-                self._pending_counts['messages with the dup flag'] += 1
+                self._thread_counts['messages with the dup flag'] += 1
             cause, topic = self._rejection_cause(message)
             if cause:
-                self._pending_counts[cause] += 1
+                self._thread_counts[cause] += 1
                 return
             if len(self._queue) == self._settings.queue:
                 self._queue.popleft()
-                self._pending_counts['messages dropped (queue full)'] += 1
+                self._thread_counts['messages dropped (queue full)'] += 1
             self._queue.append(Chunk(arrival_ns, bytes(message.payload), topic))
             self._changed.notify_all()
 
     def _rejection_cause(self, message: paho.MQTTMessage) -> tuple[str, str]:
-        """Return (cause of rejection, topic) of a message; the cause is empty if it is valid."""
+        """Return (cause of rejection, topic); the cause is empty for a valid message."""
         try:
             topic = message.topic
         except UnicodeDecodeError:
@@ -314,15 +314,15 @@ class MqttTopics:
             chunks = list(self._queue)
             self._queue.clear()
             # Only the reader's thread changes `counts`, which it may be iterating over.
-            self._add_pending_counts()
+            self._add_thread_counts()
             if not chunks and self._loss and not self._closing:
                 raise DeviceError(self._loss)
             return chunks
 
-    def _add_pending_counts(self) -> None:
-        """Add the pending counts to `counts`."""
-        self.counts += self._pending_counts
-        self._pending_counts.clear()
+    def _add_thread_counts(self) -> None:
+        """Add the counts of the network thread to `counts`."""
+        self.counts += self._thread_counts
+        self._thread_counts.clear()
 
     def close(self) -> None:
         """Disconnect and end the thread; a `read` in another thread returns."""

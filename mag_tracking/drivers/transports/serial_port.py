@@ -156,7 +156,7 @@ class SerialPort(Polled[serial.Serial]):
         return [Chunk(arrival_ns, data)] if data else []
 
     def _count_line_errors(self, before: tuple[int, ...], now: tuple[int, ...]) -> None:
-        """Count the errors that occurred between two readings of the kernel's counters."""
+        """Count the line errors between two states of the kernel's error counters."""
         for i, cause in LINE_ERRORS.items():
             if now[i] != before[i]:
                 self.counts[cause] += (now[i] - before[i]) % 2**32

@@ -4,9 +4,9 @@ The kernel measures the arrival time of a datagram (SO_TIMESTAMPNS), so the arri
 depend on when this process runs. The wall-clock time of the kernel is converted to the monotonic
 clock by the difference of the clocks. The difference is constant unless the wall clock is set,
 because fine adjustments by the system change the rate of both clocks. If the difference has changed
-since the queue was last empty, the wake-up time of the thread is used instead, and counted. For a
-few milliseconds after the first socket of the machine has requested timestamps, the kernel returns
-the time of the read access instead of the arrival time.
+since the queue was last empty, the wake-up time of the thread is used instead, and the datagram is
+counted. For a few milliseconds after the first socket of the machine has requested timestamps, the
+kernel returns the time of the read access instead of the arrival time.
 
 The number of datagrams dropped by the kernel because of a full buffer is read from the counter of
 the socket (SO_MEMINFO). SO_RXQ_OVFL is not used, because it is delivered with the next datagram and
@@ -38,7 +38,7 @@ CLOCK_SET_NS = 1_000_000
 SO_TIMESTAMPNS = getattr(socket, 'SO_TIMESTAMPNS', 35)
 SO_MEMINFO = 55
 MEMINFO = struct.Struct('9I')
-DROPS = 8
+DROPS_INDEX = 8
 TIMESPEC = struct.Struct('ll')
 Ancillary: TypeAlias = tuple[int, int, bytes]
 """Level, type and data of a control message received with a datagram."""
@@ -171,7 +171,7 @@ class UdpSocket(Polled[socket.socket]):
         opened.bind((s.group or s.address, s.port))
 
     def _socket_name(self) -> str:
-        """Local address and group, for messages."""
+        """Local address, port and group, for messages."""
         s = self._settings
         return f'{s.address}:{s.port}' + (f', group {s.group}' if s.group else '')
 
@@ -253,7 +253,10 @@ class UdpSocket(Polled[socket.socket]):
         return False
 
     def _arrival(self, ancillary: list[Ancillary], difference: int | None, woken_ns: int) -> int:
-        """Return the monotonic arrival time of a datagram [ns], or count and return `woken_ns`."""
+        """Return the monotonic arrival time of a datagram [ns] from the timestamp in `ancillary`.
+
+        If there is no timestamp or `difference` is None, count the datagram and return `woken_ns`.
+        """
         if difference is not None:
             for level, kind, data in ancillary:
                 if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):
@@ -266,7 +269,7 @@ class UdpSocket(Polled[socket.socket]):
     def _count_drops(self, opened: socket.socket) -> None:
         """Count the datagrams that the kernel has dropped since the previous call."""
         drops = MEMINFO.unpack(
-            opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size))[DROPS]
+            opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size))[DROPS_INDEX]
         if drops != self._drops:
             self.counts['datagrams dropped by the kernel'] += (drops - self._drops) % 2**32
             self._drops = drops

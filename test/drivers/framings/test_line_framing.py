@@ -71,12 +71,12 @@ def test_an_invalid_line_is_rejected_with_its_cause(line, cause):
     (b'A,,7,?,1,2,3', 'without ticks'),
     (b'A,nan,7,?,1,2,3', 'without ticks'),
     (b'A,inf,7,?,1,2,3', 'with an infinite number'),
-    (b'A,1,,?,1,2,3', 'with a sequence that is not an integer'),
-    (b'A,1,7.0,?,1,2,3', 'with a sequence that is not an integer'),
-    (b'A,1,1_0,?,1,2,3', 'with a sequence that is not an integer'),
-    (b'A,1,' + b'1' * 5000 + b',?,1,2,3', 'with a sequence that is not an integer'),
-    (b'A,1,18446744073709551616,?,1,2,3', 'with a sequence of more than 64 bits'),
-    (b'A,1,-9223372036854775809,?,1,2,3', 'with a sequence of more than 64 bits')])
+    (b'A,1,,?,1,2,3', 'with a sequence number that is not an integer'),
+    (b'A,1,7.0,?,1,2,3', 'with a sequence number that is not an integer'),
+    (b'A,1,1_0,?,1,2,3', 'with a sequence number that is not an integer'),
+    (b'A,1,' + b'1' * 5000 + b',?,1,2,3', 'with a sequence number that is not an integer'),
+    (b'A,1,18446744073709551616,?,1,2,3', 'with a sequence number of more than 64 bits'),
+    (b'A,1,-9223372036854775809,?,1,2,3', 'with a sequence number of more than 64 bits')])
 def test_a_missing_or_invalid_value_rejects_the_line(line, cause):
     parsed = text_framing(fields=ALL_FIELDS, max_length=6000).parse(line, final=True)
     assert parsed.rejected == {f'lines {cause}': 1} and not parsed.readings
@@ -188,7 +188,7 @@ def test_an_invalid_object_is_rejected_with_its_cause(line, cause):
     (b'"n": 7', b'"n": 7.5', 'whose n is not an integer'),
     (b'"n": 7', b'"n": NaN', 'whose n is not an integer'),
     (b'"n": 7', b'"n": -Infinity', 'whose n is not an integer'),
-    (b'"n": 7', b'"n": 1e30', 'with a sequence of more than 64 bits'),
+    (b'"n": 7', b'"n": 1e30', 'with a sequence number of more than 64 bits'),
     (b'"n": 7', b'"n": false', 'whose n is not a number'),
     (b'[1, 2]', b'[1]', 'without m.y.1'), (b'[1, 2]', b'{"0": 1}', 'without m.y.1'),
     (b'{"x"', b'{"q"', 'without m.x'), (b'{"x": 1, "y": [1, 2]}', b'"xy"', 'without m.x'),
