@@ -194,7 +194,7 @@ def archive(recordings: Iterable[str | PathLike[str]],
                         remaining, stopped or (lambda: False))
                     run.lost_workers = cluster.n_lost
         finally:
-            dataset.write_recordings([*dataset.known(), *(
+            dataset.write_recordings([*dataset.summaries(), *(
                 common_columns(path, None) | {'error': reason}
                 for path, reason in run.failed.items())])
     return run

@@ -8,7 +8,7 @@ from mag_tracking.apps.record import Selection
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.file import read_network
-from mag_tracking.network.topics import NAME
+from mag_tracking.network.topics import TOPIC_NAME_PATTERN
 
 _RECORD_HELP = '''
 Records the magnetic fields on the topics of the network, unchanged, until Ctrl-C. The
@@ -56,7 +56,7 @@ def _record(args: argparse.Namespace) -> int:
         if not (math.isfinite(value) and value >= minimum):
             raise SettingsError(f'{option}: expected {minimum:g} or more, got {value:g}')
     for topic in args.topics:
-        if not NAME.fullmatch(topic):
+        if not TOPIC_NAME_PATTERN.fullmatch(topic):
             raise SettingsError(f'--topics: {topic!r} is not a valid topic name')
     network = read_network(args.network)
     # Imported here because it needs ROS.

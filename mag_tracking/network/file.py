@@ -16,7 +16,7 @@ from mag_tracking.files import replace_text
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 from mag_tracking.network import CalibrationRecord, SensorNetwork
 from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
-from mag_tracking.network.topics import NAME
+from mag_tracking.network.topics import TOPIC_NAME_PATTERN
 from mag_tracking.yaml_file import is_text, read_yaml, short_repr
 
 _SENSOR_NAME_PATTERN = re.compile(r'[A-Za-z0-9_.-]+')
@@ -179,7 +179,7 @@ def _parse_rotation(label: str, q: FloatArray) -> FloatArray:
 
 def _check_topic(label: str, key: str, topic: object) -> str:
     """Return `topic` if it is a valid topic name; raise NetworkError otherwise."""
-    if not isinstance(topic, str) or not NAME.fullmatch(topic):
+    if not isinstance(topic, str) or not TOPIC_NAME_PATTERN.fullmatch(topic):
         raise NetworkError(f'{label}: {key}: {short_repr(topic)} is not a valid ROS topic: use '
                            'letters, digits and _; no part may begin with a digit')
     return topic

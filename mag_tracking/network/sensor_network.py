@@ -84,8 +84,8 @@ class SensorNetwork:
         duplicates = sorted({name for name in self.names if self.names.count(name) > 1})
         if duplicates:
             raise NetworkError(f'duplicate sensor name {duplicates[0]}; names must be unique')
-        names = [absolute(t) for t in self.topics]
-        duplicate_topics = sorted({t for t in names if names.count(t) > 1})
+        topics = [absolute(t) for t in self.topics]
+        duplicate_topics = sorted({t for t in topics if topics.count(t) > 1})
         if duplicate_topics:
             raise NetworkError(f'topic {duplicate_topics[0]} is assigned to more than one sensor')
         if self.positions.shape != (n, 3) or self.R_ws.shape != (n, 3, 3):
@@ -108,7 +108,7 @@ class SensorNetwork:
 
     @property
     def absolute_topics(self) -> tuple[str, ...]:
-        """Absolute topic of each sensor; relative names are resolved in `namespace`, or in /."""
+        """Absolute topic of each sensor, resolved in `namespace`, or in / if it is None."""
         return tuple(absolute(topic, self.namespace or '/') for topic in self.topics)
 
     @property
@@ -132,7 +132,7 @@ class SensorNetwork:
     def is_compact(self) -> bool:
         """Whether the horizontal extent of the network is less than `MAX_COMPACT_EXTENT`.
 
-        The model errors of a vehicle are almost equal at all sensors of a compact network. Such a
+        In a compact network, the errors of a vehicle model are almost equal at all sensors. Such a
         network determines range and moment hardly better than a single sensor.
         """
         return bool(np.hypot(*np.ptp(self.positions[:, :2], axis=0)) < MAX_COMPACT_EXTENT)
@@ -157,12 +157,12 @@ class SensorNetwork:
                        clock_offset=self.clock_offset[rows], **per_sensor)
 
     def with_nominal_orientations(self) -> 'SensorNetwork':
-        """Copy the network with the orientations that were entered by hand.
+        """Copy the network with the orientations and uncertainties that were entered by hand.
 
         Returns
         -------
         SensorNetwork
-            Sensors without a recorded orientation are unchanged.
+            Sensors without a record of such an orientation are unchanged.
         """
         R_ws, std = self.R_ws.copy(), list(self.orientation_std)
         for j, record in enumerate(self.calibrated):

@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterable
 
 from mag_tracking.errors import NetworkError
 
-NAME = re.compile(r'/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
+TOPIC_NAME_PATTERN = re.compile(r'/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 """Pattern of a valid relative or absolute topic name."""
 _NAMESPACE_PATTERN = re.compile(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+')
 

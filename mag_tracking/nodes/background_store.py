@@ -26,7 +26,7 @@ class BackgroundStore:
     Parameters
     ----------
     path : Path or None
-        File to write; None disables storage.
+        File of the backgrounds; None disables storage.
     stage : Calibrate
         Calibration stage.
     settings : CalibrateSettings
@@ -42,7 +42,7 @@ class BackgroundStore:
         self._next_write = 0.0
 
     def restore(self, network: SensorNetwork) -> None:
-        """Pass the stored backgrounds to the stage; each is restored at its sensor's first reading.
+        """Pass the stored backgrounds to the stage, to be used from each sensor's first reading.
 
         Outdated backgrounds are not restored; invalid backgrounds are logged.
 
@@ -67,7 +67,7 @@ class BackgroundStore:
                 'the backgrounds again')
 
     def update(self, network: SensorNetwork, j: int) -> None:
-        """Update the entry of a sensor; remove the entry if the background is unknown or doubtful.
+        """Update the stored background of a sensor; remove it if it is unknown or doubtful.
 
         The file is not written until the next `write_if_due`.
 
@@ -85,7 +85,7 @@ class BackgroundStore:
             self._entries[name] = background_text(background, network, j, self._settings)
 
     def write_if_due(self, is_live: bool) -> None:
-        """Write the file if the interval has elapsed or a sensor has a new entry; log a failure.
+        """Write the file if the interval has elapsed or the file lacks a sensor; log a failure.
 
         Parameters
         ----------
@@ -93,8 +93,8 @@ class BackgroundStore:
             Whether the readings are live. During a replay, nothing is written.
         """
         now = time.monotonic()
-        is_new = not self._entries.keys() <= self._written_sensors
-        if self._path is None or not is_live or now < self._next_write and not is_new:
+        has_new_sensor = not self._entries.keys() <= self._written_sensors
+        if self._path is None or not is_live or now < self._next_write and not has_new_sensor:
             return
         self._next_write = now + min(WRITE_INTERVAL_S, self._settings.max_resume_gap_s / 4.0)
         try:

@@ -146,7 +146,7 @@ class CalibrationNode(StageNode):
         return path
 
     def _output_path(self, parameter: str, name: str) -> Path:
-        """Return the path of an output file; raise SettingsError if the path is not allowed."""
+        """Resolve `name` in the network file's folder; raise SettingsError if it is disallowed."""
         prefix = f'calibration_node: parameter {parameter}: '
         network_folder, state_root = self.network_path.parent, state_folder().resolve()
         path = checked_path(network_folder / name, SettingsError)
@@ -233,7 +233,7 @@ class CalibrationNode(StageNode):
         self._deferred.request()
 
     def _calibrate_readings(self, raw: Readings) -> list[Readings]:
-        """Calibrate readings, return the result, and pass it to the `next_steps`, if any."""
+        """Calibrate readings; pass the result and the doubtful intervals to any `next_steps`."""
         calibrated = self._stage.feed(raw)
         if self._next_steps is not None:
             detection, tracker = self._next_steps
@@ -243,7 +243,10 @@ class CalibrationNode(StageNode):
         return calibrated
 
     def _do_deferred_work(self) -> None:
-        """Run deferred work, health checks and any due step of the round; report changed doubts."""
+        """Run the deferred work of the stages, the health checks and a due step of the rounds.
+
+        Also report changed doubts about backgrounds.
+        """
         self._stage.idle()
         if self._next_steps is not None:
             self._next_steps[1].idle()

@@ -55,7 +55,7 @@ def to_message(cls: Any, content: Mapping[str, Any]) -> Any:
     Raises
     ------
     AttributeError
-        If the message does not have a field of `content`.
+        If `content` has a field that the message does not have.
     """
     message = cls()
     for name, value in content.items():

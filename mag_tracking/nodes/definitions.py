@@ -35,9 +35,9 @@ def definition_of(type_name: str) -> str | None:
             return None
         package, _, leaf = name.split('/')
         schema += content if not schema else f'{"=" * 80}\nMSG: {package}/{leaf}\n{content}'
-        new = [t for t in referenced_types(content, package) if t not in known]
-        known += new
-        queue += new
+        new_types = [t for t in referenced_types(content, package) if t not in known]
+        known += new_types
+        queue += new_types
     return schema
 
 

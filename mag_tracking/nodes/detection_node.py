@@ -82,7 +82,7 @@ class DetectionNode(StageNode):
         self.report_state()
 
     def _subscribe(self) -> None:
-        """Subscribe to the calibrated fields and monitor the tracker."""
+        """Subscribe to the calibrated fields; monitor whether a tracker receives the frames."""
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self.subscription(MagneticField, f'{topic}_calibrated', partial(self._receive, sensor),
                               STREAM_QOS, source='calibration')
@@ -123,7 +123,7 @@ class DetectionNode(StageNode):
             self._feed(readings)
 
     def _feed(self, readings: Readings) -> None:
-        """Add calibrated readings; publish the completed frames and events."""
+        """Add calibrated readings; publish completed frames with their detections, and events."""
         frames = self._align.feed(readings)
         self._publish(frames)
         if self._events is not None:
@@ -153,7 +153,10 @@ class DetectionNode(StageNode):
                     self._publish_pending_frame()
 
     def _publish_pending_frame(self) -> None:
-        """Publish the pending frame once, after its pose, if the frame topic has subscribers."""
+        """Publish the pending frame, if there is one and its topic has subscribers.
+
+        Called when the tracker has published a pose or has processed the frame.
+        """
         frame, self._pending_frame = self._pending_frame, None
         if frame is not None and has_subscribers(self._frame_publisher):
             self._publish_frame(frame)

@@ -56,7 +56,7 @@ class DoctorNode(Node):
         self.doctor.feed(reading_of(message, sensor), time.time_ns())
 
     def _receive_batch(self, message: FieldReadings) -> None:
-        """Pass the readings of sensors of the network to the doctor; count invalid messages."""
+        """Pass the readings of the network's sensors to the doctor; count invalid messages."""
         try:
             readings = readings_of(message)
         except RecordingError as error:
@@ -68,7 +68,7 @@ class DoctorNode(Node):
         self.doctor.feed(readings, time.time_ns())
 
     def findings(self) -> list[Finding]:
-        """Faults of publishers in the ROS graph and of message contents.
+        """Faults found in the ROS graph and in the contents of messages.
 
         Returns
         -------

@@ -186,7 +186,7 @@ class DriverNode(ManagedNode):
                 self.create_publisher(Imu, imu_topic, PUBLISHER_QOS))
 
     def _publish(self, readings: Readings, accelerations: list[AccelerationSample]) -> None:
-        """Publish each reading on its sensor topic, or all in one message if `batches` is set."""
+        """Publish readings, in one message if `batches` is set, and accelerations."""
         if self._readings_publisher is None:
             for sensor, content in magnetic_field_dicts(readings):
                 self._publishers_by_sensor[sensor][0].publish(to_message(MagneticField, content))
@@ -197,7 +197,7 @@ class DriverNode(ManagedNode):
                 to_message(Imu, acceleration_dict(acceleration, acceleration.sensor)))
 
     def _stop(self) -> None:
-        """Stop the threads, which close their devices."""
+        """Stop the threads and wait, at most `STOP_TIMEOUT_S`, until their devices are closed."""
         if self._stop_event is not None:
             self._stop_event.set()
         end = time.monotonic() + STOP_TIMEOUT_S

@@ -180,12 +180,12 @@ class SubscriberMonitor:
         """
         self._known_nodes |= {name for name in set(names) - self._known_nodes
                               if self._publishes in types_of(name)}
-        missing = sorted(self._known_nodes - set(names))
-        is_gone = bool(missing) and not self._known_nodes.intersection(names)
+        missing_nodes = sorted(self._known_nodes - set(names))
+        is_gone = bool(missing_nodes) and not self._known_nodes.intersection(names)
         message = 'running' if self._known_nodes else \
             f'no {self.role} node has subscribed to {self.topic} yet'
         return DiagnosticStatus(
             level=DiagnosticStatus.ERROR if is_gone else DiagnosticStatus.OK,
             name=f'{node}: to {self.role}', hardware_id='magnetometer network',
-            message=f'{", ".join(missing)} has disappeared: check that it is running'
+            message=f'{", ".join(missing_nodes)} has disappeared: check that it is running'
             if is_gone else message)

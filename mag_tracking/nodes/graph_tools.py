@@ -345,8 +345,14 @@ def lifecycle_state(graph: Observer, node: str) -> tuple[str, list[str]]:
     Returns
     -------
     state : str
+        Label of the state.
     transitions : list of str
-        Transitions that are currently possible.
+        Labels of the transitions that are currently possible.
+
+    Raises
+    ------
+    GraphError
+        If the node does not exist or is not a lifecycle node.
     """
     state = graph.call(GetState, f'{node}/get_state', GetState.Request()).current_state.label
     possible = graph.call(GetAvailableTransitions, f'{node}/get_available_transitions',
@@ -362,11 +368,12 @@ def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
     graph : Observer
     node : str
     transition : str
+        Label of the transition.
 
     Raises
     ------
     GraphError
-        If the transition is not possible or fails.
+        If the node does not exist, or the transition is not possible or fails.
     """
     possible = graph.call(GetAvailableTransitions, f'{node}/get_available_transitions',
                           GetAvailableTransitions.Request()).available_transitions

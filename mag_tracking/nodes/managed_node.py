@@ -29,7 +29,7 @@ class ManagedNode(LifecycleNode):
         Raises
         ------
         MagTrackingError
-            If the settings are invalid.
+            If `prepare` fails.
         """
         if not fixed_parameter(self, 'autostart', True,
                                'Configure and activate the node at startup.'):

@@ -1,4 +1,4 @@
-"""Services that respond to many simultaneous calls."""
+"""Services that lose no responses when many calls arrive simultaneously."""
 
 from collections import deque
 from collections.abc import Callable

@@ -93,20 +93,20 @@ class PageNode(Node):
         steady_timer(self, UPDATE_INTERVAL_S, self._tick)
         steady_timer(self, 1.0, self._update_health)
 
-    def _subscribe_to_tracker(self, tracks: str) -> None:
-        """Subscribe to the topics of the tracker that publishes `tracks`."""
+    def _subscribe_to_tracker(self, tracks_topic: str) -> None:
+        """Subscribe to the tracker that publishes `tracks_topic`, instead of any previous one."""
         for subscription in self._tracker_subscriptions:
             self.destroy_subscription(subscription)
-        self._tracks_topic, base = tracks, tracks.rpartition('/')[0]
+        self._tracks_topic, base = tracks_topic, tracks_topic.rpartition('/')[0]
         self._tracker_subscriptions = [
             self.create_subscription(MarkerArray, f'{base}/sensor_markers', self._receive_sensors,
                                      LATCHED_QOS),
-            self.create_subscription(TrackArray, tracks, self._receive_tracks, STREAM_QOS),
+            self.create_subscription(TrackArray, tracks_topic, self._receive_tracks, STREAM_QOS),
             self.create_subscription(SmoothedTrack, f'{base}/smoothed', self._receive_smoothed,
                                      RESULT_QOS)]
 
     def _find_tracker(self) -> list[str]:
-        """Return all track topics in the namespace; if there is only one, follow its tracker."""
+        """Return the published track topics in the namespace; subscribe if there is only one."""
         namespace = self.get_namespace().rstrip('/')
         topics = [name for name, kinds in self.get_topic_names_and_types()
                   if TRACKS_TYPE in kinds and name.startswith(f'{namespace}/')
@@ -153,7 +153,7 @@ class PageNode(Node):
                                if self._is_in_namespace(s.name)})
 
     def _is_in_namespace(self, status: str) -> bool:
-        """Whether a diagnostic status belongs to a node of this namespace."""
+        """Whether the node of the status named `status` is in the namespace of this node."""
         namespace = status.partition(':')[0].rpartition('/')[0]
         return namespace == self.get_namespace().strip('/')
 
@@ -161,11 +161,11 @@ class PageNode(Node):
         """Add received tracks and frames to the scene; without tracks, only the latest frame."""
         if not len(self._layout):
             return
-        raw = list(self._frames)
+        serialised_frames = list(self._frames)
         self._frames.clear()
         if not self._tracks:
-            raw = raw[-1:]
-        for data in raw:
+            serialised_frames = serialised_frames[-1:]
+        for data in serialised_frames:
             try:
                 self._scene.add_frame(
                     frame_of(deserialize_message(data, NetworkFrame), self._layout))
@@ -192,7 +192,7 @@ class PageNode(Node):
                                [Table('Health', ['node', 'level', 'message'], rows)])
 
     def _missing_topics(self) -> Iterator[Note]:
-        """Yield notes on missing topics or sensor positions, and on several trackers."""
+        """Yield notes if a topic, the sensor positions or the selection of a tracker is missing."""
         topics = self._find_tracker()
         if len(topics) > 1 and self._tracks_topic not in topics:
             yield Note(WARNING, f'several trackers: {", ".join(topics)}; select one (--ros-args -r '

@@ -73,7 +73,10 @@ class _PolledSubscription:
         return out
 
     def _count_lost(self, number: int | None) -> None:
-        """Count the messages lost before sequence number `number`, if there is one publisher."""
+        """Count the messages lost before sequence number `number`.
+
+        Nothing is counted if the topic has several publishers.
+        """
         if number is None or len(self.publishers) > 1:
             self.last_number = None
             return
@@ -129,8 +132,8 @@ class RecordNode(Node):
     @property
     def lost(self) -> 'Counter[str]':
         """Numbers of lost messages by topic; topics without losses are omitted."""
-        now = Counter({topic: s.n_lost for topic, s in self._polled_subscriptions.items()})
-        return +(now + self._n_lost_before)
+        current = Counter({topic: s.n_lost for topic, s in self._polled_subscriptions.items()})
+        return +(current + self._n_lost_before)
 
     @property
     def refused(self) -> dict[str, str]:
@@ -192,7 +195,10 @@ class RecordNode(Node):
         self._report(f'{topic} is not recorded: {reason}')
 
     def _update_publishers(self, topic: str, infos: list[TopicEndpointInfo]) -> None:
-        """Update a topic's publishers; resubscribe as volatile if one of them is not latched."""
+        """Update a topic's publishers; report other message types; resubscribe if necessary.
+
+        A latched subscription is replaced by a volatile one if a publisher is not latched.
+        """
         polled = self._polled_subscriptions[topic]
         other_types = sorted({i.topic_type for i in infos} - {polled.type})
         if other_types and f'{topic} as {other_types[0]}' not in self._refused:
@@ -290,7 +296,7 @@ def run(selection: Selection, out: Path, split_bytes: int = 10**9,
 
 
 def _record(node: RecordNode, stopped: Callable[[], bool]) -> None:
-    """Poll the node and show the progress until `stopped()`."""
+    """Record messages, discover topics and show the progress until `stopped()`."""
     start = time.monotonic()
     next_discovery, next_line, topic_counts = start, start + PROGRESS_INTERVAL_S, None
     bar = tqdm(unit=' messages', unit_scale=True, disable=None)

@@ -115,9 +115,9 @@ class ReplayNode(ManagedNode):
         recording = Recording(self._path)
         self._begin_ns = _first_time_ns(recording)
         self._selected_topics = _selected_topics(recording, self._topics)
-        end = recording.end_ns
+        end_ns = recording.end_ns
         if not self._start_offset_s >= 0.0 or (
-                end is not None and self._begin_ns + self._start_offset_s * 1e9 > end):
+                end_ns is not None and self._begin_ns + self._start_offset_s * 1e9 > end_ns):
             raise SettingsError(f'replay_node: parameter start_offset: {self._start_offset_s} s '
                                 'is outside the recording')
         self._recording = recording
@@ -210,7 +210,7 @@ class ReplayNode(ManagedNode):
         return self.publishers_by_topic.get(topic)
 
     def _within_namespace(self, topic: str) -> str:
-        """Return the name of a recorded topic in the namespace of this node."""
+        """Prefix a recorded topic with the namespace of this node, unless it has this prefix."""
         namespace = self.get_namespace().rstrip('/')
         return topic if topic.startswith(f'{namespace}/') else f'{namespace}{topic}'
 
@@ -254,7 +254,7 @@ class ReplayNode(ManagedNode):
             self._end()
 
     def _has_subscribers(self, now: float) -> bool:
-        """Whether every magnetic field topic has a subscriber, or the timeout has expired."""
+        """Whether each magnetic field topic has a subscriber, or `wait_for_subscribers` elapsed."""
         recording = self._recording
         if recording is not None and now < self._start_time + self._subscriber_timeout_s:
             return all(p.get_subscription_count() for topic, p in self.publishers_by_topic.items()
@@ -296,9 +296,9 @@ class ReplayNode(ManagedNode):
             response.success, response.message = \
                 False, 'no recording is open: configure the node first'
             return response
-        last = self._recording.end_ns
+        end_ns = self._recording.end_ns
         if not request.offset >= 0.0 or (
-                last is not None and self._begin_ns + request.offset * 1e9 > last):
+                end_ns is not None and self._begin_ns + request.offset * 1e9 > end_ns):
             response.success = False
             response.message = f'offset: {request.offset} s is outside the recording'
             return response
@@ -322,10 +322,10 @@ def _first_time_ns(recording: Recording) -> int:
 def _selected_topics(recording: Recording, topics: Sequence[str]) -> set[str] | None:
     """Return the topics to play, None for all; raise RecordingError for an unknown topic."""
     selected = [t for t in topics if t]
-    unknown = [t for t in selected if t not in recording.types]
-    if unknown and recording.message_counts:
-        raise RecordingError(f'{recording.path} does not contain topic {unknown[0]}; it contains '
-                             f'{", ".join(sorted(recording.types))}')
+    unknown_topics = [t for t in selected if t not in recording.types]
+    if unknown_topics and recording.message_counts:
+        raise RecordingError(f'{recording.path} does not contain topic {unknown_topics[0]}; '
+                             f'it contains {", ".join(sorted(recording.types))}')
     return set(selected) or None
 
 

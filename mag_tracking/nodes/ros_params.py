@@ -97,7 +97,7 @@ def declare_settings(node: Node, settings: Settings, group: str) -> Settings:
 
 
 def _without_array(value: Any) -> Any:
-    """Value of a parameter; an array is converted to a list."""
+    """Return the value of a parameter; arrays and tuples are converted to lists."""
     return list(value) if hasattr(value, '__iter__') and not isinstance(value, str) else value
 
 

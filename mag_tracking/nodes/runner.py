@@ -54,7 +54,7 @@ class TrackPrinter(Node):
         self.create_subscription(TrackArray, topic, self._receive, STREAM_QOS)
 
     def _receive(self, message: TrackArray) -> None:
-        """Print the pose of each track, or its end."""
+        """Print the pose of each track, or that the track has ended."""
         for track in map(track_of, message.tracks):
             line = f'track {track.id} has ended' if track.ended else pose_line(track)
             print(line, file=self._out, flush=True)
@@ -148,7 +148,9 @@ def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike |
     Returns
     -------
     stages : list of StageNode
+        Calibration, detection and tracker nodes.
     replay : ReplayNode or None
+        None without a recording.
     """
     overrides = parameters(network_path, settings, reliable=recording is not None)
     tracker = TrackerNode(has_direct_input=True, parameter_overrides=overrides)
@@ -176,9 +178,9 @@ def all_connected(stages: list[StageNode], replay: ReplayNode) -> bool:
     -------
     bool
     """
-    raw = [p for p in replay.publishers_by_topic.values()
-           if p.topic_name in stages[0].sensor_topics]
-    return all(p.get_subscription_count() > 0 for p in raw)
+    sensor_publishers = [p for p in replay.publishers_by_topic.values()
+                         if p.topic_name in stages[0].sensor_topics]
+    return all(p.get_subscription_count() > 0 for p in sensor_publishers)
 
 
 def run(network_path: PathLike, settings: Settings, recording: PathLike | None = None,
@@ -270,9 +272,10 @@ def _check_topics(node: StageNode, replay: ReplayNode) -> None:
     played = {p.topic_name for p in replay.publishers_by_topic.values()}
     if played & {*node.sensor_topics, node.resolve_topic_name(RAW_READINGS)}:
         return
-    found = namespaces_of((*node.network.topics, RAW_READINGS), list(replay.publishers_by_topic))
-    hint = f'; start the nodes in its namespace: --ros-args -r __ns:={found[0]}' \
-        if found and found != ['/'] else ''
+    namespaces = namespaces_of((*node.network.topics, RAW_READINGS),
+                               list(replay.publishers_by_topic))
+    hint = f'; start the nodes in its namespace: --ros-args -r __ns:={namespaces[0]}' \
+        if namespaces and namespaces != ['/'] else ''
     raise MagTrackingError(f'the recording contains none of the topics '
                            f'{", ".join(node.sensor_topics)}{hint}')
 

@@ -81,13 +81,13 @@ def no_message_finding(node: Node, sensor: str, topic: str, known: Mapping[str, 
         return Finding(True, sensor, f'no message received on {topic}, although it has a '
                        'publisher', 'check the sensor and its driver')
     namespace = node.get_namespace().rstrip('/')
-    others = sorted((name for name, kinds in node.get_topic_names_and_types()
-                     if MAGNETIC_FIELD in kinds and name not in known.values()
-                     and not name.endswith('_calibrated') and node.count_publishers(name)),
-                    key=lambda name: (not name.startswith(f'{namespace}/'), name))
+    other_topics = sorted((name for name, kinds in node.get_topic_names_and_types()
+                           if MAGNETIC_FIELD in kinds and name not in known.values()
+                           and not name.endswith('_calibrated') and node.count_publishers(name)),
+                          key=lambda name: (not name.startswith(f'{namespace}/'), name))
     advice = 'start its driver, or remap its topic'
-    if others:
-        advice += f'; magnetic fields are published on {shortened(others)}'
+    if other_topics:
+        advice += f'; magnetic fields are published on {shortened(other_topics)}'
     return Finding(True, sensor, f'no message received: {topic} has no publisher', advice)
 
 
@@ -102,5 +102,5 @@ def shortened(names: list[str]) -> str:
     -------
     str
     """
-    more = len(names) - MAX_NAMED
-    return ', '.join(names[:MAX_NAMED]) + (f' and {more} more' if more > 0 else '')
+    n_more = len(names) - MAX_NAMED
+    return ', '.join(names[:MAX_NAMED]) + (f' and {n_more} more' if n_more > 0 else '')

@@ -190,8 +190,8 @@ class HealthDiagnostics:
         timeout_s = 5.0 + LEARNING_TIMEOUT_FACTOR * self._settings.calibrate.learn_s
         if calibrate.backgrounds()[name].ready:
             self._unready_since.pop(name, None)
-        since = self._unready_since.setdefault(name, time.monotonic())
-        if calibrate.backgrounds()[name].ready or time.monotonic() - since > timeout_s:
+        unready_since = self._unready_since.setdefault(name, time.monotonic())
+        if calibrate.backgrounds()[name].ready or time.monotonic() - unready_since > timeout_s:
             findings.update({f.fault: f for f in background_findings(
                 name, calibrate, self._frozen_since_ns.get(name), self._relearnt_counts[0][name])})
         findings.update({f.fault: f for f in covariance_findings(

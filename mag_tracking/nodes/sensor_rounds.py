@@ -59,7 +59,7 @@ class SensorRounds:
         self._states = [self._state(j) for j in range(len(network))]
 
     def tick(self) -> None:
-        """Mark the next step as due after the next readings; first run a step that is still due."""
+        """Make the next step due after the next readings; if a step is still due, run it first."""
         if self._is_step_due:
             self._step()
         self._is_step_due = True
@@ -72,16 +72,16 @@ class SensorRounds:
     def report_doubts(self) -> None:
         """Publish the calibration immediately if a background becomes or ceases to be doubtful.
 
-        The tracker flags tracks as ambiguous only after it has received this message.
+        The tracker flags tracks as ambiguous only after it has received the new calibration.
         """
         backgrounds = self._stage.backgrounds()
-        latest = {(j, times[-1]) for j, name in enumerate(self._network.names)
-                  if (times := backgrounds[name].doubtful_times)}
-        if changed := latest - self._reported_doubts:
+        latest_doubts = {(j, times[-1]) for j, name in enumerate(self._network.names)
+                         if (times := backgrounds[name].doubtful_times)}
+        if changed := latest_doubts - self._reported_doubts:
             for j, _ in changed:
                 self._states[j] = self._state(j)
             self.publish()
-        self._reported_doubts = latest
+        self._reported_doubts = latest_doubts
 
     def _step(self) -> None:
         """Run the next step of the round."""
@@ -97,7 +97,7 @@ class SensorRounds:
         return to_message(SensorCalibration, sensor_dict(self._stage, self._network, j))
 
     def _rounds(self) -> Iterator[None]:
-        """Run endless rounds; yield after each step: compare, update, report, publish, store."""
+        """Run endless rounds over the sensors; yield after each step."""
         while True:
             self._health.begin_round(self._stage)
             yield

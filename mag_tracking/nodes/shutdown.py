@@ -25,7 +25,7 @@ def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: i
 
     Workaround: Fast DDS 2.14 blocks forever, while it holds the interpreter lock, if a participant
     is destroyed while another one leaves (eProsima/Fast-DDS 6513). This happened to 1 of 1165 nodes
-    when five were signalled at once. The deadline can be removed once Fast DDS is fixed.
+    when five nodes were signalled at once. The deadline can be removed once Fast DDS is fixed.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: i
 def limit_exit_time(status: int) -> None:
     """Limit the time until the process ends, with the same timeout as `shut_down`.
 
-    A node whose constructor raised is destroyed together with the interpreter, which may also hang.
+    If the constructor of a node fails, the node is destroyed with the interpreter, which may hang.
 
     Parameters
     ----------

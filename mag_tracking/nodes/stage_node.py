@@ -248,7 +248,7 @@ class StageNode(Node):
 
     def direct_input(self, source: str, topics: Sequence[str], callback: Callable[[_Record], None],
                      stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
-        """Create a function that receives the records of the preceding step in place of a topic.
+        """Create a function that receives records of the preceding step without a topic.
 
         Parameters
         ----------
@@ -299,7 +299,7 @@ class StageNode(Node):
             return None
 
     def _publish_diagnostics(self) -> None:
-        """Publish the counts of the stages and the state of the connections; log a new state."""
+        """Publish the state of the stages and connections; log the node's state if it changed."""
         statuses, queues = [], self.queues()
         for name, stage in self.stages().items():
             rejections = {k: n for k, n in stage.counts.items() if k.startswith('rejected: ')}
@@ -343,13 +343,13 @@ class StageNode(Node):
         """Return the message types that a node publishes; empty if it has not been discovered."""
         namespace, _, leaf = name.rpartition('/')
         try:
-            found = self.get_publisher_names_and_types_by_node(leaf, namespace or '/')
+            topics = self.get_publisher_names_and_types_by_node(leaf, namespace or '/')
         except NodeNameNonExistentError:
             return set()
-        return {kind for _, kinds in found for kind in kinds}
+        return {kind for _, kinds in topics for kind in kinds}
 
     def _has_publisher(self, flow: Flow) -> bool:
-        """Whether the topics of a flow still have a publisher."""
+        """Whether any topic of a flow still has a publisher."""
         return any(map(self.count_publishers, (*flow.topics, *flow.batches)))
 
     def publish_statuses(self, statuses: list[DiagnosticStatus]) -> None:
@@ -459,7 +459,7 @@ def main(node_class: Callable[[], Node], arguments: list[str] | None = None) -> 
 
 def _run_until(signals: list[int], node_class: Callable[[], Node],
                arguments: list[str] | None) -> int:
-    """Run a node until `signals` contains a received signal."""
+    """Run a node until `signals` contains a received signal; return the exit status."""
     try:
         init_ros(arguments)
     except SettingsError as error:

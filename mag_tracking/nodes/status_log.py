@@ -1,4 +1,7 @@
-"""Log of diagnostics: faults are logged when they begin and end; errors are repeated meanwhile."""
+"""Log of diagnostics: each fault is logged when it begins and when it ends.
+
+Lasting errors are repeated at intervals.
+"""
 
 import re
 import time
@@ -78,7 +81,7 @@ class StatusLog:
         self._log(DiagnosticStatus.OK, text)
 
     def _log(self, level: bytes, text: str) -> None:
-        """Log a line unless `MAX_SIMILAR_LINES` similar lines were logged in this interval."""
+        """Log a line unless the current interval already has `MAX_SIMILAR_LINES` similar lines."""
         now, pattern = time.monotonic(), _NUMBER.sub('#', text)
         if now - self._interval_start > REPEAT_INTERVAL_S or len(self._similar) >= MAX_FAULTS:
             self._similar.clear()

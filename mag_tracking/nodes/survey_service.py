@@ -40,7 +40,7 @@ class SurveyService:
 
     def solve(self, network: SensorNetwork, save: bool,
               response: SurveyMessage.Response) -> SensorNetwork | None:
-        """Solve a survey, and save the result if requested, unless a survey has just ended.
+        """Solve a survey and save the result if requested; fail if a survey has just ended.
 
         Parameters
         ----------

@@ -87,7 +87,8 @@ class TrackerNode(StageNode):
     Attributes
     ----------
     after_pose : function or None
-        Publishes the frame of a pose; called between the publication of the pose and of the track.
+        Publishes the frame from which a pose was computed; called after the pose and before the
+        track are published.
     """
 
     def __init__(self, has_direct_input: bool = False, **node_arguments: Any) -> None:
@@ -199,7 +200,7 @@ class TrackerNode(StageNode):
         self._stage.set_doubtful_times(times)
 
     def idle(self) -> None:
-        """Run the deferred work of the stage; called after the preceding step has published."""
+        """Run the deferred work of the stage; called by a calibration node in the same process."""
         self._stage.idle()
 
     def _feed(self, frame: FieldFrame) -> None:
@@ -209,8 +210,8 @@ class TrackerNode(StageNode):
             self.get_logger().warning(self._stage.clock_warning, throttle_duration_sec=60.0)
 
     def _publish_all(self, records: list[TrackRecord], frame: FieldFrame | None) -> None:
-        """Publish the records of a frame on their topics."""
-        complete = []
+        """Publish the records that result from `frame`, which is None if frames do not arrive."""
+        complete_poses = []
         for record in records:
             if isinstance(record, Disturbance):
                 self._disturbance_publisher.publish(to_message(
@@ -218,13 +219,13 @@ class TrackerNode(StageNode):
             elif not isinstance(record, SmoothedPose):
                 self._publish(record)
             elif record.complete:
-                complete.append(record)
+                complete_poses.append(record)
             # The message has no flag for ambiguity, and other hypotheses are not smoothed.
             elif not record.ambiguous or self.settings.track.ambiguous_poses == BEST:
                 self._smoothed_pose_publisher.publish(to_message(
                     PoseWithCovarianceStamped, smoothed_pose_dict(record, self.network.frame)))
-        for id in dict.fromkeys(pose.id for pose in complete):
-            poses = [pose for pose in complete if pose.id == id]
+        for id in dict.fromkeys(pose.id for pose in complete_poses):
+            poses = [pose for pose in complete_poses if pose.id == id]
             self._smoothed_publisher.publish(to_message(
                 SmoothedTrack, smoothed_track_dict(poses, self.network.frame)))
             self._smoothed_path_publisher.publish(self._path_of(poses))
@@ -232,9 +233,9 @@ class TrackerNode(StageNode):
 
     def _path_of(self, poses: list[SmoothedPose]) -> Path:
         """nav_msgs/Path of smoothed poses, with the header of the latest pose."""
-        steps = [to_message(PoseStamped, pose_dict(p.stamp_ns, self.network.frame, p.position,
-                                                   p.orientation)) for p in poses]
-        return Path(header=steps[-1].header, poses=steps)
+        messages = [to_message(PoseStamped, pose_dict(
+            p.stamp_ns, self.network.frame, p.position, p.orientation)) for p in poses]
+        return Path(header=messages[-1].header, poses=messages)
 
     def _publish(self, track: Track) -> None:
         """Publish one record of a track, or the end of the track, on all topics."""

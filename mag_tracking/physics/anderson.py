@@ -57,7 +57,7 @@ def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatA
     Returns
     -------
     t_cpa : float, s
-        Time of the CPA, from time zero.
+        Time of the CPA, relative to time zero.
     distance : float, m
         Range at the CPA. Zero if r0 is parallel to v0; a range below 1e-15 ‖r0‖ is rounded to zero.
     r_cpa : (3,) array, m
@@ -108,8 +108,8 @@ def anderson_coefficients(r_cpa: ArrayLike, v0: ArrayLike, m: ArrayLike) -> Floa
     Raises
     ------
     ValueError
-        If `v0` is zero or not finite, if the cosine between `r_cpa` and `v0` exceeds 1e-6, or if a
-        shape is not (3,).
+        If `v0` is zero or not finite, if the magnitude of the cosine between `r_cpa` and `v0`
+        exceeds 1e-6, or if a shape is not (3,).
 
     Notes
     -----
@@ -185,7 +185,7 @@ def anderson_residual(t: FloatArray, y: FloatArray, time: float, scale: float) -
     time : float, s
         Time of the closest point of approach (CPA).
     scale : float, s
-        Range at the CPA over the speed.
+        Range at the CPA divided by the speed.
 
     Returns
     -------

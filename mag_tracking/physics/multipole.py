@@ -27,7 +27,7 @@ from mag_tracking.physics import core
 
 def _field_and_jacobians(r: ArrayLike,
                          moments: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Field of broadcast arguments, and its Jacobians with respect to position and moments."""
+    """Field and its Jacobians with respect to `r` and `moments`, which are broadcast."""
     r, moments = np.asarray(r, dtype=float), np.asarray(moments, dtype=float)
     if r.shape[-1:] != (3,):
         raise ValueError(f'r requires a last axis of length 3, got shape {r.shape}')

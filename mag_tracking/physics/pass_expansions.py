@@ -107,7 +107,7 @@ class AndersonPass:
     """Names of the path parameters."""
 
     def _design_matrix(self, f: FloatArray) -> FloatArray:
-        """Whitened design matrix (n_paths, 3 n, 9) from functions of time (n_paths, n, 3)."""
+        """Whitened design matrix (n_paths, 3 n, 9) of three functions `f`, (n_paths, n, 3)."""
         columns: FloatArray = np.einsum('nab,pnf->pnabf', self.W, f)
         return columns.reshape(len(f), 3 * len(self.t), 9)
 

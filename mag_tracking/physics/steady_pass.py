@@ -54,10 +54,10 @@ class SteadyPass:
     offsets: FloatArray = field(init=False)
     """Offsets of the dipoles from the centre of the row, (d,), relative to its length."""
     combinations: FloatArray = field(init=False)
-    """Orthogonal matrix, (d, d), that converts the linear parameters of a component to moments."""
+    """Orthogonal matrix, (d, d), that converts linear parameters to moments, for x, y or z."""
 
     def __post_init__(self) -> None:
-        """Compute the positions of the dipoles and the combinations of their moments."""
+        """Compute the offsets of the dipoles in the row and the combinations of their moments."""
         d = self.n_dipoles
         offsets = np.linspace(-0.5, 0.5, d) if d > 1 else np.zeros(1)
         object.__setattr__(self, 'offsets', offsets)

@@ -82,9 +82,9 @@ class RowVehicle:
 
     @cached_property
     def _moment_walk(self) -> FloatArray:
-        """Relative random walk covariance of the hard iron moments, (3 d, 3 d) 1/s.
+        """Random walk covariance of the hard iron moments, (3 d, 3 d) 1/s.
 
-        It is relative to the squared magnitude of the hard and soft iron moments.
+        Normalised by the squared magnitude of the hard and soft iron moments.
         """
         d = self.n_dipoles
         averaging = np.full((d, d), 1.0 / d)
@@ -159,7 +159,7 @@ class RowVehicle:
         return predicted, F_turn, Q
 
     def turn_variance(self, speed: FloatArray) -> FloatArray:
-        """Variance of the turn rate at a given speed, at most `MAX_TURN_RATE` squared.
+        """Stationary variance of the turn rate at a speed, at most `MAX_TURN_RATE` squared.
 
         Parameters
         ----------

@@ -5,8 +5,9 @@
     DIR/done/NAME.json                  written last; marks a recording as processed
     DIR/unfinished/NAME.STATE/          partial results, from which the next run resumes
 
-NAME is the stem of the recording and a hash of its path; STATE is a hash of the names, sizes and
-modification times of its files. pyarrow is imported when a table is written or read.
+NAME is the stem of the recording and a hash of its path. STATE is a hash of the program version and
+of the names, sizes and modification times of the recording's files. pyarrow is imported when a
+table is written or read.
 """
 
 import datetime
@@ -140,18 +141,18 @@ class ArchiveFolder:
         self.close()
 
     def _check_head(self, head: dict[str, Any]) -> None:
-        """Write `head`, or compare it with the head of an earlier run; raises OutputError."""
+        """Write `head` to archive.json; raise OutputError if the file has other metadata."""
         path = self.path / _HEAD
         if not path.exists():
             replace_text(path, json.dumps(head, indent=1, sort_keys=True) + '\n')
             return
-        before = _read_json(path)
-        if before.get('schema') != VERSION:
-            raise OutputError(f'{self.path} has tables of version {before.get("schema")}; this '
-                              f'program writes version {VERSION}. Choose another folder')
-        differing_keys = sorted(key for key in {*head, *before}
+        previous_head = _read_json(path)
+        if previous_head.get('schema') != VERSION:
+            raise OutputError(f'{self.path} has tables of version {previous_head.get("schema")}; '
+                              f'this program writes version {VERSION}. Choose another folder')
+        differing_keys = sorted(key for key in {*head, *previous_head}
                                 if json.dumps(head.get(key), sort_keys=True)
-                                != json.dumps(before.get(key), sort_keys=True))
+                                != json.dumps(previous_head.get(key), sort_keys=True))
         if differing_keys:
             raise OutputError(f'{self.path} was created with other values of '
                               f'{", ".join(differing_keys)}: the new rows would not be comparable '
@@ -172,8 +173,8 @@ class ArchiveFolder:
         path = self.path / _DONE / f'{recording_key(recording)}.json'
         if not path.exists():
             return None
-        known = _read_json(path)
-        return known if known.get('state') == recording_state(recording) else None
+        summary = _read_json(path)
+        return summary if summary.get('state') == recording_state(recording) else None
 
     def begin(self, recording: Path, state: list[list[Any]]) -> Path:
         """Remove outdated results of a recording, and create the folder for its partial results.
@@ -208,7 +209,7 @@ class ArchiveFolder:
         return output_folder(folder)
 
     def complete(self, recording: Path, work: Path, state: list[list[Any]],
-                 known: Mapping[str, Any]) -> None:
+                 summary: Mapping[str, Any]) -> None:
         """Mark a recording as processed, after all of its tables have been written.
 
         Parameters
@@ -219,11 +220,11 @@ class ArchiveFolder:
         state : list
             State of the recording when its processing began. If the recording has changed since
             then, the next run processes it again.
-        known : mapping
+        summary : mapping
             Summary of the recording.
         """
         replace_text(self.path / _DONE / f'{recording_key(recording)}.json',
-                     json.dumps({**known, 'state': state}, indent=1) + '\n')
+                     json.dumps({**summary, 'state': state}, indent=1) + '\n')
         _remove(work)
 
     def write_recordings(self, rows: Iterable[Mapping[str, Any]]) -> None:
@@ -238,7 +239,7 @@ class ArchiveFolder:
             for row in rows:
                 table.add(row)
 
-    def known(self) -> list[dict[str, Any]]:
+    def summaries(self) -> list[dict[str, Any]]:
         """Return the summaries of all processed recordings, from this run and earlier runs.
 
         Returns
@@ -264,7 +265,7 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
     parts : iterable of Path
         Files of the same table, in chronological order.
     shifts : iterable of int
-        Offset for each part, to be added to the column `track_id`.
+        Offset of each part, which is added to its column `track_id`.
     table : str
         Name of the table.
     folder : Path
@@ -293,13 +294,13 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
                 index = rows.schema.get_field_index('track_id')
                 rows = rows.set_column(index, rows.schema.field(index),
                                        pa.compute.add(rows['track_id'], shift))
-            day_of = pa.compute.divide(rows['stamp_ns'], day_ns)
-            for day in sorted(pa.compute.unique(day_of).to_pylist()):
+            days_of_rows = pa.compute.divide(rows['stamp_ns'], day_ns)
+            for day in sorted(pa.compute.unique(days_of_rows).to_pylist()):
                 if day not in days:
                     date = datetime.date(1970, 1, 1) + datetime.timedelta(days=day)
                     days[day] = files.enter_context(TableWriter(
                         folder / table / f'date={date}' / f'{name}.parquet', TABLES[table]))
-                days[day].add_table(rows.filter(pa.compute.equal(day_of, day)))
+                days[day].add_table(rows.filter(pa.compute.equal(days_of_rows, day)))
     return n
 
 

@@ -1,4 +1,4 @@
-"""Background file: the calibration stores learnt backgrounds and restores them after a restart.
+"""Background file, in which calibration_node stores learnt backgrounds for a restart.
 
 A network file contains parameters that stay valid for years. A background file contains the current
 background of each sensor, which is soon outdated.
@@ -110,7 +110,7 @@ def write_backgrounds(path: str | PathLike[str], texts: Mapping[str, str]) -> No
     ----------
     path : path_like
     texts : mapping of str to str
-        `background_text` by sensor.
+        Result of `background_text` for each sensor, by name.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def write_backgrounds(path: str | PathLike[str], texts: Mapping[str, str]) -> No
 def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
                      settings: CalibrateSettings
                      ) -> tuple[dict[str, StoredBackground], dict[str, str]]:
-    """Read the stored backgrounds that match a network and its settings.
+    """Read the stored backgrounds that match a network and the calibration settings.
 
     Parameters
     ----------

@@ -70,7 +70,7 @@ class BagFile:
                 self.start_ns, self.end_ns = time_range.start_time, time_range.end_time - 1
 
     def _open_reader(self) -> AbstractContextManager[Any]:
-        """Open the bag with the reader of the library; raises RecordingError."""
+        """Open the bag with the reader of `rosbags`; raises RecordingError."""
         try:
             reader = self._new_reader()
             reader.open()
@@ -79,7 +79,7 @@ class BagFile:
         return closing(reader)
 
     def _new_reader(self) -> 'Ros1Reader | Sqlite3Reader':
-        """Create the library's reader for this type of bag."""
+        """Create the reader of `rosbags` for this type of bag."""
         # Imported here because most recordings are MCAP and do not need the library.
         if self._is_ros1:
             from rosbags.rosbag1 import Reader
@@ -117,7 +117,10 @@ class BagFile:
                 reported = position
 
     def _raw(self, start_ns: int | None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Iterate over (topic, type, log time [ns], bytes); at damage, count a loss and stop."""
+        """Iterate over (topic, type, log time [ns], bytes) up to the first damage, if any.
+
+        The damage is counted in `losses`.
+        """
         n = 0
         with self._open_reader() as reader:
             try:
@@ -131,7 +134,7 @@ class BagFile:
 
 @functools.cache
 def bag_errors() -> tuple[type[Exception], ...]:
-    """Exceptions that the library raises for damaged or invalid bags.
+    """Exceptions that `rosbags` raises for damaged or invalid bags.
 
     Returns
     -------
@@ -171,7 +174,7 @@ def cdr_of_ros1(data: bytes, type_name: str) -> bytes:
 
 @functools.cache
 def _ros1_types() -> 'Typestore':
-    """Type definitions of ROS 1 messages."""
+    """Definitions of the ROS 1 message types, for `rosbags`."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS1_NOETIC)

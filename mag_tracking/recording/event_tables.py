@@ -62,11 +62,11 @@ def write_events(folder: str | PathLike[str], events: Iterable[PassEvent]) -> No
             writer = csv.writer(stream)
             writer.writerow(SIGNATURE_COLUMNS)
             for event in events:
-                since = event.time_scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN,
-                                                       len(event.signature))
-                first = (event.closest_ns - event.onset_ns) / NS
-                writer.writerows([event.sensor, event.number, _number(first + t),
+                offsets_s = event.time_scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN,
+                                                           len(event.signature))
+                closest_s = (event.closest_ns - event.onset_ns) / NS
+                writer.writerows([event.sensor, event.number, _number(closest_s + t),
                                   *(_number(1e9 * v) for v in field)]
-                                 for t, field in zip(since, event.signature, strict=True))
+                                 for t, field in zip(offsets_s, event.signature, strict=True))
     except OSError as error:
         raise OutputError(f'cannot write to {folder}: {error.strerror}') from error

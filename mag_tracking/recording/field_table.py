@@ -104,9 +104,9 @@ def import_field_table(table: _Path, columns: Sequence[str], unit: str, out: _Pa
     OutputError
         If `out` cannot be written.
     """
-    for name, value, known in (('unit', unit, FIELD_UNITS), ('time unit', time_unit, TIME_UNITS)):
-        if value not in known:
-            raise RecordingError(f'{name}: expected one of {", ".join(known)}, got {value!r}')
+    for name, value, units in (('unit', unit, FIELD_UNITS), ('time unit', time_unit, TIME_UNITS)):
+        if value not in units:
+            raise RecordingError(f'{name}: expected one of {", ".join(units)}, got {value!r}')
     readings = _readings(Path(table), parse_columns(columns), FIELD_UNITS[unit],
                          TIME_UNITS[time_unit])
     recording = Path(out) / f'{Path(table).stem}.mcap'
@@ -151,9 +151,10 @@ def _rows(table: Path, column_names: Sequence[str]) -> list[tuple[int, dict[str,
     try:
         with open(table, newline='', encoding='utf-8-sig') as stream:
             reader = csv.DictReader(stream, skipinitialspace=True)
-            missing = [c for c in column_names if c not in (reader.fieldnames or ())]
-            if missing:
-                raise RecordingError(f'{table}: column {missing[0]} is missing; the columns are '
+            missing_columns = [c for c in column_names if c not in (reader.fieldnames or ())]
+            if missing_columns:
+                raise RecordingError(f'{table}: column {missing_columns[0]} is missing; the '
+                                     'columns are '
                                      f'{", ".join(reader.fieldnames or ["none"])}')
             rows = [(reader.line_num, row) for row in reader]
     except OSError as error:
@@ -170,7 +171,7 @@ def _rows(table: Path, column_names: Sequence[str]) -> list[tuple[int, dict[str,
 
 
 def _number(text: str, where: str) -> float:
-    """Convert a cell to a number, NaN if it is empty; raises RecordingError."""
+    """Convert a cell to a number, NaN if empty; raises RecordingError if invalid or infinite."""
     if not text.strip():
         return float('nan')
     try:
@@ -183,7 +184,10 @@ def _number(text: str, where: str) -> float:
 
 
 def _stamp(text: str, scale: int, where: str) -> int:
-    """Convert a cell to a time [ns]; integers are not rounded; raises RecordingError."""
+    """Convert a cell, in units of `scale` ns, to a time [ns]; raises RecordingError.
+
+    Integer cells are converted exactly.
+    """
     text = text.strip()
     is_integer = re.fullmatch(r'[+-]?[0-9]{1,20}', text)
     value = int(text) * scale if is_integer else _number(text, where) * scale

@@ -30,7 +30,7 @@ FIT_COLUMNS = (
 point of approach (CPA) refers to the centre of the sensors; its time is in seconds after
 `stamp_ns`. `rate` is the speed divided by the CPA range, which a single sensor can observe; the
 corresponding directions are in `fits.json`. For a fit that is not trusted as a whole, only the
-trusted quantities (speed, heading, time of the CPA) are written, and only if the fit is selected
+trusted quantities (speed, heading, time of the CPA) are written, and only if the fit is reported
 for its pass. Jointly fitted vehicles share their unknowns and costs. The speed and heading from the
 delays between sensors are model-free and equal for all fits of a pass."""
 
@@ -58,15 +58,15 @@ class _FittedPass(Protocol):
     def chosen(self) -> PassFit | None: ...
 
 
-def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
+def fit_row(fit: PassFit, is_reported: bool = True) -> dict[str, Any]:
     """Values of a fit by column, without the columns that identify the pass.
 
     Parameters
     ----------
     fit : PassFit
-    is_known : bool, optional
-        Whether the fit is selected for its pass. A fit that is not trusted as a whole keeps its
-        trusted quantities only if it is selected.
+    is_reported : bool, optional
+        Whether the fit is reported for its pass. If not, and if the fit is not trusted as a whole,
+        its trusted quantities are not included either.
 
     Returns
     -------
@@ -81,14 +81,14 @@ def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
         row |= {'normalised_cost': fit.normalised_cost, 'explained': fit.explained,
                 'residual_elsewhere': fit.residual_elsewhere,
                 'velocity_change': fit.velocity_change,
-                'trusted': ' '.join(fit.trusted) if is_known else ''}
+                'trusted': ' '.join(fit.trusted) if is_reported else ''}
     if fit.bearing is not None:
         b = fit.bearing
         row |= {'cpa_time': b.cpa_time, 'sd_cpa_time': b.cpa_time_std, 'rate': b.rate,
                 'sd_rate': b.rate_std}
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     if fit.reason:
-        return row | (_trusted_quantities(fit, centre) if is_known else {})
+        return row | (_trusted_quantities(fit, centre) if is_reported else {})
     row['ambiguous'] = int(fit.ambiguous)
     sd = np.sqrt(np.diagonal(fit.robust_covariance))
     moment, P = fit.moment
@@ -105,7 +105,7 @@ def fit_row(fit: PassFit, is_known: bool = True) -> dict[str, Any]:
 
 
 def _trusted_quantities(fit: PassFit, centre: FloatArray) -> dict[str, float]:
-    """Values of the trusted quantities of a fit, by column; others are omitted."""
+    """Trusted quantities of a fit, by column; the time of the CPA refers to `centre`, (3,) m."""
     quantities: dict[str, Iterable[float]] = {}
     if 'speed' in fit.trusted:
         quantities['speed sd_speed'] = fit.speed
@@ -129,13 +129,13 @@ def pass_rows(fitted_pass: _FittedPass) -> list[dict[str, Any]]:
     list of dict
         Values by `FIT_COLUMNS`.
     """
-    chosen, known, c = fitted_pass.chosen, fitted_pass.reported, fitted_pass.correlated
+    chosen, reported, c = fitted_pass.chosen, fitted_pass.reported, fitted_pass.correlated
     delay = {'delay_speed': c.speed, 'sd_delay_speed': c.speed_std,
              'delay_heading_deg': math.degrees(c.heading),
              'sd_delay_heading_deg': math.degrees(c.heading_std), 'no_delay': c.reason}
     return [{'recording': fitted_pass.recording, 'pass': fitted_pass.number,
              'vehicle': fitted_pass.vehicle, 'n_vehicles': fitted_pass.n_vehicles,
-             **fit_row(fit, fit is known),
+             **fit_row(fit, fit is reported),
              'chosen': int(fit is chosen), **delay} for fit in fitted_pass.fits]
 
 

@@ -67,11 +67,12 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
         raise RecordingError(f'the tables have different numbers of sensors: {background} has '
                              f'{len(backgrounds)}, {table} has {len(ids)}')
     names = tuple(f'mag_{i}' for i in ids)
-    position, vectors = (np.array([np.median(rows[kind][rows['id'] == i], axis=0) for i in ids])
-                         for kind in ('sensor', 'sensor_rotation'))
-    quaternions = quaternion_from_rotation_vector(vectors)
+    positions, rotation_vectors = (
+        np.array([np.median(rows[kind][rows['id'] == i], axis=0) for i in ids])
+        for kind in ('sensor', 'sensor_rotation'))
+    quaternions = quaternion_from_rotation_vector(rotation_vectors)
     network = SensorNetwork(
-        names, position * 1e-3, rotation_from_quaternion(quaternions),
+        names, positions * 1e-3, rotation_from_quaternion(quaternions),
         tuple(f'/{name}/imu/mag' for name in names),
         noise_std=(np.full(3, noise_std),) * len(ids), background=tuple(backgrounds * 1e-6))
     out = Path(out)
@@ -94,11 +95,11 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
 
 
 def _read_table(path: _Path) -> dict[str, FloatArray]:
-    """Read the columns of the table as arrays; raises RecordingError."""
+    """Read a table of poses as arrays, in the units of the table; raises RecordingError."""
     header, rows = read_csv(path)
-    missing = [c for c in _COLUMNS if c not in header]
-    if missing:
-        raise RecordingError(f'{path}: column {missing[0]} is missing')
+    missing_columns = [c for c in _COLUMNS if c not in header]
+    if missing_columns:
+        raise RecordingError(f'{path}: column {missing_columns[0]} is missing')
     a = np.array([[number(path, line, c, row[header.index(c)], True) for c in _COLUMNS]
                   for line, row in rows])
     if ((a[:, 0] != np.round(a[:, 0])) | (np.abs(a[:, 0]) > MAX_ID)).any():

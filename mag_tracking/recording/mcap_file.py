@@ -114,7 +114,7 @@ class McapFile:
 
     def _indexed_blocks(self, stream: BinaryIO, index: list[ChunkIndex], start_ns: int | None,
                         progress: Progress | None) -> Iterator[MessageBlock]:
-        """Iterate over the messages of an intact file, in order of log time across chunks."""
+        """Iterate over the messages of a file with an index, in order of log time across chunks."""
         channels = _Channels()
         pending = MessageBlock.of_messages([])
         for k, entry in enumerate(index):
@@ -140,13 +140,13 @@ class McapFile:
 
     def _count_lost_chunk(self, entry: ChunkIndex) -> None:
         """Count an unreadable chunk as a loss, described by its duration and start time."""
-        seconds = (entry.message_end_time - entry.message_start_time) / 1e9
-        after = (entry.message_start_time - (self.start_ns or entry.message_start_time)) / 1e9
+        duration_s = (entry.message_end_time - entry.message_start_time) / 1e9
+        start_s = (entry.message_start_time - (self.start_ns or entry.message_start_time)) / 1e9
         self._count_loss(entry.chunk_start_offset, f'damaged segments ({self._path.name}, '
-                         f'{seconds:.1f} s long, {after:.1f} s after the start)')
+                         f'{duration_s:.1f} s long, {start_s:.1f} s after the start)')
 
     def _count_loss(self, offset: int, description: str) -> None:
-        """Count an unreadable part at a byte offset; a repeated read does not count it again."""
+        """Count the unreadable part at byte `offset`, unless it has already been counted."""
         if offset not in self._lost_offsets:
             self._lost_offsets.add(offset)
             self._losses[description] += 1

@@ -27,7 +27,7 @@ class McapFileWriter:
     ----------
     path : Path
     counts : Counter
-        Number of messages by topic.
+        Number of messages by topic, including pending messages.
     pending : Counter
         Number of messages by topic that are not yet in a complete chunk.
     """
@@ -109,7 +109,7 @@ class McapFileWriter:
             raise OSError(errno.ENOENT, 'the file was removed')
 
     def _mark_intact(self) -> None:
-        """Record that all bytes written so far form complete chunks."""
+        """Mark all bytes written so far as complete chunks, which `abandon` keeps."""
         self._intact_size, self._buffered_size = self._stream.offset, 0
         self.pending.clear()
         if self._times:

@@ -27,7 +27,7 @@ class ChannelKind(NamedTuple):
 
     @classmethod
     def of(cls, topic: str, schema: Schema) -> 'ChannelKind':
-        """Create the description of a channel in a file.
+        """Describe a channel by its topic and the schema in the file.
 
         Parameters
         ----------

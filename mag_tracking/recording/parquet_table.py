@@ -148,7 +148,7 @@ class TableWriter:
             self._flush()
 
     def add_table(self, table: 'pa.Table') -> None:
-        """Add a table of rows.
+        """Add all rows of a table.
 
         Parameters
         ----------

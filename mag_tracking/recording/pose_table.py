@@ -21,7 +21,9 @@ def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
     Returns
     -------
     field : (K, n, 3) array, T, sensor frames
+        Fields of the n sensors at each of the K poses. NaN if not measured.
     positions : (K, 3) array, m, tracker frame
+        Positions of the magnet.
     axes : (K, 3) array, tracker frame
         Unit vectors of the magnet's axis, normalised.
 
@@ -42,7 +44,7 @@ def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def read_readings(path: CsvPath) -> FloatArray:
-    """Read only the fields from a pose table, which need not contain poses.
+    """Read only the fields of a pose table, whose pose columns may be missing.
 
     Parameters
     ----------
@@ -51,6 +53,7 @@ def read_readings(path: CsvPath) -> FloatArray:
     Returns
     -------
     (K, n, 3) array, T, sensor frames
+        NaN if not measured.
 
     Raises
     ------
@@ -62,11 +65,12 @@ def read_readings(path: CsvPath) -> FloatArray:
 
 
 def read_sensor_positions(path: CsvPath) -> FloatArray:
-    """Read sensor positions from a CSV file of x, y, z, in which # begins a comment line.
+    """Read sensor positions from a CSV file without a header; # begins a comment line.
 
     Parameters
     ----------
     path : path_like
+        CSV file with the columns x, y, z [m].
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""A message as stored in a recording."""
+"""Message of a recording."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ from mcap.records import Schema
 
 
 class RawMessage(NamedTuple):
-    """One message as stored in the file."""
+    """Message of a recording, converted to CDR if it is stored in another encoding."""
 
     topic: str
     """Name of the topic."""
@@ -15,6 +15,6 @@ class RawMessage(NamedTuple):
     log_time_ns: int
     """Log time, ns since 1970."""
     data: bytes
-    """Serialised message, CDR."""
+    """Serialised message, CDR. Empty if the stored message cannot be converted."""
     schema: Schema
     """Schema of the message type."""

@@ -54,12 +54,12 @@ class Recording:
         self.message_counts: Counter[str] = Counter()
         self.losses: Counter[str] = Counter()
         self._files = _files(self.path)
-        empty = [f for f in self._files if f.stat().st_size == 0]
-        if len(empty) < len(self._files):
+        empty_files = [f for f in self._files if f.stat().st_size == 0]
+        if len(empty_files) < len(self._files):
             # A crash between two files of a recording leaves an empty file, which is skipped. If
             # all files are empty, opening them fails.
-            self._files = [f for f in self._files if f not in empty]
-            self.losses.update(f'empty files ({f.name})' for f in empty)
+            self._files = [f for f in self._files if f not in empty_files]
+            self.losses.update(f'empty files ({f.name})' for f in empty_files)
         self._opened = [(BagFile if f.suffix in BAG_SUFFIXES else McapFile)(f, self.losses)
                         for f in self._files]
         for file in self._opened:
@@ -90,9 +90,10 @@ class Recording:
 
     def messages(self, topics: Collection[str] | None = None, start_ns: int | None = None,
                  progress: Progress | None = None) -> Iterator[RawMessage]:
-        """Iterate over the messages in order of log time.
+        """Iterate over the messages file by file, in order of log time.
 
-        Unreadable parts are counted in `losses`.
+        Messages of a file without an index are in file order. Unreadable parts are counted in
+        `losses`.
 
         Parameters
         ----------
@@ -148,8 +149,8 @@ def _files(path: Path) -> list[Path]:
     if metadata.exists():
         content = read_yaml(metadata, RecordingError)
         try:
-            listed = content['rosbag2_bagfile_information']['relative_file_paths']
-            files = [path / name for name in listed]
+            listed_names = content['rosbag2_bagfile_information']['relative_file_paths']
+            files = [path / name for name in listed_names]
         except (KeyError, TypeError) as error:
             raise RecordingError(f'{metadata} is not rosbag2 metadata: relative_file_paths is '
                                  'missing or not a list') from error

@@ -119,7 +119,7 @@ class Recorder:
 
     def add_topic(self, name: str, type_name: str, definition: str = '', qos: str | None = None,
                   latched: int = 0) -> None:
-        """Register a topic before its first message.
+        """Register a topic before its first message, or change its number of latched messages.
 
         Parameters
         ----------
@@ -167,7 +167,7 @@ class Recorder:
             self._latched[name].append(message)
 
     def tick(self, now_ns: int) -> None:
-        """Flush or split the file, and retry failed metadata, when due.
+        """Flush or split the file, and retry writing the metadata, when due.
 
         To be called several times per second.
 
@@ -219,7 +219,7 @@ class Recorder:
             self._write_metadata()
 
     def _add_finished(self, file: McapFileWriter) -> None:
-        """Add the summary and the size of a closed file."""
+        """Add the summary and the size of a closed file to those of the recording."""
         self._summaries.append(file.summary())
         self._finished_bytes += file.size
 
@@ -227,9 +227,9 @@ class Recorder:
         """Close the open file at its last complete chunk, count the lost messages, and schedule a
         retry."""
         self._file = None
-        lost = file.pending if file.path.exists() else file.counts
-        self.dropped += lost
-        self.counts -= lost
+        lost_counts = file.pending if file.path.exists() else file.counts
+        self.dropped += lost_counts
+        self.counts -= lost_counts
         file.abandon()
         if file.counts and file.path.exists():
             self._add_finished(file)
@@ -269,9 +269,9 @@ class Recorder:
     def _open_next(self, log_ns: int = 0) -> None:
         """Create the next file with the latched messages, or remove it and raise OSError."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        names = (self.folder / f'{self.folder.resolve().name}_{n}.mcap'
+        paths = (self.folder / f'{self.folder.resolve().name}_{n}.mcap'
                  for n in itertools.count(len(self._summaries)))
-        file = McapFileWriter(next(p for p in names if not p.exists()), self._opener)
+        file = McapFileWriter(next(p for p in paths if not p.exists()), self._opener)
         try:
             file.start()
             for name, messages in self._latched.items():

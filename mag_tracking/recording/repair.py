@@ -257,12 +257,12 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     n, summaries = 0, []
     topics: dict[str, Topic] = {}
     # A crash at a split leaves an empty file.
-    empty = [file for file in files if file.stat().st_size < len(_MAGIC)]
-    if len(empty) == len(files):
+    empty_files = [file for file in files if file.stat().st_size < len(_MAGIC)]
+    if len(empty_files) == len(files):
         raise RecordingError(f'{path} cannot be repaired: all .mcap files are empty')
-    for file in empty:
+    for file in empty_files:
         report(f'{file} is empty and was skipped')
-    for file in [file for file in files if file not in empty]:
+    for file in [file for file in files if file not in empty_files]:
         try:
             lines = finish_file(file)
         except OSError as error:

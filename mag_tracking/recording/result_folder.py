@@ -105,12 +105,12 @@ class ResultFolder:
     def _remove_earlier_results(self) -> bool:
         """Remove the results of an earlier run; return whether there were any."""
         # The summary and figures of an earlier run could be mistaken for results of this run.
-        earlier = [path for path in self.folder.iterdir()
-                   if (path.name in _RESULTS or _TRACK_FILE.fullmatch(path.name))
-                   and (path.is_symlink() or not path.is_dir())]
-        for path in earlier:
+        earlier_files = [path for path in self.folder.iterdir()
+                         if (path.name in _RESULTS or _TRACK_FILE.fullmatch(path.name))
+                         and (path.is_symlink() or not path.is_dir())]
+        for path in earlier_files:
             path.unlink()
-        return bool(earlier)
+        return bool(earlier_files)
 
     def _stream(self, name: str, columns: tuple[str, ...]) -> TextIO:
         """Create a CSV file and write its header; return the open file."""
@@ -176,11 +176,11 @@ class ResultFolder:
             return
         sd = np.sqrt(np.diagonal(h.covariances, axis1=1, axis2=2))
         rows = core.number_rows(np.column_stack([h.weights, h.states, sd, h.moments]))
-        begin = f'{track.stamp_ns},{track.id},'
+        row_prefix = f'{track.stamp_ns},{track.id},'
         pairs = [*zip(h.arrivals, h.kinds, strict=True)]
         names = {pair: ','.join(map(_csv_cell, pair)) for pair in {*pairs}}
         self._hypotheses.write(''.join(
-            f'{begin}{names[pair]},{row}\r\n' for pair, row in zip(pairs, rows, strict=True)))
+            f'{row_prefix}{names[pair]},{row}\r\n' for pair, row in zip(pairs, rows, strict=True)))
 
     def add_disturbance(self, d: Disturbance) -> None:
         """Write a disturbance to the recording and the table, at its detection and at its end.
