@@ -99,7 +99,7 @@ class NewTargetSearch:
             * len(settings.kinds) * len(moment_directions()) * N_DISTANCES))
 
     def find(self) -> JointExplanation | None:
-        """Return the best explanation with a new target, or with a vehicle at another position.
+        """Return the best explanation with a new or a relocated vehicle.
 
         Returns
         -------
@@ -135,7 +135,7 @@ class NewTargetSearch:
 
     def _best_of(self, starts: Sequence[WindowStart], track_evidence: float
                  ) -> JointExplanation | None:
-        """Joint explanation of the refined starts; None if no start is usable.
+        """Refine the starts; return their joint explanation, or None if no start is usable.
 
         `track_evidence` is the log-evidence of the track.
         """
@@ -148,8 +148,8 @@ class NewTargetSearch:
     def _current_track(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
         """Run the leading hypotheses of the current track along their paths.
 
-        Returns their indices in the bank (n,), log-likelihoods (n,), log-weights after these frames
-        (n,) and paths (n, n_frames, n_x).
+        Returns their indices in the bank (n,), log-likelihoods of the window (n,), log-weights
+        after the window (n,) and paths (n, n_frames, n_x).
         """
         window, bank = self._window, self._bank
         order = np.argsort(-bank.log_w, kind='stable')[:window.max_hypotheses]
@@ -237,7 +237,7 @@ class NewTargetSearch:
 
     def _starts_on(self, known: KnownVehicleHypothesis, paths: FloatArray, moments: FloatArray,
                    replaced: int | None) -> list[WindowStart]:
-        """Starts with the known vehicles and k new vehicles, one for each combination of kinds.
+        """One start for each combination of kinds of k new vehicles, which join the known vehicles.
 
         The new vehicles have the `paths` (k, 7) and the `moments` (k, 3, 3).
         """
@@ -271,7 +271,7 @@ class NewTargetSearch:
                 if log_w[k] >= log_w.max() - MAX_LOSS_NATS]
 
     def _add_turning_starts(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
-        """Each start with straight new vehicles, and its copies in which one new vehicle turns."""
+        """Return the starts and copies of them, in each of which one new vehicle turns."""
         fraction = self._vehicles.settings.turn_share
         out = []
         for start in starts:
@@ -309,7 +309,7 @@ class NewTargetSearch:
         return bank, log_likelihood, log_w, paths
 
     def _are_plausible(self, start: WindowStart, x: FloatArray) -> bool:
-        """Whether speeds and moments of the new vehicles in the state `x` (n_x,) are plausible.
+        """Whether the new vehicles in the state `x` (n_x,) have plausible speeds and moments.
 
         A stationary vehicle cannot have arrived during the window.
         """

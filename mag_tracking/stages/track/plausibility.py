@@ -41,7 +41,7 @@ class Plausibility:
 
     def evaluate(self, observation: Observation, bank: FilterBank, best: int,
                  settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
-        """Update the closest points of all hypotheses; return the doubts about hypothesis `best`.
+        """Update the closest approach of all hypotheses; return the doubts about hypothesis `best`.
 
         Parameters
         ----------
@@ -52,7 +52,7 @@ class Plausibility:
         settings : VehicleSettings
         mounting_std : float, rad
             Minimum standard deviation of the mounting angles of each sensor. It also applies to
-            accurately mounted sensors, because a model error rotates the field, too.
+            accurately mounted sensors, because a model error also rotates the field.
         dt : float, s
             Duration of the frame.
 
