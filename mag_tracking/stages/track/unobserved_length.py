@@ -25,13 +25,14 @@ class UnobservedLength:
     behind the row. Afterwards, it may be at either end, and the middle is uniformly distributed
     between these two cases.
 
-    Each track has its own object.
+    Use one instance for each target.
 
     Parameters
     ----------
     lengths : sequence of float, m
         Length of each kind of vehicle; all kinds are equally frequent.
     length_stds : sequence of float, m
+        Standard deviation of the length of each kind.
     """
 
     def __init__(self, lengths: Sequence[float], length_stds: Sequence[float]) -> None:
@@ -66,7 +67,7 @@ class UnobservedLength:
         self._last_position = x[:2].copy()
 
     def covariance(self, x: FloatArray, P: FloatArray, length: float, kind: int) -> FloatArray:
-        """Covariance to be added to the covariance of the horizontal position.
+        """Covariance of the middle, to be added to the covariance of the horizontal position.
 
         Parameters
         ----------
