@@ -371,11 +371,11 @@ def members_in_order(members: Sequence[Member], new: Member | None, joint: Joint
     list of Member
     """
     others = list(members)
-    old = others.pop(joint.replaced) if joint.replaced is not None else None
-    if new is None or old is None:
-        return [*others, *([old] if old else []), *([new] if new else [])]
+    replaced = others.pop(joint.replaced) if joint.replaced is not None else None
+    if new is None or replaced is None:
+        return [*others, *([replaced] if replaced else []), *([new] if new else [])]
     first = n_one * len(others)
     paths = np.array([path[joint.bank.best(), first:] for path in joint.window.paths])
     stamps = [frame.stamp_ns for frame in joint.window.frames]
-    distances = [old.distance_from(stamps, paths[:, k * n_one:k * n_one + 2]) for k in (0, 1)]
-    return [*others, old, new] if distances[0] <= distances[1] else [*others, new, old]
+    distances = [replaced.distance_from(stamps, paths[:, k * n_one:k * n_one + 2]) for k in (0, 1)]
+    return [*others, replaced, new] if distances[0] <= distances[1] else [*others, new, replaced]

@@ -156,14 +156,14 @@ class NewTargetSearch:
         rows = np.searchsorted(window.anchor.origin, bank.origin[order])
         anchor, paths = window.anchor.rows(rows), np.stack([p[rows] for p in window.paths], axis=1)
         begin = int(window.is_updated)
-        before = bank.log_w[order] + window.evidence \
+        anchor_log_w = bank.log_w[order] + window.evidence \
             - np.sum([values[rows] for values in window.log_likelihoods[begin:]], axis=0)
         path_result = self._filter.run_along(anchor, window.frames, window.intervals, paths,
                                              passes=PASSES, step=STEP,
                                              first_is_updated=window.is_updated)
         is_usable = np.isfinite(path_result.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
         track_log_likelihood = np.where(is_usable, path_result.log_likelihood, -np.inf)
-        return order, track_log_likelihood, before + track_log_likelihood, paths
+        return order, track_log_likelihood, anchor_log_w + track_log_likelihood, paths
 
     def _leading_indices(self, rows: IntArray, log_w: FloatArray) -> list[int]:
         """Indices into `rows` of the hypotheses to be tried: the best of each arrival and kind."""
@@ -181,10 +181,10 @@ class NewTargetSearch:
     def _known_vehicles(self, row: int, log_w: float, path: FloatArray) -> KnownVehicleHypothesis:
         """Vehicles of hypothesis `row` of the track; `log_w` is its log-weight at the anchor."""
         at = np.searchsorted(self._window.anchor.origin, self._bank.origin[[row]])
-        before = self._window.anchor.rows(at)
+        at_anchor = self._window.anchor.rows(at)
         label, kind = (tuple(np.ravel(of[row]).tolist())
                        for of in (self._bank.label, self._bank.kind))
-        return KnownVehicleHypothesis(before.x[0], before.P[0], path, label, kind, log_w,
+        return KnownVehicleHypothesis(at_anchor.x[0], at_anchor.P[0], path, label, kind, log_w,
                                       self._filter)
 
     def _may_be_two(self, known: KnownVehicleHypothesis, i: int) -> bool:
@@ -264,7 +264,7 @@ class NewTargetSearch:
                           std**2 * np.eye(3 * len(observation.positions)))
 
     def _refine_starts(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
-        """Starts that are about as probable as the best start, with refined paths."""
+        """Refine the paths of the starts; return the starts about as probable as the best one."""
         _, _, log_w, paths = self._run_starts(starts)
         order = np.argsort(-log_w, kind='stable')[:MAX_EXPLANATIONS]
         return [replace(starts[k], path=paths[k]) for k in order.tolist()

@@ -148,5 +148,5 @@ def _needs_rotated_sensors(observation: Observation, x: FloatArray, mounting_std
     if not angles.size:
         return False
     variance = np.einsum('jii->ji', observation.own_covariance[:, :3, :3])
-    square = float((angles**2 / np.maximum(variance, mounting_std**2)).sum())
-    return bool(square > chdtri(angles.size, P_MOUNTING))
+    squared_norm = float((angles**2 / np.maximum(variance, mounting_std**2)).sum())
+    return bool(squared_norm > chdtri(angles.size, P_MOUNTING))

@@ -331,7 +331,7 @@ class Relinearisation:
 
 
 def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
-    """Replace states `rows` of the bank in place, and each covariance that is smaller than `P`."""
+    """Replace states `rows` in place, and covariances with a smaller position variance than `P`."""
     bank_variance, path_variance = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P))
     bank.x[rows] = x
     bank.P[rows[path_variance > bank_variance]] = P[path_variance > bank_variance]
@@ -339,7 +339,7 @@ def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArr
 
 def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
                        nearly_linear: Callable[[FloatArray], FloatArray]) -> None:
-    """Replace the covariances of hypotheses `rows` in place where `P` is larger.
+    """Replace covariances `rows` in place where `P` has a larger position variance.
 
     The new covariance includes the difference between `x` and the state of the bank. It is not
     adopted if it is too large for the next linear update.

@@ -124,8 +124,8 @@ class RigidPass:
         (3,) array, m
         """
         offsets = positions - self.position
-        square = max(float(self.velocity @ self.velocity), 1e-12)
-        points = self.position + (offsets @ self.velocity / square)[:, None] * self.velocity
+        squared_speed = max(float(self.velocity @ self.velocity), 1e-12)
+        points = self.position + (offsets @ self.velocity / squared_speed)[:, None] * self.velocity
         nearest: FloatArray = points[np.argmin(np.linalg.norm(points - positions, axis=1))]
         return nearest
 

@@ -211,7 +211,7 @@ class WholeTrack:
 
 
 class _LaggedFrame(NamedTuple):
-    """A frame of a running track, and its bank after the update."""
+    """A frame of a running track, and the bank after the update with this frame."""
 
     frame: FieldFrame
     dt: float

@@ -96,10 +96,10 @@ class WindowSearch:
         out = []
         for first in range(0, H.shape[-1], n_one):
             H_one = H[..., first:first + n_one]
-            by_velocity = H_one[..., 3:6] + t[:, None, None, None] * H_one[..., :3]
+            H_velocity = H_one[..., 3:6] + t[:, None, None, None] * H_one[..., :3]
             hard = self._vehicles.hard_moments(x[first:first + n_one])
-            by_moment = H_one[..., 6:6 + hard.size].reshape(*H_one.shape[:3], -1, 3).mean(axis=3)
+            H_moment = H_one[..., 6:6 + hard.size].reshape(*H_one.shape[:3], -1, 3).mean(axis=3)
             magnitude = float(np.linalg.norm(hard.sum(axis=0)))
-            out += [KNOWN_STD * H_one[..., :3], KNOWN_STD * by_velocity,
-                    KNOWN_MOMENT_RATIO * magnitude * by_moment]
+            out += [KNOWN_STD * H_one[..., :3], KNOWN_STD * H_velocity,
+                    KNOWN_MOMENT_RATIO * magnitude * H_moment]
         return np.concatenate(out, axis=3)
