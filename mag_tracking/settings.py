@@ -13,7 +13,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, TypeVar
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.yaml_file import is_text, read_yaml, short_repr
+from mag_tracking.yaml_file import is_utf8_encodable, read_yaml, short_repr
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -150,7 +150,7 @@ def _scalar(name: str, value: object, kind: _Class) -> Scalar:
         return float(value)
     if kind is int and isinstance(value, int) and not isinstance(value, bool):
         return value
-    if kind is str and isinstance(value, str) and not is_text(value):
+    if kind is str and isinstance(value, str) and not is_utf8_encodable(value):
         raise SettingsError(f'{name}: {short_repr(value)} is not text: it contains an unpaired '
                             'surrogate')
     if kind in (bool, str) and isinstance(value, kind):

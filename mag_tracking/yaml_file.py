@@ -23,7 +23,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
     """Safe loader that rejects duplicate keys, and content that exceeds the limits."""
 
     def get_single_node(self) -> yaml.Node | None:
-        """Return the root node after checking its expanded size; None for an empty document."""
+        """Return the root node after checking its size and depth; None for an empty document."""
         node = super().get_single_node()
         if node is not None:
             _check_size(node)
@@ -57,7 +57,7 @@ _UniqueKeyLoader.add_constructor('tag:yaml.org,2002:int', _UniqueKeyLoader.const
 
 
 def _check_size(root: yaml.Node) -> None:
-    """Raise YAMLError if a file with expanded aliases is too large, too deep or infinite.
+    """Raise YAMLError if a file is too large, too deep or infinite once aliases are expanded.
 
     Aliases are not expanded here: a node with several aliases is one object and is visited once.
     """
@@ -143,7 +143,7 @@ def parse_yaml(text: str | TextIO, name: str, error: type[MagTrackingError]) -> 
         raise error(f'{name} is nested too deeply') from problem
 
 
-def is_text(value: str) -> bool:
+def is_utf8_encodable(value: str) -> bool:
     """Whether a string can be encoded as UTF-8: it has no unpaired surrogate such as "\\ud800".
 
     Parameters

@@ -32,7 +32,7 @@ from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.sensor_network import SensorNetwork
 from mag_tracking.settings import replace
-from mag_tracking.yaml_file import is_text, read_yaml, short_repr
+from mag_tracking.yaml_file import is_utf8_encodable, read_yaml, short_repr
 
 _PACKAGE = 'mag_tracking.drivers'
 KINDS = {
@@ -146,7 +146,7 @@ def driver_of(name: object, entry: object) -> Driver:
     """
     if not isinstance(name, str) or not isinstance(entry, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {short_repr(entry)}')
-    if not is_text(name):
+    if not is_utf8_encodable(name):
         raise SettingsError(f'{short_repr(name)} is not a device name: it is not valid Unicode')
     options = dict(entry)
     try:
@@ -232,7 +232,7 @@ def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:
     for key, value in sensors.items():
         if isinstance(key, bool) or not isinstance(key, (str, int)):
             raise SettingsError(f'sensors: {short_repr(key)} is not a name; put it in quotes')
-        if not is_text(str(key)):
+        if not is_utf8_encodable(str(key)):
             raise SettingsError(f'sensors: {short_repr(key)} is not a name: it is not valid '
                                 'Unicode')
         if not isinstance(value, str) or not (value == IGNORED or _NAME_PATTERN.fullmatch(value)):

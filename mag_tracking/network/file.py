@@ -17,7 +17,7 @@ from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quater
 from mag_tracking.network import CalibrationRecord, SensorNetwork
 from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
 from mag_tracking.network.topics import TOPIC_NAME_PATTERN
-from mag_tracking.yaml_file import is_text, read_yaml, short_repr
+from mag_tracking.yaml_file import is_utf8_encodable, read_yaml, short_repr
 
 _SENSOR_NAME_PATTERN = re.compile(r'[A-Za-z0-9_.-]+')
 _FRAME_PATTERN = re.compile(r'[A-Za-z0-9_./-]+')
@@ -153,7 +153,7 @@ def _parse_calibration(label: str, value: Any) -> CalibrationRecord | None:
     label = f'{label}: calibrated'
     _check_keys(label, value, {'date', 'by', 'clock_offset_std', 'stated', 'stated_std_deg'})
     for key in ('date', 'by'):
-        if not isinstance(value.get(key), str) or not is_text(value[key]):
+        if not isinstance(value.get(key), str) or not is_utf8_encodable(value[key]):
             raise NetworkError(f"{label}: {key} must be a string ('...'), "
                                f'got {short_repr(value.get(key))}')
     std, orientation = value.get('clock_offset_std'), value.get('stated')

@@ -18,7 +18,7 @@ from mag_tracking.units import NS
 from mag_tracking.web.live_track import LiveTrack
 
 HISTORY_S = 600.0
-"""[s] Time from the end of a track to its removal."""
+"""[s] Time from the latest pose of a track to its removal."""
 MAX_POSES = 30_000
 """Maximum number of poses over all tracks; the oldest tracks are removed first."""
 MAX_FRAMES = 64
@@ -148,7 +148,7 @@ class LiveScene:
                 self._notes, self._tables, self._is_health_new = notes, tables, True
 
     def snapshot(self) -> list[str]:
-        """Messages that bring a new viewer to the state of all other viewers.
+        """Messages that give a new viewer the state that all other viewers have received.
 
         Returns
         -------
@@ -215,7 +215,7 @@ class LiveScene:
         self._end_ns = max(self._end_ns, stamp_ns)
 
     def _remove_old_tracks(self) -> None:
-        """Remove tracks that ended more than `HISTORY_S` ago, and the oldest beyond `MAX_POSES`."""
+        """Remove tracks older than `HISTORY_S`, and the oldest while `MAX_POSES` is exceeded."""
         n = sum(len(live.log.stamp_ns) for live in self._tracks.values())
         for key, live in list(self._tracks.items())[:-1]:
             is_old = (self._end_ns - live.end_ns) / NS > HISTORY_S

@@ -13,7 +13,8 @@ MAX_TRACK_POSES, N_REMOVED = 8_000, 1_000
 MAX_GAP_S = 60.0
 """[s] A pose after a longer gap belongs to another track with the same id."""
 N_RECENT = 100
-"""Number of latest poses used to select the sensors whose fields are sent."""
+"""Minimum number of latest poses from which the sensors with the strongest fields are selected.
+Only the fields of these sensors are sent."""
 
 
 class LiveTrack:
@@ -53,7 +54,7 @@ class LiveTrack:
         return self._n_sent < len(self.log.stamp_ns) or self.log.ended and not self._is_end_sent
 
     def continues(self, track: Track) -> bool:
-        """Whether a pose belongs to this track.
+        """Whether a record with the same track id belongs to this track.
 
         Parameters
         ----------
@@ -112,7 +113,10 @@ class LiveTrack:
         return self._entry(begin_ns, range(self._n_sent)) if self._n_sent else None
 
     def _entry(self, begin_ns: int, rows: range) -> dict[str, Any]:
-        """JSON object with the poses of `rows` and the fields of the recently strongest sensors."""
+        """JSON object with the poses of `rows`, and the fields at some of the sensors.
+
+        The sensors are those with the strongest fields at the latest poses.
+        """
         recent = range(max(0, rows.stop - max(N_RECENT, len(rows))), rows.stop)
         entry = track_entry(self.log, begin_ns, strongest_sensors(self.log, recent), rows)
         entry['key'], entry['smoothed'] = self.key, self.smoothed

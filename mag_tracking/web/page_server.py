@@ -151,7 +151,7 @@ class PageServer:
                     continue
 
     def _messages(self, get_messages: Callable[[], list[str]]) -> list[str]:
-        """Get messages from the source; log an error once and show it on the page."""
+        """Get messages from the source; log each error once, and show it on the page."""
         try:
             return get_messages()
         except Exception as error:
@@ -317,10 +317,10 @@ def _open_socket(host: str, port: int) -> socket.socket:
                           'check the address or choose another port') from error
 
 
-def _response(status: HTTPStatus, body: bytes, kind: str, encoding: str = '') -> Response:
+def _response(status: HTTPStatus, body: bytes, media_type: str, encoding: str = '') -> Response:
     """HTTP response with security headers."""
     headers = Headers({
-        'Content-Type': f'{kind}; charset=utf-8', 'Content-Length': str(len(body)),
+        'Content-Type': f'{media_type}; charset=utf-8', 'Content-Length': str(len(body)),
         'Cache-Control': 'no-store', 'Referrer-Policy': 'no-referrer', 'Connection': 'close',
         'X-Content-Type-Options': 'nosniff', 'X-Frame-Options': 'DENY'})
     if encoding:

@@ -11,7 +11,10 @@ N = 30
 
 
 def log_with_errors(errors, noise=NOISE, missing=False):
-    """Create the log of a straight track with position errors (n, 3), and its ground truth."""
+    """Create the log of a straight track with position errors (n, 3), and its ground truth.
+
+    If `missing`, the second sensor has no measurements.
+    """
     t = 0.08 * np.arange(N)
     true_path = np.column_stack([10.0 * t - 12.0, np.full(N, 1.0), np.full(N, 0.5)])
     log = TrackLog(1)

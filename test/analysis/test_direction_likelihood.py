@@ -15,7 +15,7 @@ T = np.arange(-0.75, 0.75, 0.01)
 
 
 def passing_field(rng, lane):
-    """Horizontal field (n, 2) [T] of a random dipole in a lane, at the sensor."""
+    """Horizontal field (n, 2) [T] at the sensor while a random dipole passes in a lane."""
     r = np.stack([lane.speed * (T - rng.uniform(-0.1, 0.1)), np.full(len(T), lane.distance),
                   np.full(len(T), lane.height)], axis=1)
     return dipole_field(-r, 400.0 * rng.standard_normal(3))[:, :2]

@@ -220,7 +220,7 @@ def test_a_false_track_is_not_fitted_as_a_vehicle():
 
 
 def test_a_velocity_change_of_one_target_rejects_all_fits():
-    """The second vehicle changes from half its nominal speed to twice its nominal speed."""
+    """The second vehicle suddenly changes from half to twice its nominal speed."""
     rng = np.random.default_rng(11)
     (first, first_moments), (second, second_moments) = (
         random_lane_path(rng, -0.3, 1, 1), random_lane_path(rng, 0.2, -1, 1))
@@ -257,9 +257,9 @@ def test_a_fit_that_differs_from_its_track_has_a_reason():
 
 
 def fits_with_minima(*others):
-    """Create fits of two points; each of `others` maps theta (12,) to an additional minimum.
+    """Create fits of two points; each of `others` maps theta (12,) to another minimum of the cost.
 
-    Return (data, theta, fits, (linear parameters, minimum)).
+    Return (data, true theta, fits, (linear parameters, minimum)).
     """
     rng = np.random.default_rng(15)
     data, paths = simulated_pass(rng, MEETING, 1)

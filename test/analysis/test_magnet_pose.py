@@ -14,7 +14,7 @@ from support.magnet_boards import HIGH, LOW, MOMENT, SETTINGS, board, estimated,
 
 
 def test_single_poses_have_consistent_covariances():
-    """The poses in the box are random, with one reading per sensor and a random field error."""
+    """Each random pose above the board has one reading per sensor, with a random field error."""
     network = board(4, 0.05)
     rng = np.random.default_rng(5)
     settings = PoseSettings()

@@ -62,7 +62,10 @@ def test_a_row_is_the_sum_of_its_dipoles(n_dipoles):
 @pytest.mark.parametrize('road', [True, False], ids=['road', 'any heading'])
 @pytest.mark.parametrize('n_dipoles', ORDERS)
 def test_the_search_finds_the_global_optimum(n_dipoles, road):
-    """The cost does not exceed the minimum near the truth; `bench.pass_search` fits 200 passes."""
+    """The cost does not exceed the minimum near the truth.
+
+    `bench.pass_search` measures the same on more passes.
+    """
     failures = []
     for seed in range(10):
         rng = np.random.default_rng([seed, n_dipoles, road])
@@ -173,7 +176,7 @@ def test_robust_covariance_is_slightly_larger_than_the_nominal_covariance(n_dipo
 
 
 def test_hard_and_soft_iron_are_estimated_from_four_headings():
-    """m0 and D from passes of three dipoles have errors below three stds; TSP14 section VI.E."""
+    """Hard and soft iron of a row of three dipoles have errors below three stds; TSP14 VI.E."""
     rng = np.random.default_rng(5)
     hard, soft = np.array([[60.0, 30.0, -40.0], [120.0, -10.0, -70.0], [20.0, 40.0, 30.0]]), 5.0
     moments, headings, covariances = [], [], []
@@ -238,7 +241,7 @@ def test_one_sensor_determines_directions_and_time_but_not_the_scale():
 
 
 def test_a_fit_of_one_sensor_is_ambiguous_in_the_sign_of_the_path():
-    """The paths (r, v) and (-r, -v) have the same field; the fit is above the sensor."""
+    """The paths (r, v) and (-r, -v) have the same field; the fit is the path above the sensor."""
     for seed in range(12):
         rng = np.random.default_rng([seed, 5])
         path, moments = random_path(rng, 1, False)

@@ -26,7 +26,7 @@ PATH = np.array([0.0, -2.0, 0.5, 10.0, 0.0, 0.0, 3.0])
 
 
 def test_reach_covers_the_residuals_of_published_vehicles():
-    """A published cost at 4.5 m means that a fraction (cost - 1) / 87 of energy is unexplained."""
+    """At 4.5 m, a published cost means that (cost - 1) / 87 of the energy is unexplained."""
     cars, trucks = (10, 14, 17), ((302.6, 9.09), (76.7, 11.25))
     for cost in cars:
         assert 1.0 < 4.5 * np.sqrt((cost - 1.0) / 87.0) <= reach(1, 0.0)
@@ -141,7 +141,10 @@ def test_repeated_readings_of_a_coarse_sensor_are_counted_as_fractions():
 
 
 def point_fit(std_speed, std_heading, change=0.0):
-    """Create the `PassFit` of a point with given stds of speed [m/s] and heading [rad]."""
+    """Create the `PassFit` of a point with given stds of speed [m/s] and heading [rad].
+
+    `change` is the apparent relative change of the velocity.
+    """
     data, _ = noisy_data_and_field()
     x = np.concatenate([[0.0, -2.0, 0.5], [10.0, 0.0, 0.0], np.ones(9)])
     P = 1e-4 * np.eye(len(x))

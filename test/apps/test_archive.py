@@ -39,7 +39,10 @@ def road_network_file(tmp_path_factory):
 
 
 def archive_without_cluster(folder, recording, network, settings, in_order=True):
-    """Archive a recording without a cluster; return (columns of its row, number of segments)."""
+    """Archive a recording without a cluster; return (columns of its row, number of segments).
+
+    With `in_order` False, the segments are tracked in reverse order.
+    """
     work = folder / 'unfinished'
     work.mkdir(parents=True)
     job = Job(recording, work, folder, network, settings)
@@ -50,7 +53,7 @@ def archive_without_cluster(folder, recording, network, settings, in_order=True)
 
 
 def assert_rows_of_replay(folder, result):
-    """Assert that the tables contain the poses and tracks of a result in the same order."""
+    """Assert that the tables in `folder` contain the poses and tracks of a replay in its order."""
     for table, poses in (('poses', result.poses),
                          ('smoothed', result.smoothed[result.smoothed['complete']])):
         files = pq.read_table(folder / table).to_pandas()

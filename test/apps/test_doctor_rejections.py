@@ -51,7 +51,7 @@ def changed(samples, k, **values):
 
 
 def rejections(samples, network):
-    """Feed samples to the stage; return its rejections {description: number}."""
+    """Feed samples to the calibration stage; return its rejections {description: number}."""
     stage = Calibrate(network, SETTINGS)
     for sample in samples:
         stage.feed(one(sample))
@@ -69,7 +69,7 @@ FAULTS = {
     RejectionCause.DUPLICATE: {'stamp_ns': 10**18 + 498 * STEP_NS},
     RejectionCause.OUT_OF_ORDER: {'stamp_ns': 10**18 + 498 * STEP_NS - STEP_NS // 2},
     RejectionCause.SPIKES: {'field': np.full(3, 2e-4)}}
-"""{cause: change that makes the stage reject a reading for this cause}."""
+"""{cause: change of a reading that makes the calibration stage reject it for this cause}."""
 
 
 @pytest.mark.parametrize('cause', FAULTS, ids=lambda cause: cause.name)

@@ -9,7 +9,7 @@ from support.samples import MagSample, batch
 
 
 def test_an_empty_batch_is_accepted_while_a_reading_is_held():
-    """A message may contain only readings of sensors outside the network."""
+    """A batch is empty if all readings of a message come from sensors outside the network."""
     rng, passes = np.random.default_rng(0), []
     collector = PassCollector(ROAD, settings_for('vehicle'))
 

@@ -62,7 +62,7 @@ def pass_of(begin, end):
 
 
 def crossing(number, at, y, v, n=5, std=0.1):
-    """Poses of a track that crosses x = 0 at time `at` [s], when its covariance is smallest."""
+    """Poses of a track that crosses x = 0 at time `at` [s]; the covariance is smallest there."""
     return [track_pose(at + 0.2 * k, 0.2 * k * v, y, v, id=number,
                        covariance=(std + 0.1 * abs(k))**2 * np.eye(6))
             for k in range(-n, n + 1)]

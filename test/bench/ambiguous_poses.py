@@ -31,7 +31,7 @@ def passes_of(policy, seed):
 
 
 def summary(figures, policy, found):
-    """Record the figures of a policy; return a line and whether the aim is met."""
+    """Record the figures of a policy for ambiguous poses; return (text, whether the aim is met)."""
     found = [f for passes in found for f in passes]
     ambiguous = np.concatenate([f.ambiguous for f in found])
     nees = np.concatenate([f.topic_nees for f in found])

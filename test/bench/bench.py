@@ -63,7 +63,7 @@ def moment(x):
 
 
 def dipole(d, m):
-    """Field (3,) [T] of a dipole at the position `d` from it; its Jacobians about `d` and `m`."""
+    """Field (3,) [T] of a dipole `m` at the relative position `d`; Jacobians in `d` and `m`."""
     n2 = d @ d
     k3 = 1e-7 / n2**1.5
     dm = d @ m
@@ -200,7 +200,7 @@ def bank_case(n_sensors, n_hyp, rng, has_mounting):
 
 
 def bank_ratio(peer_class, n_sensors, has_mounting, n_hyp=64, rounds=12, repeats=100):
-    """Time updates; return (median, minimum, maximum ratio, time [us] of bank, time of peer)."""
+    """Time the updates; return (median, minimum, maximum ratio, bank time [us], peer time [us])."""
     rng = np.random.default_rng(n_sensors)
     bank_filter, positions, R_sw, bank, frame = bank_case(n_sensors, n_hyp, rng, has_mounting)
     x, P = bank.x, bank.P

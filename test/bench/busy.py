@@ -3,7 +3,7 @@
 Recordings and simulated worlds with meeting and following vehicles and dense traffic are tracked.
 The figures are the fraction of detected vehicles, the RMS error, the NEES, the number of false
 tracks and the time of a search for another vehicle. At most 1 % of the poses that are not flagged
-as ambiguous may be wrong; these include poses of single vehicles. A frame of two vehicles may take
+as ambiguous may be wrong, including poses of single vehicles. A frame of two vehicles may take
 four times as long as a frame of one vehicle. With `--data FOLDER`, the recordings of another folder
 are used (`*.mcap` with `*.truth.json`).
 """
@@ -72,7 +72,7 @@ def timed_searches():
 
 
 def recordings(figures, folder):
-    """Track the recordings; return [(number of unflagged poses, number of wrong ones of these)]."""
+    """Track the recordings; return the numbers [(unflagged poses, wrong unflagged poses)]."""
     counted = []
     for path in with_progress_bar(sorted(folder.glob('*.truth.json')), 'recordings'):
         name = path.name.removesuffix('.truth.json')
@@ -134,7 +134,7 @@ def single_vehicles(passes):
 
 
 def cost():
-    """Ratio of the time of a frame with two vehicles to the time with one, for equal banks."""
+    """Time of a frame with two vehicles relative to one vehicle, for banks of equal size."""
     settings, network = settings_for('vehicle').track, NETWORKS[2]
     model, C = vehicle_model(settings.vehicle, network), np.tile(3.6e-17 * np.eye(3), (2, 1, 1))
     frame = FieldFrame(0, np.full((2, 3), 2e-8), C, np.full(2, 4), np.zeros(2), True)

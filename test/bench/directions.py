@@ -3,8 +3,9 @@
 Three replicas of 511 vehicles on a road with two lanes are simulated by each of two simulators,
 with a two-axis sensor on each side of the road. The figures are the fractions of correct directions
 from the sensor of the near lane, from the sensor of the far lane and from their fusion, for the
-correlation and for the likelihood ratio. The aims for the correlation are 99.8 % near and 97 %
-fused. The reported error probabilities may differ by at most 0.05 from the measured error rates.
+correlation and for the likelihood ratio. The aims for the correlation are 99.8 % for the near
+sensor and 97 % for the fusion. The reported error probabilities may differ by at most 0.05 from the
+measured error rates.
 """
 
 import sys

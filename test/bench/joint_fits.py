@@ -40,14 +40,17 @@ class Tally:
         self.found, self.seconds = [], 0.0
 
     def add(self, passes, of_vehicles, n_vehicles, seconds):
-        """Add the fits of a recording or world."""
+        """Add the fits of a recording or world.
+
+        `passes` are all fitted passes; `of_vehicles` are the fits assigned to true vehicles.
+        """
         self.n_vehicles += n_vehicles
         self.n_passes += len({(one.recording, one.number) for one in passes})
         self.found += of_vehicles
         self.seconds += seconds
 
     def figures(self, figures, label, aim=None):
-        """Print the figures; return (number of unflagged fits, number of wrong unflagged fits)."""
+        """Print and record figures; return (number of unflagged fits, number of wrong ones)."""
         error = np.array([of.one.chosen.speed[0] / of.speed - 1.0 for of in self.found])
         sd = np.array([of.one.chosen.speed[1] / of.speed for of in self.found])
         unflagged = np.array([not of.one.chosen.ambiguous for of in self.found], dtype=bool)

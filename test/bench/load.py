@@ -2,7 +2,7 @@
 
     PYTHONPATH=test python -m bench.load                         # 100 sensors x 100 Hz, ten minutes
     PYTHONPATH=test python -m bench.load --pages 10              # the same with ten live pages open
-    PYTHONPATH=test python -m bench.load --sensors 2 --minutes 2 --lean  # two, 126 hypotheses
+    PYTHONPATH=test python -m bench.load --sensors 2 --minutes 2 --lean  # 2 sensors, 126 hypotheses
                                 --one-process --batches          # further options for minimum cost
 
 Driver, calibration, detection and tracker run as processes; a simulator in the driver replaces the

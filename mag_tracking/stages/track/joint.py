@@ -54,8 +54,9 @@ class JointExplanation:
         """Indices of the vehicles whose states may be wrong.
 
         - All vehicles of an explanation whose log-odds are below `CONFIDENT_NATS`, or below
-          `IMPLAUSIBLE_NATS` if a new vehicle crosses another or one overtakes too fast.
-        - A vehicle that was found at another position than its track.
+          `IMPLAUSIBLE_NATS` if a new vehicle crosses another vehicle, or one overtakes the other
+          too fast.
+        - A vehicle that the explanation relocates.
         - Two vehicles that replace one vehicle and move in the same direction, because a long
           vehicle with large model errors resembles two vehicles.
 
@@ -82,9 +83,9 @@ class JointExplanation:
 
 
 def _are_implausible(velocity: FloatArray, n_new: int) -> bool:
-    """Whether one of the last `n_new` vehicles crosses another, or one overtakes too fast.
+    """Whether a new vehicle crosses another vehicle, or one overtakes the other too fast.
 
-    The `velocity` is (n, 2) [m/s].
+    The last `n_new` rows of `velocity` (n, 2) [m/s] are the velocities of the new vehicles.
     """
     speed = np.linalg.norm(velocity, axis=1)
     for i in range(len(velocity) - n_new, len(velocity)):

@@ -131,13 +131,13 @@ class TrackManager:
             self._doubtful_by_sensor = {self._network.index(name): t for name, t in times.items()}
 
     def _doubtful_sensors(self, *frames: FieldFrame) -> list[int]:
-        """Indices of the sensors whose backgrounds are doubtful in any of the frames."""
+        """Indices of the sensors that measured with a doubtful background in any of the frames."""
         return [j for j, times in self._doubtful_by_sensor.items()
                 if any(f.n_samples[j] and are_doubtful(times, f.stamp_ns) for f in frames)]
 
     @property
     def clock_warning(self) -> str:
-        """Message about a significant clock offset; empty if all clocks agree."""
+        """Message about a significant clock offset; empty if none, or without `cross_check`."""
         offset = self._clocks.largest_offset if self._settings.cross_check else None
         return '' if offset is None else offset.text(self._network.names)
 
@@ -228,10 +228,10 @@ class TrackManager:
         out = [record for track in tracks for record in track.end(reason)]
         if stamp_ns is None:
             return out
-        return [*out, *self._unexplained(tracks, stamp_ns), *self._disturbances.end(stamp_ns)]
+        return [*out, *self._add_unexplained(tracks, stamp_ns), *self._disturbances.end(stamp_ns)]
 
-    def _unexplained(self, tracks: list[RunningTrack], stamp_ns: int) -> list[TrackRecord]:
-        """Start or extend a disturbance with the unexplained fields of `tracks`; return records."""
+    def _add_unexplained(self, tracks: list[RunningTrack], stamp_ns: int) -> list[TrackRecord]:
+        """Start or extend a disturbance with unexplained fields of `tracks`; return its records."""
         out: list[TrackRecord] = []
         for found in (found for track in tracks for found in track.unexplained):
             self.counts[DISTURBANCE_TRACKS] += 1
@@ -239,7 +239,7 @@ class TrackManager:
         return out
 
     def _maintain(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
-        """Update every running track with the frame, and delete the tracks that have ended."""
+        """Update the running tracks with a frame, delete the ended ones, and return the records."""
         doubtful = self._doubtful_sensors(frame)
         self._max_energy = max(self._max_energy, _energy(frame))
         for track in self._tracks:
@@ -248,9 +248,9 @@ class TrackManager:
         return out + self._delete_ended(frame.stamp_ns)
 
     def _delete_ended(self, stamp_ns: int) -> list[TrackRecord]:
-        """Delete the tracks that ended, and return the records of their disturbances."""
-        out = self._unexplained([track for track in self._tracks if track.ended is not None],
-                                stamp_ns)
+        """Delete the ended tracks; return the records of disturbances that explain their fields."""
+        out = self._add_unexplained([track for track in self._tracks if track.ended is not None],
+                                    stamp_ns)
         # A track that restarts while the vehicle departs would be placed on the wrong line.
         if any(track.is_lost for track in self._tracks) and not self._target.starts_anywhere:
             self._restart_energy = RESTART_ENERGY_RATIO * self._max_energy
@@ -258,7 +258,7 @@ class TrackManager:
         return out
 
     def _store_frame(self, frame: FieldFrame) -> None:
-        """Store a frame for the lookback of a later track."""
+        """Store a frame for the lookback of a later track, and drop frames that are too old."""
         self._recent.append(frame)
         oldest = frame.stamp_ns - self._settings.lookback_s * NS
         while self._recent and self._recent[0].stamp_ns < oldest:
@@ -304,7 +304,7 @@ class TrackManager:
         return out + self._delete_ended(frame.stamp_ns)
 
     def _sensors_at(self, frame: FieldFrame, n: int) -> SensorSubset:
-        """Up to `n` sensors for a new track: the sensors nearest to the strongest field."""
+        """Up to `n` sensors for a new track, nearest to the sensor with the strongest field."""
         if len(self._network) <= n:
             return SensorSubset(self._network)
         strongest = int(np.argmax(whitened_energy(frame.field, frame.covariance)[0]))

@@ -53,8 +53,8 @@ class MemberView:
     """Index of the published hypothesis."""
     observation: Observation
     gain: float
-    """Log-likelihood along the path of this hypothesis, minus its log-likelihood in the filter, for
-    the latest frames [nats]."""
+    """Increase of the log-likelihood of the latest frames by relinearising the path of this
+    hypothesis, relative to the filter [nats]."""
 
 
 class Member:
@@ -87,7 +87,7 @@ class Member:
     is_lost : bool
         Whether the member ended while the target was still detected.
     early : list of TrackState
-        Smoothed states at times before the target shared its state with other targets.
+        Smoothed states from the time before the target shared its state with other targets.
     slot : int
         Index of the target in the joint states that are stored for smoothing.
     """
@@ -134,8 +134,8 @@ class Member:
     def start_alongside(self, first: 'Member', stamp_ns: int, ratio: float) -> None:
         """Start as a new target of a track, in addition to its first member.
 
-        The new target inherits the first member's doubt about the approach, and its evidence
-        against a disturbance.
+        The new target inherits two properties of the first member: the doubt that it was not seen
+        approaching, and its evidence for a target against a disturbance.
 
         Parameters
         ----------
@@ -149,7 +149,7 @@ class Member:
         self.evidence.bayes_factor.add(first.evidence.bayes_factor.log_ratio, stamp_ns, ratio)
 
     def distance_from(self, stamps_ns: Sequence[int], path: FloatArray) -> float:
-        """Mean distance of the recent positions from a path.
+        """Mean distance of the recently published positions from a path.
 
         Parameters
         ----------
@@ -168,7 +168,7 @@ class Member:
         return float(np.mean(distances)) if distances else 0.0
 
     def publish(self, update: BankUpdate, view: MemberView) -> Track:
-        """Create and store the record of a frame.
+        """Create and store the `Track` record of this member for a frame.
 
         Parameters
         ----------
@@ -187,7 +187,7 @@ class Member:
         return self.last
 
     def _create_record(self, update: BankUpdate, view: MemberView) -> Track:
-        """Update the evidence with a frame, and return its `Track`."""
+        """Update the evidence with a frame, and return the `Track` record for this frame."""
         frame, dt, sensors, best = update.frame, update.dt, update.sensors, view.best
         measured: BoolArray = ~np.isnan(frame.field)
         measuring = np.flatnonzero(measured.any(axis=1))
@@ -228,7 +228,7 @@ class Member:
             or not self._target.starts_anywhere and self.evidence.is_sensed_by_one
 
     def _doubts(self, update: BankUpdate, view: MemberView, is_single_sensor: bool) -> set[str]:
-        """Update the checks of the member, and return the doubts about a pose."""
+        """Update the checks of the member, and return the doubts about its latest pose."""
         bank, best, evidence, settings = view.bank, view.best, self.evidence, update.settings
         reasons = evidence.doubts | ({doubts.ONE_SENSOR} if is_single_sensor else set())
         if update.bank_filter.is_implausible(bank, best, update.frame):
@@ -252,7 +252,7 @@ class Member:
         return reasons | evidence.doubts
 
     def _overfits(self, update: BankUpdate, view: MemberView) -> bool:
-        """Update the doubt about the filter, and return whether the filter is doubtful."""
+        """Update and return the doubt that the filter fits the frames better than its path."""
         overfits = self.evidence.update_filter_doubt(view.gain, update.frame.stamp_ns,
                                                update.settings.relinearise_window_s)
         if overfits:
@@ -277,17 +277,17 @@ class Member:
         return self.evidence.reason_to_end(self.last, self._position_std, is_approaching, settings)
 
     def unexplained(self, uniform: float) -> UnexplainedField | None:
-        """Field of the track, if no target has explained it in any frame.
+        """Field of the track, if all its poses were ambiguous and a disturbance explains it better.
 
         Parameters
         ----------
         uniform : float
-            Probability of a common field over the network.
+            Probability that the field is the same at all sensors of the network.
 
         Returns
         -------
         UnexplainedField or None
-            None if a target has explained the field.
+            None if a target may have explained the field.
         """
         if self._was_unambiguous or self.last is None \
                 or self.evidence.bayes_factor.disfavoured_s(self.last.stamp_ns) <= 0.0:
@@ -322,7 +322,8 @@ class Member:
                  doubtful: bool) -> list[SmoothedPose]:
         """Return smoothed poses for the states of a hypothesis.
 
-        Smoothing removes the doubts about the filter only in part.
+        Poses at times at which the filter was doubtful are marked as ambiguous, because smoothing
+        corrects its errors only in part.
 
         Parameters
         ----------
@@ -334,7 +335,7 @@ class Member:
             Whether the states cover the whole track.
         states : list of TrackState
         doubtful : bool
-            Whether all poses are marked as ambiguous.
+            Whether to mark all poses as ambiguous.
 
         Returns
         -------
@@ -352,7 +353,7 @@ class Member:
 
 def members_in_order(members: Sequence[Member], new: Member | None, joint: JointExplanation,
                      n_one: int) -> list[Member]:
-    """Return the members and a new target in the order of the states of a joint explanation.
+    """Return the members and a new target, ordered like the states in a joint explanation.
 
     If two vehicles replace one member, this member continues as the vehicle whose path is nearer to
     its published positions.
@@ -370,11 +371,11 @@ def members_in_order(members: Sequence[Member], new: Member | None, joint: Joint
     list of Member
     """
     others = list(members)
-    old = others.pop(joint.replaced) if joint.replaced is not None else None
-    if new is None or old is None:
-        return [*others, *([old] if old else []), *([new] if new else [])]
+    replaced = others.pop(joint.replaced) if joint.replaced is not None else None
+    if new is None or replaced is None:
+        return [*others, *([replaced] if replaced else []), *([new] if new else [])]
     first = n_one * len(others)
     paths = np.array([path[joint.bank.best(), first:] for path in joint.window.paths])
     stamps = [frame.stamp_ns for frame in joint.window.frames]
-    distances = [old.distance_from(stamps, paths[:, k * n_one:k * n_one + 2]) for k in (0, 1)]
-    return [*others, old, new] if distances[0] <= distances[1] else [*others, new, old]
+    distances = [replaced.distance_from(stamps, paths[:, k * n_one:k * n_one + 2]) for k in (0, 1)]
+    return [*others, replaced, new] if distances[0] <= distances[1] else [*others, new, replaced]

@@ -1,4 +1,4 @@
-"""Triggers and acceptance criteria for comparing a track with other explanations of its frames."""
+"""When to compare a track with other explanations of its frames, and when to accept one."""
 
 import numpy as np
 from scipy.special import chdtrc
@@ -26,7 +26,7 @@ IMPROBABLE, LONG_VEHICLE = 'improbable innovations', 'a long vehicle'
 
 
 class NewTargetEvidence:
-    """Decision when to compare a track with other explanations, and whether to accept one.
+    """Decides when to compare a track with other explanations, and whether to accept one.
 
     A comparison is due when the latest innovations are improbable. A model of one long vehicle may
     explain two short vehicles without improbable innovations. A track of a long vehicle is
@@ -51,8 +51,9 @@ class NewTargetEvidence:
         degrees_of_freedom : int
         stamp_ns : int, ns
         rejected : bool
-            Whether one of two sensors was rejected, which has the effect of improbable innovations.
-            With more sensors, the majority shows that the rejected sensor is faulty.
+            Whether one of two sensors was rejected. This triggers a comparison in the same way as
+            improbable innovations. With more sensors, the majority shows that the rejected sensor
+            is faulty.
         is_long : bool
             Whether the best hypothesis is a long vehicle.
         """
@@ -85,7 +86,7 @@ class NewTargetEvidence:
         return reason
 
     def accepts(self, log_odds: float) -> bool:
-        """Whether another explanation is accepted; store whether a repetition would be accepted.
+        """Whether another explanation is accepted, at once or in two successive comparisons.
 
         Parameters
         ----------

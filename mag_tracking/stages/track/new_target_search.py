@@ -99,7 +99,7 @@ class NewTargetSearch:
             * len(settings.kinds) * len(moment_directions()) * N_DISTANCES))
 
     def find(self) -> JointExplanation | None:
-        """Return the best explanation with a new target, or with a vehicle at another position.
+        """Return the best explanation with a new or a relocated vehicle.
 
         Returns
         -------
@@ -135,7 +135,7 @@ class NewTargetSearch:
 
     def _best_of(self, starts: Sequence[WindowStart], track_evidence: float
                  ) -> JointExplanation | None:
-        """Joint explanation of the refined starts; None if no start is usable.
+        """Refine the starts; return their joint explanation, or None if no start is usable.
 
         `track_evidence` is the log-evidence of the track.
         """
@@ -148,22 +148,22 @@ class NewTargetSearch:
     def _current_track(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
         """Run the leading hypotheses of the current track along their paths.
 
-        Returns their indices in the bank (n,), log-likelihoods (n,), log-weights after these frames
-        (n,) and paths (n, n_frames, n_x).
+        Returns their indices in the bank (n,), log-likelihoods of the window (n,), log-weights
+        after the window (n,) and paths (n, n_frames, n_x).
         """
         window, bank = self._window, self._bank
         order = np.argsort(-bank.log_w, kind='stable')[:window.max_hypotheses]
         rows = np.searchsorted(window.anchor.origin, bank.origin[order])
         anchor, paths = window.anchor.rows(rows), np.stack([p[rows] for p in window.paths], axis=1)
         begin = int(window.is_updated)
-        before = bank.log_w[order] + window.evidence \
+        anchor_log_w = bank.log_w[order] + window.evidence \
             - np.sum([values[rows] for values in window.log_likelihoods[begin:]], axis=0)
         path_result = self._filter.run_along(anchor, window.frames, window.intervals, paths,
                                              passes=PASSES, step=STEP,
                                              first_is_updated=window.is_updated)
         is_usable = np.isfinite(path_result.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
         track_log_likelihood = np.where(is_usable, path_result.log_likelihood, -np.inf)
-        return order, track_log_likelihood, before + track_log_likelihood, paths
+        return order, track_log_likelihood, anchor_log_w + track_log_likelihood, paths
 
     def _leading_indices(self, rows: IntArray, log_w: FloatArray) -> list[int]:
         """Indices into `rows` of the hypotheses to be tried: the best of each arrival and kind."""
@@ -181,10 +181,10 @@ class NewTargetSearch:
     def _known_vehicles(self, row: int, log_w: float, path: FloatArray) -> KnownVehicleHypothesis:
         """Vehicles of hypothesis `row` of the track; `log_w` is its log-weight at the anchor."""
         at = np.searchsorted(self._window.anchor.origin, self._bank.origin[[row]])
-        before = self._window.anchor.rows(at)
+        at_anchor = self._window.anchor.rows(at)
         label, kind = (tuple(np.ravel(of[row]).tolist())
                        for of in (self._bank.label, self._bank.kind))
-        return KnownVehicleHypothesis(before.x[0], before.P[0], path, label, kind, log_w,
+        return KnownVehicleHypothesis(at_anchor.x[0], at_anchor.P[0], path, label, kind, log_w,
                                       self._filter)
 
     def _may_be_two(self, known: KnownVehicleHypothesis, i: int) -> bool:
@@ -237,7 +237,7 @@ class NewTargetSearch:
 
     def _starts_on(self, known: KnownVehicleHypothesis, paths: FloatArray, moments: FloatArray,
                    replaced: int | None) -> list[WindowStart]:
-        """Starts with the known vehicles and k new vehicles, one for each combination of kinds.
+        """One start for each combination of kinds of k new vehicles, which join the known vehicles.
 
         The new vehicles have the `paths` (k, 7) and the `moments` (k, 3, 3).
         """
@@ -264,14 +264,14 @@ class NewTargetSearch:
                           std**2 * np.eye(3 * len(observation.positions)))
 
     def _refine_starts(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
-        """Starts that are about as probable as the best start, with refined paths."""
+        """Refine the paths of the starts; return the starts about as probable as the best one."""
         _, _, log_w, paths = self._run_starts(starts)
         order = np.argsort(-log_w, kind='stable')[:MAX_EXPLANATIONS]
         return [replace(starts[k], path=paths[k]) for k in order.tolist()
                 if log_w[k] >= log_w.max() - MAX_LOSS_NATS]
 
     def _add_turning_starts(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
-        """Each start with straight new vehicles, and its copies in which one new vehicle turns."""
+        """Return the starts and copies of them, in each of which one new vehicle turns."""
         fraction = self._vehicles.settings.turn_share
         out = []
         for start in starts:
@@ -309,7 +309,7 @@ class NewTargetSearch:
         return bank, log_likelihood, log_w, paths
 
     def _are_plausible(self, start: WindowStart, x: FloatArray) -> bool:
-        """Whether speeds and moments of the new vehicles in the state `x` (n_x,) are plausible.
+        """Whether the new vehicles in the state `x` (n_x,) have plausible speeds and moments.
 
         A stationary vehicle cannot have arrived during the window.
         """

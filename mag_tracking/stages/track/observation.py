@@ -244,6 +244,7 @@ class Observation:
         x : (n_hyp, n_x) array
         time_offset : (n_sensors,) array, s
         near_field_length : (n_hyp, n_targets) array, m
+            Model error near each target, relative to the field gradient.
 
         Returns
         -------
@@ -265,7 +266,7 @@ class Observation:
 
     def _single_target_field(self, x: FloatArray, time_offset: FloatArray
                              ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Field of one target with states (n_hyp, n_one); see `sensor_fields`."""
+        """Field of one target with states (n_hyp, n_one), as returned by `sensor_fields`."""
         n_hyp, n, n_t = len(x), len(self.positions), self.n_one
         if not time_offset.any():
             return sensor_fields(self.positions, self.R_sw, *self._model.dipoles(x))
@@ -282,7 +283,7 @@ class Observation:
 
     def field_of(self, x: FloatArray, targets: Iterable[int], time_offset: FloatArray
                  ) -> FloatArray:
-        """Field of selected targets at the sampling time of each sensor.
+        """Field of selected targets at the sampling time of each sensor, with mounting errors.
 
         Parameters
         ----------
@@ -290,6 +291,7 @@ class Observation:
         targets : iterable of int
             Indices of the targets.
         time_offset : (n_sensors,) array, s
+            Sampling time of each sensor, relative to the timestamp.
 
         Returns
         -------
@@ -310,13 +312,14 @@ class Observation:
 
         `H` neglects that the standard deviation of the model error depends on the state. This
         dependence is a few per cent of the derivative where the error is large. The standard
-        deviation follows ICASSP11 eq. (9), where the error is noise.
+        deviation follows ICASSP11 eq. (9), which treats the error as noise.
 
         Parameters
         ----------
         x : (n_hyp, n_x) array
         time_offset : (n_sensors,) array, s
         near_field_length : (n_hyp, n_targets) array, m
+            Model error near each target, relative to the field gradient.
         field_error : float
             Model error relative to the field.
 
@@ -346,12 +349,13 @@ class Observation:
 
     def model_error(self, x: FloatArray, near_field_length: FloatArray, field_error: float
                     ) -> FloatArray:
-        """Variance per axis of the model error in the field of a state, for each sensor.
+        """Variance of the model error on each axis of each sensor, for one state.
 
         Parameters
         ----------
         x : (n_x,) array
         near_field_length : (n_targets,) array, m
+            Model error near each target, relative to the field gradient.
         field_error : float
             Model error relative to the field.
 

@@ -88,9 +88,9 @@ class PassSamples:
         # The noise that whitens the signal already includes the smaller model error.
         signal = np.square(np.linalg.norm(self.y.reshape(-1, 3), axis=1))
         weight = 1.0 / np.sqrt(1.0 + (relative_error**2 - MODEL_ERROR**2) * signal)
-        rows = np.repeat(weight, 3)
-        return replace(self, M=self.M * weight[:, None, None], y=self.y * rows,
-                       backgrounds=self.backgrounds * rows[:, None])
+        row_weight = np.repeat(weight, 3)
+        return replace(self, M=self.M * weight[:, None, None], y=self.y * row_weight,
+                       backgrounds=self.backgrounds * row_weight[:, None])
 
     @classmethod
     def of(cls, network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int,

@@ -41,7 +41,7 @@ class Plausibility:
 
     def evaluate(self, observation: Observation, bank: FilterBank, best: int,
                  settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
-        """Update the closest points of all hypotheses; return the doubts about hypothesis `best`.
+        """Update the closest approach of all hypotheses; return the doubts about hypothesis `best`.
 
         Parameters
         ----------
@@ -52,7 +52,7 @@ class Plausibility:
         settings : VehicleSettings
         mounting_std : float, rad
             Minimum standard deviation of the mounting angles of each sensor. It also applies to
-            accurately mounted sensors, because a model error rotates the field, too.
+            accurately mounted sensors, because a model error also rotates the field.
         dt : float, s
             Duration of the frame.
 
@@ -148,5 +148,5 @@ def _needs_rotated_sensors(observation: Observation, x: FloatArray, mounting_std
     if not angles.size:
         return False
     variance = np.einsum('jii->ji', observation.own_covariance[:, :3, :3])
-    square = float((angles**2 / np.maximum(variance, mounting_std**2)).sum())
-    return bool(square > chdtri(angles.size, P_MOUNTING))
+    squared_norm = float((angles**2 / np.maximum(variance, mounting_std**2)).sum())
+    return bool(squared_norm > chdtri(angles.size, P_MOUNTING))

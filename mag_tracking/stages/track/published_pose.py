@@ -158,7 +158,7 @@ class MagnetOrientation:
 
 
 def published_track(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
-                    names: Sequence[str], kinds: Sequence[str], found: Set[str],
+                    arrivals: Sequence[str], kinds: Sequence[str], found: Set[str],
                     unobserved_length: UnobservedLength | None, *, excess: float = 1.0,
                     ambiguous_poses: str = MIXTURE, difference: FloatArray,
                     stamp_ns: int, id: int, ended: bool, existence: float,
@@ -173,7 +173,7 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         Index of the hypothesis to be published.
     model : SourceModel
     orientation : Orientation
-    names : sequence of str
+    arrivals : sequence of str
         Name of the arrival direction for each label.
     kinds : sequence of str
         Name of each kind of target.
@@ -217,7 +217,7 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
     order = np.argsort(-bank.log_w, kind='stable')
     hypotheses = Hypotheses(
-        tuple(names[k] for k in bank.label[order].tolist()), weights[order], bank.x[order, :6],
+        tuple(arrivals[k] for k in bank.label[order].tolist()), weights[order], bank.x[order, :6],
         bank.P[order, :6, :6], moments[order], tuple(kinds[k] for k in bank.kind[order].tolist()))
     nis = bank.nis[best]
     return Track(
@@ -225,7 +225,7 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
         degrees_of_freedom=degrees_of_freedom, predicted=predicted, mounting=mounting,
         mounting_covariance=mounting_covariance,
         nis=float('nan') if np.isnan(nis).all() else float(np.nansum(nis)),
-        nis_by_sensor=nis.copy(), weight=float(weights[best]), arrival=names[bank.label[best]],
+        nis_by_sensor=nis.copy(), weight=float(weights[best]), arrival=arrivals[bank.label[best]],
         kind=kinds[bank.kind[best]],
         kind_weight=float(weights.sum(where=bank.kind == bank.kind[best])),
         ambiguous=bool(reasons), doubts=reasons,
@@ -259,7 +259,7 @@ def covariance_about(bank: FilterBank, best: int, model: SourceModel, is_separat
 
 def _second_moment(bank: FilterBank, best: int, model: SourceModel,
                    log_w: FloatArray) -> FloatArray:
-    """Covariance about hypothesis `best`, from all hypotheses weighted by `log_w` (n_hyp,)."""
+    """Covariance about hypothesis `best`, from all hypotheses with log-weights `log_w` (n_hyp,)."""
     n_t = len(model.state_names)
     weight = np.exp(log_w - log_w.max())
     rows = np.flatnonzero(weight >= NEGLIGIBLE_WEIGHT)

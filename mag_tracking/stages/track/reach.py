@@ -1,4 +1,4 @@
-"""Energy of the whitened field of a target at the sensors, from the states of its track."""
+"""Energy of a target's whitened field at the sensors, from the states of its track."""
 
 import numpy as np
 
@@ -75,7 +75,7 @@ def first_weak_frame(bank_filter: BankFilter, target: int, window: Window | None
     Returns
     -------
     int
-        0 if there is no window, or if the energy never exceeds `WEAK_ENERGY`.
+        Index in the window; 0 if there is no window, or if the energy never exceeds the limit.
     """
     if window is None:
         return 0

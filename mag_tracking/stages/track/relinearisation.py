@@ -84,7 +84,7 @@ class Window:
 
 
 class Relinearisation:
-    """Relinearisation over a window of the latest frames, with the path of each hypothesis.
+    """Relinearisation of a bank over a window of the latest frames.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ class Relinearisation:
         self._gain = {}
 
     def restart(self) -> None:
-        """Start a new window at the next frame, because the filter has changed."""
+        """Start a new window at the next frame, after a change of the filter."""
         self._is_stale = self._anchor is not None
 
     def add(self, bank: FilterBank, predicted: FloatArray, log_likelihood: FloatArray,
@@ -192,7 +192,7 @@ class Relinearisation:
         Returns
         -------
         Counter of str
-            Number of relinearised paths, and number of rejected paths.
+            Number of relinearised paths, and number of those whose states were not adopted.
         """
         anchor = self._anchor
         if anchor is None or self._last_ns is None \
@@ -276,7 +276,9 @@ class Relinearisation:
         self._last_ns = window.frames[-1].stamp_ns
 
     def gain(self, origin: int) -> float:
-        """Log-likelihood of the window along a path, minus its log-likelihood in the filter.
+        """Increase of the window's log-likelihood by relinearising the path of a hypothesis.
+
+        The increase is relative to the log-likelihood in the filter.
 
         Parameters
         ----------
@@ -291,7 +293,7 @@ class Relinearisation:
         return self._gain.get(origin, 0.0)
 
     def _leading_rows(self, bank: FilterBank) -> IntArray:
-        """Indices of the heaviest hypotheses within `MAX_LOG_RATIO`, up to the maximum number."""
+        """Indices of the heaviest hypotheses, as many as are to be relinearised."""
         n_affordable = MAX_ELEMENTS // (len(self._frames) * bank.x.shape[1]**2)
         order = np.argsort(-bank.log_w, kind='stable')
         leading: IntArray = order[bank.log_w[order] >= bank.log_w.max() - MAX_LOG_RATIO]
@@ -299,7 +301,7 @@ class Relinearisation:
 
     def _move_window(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
                      bank: FilterBank) -> FilterBank | InitialBank:
-        """Shorten the window to its nominal duration once the frames cover twice this duration."""
+        """Shorten the window to its nominal duration if it is too long; return its anchor."""
         now_ns, n_frames = self._frames[-1].stamp_ns, len(self._frames)
         if now_ns - self._frames[0].stamp_ns <= 2 * self._window_ns and n_frames <= MAX_FRAMES:
             return anchor
@@ -309,7 +311,7 @@ class Relinearisation:
 
     def _move_to(self, bank_filter: BankFilter, anchor: FilterBank | InitialBank,
                  bank: FilterBank, n: int) -> FilterBank:
-        """Move the anchor to frame `n`, the new start of the window."""
+        """Move the anchor to frame `n`, the new start of the window, and return it."""
         self._keep_hypotheses(anchor, np.isin(anchor.origin, bank.origin))
         moved = self._anchor = anchor.rows(np.arange(len(anchor)))
         self._run_along(bank_filter, moved, np.stack(self._paths[:n + 1], axis=1), 1)
@@ -329,7 +331,7 @@ class Relinearisation:
 
 
 def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray) -> None:
-    """Replace states `rows` of the bank in place, and each covariance that is smaller than `P`."""
+    """Replace states `rows` in place, and covariances with a smaller position variance than `P`."""
     bank_variance, path_variance = (np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P))
     bank.x[rows] = x
     bank.P[rows[path_variance > bank_variance]] = P[path_variance > bank_variance]
@@ -337,7 +339,7 @@ def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArr
 
 def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
                        nearly_linear: Callable[[FloatArray], FloatArray]) -> None:
-    """Replace the covariances of hypotheses `rows` in place where `P` is larger.
+    """Replace covariances `rows` in place where `P` has a larger position variance.
 
     The new covariance includes the difference between `x` and the state of the bank. It is not
     adopted if it is too large for the next linear update.
@@ -352,5 +354,5 @@ def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: Float
 
 
 def _rows(anchor: FilterBank | InitialBank, bank: FilterBank) -> IntArray:
-    """Indices in the anchor of the hypotheses of the bank."""
+    """For each hypothesis of the bank, its index in the anchor."""
     return np.searchsorted(anchor.origin, bank.origin)

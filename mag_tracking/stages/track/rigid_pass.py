@@ -112,7 +112,7 @@ class RigidPass:
         return self.cost_with_offsets <= GOOD_MISFIT * self.degrees_of_freedom
 
     def closest(self, positions: FloatArray) -> FloatArray:
-        """Point of the path that is closest to a sensor.
+        """Point of the straight path with free clock offsets that is closest to any sensor.
 
         Parameters
         ----------
@@ -124,8 +124,8 @@ class RigidPass:
         (3,) array, m
         """
         offsets = positions - self.position
-        square = max(float(self.velocity @ self.velocity), 1e-12)
-        points = self.position + (offsets @ self.velocity / square)[:, None] * self.velocity
+        squared_speed = max(float(self.velocity @ self.velocity), 1e-12)
+        points = self.position + (offsets @ self.velocity / squared_speed)[:, None] * self.velocity
         nearest: FloatArray = points[np.argmin(np.linalg.norm(points - positions, axis=1))]
         return nearest
 
@@ -154,16 +154,16 @@ class RigidPass:
 
     @cached_property
     def speed(self) -> float:
-        """Horizontal speed [m/s]."""
+        """Horizontal speed on the straight path with free clock offsets [m/s]."""
         return float(np.hypot(self.velocity[0], self.velocity[1]))
 
     @property
     def widening(self) -> float:
-        """Factor for the variances: the reduced chi-square with free clock offsets, at least 1."""
+        """Factor for variances: reduced chi-square of the fit with clock offsets, at least 1."""
         return max(self.cost_with_offsets / self.degrees_of_freedom, 1.0)
 
     def clock_variance(self, sensor: int) -> float:
-        """Variance of the clock offset of a sensor, including the model error.
+        """Variance of the clock offset of a sensor, including the variation of the magnetic centre.
 
         Parameters
         ----------
@@ -178,7 +178,7 @@ class RigidPass:
 
     @property
     def needs_clock_offsets(self) -> bool:
-        """Whether clock offsets are significant, and displace the target by `MIN_DISTANCE`."""
+        """Whether clock offsets are significant and displace the target by over `MIN_DISTANCE`."""
         offset = float(np.nanmax(np.abs(self.offset)))
         if not self.is_explained or offset > MAX_OFFSET or offset * self.speed < MIN_DISTANCE:
             return False
@@ -269,15 +269,19 @@ class _RowFits(NamedTuple):
     @property
     def needs_no_bend(self) -> bool:
         """Whether the straight path explains the pass, without a significant gain from a bend."""
-        n_more = N_PATH - N_STRAIGHT
+        n_bend = N_PATH - N_STRAIGHT
         gain = (self.straight_cost - self.bent_cost) / max(self.misfit, 1.0)
-        return bool(self.straight_cost <= MAX_MISFIT * (self.degrees_of_freedom + n_more)
-                    and gain <= chdtri(n_more, P_BEND))
+        return bool(self.straight_cost <= MAX_MISFIT * (self.degrees_of_freedom + n_bend)
+                    and gain <= chdtri(n_bend, P_BEND))
 
 
 def _fit_long_row(data: PassSamples, straight: FloatArray, bent: FloatArray, adds_starts: bool
               ) -> _RowFits:
-    """Fit a long row from the paths of a short row; `adds_starts` adds starts for the bent path."""
+    """Fit a long row of dipoles, starting at the `straight` and `bent` paths of a short row.
+
+    The bent fit starts at the fitted straight path and, if `adds_starts`, also at both paths of the
+    short row.
+    """
     near = data.with_near_field_error(bent)
     starts = np.array([straight, bent, straight, bent])
     starts[2:, PATH.index('length')] = LONG_LENGTH

@@ -92,7 +92,7 @@ class RunningTrack:
         self._use_bank_sensors(False)
 
     def _use_bank_sensors(self, is_handover: bool) -> None:
-        """Restart the reference models and the cross-checks with the sensors of the bank."""
+        """Restart the models without a target, and the cross-checks, with the bank's sensors."""
         sensors = self._bank.sensors
         self._no_target = NoTarget(len(sensors.network), self._settings.background_std)
         self._disturbance_model = DisturbanceModel(sensors.network, self._settings.background_std,
@@ -107,7 +107,7 @@ class RunningTrack:
 
     @property
     def _final_sensors(self) -> SensorSubset:
-        """Sensors of the track after the remaining sensors have been added."""
+        """Sensors that the track uses once the bank is small enough for all of them."""
         return self._bank.later_sensors or self._bank.sensors
 
     def configure(self, settings: TrackSettings) -> None:
@@ -286,7 +286,7 @@ class RunningTrack:
         return out
 
     def _end_member(self, member: Member, reason: str) -> list[TrackRecord]:
-        """End one member, remove its states from the joint state, and return its records."""
+        """End one member, remove its states from the joint state, and return closing records."""
         if len(self.members) == 1:
             self.is_lost = member.is_lost
             return self.end(reason)
@@ -330,7 +330,7 @@ class RunningTrack:
 
     def _smoothed(self, i: int, view: MemberView, complete: bool, states: list[TrackState],
                   doubtful: bool) -> list[SmoothedPose]:
-        """Smoothed poses of member `i`; if `complete`, also those before it shared its state."""
+        """Smoothed poses of member `i`; if `complete`, also those before other members joined."""
         member, n = self.members[i], self._bank.single_target.n_target
         own_states = member.states_of(member.slot if complete else i, n, states)
         return member.smoothed(view.bank, view.best, complete,
@@ -338,7 +338,7 @@ class RunningTrack:
 
     @property
     def unexplained(self) -> list[UnexplainedField]:
-        """Fields of the ended members that no target has explained."""
+        """Unexplained fields of the members whose tracks have ended."""
         found = [m.unexplained(self._disturbance_model.uniform) for m in self.members if m.ended]
         return [u for u in found if u is not None]
 

@@ -111,7 +111,7 @@ class SensorRejection:
     def _update_without(bank_filter: BankFilter, bank: FilterBank, prior: _States,
                         frame: FieldFrame, dt: float, rejected: tuple[int, ...]
                         ) -> tuple[FloatArray, FieldFrame]:
-        """Repeat the update without some sensors; return log-likelihoods and the used frame."""
+        """Repeat the update without some sensors; return log-likelihoods and the reduced frame."""
         is_missing = np.isin(np.arange(len(frame.field)), rejected)
         reduced = replace(frame, field=np.where(is_missing[:, None], np.nan, frame.field),
                           covariance=np.where(is_missing[:, None, None], np.nan, frame.covariance),
@@ -143,7 +143,7 @@ def _leader(bank: FilterBank, log_likelihood: FloatArray) -> int | None:
 
 
 def _misfit(bank: FilterBank, frame: FieldFrame, log_likelihood: FloatArray) -> float:
-    """Normalised innovation squared per axis of the leader; infinite without a leader."""
+    """Normalised innovation squared per axis of the leading hypothesis; infinite without one."""
     leader = _leader(bank, log_likelihood)
     n_axes = np.count_nonzero(~np.isnan(frame.field))
     return np.inf if leader is None else float(np.nansum(bank.nis[leader])) / n_axes

@@ -199,21 +199,21 @@ def exchange_sensor_states(bank: FilterBank, before: IntArray, after: IntArray,
     old, new = [_state_columns(n_t, n_own, len(rows)) for rows in (before, after)]
     common = [(list(before).index(row), k) for k, row in enumerate(after) if row in before]
     source = np.concatenate([np.arange(n_t), *(old[j] for j, _ in common)])
-    target = np.concatenate([np.arange(n_t), *(new[k] for _, k in common)])
+    destination = np.concatenate([np.arange(n_t), *(new[k] for _, k in common)])
     n_x = n_t + (n_own + 3) * len(after)
     x, P = np.zeros((len(bank), n_x)), np.zeros((len(bank), n_x, n_x))
     for k in set(range(len(after))) - {k for _, k in common}:
         own, background = new[k][:n_own], new[k][n_own:]
         P[:, own[:, None], own] = own_covariance[k]
         P[:, background, background] = background_std**2
-    x[:, target] = bank.x[:, source]
-    P[:, target[:, None], target] = bank.P[:, source[:, None], source]
+    x[:, destination] = bank.x[:, source]
+    P[:, destination[:, None], destination] = bank.P[:, source[:, None], source]
     bank.x, bank.P = x, P
     bank.nis = np.full((len(bank), len(after)), np.nan)
 
 
 def _state_columns(n_t: int, n_own: int, n_sensors: int) -> IntArray:
-    """Columns (n_sensors, n_own + 3) of the states of each sensor."""
+    """Columns (n_sensors, n_own + 3) of each sensor's states in the joint state."""
     j = np.arange(n_sensors)[:, None]
     return np.hstack([n_t + n_own * j + np.arange(n_own),
                       n_t + n_own * n_sensors + 3 * j + np.arange(3)])

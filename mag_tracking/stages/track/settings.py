@@ -37,10 +37,10 @@ class TrackSettings:
         'selects independent noise in every frame, which is faster with many sensors.', 's',
         (0.0, 60.0))
     background_std: float = param(
-        2e-8, 'Standard deviation of a background at the start of a track.', 'T', (0.0, 1e-3),
+        2e-8, 'Standard deviation of each background at the start of a track.', 'T', (0.0, 1e-3),
         live=True)
     background_drift: float = param(
-        1e-8, 'Random walk of a background during a track.', 'T/s^0.5', (0.0, 1e-3), live=True)
+        1e-8, 'Random walk of each background during a track.', 'T/s^0.5', (0.0, 1e-3), live=True)
     mounting_std_deg: float = param(
         5.0, 'Standard deviation of the orientation of a sensor about each axis, relative to the '
         'network file, for sensors without orientation_std_deg. The angles are estimated with each '

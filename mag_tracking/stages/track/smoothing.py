@@ -43,7 +43,7 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
                    intervals: Sequence[float], updated: bool = False,
                    relinearisations: int = RELINEARISATIONS, path: Sequence[FloatArray] = ()
                    ) -> tuple[list[State], int]:
-    """States of a hypothesis at each frame, given all frames.
+    """Smoothed states of a hypothesis at each frame, given all frames.
 
     Parameters
     ----------
@@ -56,6 +56,7 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     updated : bool, optional
         Whether the bank has already been updated with the first frame.
     relinearisations : int, optional
+        Number of further passes, each linearised along the result of the previous pass.
     path : sequence of (n_x,) array, optional
         Known states at the first frames, at which the first pass is linearised.
 
@@ -102,9 +103,9 @@ class WholeTrack:
 
     Attributes
     ----------
-    is_too_long : bool
-        Whether the track exceeded a limit or changed its sensors, and cannot be smoothed as a
-        whole.
+    is_abandoned : bool
+        Whether the track cannot be smoothed as a whole, because it exceeded a limit or changed its
+        sensors.
     """
 
     def __init__(self, max_duration_s: float) -> None:
@@ -117,7 +118,7 @@ class WholeTrack:
         self._frames: list[FieldFrame] = []
         self._intervals: list[float] = []
         self._is_published: list[bool] = []
-        self._duration_s, self.is_too_long = 0.0, False
+        self._duration_s, self.is_abandoned = 0.0, False
         self._is_updated = False
 
     def begin(self, bank: FilterBank | InitialBank, bank_filter: BankFilter) -> None:
@@ -152,9 +153,9 @@ class WholeTrack:
             self.add(anchor, frame, dt, True)
 
     def abandon(self) -> None:
-        """Discard all stored frames; the track cannot be smoothed as a whole."""
+        """Discard all stored frames, and mark the track as not smoothable as a whole."""
         self.clear()
-        self.is_too_long = True
+        self.is_abandoned = True
 
     def add(self, bank: FilterBank, frame: FieldFrame, dt: float, published: bool) -> None:
         """Add a frame with which the bank has been updated.
@@ -210,7 +211,7 @@ class WholeTrack:
 
 
 class _LaggedFrame(NamedTuple):
-    """A frame of a running track, and its bank after the update."""
+    """A frame of a running track, and the bank after the update with this frame."""
 
     frame: FieldFrame
     dt: float
@@ -230,6 +231,7 @@ class FixedLag:
     Parameters
     ----------
     lag_s : float, s
+        Lag of the smoothed poses.
     """
 
     def __init__(self, lag_s: float) -> None:
@@ -294,7 +296,7 @@ class FixedLag:
             self._frames, self._states(bank_filter, bank, best), strict=True) if lagged.published]
 
     def _states(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[State]:
-        """Smoothed states of the stored frames; relinearisation is omitted to save time."""
+        """Smoothed states of hypothesis `best` at the stored frames, without relinearisation."""
         oldest = self._frames[0]
         single, row = bank.alone(best), np.flatnonzero(oldest.origin == bank.origin[best])
         single.x, single.P = oldest.x[row].copy(), oldest.P[row].copy()

@@ -124,7 +124,7 @@ class PathPrior:
         return line, relative_headings[np.arange(len(theta)), line]
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals of paths with respect to the prior.
+        """Normalised residuals of paths with respect to the prior.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ class PathPrior:
         -------
         residual : (n, 7) array
         J : (n, 7, 7) array
-            Jacobian of the prediction.
+            Derivative of the negative residual with respect to `theta`.
         """
         line, relative_heading = self.nearest_line(theta)
         normals = np.stack([-np.sin(self.headings), np.cos(self.headings)], axis=1)[line]
@@ -246,9 +246,11 @@ class SteadySearch:
         return self._marginal_whitener(self.samples.y - self.known)
 
     def _solve(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Basis (n, y, 9 m), information (n, 9 m, 9 m) and its inverse, and moments (n, 9 m).
+        """Estimate the moments of vehicles on given paths.
 
-        The inverse is NaN or meaningless for a path through a sensor.
+        Returns the whitened fields of unit moments (n, y, 9 m), the information matrices of the
+        moments (n, 9 m, 9 m), their inverses, and the moments (n, 9 m). The inverse is NaN or
+        meaningless for a path through a sensor.
         """
         basis = self._model.basis(theta.reshape(-1, N_STRAIGHT))
         A = self._marginal_whitener(_joined_columns(basis, _n_vehicles(theta)))
@@ -258,7 +260,7 @@ class SteadySearch:
         return A, information, inverse, np.einsum('nij,nj->ni', inverse, At @ self._y)
 
     def _moment_std(self, theta: FloatArray) -> FloatArray:
-        """Standard deviations (9 m,) of the moments of m vehicles."""
+        """Prior standard deviations (9 m,) of the moments of m vehicles."""
         return np.tile(self.prior.moment_std, _n_vehicles(theta))
 
     def cost(self, grid: StartGrid) -> FloatArray:
@@ -297,7 +299,7 @@ class SteadySearch:
         -------
         residual : (n, y + 16 m) array
         J : (n, y + 16 m, 7 m) array
-            Jacobian of the prediction.
+            Derivative of the negative residual with respect to `theta`.
         """
         n, m, std = len(theta), _n_vehicles(theta), self._moment_std(theta)
         paths = theta.reshape(-1, N_STRAIGHT)
@@ -418,7 +420,7 @@ class SteadySearch:
             -1, 2, N_STRAIGHT))
 
     def _log_determinant_of_moments(self, theta: FloatArray) -> FloatArray:
-        """Log-determinant (n,) of each matrix from `_information_of_moments`."""
+        """Log-determinants (n,) of the matrices that `_information_of_moments` returns."""
         with ignoring_overflow():
             return _log_determinant(self._information_of_moments(theta))
 
@@ -438,7 +440,7 @@ class SteadySearch:
 
 
 def _log_determinant(A: FloatArray) -> FloatArray:
-    """Log-determinants (n,) of matrices (n, k, k); infinite for an indefinite matrix."""
+    """Log-determinants (n,) of matrices (n, k, k); infinite if the determinant is not positive."""
     sign, value = np.linalg.slogdet(A)
     return np.where(sign > 0.0, value, np.inf)
 
@@ -449,13 +451,13 @@ def _n_vehicles(theta: FloatArray) -> int:
 
 
 def _joined_columns(A: FloatArray, m: int) -> FloatArray:
-    """Matrices (n, k, m c) that join the matrices (n m, k, c) of m vehicles."""
+    """Join the columns of `m` successive matrices of `A` (n m, k, c); return (n, k, m c)."""
     n, k, c = len(A) // m, *A.shape[1:]
     return A.reshape(n, m, k, c).swapaxes(1, 2).reshape(n, k, m * c)
 
 
 def _block_diagonal(A: FloatArray, m: int) -> FloatArray:
-    """Block-diagonal matrices (n, m k, m c) of the blocks (n m, k, c) of m vehicles."""
+    """Block-diagonal matrices (n, m k, m c), each of `m` successive blocks of `A` (n m, k, c)."""
     n, k, c = len(A) // m, *A.shape[1:]
     out = np.zeros((n, m, k, m, c))
     for i in range(m):

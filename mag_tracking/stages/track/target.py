@@ -47,7 +47,7 @@ class Target:
 
 
 def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
-    """Create the target that the settings select, and check its settings.
+    """Create the target that the settings select, and check the settings of this target.
 
     Parameters
     ----------
@@ -86,13 +86,13 @@ def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
 
 def _start_vehicle(settings: TrackSettings, network: SensorNetwork, frame: FieldFrame,
                    own_covariance: FloatArray) -> FilterBank | None:
-    """First hypotheses of a vehicle."""
+    """First hypotheses of a vehicle; None if the frame does not allow a start."""
     return start_vehicle(settings.vehicle, network, frame, settings.background_std,
                          own_covariance)
 
 
 def _start_magnet(settings: TrackSettings, network: SensorNetwork, frame: FieldFrame,
                   own_covariance: FloatArray) -> FilterBank | None:
-    """First hypotheses of a magnet."""
+    """First hypotheses of a magnet; None if the frame does not allow a start."""
     return start_magnet(settings.magnet, network, frame, settings.background_std, own_covariance,
                         settings.field_error)

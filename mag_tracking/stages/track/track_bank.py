@@ -65,7 +65,7 @@ class TrackBank:
     sensors : SensorSubset
         Sensors in use.
     later_sensors : SensorSubset or None
-        Sensors that will be used; None after the switch.
+        Sensors that will be used later; None after the switch to them.
     """
 
     def __init__(self, target: Target, settings: TrackSettings, sensors: SensorSubset,
@@ -88,7 +88,7 @@ class TrackBank:
 
     @property
     def window(self) -> Window | None:
-        """The latest frames, with the paths of the hypotheses; None if no frame is stored."""
+        """The latest frames with the paths of the hypotheses; None if empty or about to restart."""
         return self._relinearisation.window
 
     @property
@@ -97,7 +97,9 @@ class TrackBank:
         return self._fixed_lag is not None
 
     def gain(self, row: int) -> float:
-        """Log-likelihood of the window along a path, minus its log-likelihood in the filter.
+        """Increase of the window's log-likelihood by relinearising the path of a hypothesis.
+
+        See `Relinearisation.gain`.
 
         Parameters
         ----------
@@ -224,7 +226,7 @@ class TrackBank:
             self.filter, self.bank, best)
 
     def smoothed(self, best: int, counts: bool = True) -> list[TrackState]:
-        """Smoothed states of the published frames; empty if the whole track cannot be smoothed.
+        """Smoothed states of the published frames; empty if smoothing is disabled or impossible.
 
         Parameters
         ----------
@@ -240,11 +242,11 @@ class TrackBank:
         states, n_excluded = self._whole_track.smoothed(self.bank, best)
         if counts:
             self._counts['frames left out of smoothing'] += n_excluded
-            self._counts['tracks too long to smooth'] += self._whole_track.is_too_long
+            self._counts['tracks too long to smooth'] += self._whole_track.is_abandoned
         return states
 
     def without_target(self, i: int) -> None:
-        """Remove a target from the state.
+        """Remove a target from the hypotheses, the filter and the relinearisation window.
 
         Parameters
         ----------
@@ -328,7 +330,7 @@ class TrackBank:
         return True
 
     def _switch_sensors(self, sensors: SensorSubset) -> None:
-        """Replace the sensor states of the hypotheses by the states of other sensors."""
+        """Switch to other sensors: replace the filter and the sensor states of the hypotheses."""
         before, self.sensors = self.sensors.rows, sensors
         self.filter = self.filter_of(1)
         self._rejection = SensorRejection(sensors.network.names)

@@ -25,13 +25,14 @@ class UnobservedLength:
     behind the row. Afterwards, it may be at either end, and the middle is uniformly distributed
     between these two cases.
 
-    Each track has its own object.
+    Use one instance for each target.
 
     Parameters
     ----------
     lengths : sequence of float, m
         Length of each kind of vehicle; all kinds are equally frequent.
     length_stds : sequence of float, m
+        Standard deviation of the length of each kind.
     """
 
     def __init__(self, lengths: Sequence[float], length_stds: Sequence[float]) -> None:
@@ -66,7 +67,7 @@ class UnobservedLength:
         self._last_position = x[:2].copy()
 
     def covariance(self, x: FloatArray, P: FloatArray, length: float, kind: int) -> FloatArray:
-        """Covariance to be added to the covariance of the horizontal position.
+        """Covariance of the middle, to be added to the covariance of the horizontal position.
 
         Parameters
         ----------
@@ -82,14 +83,14 @@ class UnobservedLength:
         -------
         (2, 2) array, m^2
         """
-        hidden = 0.5 * (self._lengths - length)
-        second_moment = np.maximum(hidden, 0.0)**2 + 0.25 * self._stds**2
+        half_hidden = 0.5 * (self._lengths - length)
+        second_moment = np.maximum(half_hidden, 0.0)**2 + 0.25 * self._stds**2
         # A longer vehicle would have been observed once its middle has passed a sensor.
-        is_possible = ((self._lengths > self._lengths[kind]) & (hidden > 0.0)
-                       & (self._distance_travelled < hidden))
+        is_possible = ((self._lengths > self._lengths[kind]) & (half_hidden > 0.0)
+                       & (self._distance_travelled < half_hidden))
         variance = second_moment[is_possible].sum() / len(self._lengths)
         if self._lengths[kind] > MAX_CAR_ROW:
-            is_sensed = self._distance_travelled >= hidden[kind]
+            is_sensed = self._distance_travelled >= half_hidden[kind]
             variance += second_moment[kind] / (3.0 if is_sensed else 1.0)
         forward = self._direction(x, P)
         covariance: FloatArray = variance * np.outer(forward, forward)

@@ -57,7 +57,7 @@ class VehicleState:
         theta : (7,) array
             Straight path.
         moments : (k, 3) array, A m^2, world frame
-            Estimated moments.
+            Estimated moments of the dipoles.
         t : float, s
             Time on the path.
         kind : int
@@ -68,7 +68,9 @@ class VehicleState:
         Returns
         -------
         x : (n_t,) array
+            Mean of the state.
         P : (n_t, n_t) array
+            Covariance of the state.
         """
         s = self.settings
         R = rotation_about_z(float(np.deg2rad(s.arrival_headings_deg[label])))

@@ -50,7 +50,7 @@ class WindowSearch:
 
     @cached_property
     def grid(self) -> StartGrid:
-        """Start paths of the search."""
+        """Grid of start paths for the searches in this window."""
         return StartGrid(self.samples, self.prior,
                          self.prior.starts(self._vehicles.settings, self._vehicles.network))
 
@@ -77,7 +77,7 @@ class WindowSearch:
         W = samples.M @ np.swapaxes(
             np.tile(self._vehicles.network.R_sw[samples.compared], (n, 1, 1)), 1, 2)
         h = h[:, samples.compared].reshape(-1, 3)
-        columns = self._columns(H, path[-1], t, known.filter.observation.n_one)
+        columns = self._error_columns(H, path[-1], t, known.filter.observation.n_one)
         columns = columns[:, samples.compared].reshape(len(W), 3, -1)
         return SteadySearch(samples, self.prior, np.einsum('nij,nj->ni', W, h).ravel(),
                             np.hstack([self._backgrounds(), (W @ columns).reshape(3 * len(W), -1)]))
@@ -86,19 +86,20 @@ class WindowSearch:
         """Whitened fields (3 n, q) of the backgrounds, each at one standard deviation."""
         return self._vehicles.background_std * self.samples.backgrounds
 
-    def _columns(self, H: FloatArray, x: FloatArray, t: FloatArray, n_one: int) -> FloatArray:
-        """Fields (n, n_sensors, 3, q) due to errors of known vehicles, at one standard deviation.
+    def _error_columns(self, H: FloatArray, x: FloatArray, t: FloatArray, n_one: int) -> FloatArray:
+        """Field errors (n, n_sensors, 3, q) due to errors of the known vehicles.
 
-        `H` (n, n_sensors, 3, n_t) are the derivatives along a path that ends with the state `x`
-        (n_x,), at times `t` (n,) [s] relative to its end.
+        Each column is due to one standard deviation of a position, velocity or moment. `H` (n,
+        n_sensors, 3, n_t) holds the derivatives of the fields with respect to the vehicle states.
+        The times `t` (n,) [s] are relative to the end of the path; `x` (n_x,) is the state there.
         """
         out = []
         for first in range(0, H.shape[-1], n_one):
             H_one = H[..., first:first + n_one]
-            by_velocity = H_one[..., 3:6] + t[:, None, None, None] * H_one[..., :3]
+            H_velocity = H_one[..., 3:6] + t[:, None, None, None] * H_one[..., :3]
             hard = self._vehicles.hard_moments(x[first:first + n_one])
-            by_moment = H_one[..., 6:6 + hard.size].reshape(*H_one.shape[:3], -1, 3).mean(axis=3)
+            H_moment = H_one[..., 6:6 + hard.size].reshape(*H_one.shape[:3], -1, 3).mean(axis=3)
             magnitude = float(np.linalg.norm(hard.sum(axis=0)))
-            out += [KNOWN_STD * H_one[..., :3], KNOWN_STD * by_velocity,
-                    KNOWN_MOMENT_RATIO * magnitude * by_moment]
+            out += [KNOWN_STD * H_one[..., :3], KNOWN_STD * H_velocity,
+                    KNOWN_MOMENT_RATIO * magnitude * H_moment]
         return np.concatenate(out, axis=3)

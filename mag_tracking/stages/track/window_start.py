@@ -16,7 +16,7 @@ rows of dipoles, and standard deviation of the overlap depth due to uncertain pa
 
 @dataclass(frozen=True)
 class PathHypothesis:
-    """A hypothesis of several vehicles, with the path at which it is linearised."""
+    """A hypothesis of several vehicles, with the path along which it is linearised."""
 
     x: FloatArray
     """(n_x,) State at the start of the window."""
@@ -108,8 +108,8 @@ def labels_of(labels: Sequence[tuple[int, ...]]) -> IntArray:
     return out[:, 0].copy() if out.shape[1] == 1 else out
 
 
-def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length: int | None) -> float:
-    """Maximum depth by which two vehicles overlap along a path.
+def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length_column: int | None) -> float:
+    """Maximum depth by which any two vehicles overlap along a joint path.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length: int | No
     n_one : int
         Number of states per vehicle.
     n_targets : int
-    length : int or None
+    length_column : int or None
         Column of the length among the states of a vehicle; None if all vehicles are points.
 
     Returns
@@ -128,8 +128,9 @@ def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length: int | No
     depth = 0.0
     for i in range(n_targets):
         for k in range(i):
-            gap = OVERHANG + (0.0 if length is None else
-                              0.5 * (np.abs(x[:, i, length]) + np.abs(x[:, k, length])))
+            gap = OVERHANG + (0.0 if length_column is None else
+                              0.5 * (np.abs(x[:, i, length_column])
+                                     + np.abs(x[:, k, length_column])))
             pair = x[:, [i, k]].swapaxes(0, 1)
             depth = max(depth, float(overlap(
                 pair[:, :, :2], pair[:, :, 3:5], gap, OVERLAP_WIDTH).max()))

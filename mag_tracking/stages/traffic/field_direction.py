@@ -31,14 +31,14 @@ WINDOW_RATIO = 3.0
 path."""
 
 MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S = 0.5, 4.0
-"""[s] Bounds of half the window."""
+"""[s] Bounds of half the duration of the window."""
 
 MAX_LOG_ODDS = float(np.log(MAX_CONFIDENCE / (1.0 - MAX_CONFIDENCE)))
 """Largest log odds from one sensor."""
 
 
 class FieldDirection:
-    """Estimates, from the latest frames, the probability that a crossing has a wrong direction.
+    """Estimates, from the latest frames, the probability that a crossing direction is wrong.
 
     Parameters
     ----------
@@ -92,10 +92,10 @@ class FieldDirection:
                 (np.abs(left) >= MIN_LATERAL) & (np.abs(along) <= MAX_ALONG)).tolist():
             half_window_s = np.clip(WINDOW_RATIO * abs(left[j]) / speed,
                                     MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S)
-            value = self._log_odds(j, crossing.stamp_ns + round(along[j] / speed * NS),
-                                   round(half_window_s * NS))
-            if value is not None:
-                odds.append(float(np.clip(value, -MAX_LOG_ODDS, MAX_LOG_ODDS)))
+            log_odds = self._log_odds(j, crossing.stamp_ns + round(along[j] / speed * NS),
+                                      round(half_window_s * NS))
+            if log_odds is not None:
+                odds.append(float(np.clip(log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS)))
                 # From a sensor to the left of the path, the vehicle moves from right to left.
                 same_side.append(bool(left[j] < 0.0))
         fused = fused_log_odds(odds, same_side)
@@ -108,11 +108,11 @@ class FieldDirection:
         frames = [f for f in self._frames if abs(f.stamp_ns - middle_ns) <= half_ns]
         field = horizontal_field(np.array([f.field[j] for f in frames]).reshape(-1, 3),
                                  self._network.R_ws[j])
-        known = ~np.isnan(field).any(axis=1)
-        if not known.any():
+        is_measured = ~np.isnan(field).any(axis=1)
+        if not is_measured.any():
             return None
         variance = [np.nanmean(np.diagonal(frames[k].covariance[j]))
-                    for k in np.flatnonzero(known).tolist()]
+                    for k in np.flatnonzero(is_measured).tolist()]
         noise = float(np.sqrt(np.median(variance)))
-        rotation = rotation_of_pass(field[known], noise, len(frames) // 4)
+        rotation = rotation_of_pass(field[is_measured], noise, len(frames) // 4)
         return None if rotation is None else rotation.log_odds

@@ -165,7 +165,7 @@ class Traffic:
         """Do nothing: no work is deferred."""
 
     def flush(self) -> list[TrafficRecord]:
-        """Return the remaining passages of all tracks and the summary of the current interval.
+        """End all tracks; return the remaining passages and the summary of the current interval.
 
         Returns
         -------
@@ -185,7 +185,7 @@ class Traffic:
         return min([now_ns, *begin_times]) - round(SMOOTHED_LEAD_S * NS)
 
     def _add_records(self, records: Iterable[Track | SmoothedPose | Disturbance]) -> None:
-        """Add track records and smoothed poses to the histories of their tracks."""
+        """Add poses, and the smoothed poses of whole tracks, to the histories of their tracks."""
         for record in records:
             if isinstance(record, Track):
                 self._add_pose(record)
@@ -236,7 +236,7 @@ class Traffic:
         return [p for p in map(self._passage, due) if p is not None]
 
     def _direction_error(self, crossing: Crossing, track: _TrackHistory) -> float:
-        """Probability that a direction is wrong; NaN if unknown or if other vehicles interfere."""
+        """Probability that the direction of a crossing is wrong; NaN if it cannot be checked."""
         margin_ns = round(INTERFERENCE_S * NS)
         if any(other is not track
                and other.overlaps(crossing.stamp_ns - margin_ns, crossing.stamp_ns + margin_ns)
