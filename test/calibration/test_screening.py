@@ -52,7 +52,7 @@ class SpikeScreen:
 
 
 def screened(fields, rate=100.0, std=SIGMA, threshold=30.0, step=np.inf):
-    """(spikes, maximum number of held readings, readings that were held and then released)."""
+    """(indices of spikes, maximum number of held readings, indices of readings released later)."""
     spikes, max_held, late, out, f = [], 0, [], 0, SpikeScreen(threshold, std, step)
     for k, field in enumerate(fields):
         decided = f.feed(k, round(k * NS / rate), field)
@@ -140,7 +140,7 @@ def test_spikes_of_changing_sign_and_axis_are_rejected():
 
 
 def test_spikes_in_quick_succession_are_rejected():
-    """A spike does not affect the comparison of the next spike."""
+    """A rejected spike does not affect the detection of the next spike."""
     y = noise(200)
     rows = [20, 22, 24, 40, 41, 43, 100, 105]
     y[rows] += 5e-6

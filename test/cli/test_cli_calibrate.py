@@ -57,7 +57,7 @@ def test_calibrate_writes_a_network_that_replay_accepts(tmp_path, capsys):
 
 
 def test_a_repeated_calibration_adds_no_information(tmp_path):
-    """A second calibration with the same recording does not change orientations and their stds."""
+    """A second calibration with the same recording changes neither orientations nor their stds."""
     first, again = tmp_path / 'first.yaml', tmp_path / 'again.yaml'
     for network, out in ((NETWORK_FILE, first), (first, again)):
         assert main(['calibrate', str(RECORDING), '--network', str(network), '--out',

@@ -24,7 +24,7 @@ from support.node_processes import MAX_S, environment
 COMMAND = [sys.executable, '-m', 'mag_tracking.cli']
 RECORDING = vehicle_path('straight_car_right')
 LONG_WAIT_ARGUMENTS = ('--ros-args', '-p', 'align.max_wait_s:=5.0')
-"""At a high playback rate, readings are later (in recording time) than the default wait."""
+"""At a high playback rate, readings arrive later (in recording time) than the default wait."""
 
 
 def command(*arguments):

@@ -153,7 +153,7 @@ def start_s(monkeypatch):
     pytest.param('tracker_node', 0.25), pytest.param('run', 0.25, marks=pytest.mark.study),
     *(pytest.param(name, 0.05, marks=pytest.mark.study) for name in COMMANDS)])
 def test_a_signal_at_any_moment_of_the_start_ends_the_process(start_s, name, step_s):
-    """Signals are sent at steps of `step_s`, or of more on a slow machine, which starts slowly."""
+    """Signals are sent every `step_s`, or less often on a machine where the start takes longer."""
     duration_s = start_s(COMMANDS[name])
     n = round(2.5 / step_s)
     step_s, results = max(step_s, 1.2 * duration_s / n), {}
