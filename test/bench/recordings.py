@@ -32,10 +32,10 @@ from support.random_passes import KINDS, SIMULATORS, WRONG_M, errors_of
 from support.situation_worlds import FOUR, car, random_pass_world, straight
 
 RUNS = 5
-"""Number of simulated passes of each control and simulator."""
+"""Number of simulated passes per control and simulator."""
 MIN_UNFLAGGED_RATIO = 0.95
-"""Minimum ratio of the number of unflagged poses to this number with the other checkout. It applies
-to the correct poses of each recording or control, and to all poses of the total."""
+"""Minimum number of unflagged poses, relative to the other checkout. It applies to the correct
+poses of each recording or control, and to all poses of the total."""
 MAX_ERROR = 1.03
 """Maximum ratio of an error to the error with the other checkout."""
 UNFLAGGED, CORRECT = 'unflagged', f'unflagged, within {WRONG_M:g} m'
@@ -66,7 +66,7 @@ def counts_of_table(table, truth):
 
 
 def figures_of_recording(recording, network, preset, folder):
-    """Replay a recording; return the numbers of poses and the errors of the first track."""
+    """Replay a recording; return the numbers of poses and errors of the first track, by figure."""
     run = replay(Recording(recording), read_network(network), settings_for(preset), folder)
     truth = next(iter(run.truth.values()))
     found = {}
@@ -80,7 +80,10 @@ def figures_of_recording(recording, network, preset, folder):
 
 
 def figures_of_control(name):
-    """Track `RUNS` passes of a control by each simulator live; return the numbers of poses."""
+    """Simulate `RUNS` passes of a control by each simulator and track them live.
+
+    Returns the numbers of poses, by figure.
+    """
     total = {UNFLAGGED: 0, CORRECT: 0}
     for s, simulator in enumerate(SIMULATORS):
         for seed in range(RUNS):
@@ -123,7 +126,7 @@ def measure_checkout(checkout):
 
 
 def is_worse(name, figure, now, before):
-    """Whether a figure is worse than before by more than its tolerance."""
+    """Whether a figure is worse `now` than `before` (the other checkout), beyond its tolerance."""
     if CORRECT in figure or (name, figure) == ('all', UNFLAGGED):
         return now < MIN_UNFLAGGED_RATIO * before
     if UNFLAGGED in figure:
@@ -132,7 +135,10 @@ def is_worse(name, figure, now, before):
 
 
 def comparison(name, figure, now, before):
-    """Return a line for a figure, and whether it is worse; a missing value is None."""
+    """Return a line with two values of a figure, and whether `now` is worse than `before`.
+
+    Missing values are None.
+    """
     worse = before is not None and (now is None or is_worse(name, figure, now, before))
     values = [f'{"-" if now is None else f"{now:.4g}":>8s}']
     values += [] if before is None else [f'before {before:8.4g}']

@@ -34,7 +34,7 @@ ROAD = DATA / 'two_way_road' / 'two_way_road.mcap'
 
 
 def road_network(folder):
-    """Write the network file of the road, with a larger sensor spacing; return its path."""
+    """Write a network file with sensors at y = -5.5 and 5.5 m, for the road; return its path."""
     path = folder / 'network.yaml'
     path.write_text(NETWORK_FILE.read_text().replace('4.5', '5.5'))
     assert np.abs(read_network(path).positions[:, 1]).tolist() == [5.5, 5.5]
@@ -51,7 +51,10 @@ def speed_of_replay(recording, network_file, folder):
 
 
 def frame_times():
-    """Track the bundled vehicles; return the durations [s] of frames and of starts of tracks."""
+    """Track the bundled vehicles; return processing times [s] of frames.
+
+    The first array contains the frames during tracks, the second the frames that start tracks.
+    """
     network, frames, starts = read_network(NETWORK_FILE), [], []
     for name in VEHICLES:
         pipeline = Pipeline(network, settings_for('vehicle'))

@@ -24,7 +24,7 @@ from support.situations import SITUATIONS, simulated_world, verdict
 MIN_EVENTS = 0.9
 """Minimum fraction of runs with a disturbance among runs with a detection but no vehicle."""
 MAX_COST = 0.1
-"""Maximum fraction of the processing time of a frame for the disturbance model and the tests."""
+"""Maximum fraction of a frame's processing time for the disturbance model and tests for doubts."""
 
 TABLE_HEADER = """# Situations
 
@@ -72,7 +72,7 @@ def event_counts(found):
 
 
 def cost():
-    """Fraction of the processing time of a frame for the disturbance model and the tests."""
+    """Fraction of a frame's processing time for the disturbance model and the tests for doubts."""
     durations = {'_update_evidence': 0.0, '_doubts': 0.0, 'step': 0.0}
     owner = {'_update_evidence': RunningTrack, '_doubts': Member, 'step': RunningTrack}
 
@@ -117,7 +117,7 @@ def main():
         return row(name, found), not missed[-1]
 
     print(TABLE_HEADER.format(n=args.runs), end='')
-    status = count_over([(name,) for name in args.only], both_simulators, 2 * args.runs, summary)
+    status = count_over([(name,) for name in args.only], verdict_of_run, 2 * args.runs, summary)
     print(summary_of(figures,
                      list(zip(np.repeat(args.only, 2 * args.runs), verdicts, strict=True))))
     if args.only == list(SITUATIONS):
@@ -146,7 +146,7 @@ def summary_of(figures, found):
             f'(aim at most {MAX_COST:.0%}).\n')
 
 
-def both_simulators(name, run):
+def verdict_of_run(name, run):
     """Return the `Verdict` of a run; even and odd runs use different simulators."""
     return verdict(name, SIMULATORS[run % 2], run // 2)
 

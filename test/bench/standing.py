@@ -27,7 +27,7 @@ RUNS = 20
 
 
 def run_case(case, run):
-    """Run one case; return the result of its function in `support.standing`."""
+    """Call the function of a case in `support.standing` for run number `run`; return its result."""
     if case == 'stops':
         return is_one_track(STOPS[run % len(STOPS)], run // len(STOPS))
     return background_recovery_s(run) if case == 'leaves' else error_after_parked(run)

@@ -52,9 +52,9 @@ def seconds_of(*arguments, rounds=7):
 
 
 def first_pose(cache=None):
-    """Start a process; return the time [s] until its first pose.
+    """Start a process that tracks a recording; return the time [s] until its first pose.
 
-    If `cache` is an empty folder, Python compiles all imported modules.
+    `cache` is the folder for compiled modules; if it is empty, Python compiles all imports.
     """
     environment = {k: v for k, v in os.environ.items() if k != 'PYTHONDONTWRITEBYTECODE'}
     if cache is not None:
@@ -81,7 +81,7 @@ def first_pose_times(rounds):
 def main():
     """Print the figures; return 1 if an aim is missed."""
     figures = Figures('start')
-    print('from the start of a process')
+    print('times from the start of a process')
     figures.add('mag-tracking --help', seconds_of('--help'), 's', 0.3)
     figures.add('mag-tracking info', seconds_of('info', str(RECORDING)), 's', 0.8)
     cold, warm = first_pose_times(3)

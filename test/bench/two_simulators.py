@@ -29,7 +29,7 @@ def fraction_of_wrong(found):
 
 
 def count_over(products, one_pass, n, summary):
-    """Run `n` passes of each combination, and print its summary; return 1 if an aim is missed."""
+    """Run `n` passes of each of `products`, print its summary; return 1 if an aim is missed."""
     met = True
     with ProcessPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
         jobs = {p: [pool.submit(one_pass, *p, seed) for seed in range(n)] for p in products}

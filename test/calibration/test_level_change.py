@@ -151,7 +151,7 @@ def test_a_queue_or_a_reversing_vehicle_has_not_departed(case):
 
 
 def reverse(seed):
-    """Signal of a vehicle that overshoots by 6 m, waits 1 s and reverses, and end time [s]."""
+    """Signal of a vehicle that overshoots by 6 m, waits 1 s and reverses; time of its stop [s]."""
     rng = np.random.default_rng(seed)
     moment = rng.uniform(200.0, 600.0) * _direction(rng)
     stop_position = np.array([rng.uniform(-3.0, 3.0), rng.uniform(3.0, 6.0), 0.5])
@@ -195,7 +195,7 @@ CLEAR = [seed for seed in range(20) if is_clear(seed)][:4]
 @pytest.mark.parametrize('seed', CLEAR)
 @pytest.mark.parametrize('rate', [100.0, 20.0])
 def test_a_departed_vehicle_is_removed_from_the_background_in_seconds(seed, rate):
-    """The background is replaced while the vehicle is at least 30 m away, below the noise.
+    """At the replacement, the vehicle is at least 30 m away, and its field is below the noise.
 
     At 20 Hz, with blocks of 0.4 s, the replacement takes a second longer.
     """

@@ -109,7 +109,7 @@ def test_an_axis_that_never_changed_is_at_rest_or_dead():
 
 
 def test_an_axis_at_rest_keeps_its_steps_if_another_becomes_noisy():
-    """The axis retains its quantisation variance; without it, its noise would be zero."""
+    """The other axes retain their quantisation variance; otherwise, their noise would be zero."""
     sensors = new_sensors(1)
     sensors['noise'], sensors['step'] = np.zeros((3, 3)), [np.inf, 1e-6, np.inf]
     limits = np.empty(3)

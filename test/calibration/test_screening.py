@@ -52,7 +52,7 @@ class SpikeScreen:
 
 
 def screened(fields, rate=100.0, std=SIGMA, threshold=30.0, step=np.inf):
-    """Indices of spikes, maximum number of held readings, and indices of readings decided late."""
+    """(indices of spikes, maximum number of held readings, indices of readings released later)."""
     spikes, max_held, late, out, f = [], 0, [], 0, SpikeScreen(threshold, std, step)
     for k, field in enumerate(fields):
         decided = f.feed(k, round(k * NS / rate), field)
@@ -79,7 +79,7 @@ def stuck(fields):
 @pytest.mark.parametrize('slope', [0.0, 2e-11])
 @pytest.mark.parametrize('rate', [10.0, 100.0])
 def test_noise_and_coarse_steps_at_rest_pass_immediately(step, slope, rate):
-    """None of 10 000 readings is held or stuck.
+    """None of 10 000 readings is held or classified as stuck.
 
     The background may drift across a quantisation step of the sensor.
     """
@@ -140,7 +140,7 @@ def test_spikes_of_changing_sign_and_axis_are_rejected():
 
 
 def test_spikes_in_quick_succession_are_rejected():
-    """A spike does not affect the comparison of the next spike."""
+    """A rejected spike does not affect the detection of the next spike."""
     y = noise(200)
     rows = [20, 22, 24, 40, 41, 43, 100, 105]
     y[rows] += 5e-6
@@ -171,7 +171,7 @@ def test_a_spike_is_steeper_than_preceding_changes(before, found):
 @pytest.mark.parametrize('rate, size, found', [
     (50.0, 25.0, False), (50.0, 35.0, True), (10.0, 3300.0, False), (10.0, 3700.0, True)])
 def test_a_lower_rate_requires_a_larger_spike(rate, size, found):
-    """The limit for 30 m/s at 1 m is 130 (30 / rate)^3 noise stds, but at least 30."""
+    """The limit, for 30 m/s at 1 m, is 130 (30 Hz / rate)^3 noise stds, but at least 30."""
     y = np.tile(EARTH, (40, 1))
     y[30, 1] += size * SIGMA
     assert screened(y, rate)[0] == ([30] if found else [])
@@ -338,7 +338,7 @@ def test_old_repetitions_are_forgotten():
 
 
 def test_coarse_steps_are_not_classified_as_stuck():
-    """At rest, a coarse sensor whose reading has changed often may repeat one indefinitely."""
+    """If the readings of a coarse sensor changed often, a value may repeat indefinitely at rest."""
     rng = np.random.default_rng(0)
     changes = np.eye(3)[rng.integers(0, 3, 4000)] * rng.choice([-1.0, 0.0, 1.0], (4000, 1))
     moving = np.cumsum(changes, axis=0) * 1e-7
@@ -348,7 +348,7 @@ def test_coarse_steps_are_not_classified_as_stuck():
 
 
 def test_a_coarse_sensor_that_starts_in_a_pass_recovers():
-    """The sensor changes a hundred times and then rarely; it is not stuck permanently."""
+    """The reading changes a hundred times and then rarely; the sensor is not stuck permanently."""
     moving = np.arange(100.0)[:, None] * np.array([1e-7, 2e-7, -1e-7])
     rest = [np.tile(moving[-1] + (k % 2) * 1e-7, (500, 1)) for k in range(20)]
     rows = np.array(stuck(np.concatenate([moving, *rest])))

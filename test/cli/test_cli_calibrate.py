@@ -57,7 +57,7 @@ def test_calibrate_writes_a_network_that_replay_accepts(tmp_path, capsys):
 
 
 def test_a_repeated_calibration_adds_no_information(tmp_path):
-    """The same compass and the same pass give no new evidence."""
+    """A second calibration with the same recording changes neither orientations nor their stds."""
     first, again = tmp_path / 'first.yaml', tmp_path / 'again.yaml'
     for network, out in ((NETWORK_FILE, first), (first, again)):
         assert main(['calibrate', str(RECORDING), '--network', str(network), '--out',
@@ -197,7 +197,7 @@ def test_tumbling_removes_background_and_noise_of_raw_readings(tmp_path, capsys)
 
 
 def test_tumbling_calibrates_raw_counts(tmp_path, capsys):
-    """The sensor is of another type, and is at rest for the first minute."""
+    """The sensor is a QMC5883L, which is at rest for the first minute."""
     with gzip.open(DATA / 'calibration' / 'qmc5883l_raw_counts.csv.gz', 'rt') as stream:
         counts = np.loadtxt(stream, delimiter=',', skiprows=3)
     assert main(['tumble', str(write_recording(tmp_path, counts * 1e-9)), '--network',

@@ -69,7 +69,7 @@ def device_ticks(rng, seconds, rate=100.0, ppm=0.0, wander_ppm=0.0, counter=MHZ,
 
 
 def arrival_times(rng, t, delay):
-    """Arrival times [ns] of messages in the order of measurement."""
+    """Arrival times [ns] of messages with random delays that do not overtake each other."""
     arrival = np.maximum.accumulate(t + delay(rng, t))
     return START + np.round(arrival * 1e9).astype(np.int64)
 
@@ -102,11 +102,14 @@ LINKS = {
 def error_limit(mean, rate, wander_ppm, begin, end, z):
     """Limit [s] of the error at the newest end of a line, `begin` .. `end` s after the start.
 
+    The points are the device times and arrival times of messages. T is the duration of the line,
+    `rate` the number of points per second, and 1 / `mean` the probability density of small delays.
+
     No point lies between the fitted and the true line. If the fitted line has the error x at its
     end and is not too low in the middle, the triangle between the lines has the area x T / 4 and
-    contains no point, although z = rate / mean x T / 4 points are expected. The probability is
-    P = exp(-z), times 1 + z + z^2 / 2 for the two-dimensional family of lines. Choosing an almost
-    equally likely slope lowers the line by another mean / (rate T) in the middle, and by
+    contains no point, although z = rate / mean x T / 4 points are expected. The probability of this
+    is P = exp(-z), times 1 + z + z^2 / 2 for the two-dimensional family of lines. Choosing an
+    almost equally likely slope lowers the line by another mean / (rate T) in the middle, and by
     2 mean / (rate T) at the end.
 
     A drift rate f' bends the line away from its chord or tangent by b = f' T^2 / 8, and by
@@ -293,7 +296,10 @@ def test_losses_over_several_counter_wraps_are_bridged():
 
 
 def max_rejected(rate):
-    """Maximum number of readings lost in a restart, within two tolerances of 0.1 s + 2 spreads."""
+    """Maximum number of readings rejected at a restart.
+
+    The restart takes up to two tolerances of 0.1 s plus twice the spread of the delays.
+    """
     return 2.0 * (0.1 + 2.0 * 4.0 * 2e-3) * rate + 3
 
 

@@ -281,7 +281,7 @@ def test_the_memory_of_a_sequence_check_is_bounded():
 
 
 def test_duplicate_readings_are_dropped():
-    """A repeated number with different values is a new reading, not a duplicate."""
+    """A reading with a repeated sequence number but other values is not a duplicate."""
     def reading(x, sequence, acceleration=None):
         return Reading('', (x, float('nan'), 3.0), acceleration, sequence=sequence)
     driver, *_ = driver_of([
@@ -432,7 +432,7 @@ def test_messages_are_not_joined():
 
 
 def test_numbers_skipped_while_closed_are_not_lost():
-    """A gap is counted only while the driver is open."""
+    """Gaps in the sequence numbers are counted only while the driver is open."""
     def readings_of(*numbers):
         return [Reading('', (float(n), 0.0, 0.0), sequence=n) for n in numbers]
     driver, *_ = driver_of([readings_of(1, 2), readings_of(50, 51, 53)])

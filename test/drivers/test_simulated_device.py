@@ -47,7 +47,7 @@ def first_arrivals(device, n, timeout_s=1.0):
 
 
 def true_field(network, t):
-    """World field (n_sensors, 3) T at `t` [s] after the start of a pass with `QUIET_SETTINGS`.
+    """Field (n_sensors, 3) [T], world frame, `t` [s] after a pass with `QUIET_SETTINGS` begins.
 
     Both sensors are at x = 0. The path starts 30 m before them and takes 6 s at 10 m/s.
     """

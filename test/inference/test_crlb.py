@@ -34,12 +34,12 @@ def jacobian(m, positions, r0=R0, v0=V0, n_t=60):
     return np.concatenate([-dB_dd, -t[..., None] * dB_dd, dB_dm], axis=-1)
 
 
-def unitless(m, positions):
+def example_information(m, positions):
     """Fisher information in the example of TSP14, with R = I and the field without mu0/4pi."""
     return information(jacobian(m, positions) / K_DIPOLE, np.eye(3))
 
 
-def car(positions):
+def car_jacobian(positions):
     """Jacobian of 40 samples of a car with respect to [r0, v0, m, b]; b are the backgrounds."""
     H, n = jacobian(CAR[6:], positions, CAR[:3], CAR[3:6], n_t=40), len(positions)
     H_b = np.broadcast_to(np.eye(3 * n).reshape(n, 3, 3 * n), (40, n, 3, 3 * n))
@@ -63,7 +63,7 @@ ROTATION_KERNEL = [*np.cross(UP, R0), *np.cross(UP, V0), 0.0, 0.0, 0.0]
 def test_observability_of_the_published_example(m, sensors, kernel, smallest, condition,
                                                 unobservable):
     """Check values of an example of TSP14 Proposition 1, to the published digits."""
-    o, k = observability(unitless(m, sensors), NAMES), len(kernel)
+    o, k = observability(example_information(m, sensors), NAMES), len(kernel)
     print(f'{len(sensors)} sensors, m = {m}:', o.eigenvalues, o.condition_number)
     assert np.all(np.abs(o.eigenvalues[:k]) < 1e-12 * o.eigenvalues[-1])
     assert o.eigenvalues[k] == pytest.approx(smallest[0], abs=smallest[1])
@@ -75,7 +75,7 @@ def test_observability_of_the_published_example(m, sensors, kernel, smallest, co
 
 def test_scaled_observability_does_not_depend_on_units():
     """With given scales, the eigenvalues do not depend on the units of the states."""
-    J = information(car(ROAD), NOISE * np.eye(3))
+    J = information(car_jacobian(ROAD), NOISE * np.eye(3))
     unit = np.repeat([1e3, 1e3, 1.0, 1e9], [3, 3, 3, 6])
     names = NAMES + list('abcdef')
     found = observability(J, names, CAR_SCALE)
@@ -85,7 +85,7 @@ def test_scaled_observability_does_not_depend_on_units():
     # Without scales, the background in tesla dominates all other states.
     assert observability(J, names).kernel_dimension > 0
     # The kernel is returned in the units of the states: [r0, v0, 3 m, 0].
-    one = information(car(ROAD[:1]), NOISE * np.eye(3))
+    one = information(car_jacobian(ROAD[:1]), NOISE * np.eye(3))
     kernel = observability(one, names[:12], CAR_SCALE[:12]).kernel
     x = np.concatenate([CAR[:6], 3.0 * np.array(CAR[6:]), np.zeros(3)])
     assert kernel.shape == (12, 1)
@@ -93,17 +93,17 @@ def test_scaled_observability_does_not_depend_on_units():
 
 
 def test_known_cpa_range_makes_one_sensor_observable():
-    J, prior = unitless(ONES, ONE), cpa_information(R0, V0, 0.1)
+    J, prior = example_information(ONES, ONE), cpa_information(R0, V0, 0.1)
     assert observability(J + prior, NAMES).kernel_dimension == 0
     # Only the prior determines the range, so the bound of the range equals the prior.
     gradient = np.array([0.0, 1.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 0.0])
     assert gradient @ bound(J, prior) @ gradient == pytest.approx(0.1**2, rel=1e-9)
     # With a kernel of two dimensions, the heading remains unobservable.
-    assert observability(unitless(UP, ONE) + prior, NAMES).kernel_dimension == 1
+    assert observability(example_information(UP, ONE) + prior, NAMES).kernel_dimension == 1
 
 
 def test_cpa_information_is_that_of_the_gradient_of_the_range():
-    """The gradient of the oracle is computed by central differences; TSP14 lacks a minus sign."""
+    """The oracle is a gradient by central differences; the equation of TSP14 lacks a minus sign."""
     def cpa_range(x):
         return np.linalg.norm(np.cross(x[:3], x[3:6])) / np.linalg.norm(x[3:6])
 
@@ -115,7 +115,7 @@ def test_cpa_information_is_that_of_the_gradient_of_the_range():
 
 
 def test_estimate_of_a_linear_model_reaches_the_bound():
-    rng, n, H = np.random.default_rng(3), 4000, car(ROAD)
+    rng, n, H = np.random.default_rng(3), 4000, car_jacobian(ROAD)
     P = bound(information(H, CORRELATED), np.diag(1.0 / CAR_SCALE**2))
     L = np.linalg.cholesky(CORRELATED)
     x = CAR_SCALE * rng.standard_normal((n, 15))
@@ -137,7 +137,7 @@ def test_estimate_of_a_linear_model_reaches_the_bound():
 
 @pytest.mark.parametrize('m', [ONES, UP])
 def test_unobservable_states_have_infinite_variance(m):
-    J = unitless(m, ONE)
+    J = example_information(m, ONE)
     P = bound(J)
     unobservable = np.isin(NAMES, observability(J, NAMES).unobservable)
     assert np.array_equal(np.isinf(np.diag(P)), unobservable)
@@ -150,7 +150,7 @@ def test_unobservable_states_have_infinite_variance(m):
 
 
 def test_a_state_with_a_small_part_in_the_kernel_is_unobservable():
-    """The component of the state in the kernel is far smaller than those of the other states."""
+    """In the kernel vector, one state has the component 1e-5, and four others have 1 to 3."""
     A = np.random.default_rng(4).standard_normal((20, 6))
     n = np.array([1e-5, 1.0, -2.0, 1.0, 0.0, 3.0])
     A -= np.outer(A @ n, n) / (n @ n)
@@ -165,7 +165,7 @@ def test_a_state_with_a_small_part_in_the_kernel_is_unobservable():
 
 
 def test_bound_of_an_observable_case_is_the_inverse_in_any_units():
-    J, unit = unitless(ONES, TWO), 10.0 ** np.arange(-12, 15, 3)
+    J, unit = example_information(ONES, TWO), 10.0 ** np.arange(-12, 15, 3)
     expected = np.linalg.inv(J)
     P = bound(J * np.outer(unit, unit)) * np.outer(unit, unit)
     np.testing.assert_allclose(P, expected, rtol=1e-9, atol=1e-9 * expected.max())
@@ -183,7 +183,7 @@ def test_bound_never_exceeds_the_prior():
 
 def test_exactly_known_states_have_zero_variance():
     """MITRE12 section 4.3; the other states have the bound of a problem without these states."""
-    J, free = unitless(ONES, ONE), np.ix_([1, 2, 3, 5, 6, 7, 8], [1, 2, 3, 5, 6, 7, 8])
+    J, free = example_information(ONES, ONE), np.ix_([1, 2, 3, 5, 6, 7, 8], [1, 2, 3, 5, 6, 7, 8])
     expected = np.zeros((9, 9))
     expected[free] = np.linalg.inv(J[free])
     prior = np.diag([np.inf, 0.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 0.0])
@@ -191,7 +191,8 @@ def test_exactly_known_states_have_zero_variance():
 
 
 def test_marginal_information_is_the_schur_complement():
-    J, keep = information(car(ROAD), CORRELATED) * np.outer(CAR_SCALE, CAR_SCALE), [5, 0, 1]
+    J, keep = (information(car_jacobian(ROAD), CORRELATED) * np.outer(CAR_SCALE, CAR_SCALE),
+               [5, 0, 1])
     found, rest = marginal(J, keep), np.setdiff1d(np.arange(15), keep)
     block = np.linalg.inv(J)[np.ix_(keep, keep)]
     np.testing.assert_allclose(found @ block, np.eye(3), atol=1e-8)
@@ -205,7 +206,7 @@ def test_marginal_information_is_the_schur_complement():
 @pytest.mark.parametrize('m', [ONES, UP])
 def test_unobservable_states_stay_unobservable_in_marginal_information(m, keep):
     """Rounding errors must not turn an infinite bound into a large finite bound."""
-    J, keep = unitless(m, ONE), np.array(keep)
+    J, keep = example_information(m, ONE), np.array(keep)
     expected, found = bound(J)[np.ix_(keep, keep)], bound(marginal(J, keep))
     assert np.array_equal(np.isinf(np.diag(found)), np.isinf(np.diag(expected)))
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
@@ -228,7 +229,7 @@ def plain_kalman(F, Q, H, C, P):
 def filter_problem():
     """F, Q, H and P0 along the path of a car, states [r, v, m, b]; some axes are missing."""
     dt, n = 0.1, 40
-    F, Q, H = np.eye(15), np.zeros((15, 15)), car(ROAD)
+    F, Q, H = np.eye(15), np.zeros((15, 15)), car_jacobian(ROAD)
     F[:3, 3:6] = dt * np.eye(3)
     Q[:6, :6] = 0.25 * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(3))
     H[..., 3:6] = 0.0
@@ -237,7 +238,7 @@ def filter_problem():
     return np.repeat(F[None], n, 0), np.repeat(Q[None], n, 0), H, P0
 
 
-def relative(P, expected):
+def relative_difference(P, expected):
     """Maximum difference of two covariances, relative to the products of the expected stds."""
     std = np.sqrt(np.einsum('...ii->...i', expected))
     return np.abs((P - expected) / (std[..., :, None] * std[..., None, :])).max()
@@ -247,12 +248,12 @@ def test_path_bound_is_the_covariance_of_the_kalman_filter():
     F, Q, H, P0 = filter_problem()
     expected = plain_kalman(F, Q, H, CORRELATED, P0)
     P = path_bound(F, Q, H, CORRELATED, P0)
-    print('path bound against the filter:', relative(P, expected))
-    assert relative(P, expected) < 1e-7
+    print('path bound against the filter:', relative_difference(P, expected))
+    assert relative_difference(P, expected) < 1e-7
     assert P[-1][0, 0] < 0.02 * P0[0, 0]
     # The same with whitened Jacobians, and with one F and Q for all steps.
     white = np.linalg.solve(np.linalg.cholesky(CORRELATED), H[:7])
-    assert relative(path_bound(F[0], Q[0], white, None, P0), expected[:7]) < 1e-7
+    assert relative_difference(path_bound(F[0], Q[0], white, None, P0), expected[:7]) < 1e-7
 
 
 def test_path_bound_accepts_states_known_exactly():
@@ -264,7 +265,7 @@ def test_path_bound_accepts_states_known_exactly():
     free = np.setdiff1d(np.arange(15), known)
     subset = np.ix_(range(40), free, free)
     expected = plain_kalman(F[subset], Q[subset], H[..., free], CORRELATED, P0[np.ix_(free, free)])
-    assert relative(P[subset], expected) < 1e-7
+    assert relative_difference(P[subset], expected) < 1e-7
 
 
 def test_path_bound_without_process_noise_ends_at_the_batch_bound():
@@ -276,11 +277,11 @@ def test_path_bound_without_process_noise_ends_at_the_batch_bound():
     H_batch[..., 3:6] = 0.1 * np.arange(40)[:, None, None, None] * H[..., :3]
     shift = np.eye(15) + 3.9 * np.eye(15, k=3) * (np.arange(15) < 6)
     batch = shift @ bound(information(H_batch, CORRELATED), np.linalg.inv(P0)) @ shift.T
-    assert relative(P[-1], batch) < 1e-7
+    assert relative_difference(P[-1], batch) < 1e-7
 
 
 def test_missing_axes_and_sensors_add_no_information():
-    H = car(ROAD)[:5]
+    H = car_jacobian(ROAD)[:5]
     H[1, 0] = H[2, 1, 1] = np.nan
     C = np.repeat(CORRELATED[None], 2, axis=0) * np.array([1.0, 3.0])[:, None, None]
     J = np.zeros((15, 15))

@@ -43,7 +43,10 @@ def test_expected_rotation_equals_the_published_simulation():
 
 
 def normalised_errors(snr_db, lag, runs=4000):
-    """Errors of mean, variance, error rate and estimated variance, in standard errors."""
+    """Differences between simulation and theory, in standard errors of the simulation.
+
+    Compared are the mean, variance, error rate and estimated variance of the correlation.
+    """
     rng, h = np.random.default_rng([snr_db + 50, lag]), signal()
     std = noise_for(h, snr_db)
     padded = np.pad(h, ((lag, lag), (0, 0)))

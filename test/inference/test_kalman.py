@@ -82,7 +82,7 @@ def bank_in_a_pass(n_sensors, missing=False):
 
 
 def compare(n_sensors, missing=False, shift=0.0):
-    """Maximum differences of mean [std] and covariance [std^2] from both oracles."""
+    """Maximum differences of updated means [std] and covariances [std^2] from both oracles."""
     x, P, y, h, H, C, inflation = bank_in_a_pass(n_sensors, missing)
     x_lin = x + shift * np.sqrt(np.einsum('nii->ni', P))
     new_x, new_P = x.copy(), P.copy()

@@ -151,7 +151,7 @@ def test_detection_probability_has_known_values_and_increases():
 
 
 def test_measured_rate_in_white_noise_agrees_with_theory():
-    """The filter compares s'y/sigma^2 with a threshold, with and without the signal."""
+    """The statistic is s'y / (sigma |s|), of noise with and without the signal s."""
     rng, n, sigma, rate = np.random.default_rng(7), 40_000, 4e-10, 22.0
     s = pulse(11, rate)
     noise = sigma * rng.standard_normal((n, 11, 2))

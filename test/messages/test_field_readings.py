@@ -24,7 +24,7 @@ START = 1_700_000_000_123_456_789
 
 
 def message(content):
-    """Message object as a decoder returns it."""
+    """Message with the fields `content` as attributes, like a decoded message."""
     return SimpleNamespace(**content)
 
 

@@ -44,7 +44,7 @@ def test_continuous_requests_do_not_postpone_the_call(ros):
 
 
 def test_every_reading_of_a_message_is_evaluated(ros):
-    """The calibration node evaluates the readings after publishing."""
+    """The calibration node publishes the readings before it updates their rate and noise."""
     node, spin_until = ros
     received, statuses, rng, stamps = [], {}, np.random.default_rng(0), []
     publisher = node.create_publisher(FieldReadings, RAW_READINGS, STREAM_QOS)

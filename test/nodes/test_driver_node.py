@@ -43,9 +43,10 @@ def line_of(sensor, k, tick):
 
 @pytest.fixture
 def board(ros, tmp_path):
-    """(node, spin_until, line, drivers file, state) of a board that sends at 100 Hz.
+    """(node, spin_until, serial line, drivers file, state) of a board that sends at 100 Hz.
 
-    The clock of the board continues while the process of the test is delayed.
+    `state` contains the counters of the board and the faults to simulate. The clock of the board
+    continues while the process of the test is delayed.
     """
     node, spin_until = ros
     line = SerialLine(tmp_path / 'port')

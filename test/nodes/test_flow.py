@@ -159,7 +159,7 @@ class StandIn:
     def _publish_all(self, records, frame):
         self.published += records
 
-    def ticks(self, seconds, frames):
+    def run_timer(self, seconds, frames):
         """Run the timer at 4 Hz; with `frames`, an hour-old frame arrives before each tick."""
         for _ in range(round(4 * seconds)):
             self._clock[0] += 0.25
@@ -171,28 +171,28 @@ class StandIn:
 def test_a_track_ends_when_frames_stop_not_when_they_are_old(clock):
     end_s = settings_for('magnet').track.end_gap_s + TRANSPORT_MARGIN_S
     node = StandIn(clock)
-    node.ticks(end_s + 5.0, frames=True)
+    node.run_timer(end_s + 5.0, frames=True)
     assert not node.published
-    node.ticks(end_s, frames=False)
+    node.run_timer(end_s, frames=False)
     assert not node.published
-    node.ticks(0.5, frames=False)
+    node.run_timer(0.5, frames=False)
     assert node.published[0] == 'no frames received'
 
 
 def test_a_busy_node_does_not_end_its_track(clock):
     node = StandIn(clock)
-    node.ticks(1.0, frames=True)
+    node.run_timer(1.0, frames=True)
     # The timer runs before the queued frames are processed.
     clock[0] += 100.0
     TrackerNode.end_without_frames(node)
-    node.ticks(5.0, frames=True)
+    node.run_timer(5.0, frames=True)
     assert not node.published
 
 
 def test_a_paused_recording_does_not_end_its_track(clock):
     node = StandIn(clock, is_replayed=True)
-    node.ticks(1.0, frames=True)
-    node.ticks(1000.0, frames=False)
+    node.run_timer(1.0, frames=True)
+    node.run_timer(1000.0, frames=False)
     assert not node.published
 
 

@@ -42,7 +42,7 @@ def command(capfd):
 
 
 def wait_for(condition):
-    """Poll a condition without pauses, because each command takes time."""
+    """Wait for a condition; poll it without pauses, because each evaluation runs a command."""
     end = time.monotonic() + MAX_S
     while not condition():
         assert time.monotonic() < end

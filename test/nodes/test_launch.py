@@ -81,7 +81,7 @@ def executables(monkeypatch):
 
 
 def of_class(launch_objects, name):
-    """Objects in a list whose class has the given name."""
+    """Objects of the class `name` in a list of `LaunchObject` instances."""
     return [m for m in launch_objects if m.name == name]
 
 

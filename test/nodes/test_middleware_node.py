@@ -48,7 +48,10 @@ time.sleep(600.0)
 
 @pytest.fixture
 def init_calls(monkeypatch, tmp_path):
-    """Calls of `rclpy.init`, in an empty folder and without a profile in the environment."""
+    """Arguments of the calls of `rclpy.init`, which is replaced by a function that records them.
+
+    The working folder is empty, and the environment names no profile.
+    """
     calls = []
     monkeypatch.setattr(rclpy, 'init', lambda **k: calls.append(k))
     # A copy, so that changes by `begin` are lost after the test.
@@ -83,7 +86,7 @@ def test_a_profile_in_the_working_folder_is_kept(init_calls, tmp_path):
 
 
 def test_a_restarted_node_receives_messages_at_once(ros, tmp_path):
-    """The delay is often 1 to 4 s without the profile."""
+    """Without the profile, the first message often arrives 1 to 4 s after the start."""
     node, spin_until = ros
     publisher = node.create_publisher(MagneticField, '/field', PUBLISHER_QOS)
     # Fast enough to fill the history for a killed node before the next node starts.
@@ -103,7 +106,7 @@ def test_a_restarted_node_receives_messages_at_once(ros, tmp_path):
 
 
 def test_the_history_of_each_publisher_fits_into_one_request(ros):
-    """A longer history would require a second request, which follows seconds after a restart."""
+    """A longer history would need a second request, which a restarted node sends seconds later."""
     driver = DriverNode(parameter_overrides=[
         Parameter('drivers', value=str(ROOT / 'config' / 'drivers.yaml')),
         Parameter('network', value=str(NETWORK_FILE)), Parameter('batches', value=True),

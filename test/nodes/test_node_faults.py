@@ -74,7 +74,7 @@ def check_recovery(world, vehicle_start_ns, track, lost_ns, address):
 def track_vehicle(world):
     """Start vehicles until one is tracked; return (its start [ns], track id).
 
-    The driver publishes its status once a second; the next status is due 0.35 s after the return.
+    The driver publishes its status once a second; the next is due 0.35 s after this function ends.
     """
     for _ in range(MAX_VEHICLES):
         assert world.wait(world.is_quiet)
@@ -108,7 +108,7 @@ def test_a_track_survives_a_restart_of_the_broker(site):
     site.pause(0.5)
     site.broker.start()
     returned_ns = time.time_ns()
-    print(f'the broker was missing for {(returned_ns - killed_ns) / NS:.2f} s: readings '
+    print(f'the broker was missing for {(returned_ns - killed_ns) / NS:.2f} s: first reading '
           f'{seconds_to_first_reading(site, returned_ns):.2f} s after its return')
     check_recovery(site, vehicle_start_ns, track, killed_ns, f'127.0.0.1:{site.broker.port}')
 
@@ -130,7 +130,7 @@ def test_a_killed_node_recovers_after_its_restart(site, name):
     ('detection_node', 'tracker_node: from detection', 'no message from'),
     ('tracker_node', 'detection_node: to tracker', 'tracker_node has disappeared')])
 def test_a_dead_node_is_reported_by_its_peer(site, name, reporter, words):
-    """A track without frames ends."""
+    """If the tracker receives no more frames, the track ends."""
     site.use('mqtt')
     vehicle_start_ns = track_vehicle_to(site, -4.0)
     killed_ns = time.time_ns()
@@ -179,7 +179,7 @@ def test_a_track_survives_a_missing_port(site):
     site.pause(0.5)
     site.roadside.plug_in()
     returned_ns = time.time_ns()
-    print(f'the port was missing for {(returned_ns - removed_ns) / NS:.2f} s: readings '
+    print(f'the port was missing for {(returned_ns - removed_ns) / NS:.2f} s: first reading '
           f'{seconds_to_first_reading(site, returned_ns):.2f} s after its return')
     check_recovery(site, vehicle_start_ns, track, removed_ns, str(site.line.path))
 
@@ -229,7 +229,7 @@ def restart(pipeline, name):
     # A track that begins close to the sensors may be wrong, but is ambiguous.
     ('detection_node', -8.0, 1.0), ('tracker_node', -4.0, 1.0)])
 def test_no_pose_is_wrong_after_a_gap_during_a_pass(tmp_path, name, x, gap_s):
-    """The faults occur in one process, at reproducible times, with the default frame period."""
+    """Gap and restart are simulated in one process, at fixed times, with the default period."""
     network, speed = read_network(network_file(tmp_path)), 10.0
     settings = settings_for('vehicle', {**POINT, **STEADY['calibration_node'],
                                         **STEADY['detection_node']})

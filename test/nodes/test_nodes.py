@@ -106,7 +106,7 @@ def compare_with_offline(collector, folder):
 
 
 def compare_traffic(collector, offline):
-    """Assert that passages equal the offline passages, of which the last two may be missing."""
+    """Assert that passages and summaries equal those offline; the last two may be missing."""
     n = len(collector.passages)
     assert len(offline.vehicles) - 2 <= n <= len(offline.vehicles) and n > 5
     for online, vehicle in zip(collector.passages, offline.vehicles, strict=False):
@@ -119,7 +119,7 @@ def compare_traffic(collector, offline):
 
 
 def compare_smoothed(collector, folder):
-    """Assert that the smoothed path equals poses_smoothed.csv and fixed-lag poses are close."""
+    """Assert that the smoothed path equals poses_smoothed.csv and is close to fixed-lag poses."""
     with open(folder / 'poses_smoothed.csv', newline='') as stream:
         offline = list(csv.DictReader(stream))
     assert len(collector.paths) == 1
@@ -189,7 +189,7 @@ def test_nodes_equal_offline_on_several_vehicles(tmp_path):
 
 
 def test_nodes_equal_offline_at_the_defaults(tmp_path, road_network):
-    """At the rate of the recording, no message is late by half a second."""
+    """In real time, no message is later than the default `align.max_wait_s`, half a second."""
     settings, recording = settings_for('vehicle'), vehicle_path('straight_car_fast_left')
     replay(Recording(recording), road_network, settings, tmp_path)
     max_difference = compare_with_offline(
@@ -205,7 +205,8 @@ def test_nodes_equal_offline_on_magnets(run_number, magnet_runs, tmp_path):
     replay(Recording(recording), read_network(network_file), settings, tmp_path)
     max_difference = compare_with_offline(
         collect_from_nodes(network_file, settings, recording, 80.0), tmp_path)
-    print(f'magnet run {run_number}: nodes against offline {max_difference:.1e}')
+    print(f'magnet run {run_number}: nodes against offline, largest relative difference '
+          f'{max_difference:.1e}')
     assert max_difference <= 1e-9
 
 
@@ -225,8 +226,8 @@ def receive_topics(node):
 def play_through_processes(ros, recording, received):
     """Play a recording through one process per node until its track and events have arrived.
 
-    At this rate a `STREAM_QOS` queue holds 2.5 s of samples: on a machine four times slower, a node
-    may be busy for more than a second.
+    The rate is twice real time, at which a `STREAM_QOS` queue holds 2.5 s of samples: on a machine
+    four times slower, a node may be busy for more than a second.
     """
     node, spin_until = ros
     network = ['-p', f'network:={NETWORK_FILE}', '-p', 'reliable_input:=true']

@@ -24,7 +24,7 @@ from support.node_processes import MAX_S, environment
 COMMAND = [sys.executable, '-m', 'mag_tracking.cli']
 RECORDING = vehicle_path('straight_car_right')
 LONG_WAIT_ARGUMENTS = ('--ros-args', '-p', 'align.max_wait_s:=5.0')
-"""At a high playback rate, readings are later (in recording time) than the default allows."""
+"""At a high playback rate, readings arrive later (in recording time) than the default wait."""
 
 
 def command(*arguments):
@@ -88,7 +88,7 @@ def test_the_page_of_running_nodes_shows_the_values_of_the_topic(ros):
 
 
 def messages_of(url, until, seconds=MAX_S):
-    """Yield the messages to a viewer, up to the first message for which `until` is true."""
+    """Yield the messages that a page sends to a viewer, until `until` is true for one of them."""
     with connect(url.replace('http', 'ws') + 'stream', max_size=None) as viewer:
         end = time.monotonic() + seconds
         while True:

@@ -29,7 +29,7 @@ def test_names_in_policies_of_a_namespace_have_its_prefix():
 
 
 def test_policies_allow_only_the_interfaces_of_each_node():
-    """The rules are read as in the schema of sros2."""
+    """The rules are parsed according to the schema of sros2."""
     profiles = {p.get('node'): p for p in ElementTree.parse(POLICIES).iter('profile')}
     assert set(profiles) == {'calibration_node', 'detection_node', 'tracker_node', 'driver_node',
                              'replay_node'}

@@ -33,7 +33,7 @@ class Session:
         self.node = RecordNode(self.recorder, selection, self.reports.append)
 
     def until(self, condition, seconds=MAX_S):
-        """Record until a condition holds; return whether it does."""
+        """Record until a condition holds, at most for `seconds`; return whether it holds."""
         end = time.monotonic() + seconds
         while not condition() and time.monotonic() < end:
             self.node.discover()

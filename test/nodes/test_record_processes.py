@@ -39,7 +39,7 @@ COMMAND = ('import argparse, sys; from mag_tracking.cli import record; '
 
 
 def recording_process(out, *options):
-    """Start `mag-tracking record` as a process and wait until it subscribes."""
+    """Start `mag-tracking record` as a process and wait until it reports the start."""
     process = subprocess.Popen(
         [sys.executable, '-u', '-c', COMMAND, 'record', '--network', NETWORK_FILE, '--out', out,
          *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -61,7 +61,7 @@ def await_messages(process, n):
 
 
 def contents(path, topics):
-    """{topic: [decoded message as a string]}, because padding of serialised bytes is undefined."""
+    """{topic: [decoded message as a string]}; the padding of the serialised bytes is undefined."""
     out = {t: [] for t in topics}
     for m in Recording(path).messages(topics):
         out[m.topic].append(repr(decode(m)))

@@ -13,9 +13,10 @@ from support.bundled import NETWORK_FILE, vehicle_path
 from support.node_processes import call, start, stop
 
 RECORDING = vehicle_path('straight_car_right')
-PLAIN = 'detect:\n  onset_frames: 4\ntrack:\n  vehicle:\n    arrival_names: [east, west, "no"]\n'
-ROS = ('/**:\n  ros__parameters:\n    detect:\n      onset_frames: 4\n'
-       '    track.vehicle.arrival_names: [east, west, "no"]\n')
+PLAIN_PARAMETERS = ('detect:\n  onset_frames: 4\n'
+                    'track:\n  vehicle:\n    arrival_names: [east, west, "no"]\n')
+ROS_PARAMETERS = ('/**:\n  ros__parameters:\n    detect:\n      onset_frames: 4\n'
+                  '    track.vehicle.arrival_names: [east, west, "no"]\n')
 
 
 def test_lifecycle_transitions_start_and_stop_playback(ros):
@@ -66,7 +67,7 @@ def test_an_unreadable_recording_leaves_the_node_unconfigured(ros, tmp_path):
     assert exit_codes == [0] and 'no.mcap' in outputs[0]
 
 
-@pytest.mark.parametrize('content', [PLAIN, ROS])
+@pytest.mark.parametrize('content', [PLAIN_PARAMETERS, ROS_PARAMETERS])
 def test_nodes_accept_both_formats_of_parameter_files(ros, tmp_path, content):
     path = tmp_path / 'mine.yaml'
     path.write_text(content)

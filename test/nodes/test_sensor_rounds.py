@@ -15,7 +15,7 @@ from support.bundled import NETWORK_FILE
 from support.dense_traffic import after_dense_traffic
 
 READINGS = after_dense_traffic('junction_left_to_right', 7.0)
-"""Both backgrounds become doubtful twice, and are both doubtful for a while."""
+"""Both backgrounds become doubtful twice, for a while at the same time."""
 BATCH_SIZE = 40
 
 

@@ -57,7 +57,7 @@ def launch(arguments):
 
 
 def launch_and_wait(arguments):
-    """Start Python and wait until the first line of the project handles SIGTERM."""
+    """Start Python and wait until mag_tracking has installed its SIGTERM handler."""
     process = launch(arguments)
     wait_for(lambda: handles(process.pid, signal.SIGTERM), process)
     return process
@@ -127,7 +127,7 @@ def test_a_signal_while_a_library_is_loaded_ends_the_process(library, signum):
 
 @pytest.fixture
 def start_s(monkeypatch):
-    """f(arguments): seconds from the first line until a node of the process is in the graph.
+    """f(arguments): seconds from the start of signal handling until a node is in the graph.
 
     The domain is not shared: if a process ends while its node is announced, the middleware may
     list the node until the observer ends.
@@ -153,7 +153,7 @@ def start_s(monkeypatch):
     pytest.param('tracker_node', 0.25), pytest.param('run', 0.25, marks=pytest.mark.study),
     *(pytest.param(name, 0.05, marks=pytest.mark.study) for name in COMMANDS)])
 def test_a_signal_at_any_moment_of_the_start_ends_the_process(start_s, name, step_s):
-    """The steps are longer on a slow machine; their number remains the same."""
+    """Signals are sent every `step_s`, or less often on a machine where the start takes longer."""
     duration_s = start_s(COMMANDS[name])
     n = round(2.5 / step_s)
     step_s, results = max(step_s, 1.2 * duration_s / n), {}

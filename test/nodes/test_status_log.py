@@ -1,4 +1,5 @@
-"""Faults in the log: at their beginning and end, and errors at intervals while they last."""
+"""Log of faults: each fault is logged when it begins and when it ends; lasting errors are repeated
+at intervals."""
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus

@@ -21,7 +21,7 @@ VIEWERS = ROOT / 'config' / 'viewers'
 
 
 def layout_entries():
-    """Read [(topic, path of fields)] and the frames of all layouts."""
+    """Read all layouts; return [(topic, field path)] and {frame}. PlotJuggler's topics are None."""
     content = yaml.safe_load((VIEWERS / 'mag_tracking.rviz').read_text())['Visualization Manager']
     entries = [(d['Topic']['Value'], '') for d in content['Displays'] if 'Topic' in d]
     frames = {content['Global Options']['Fixed Frame']}
@@ -67,7 +67,7 @@ def demo():
 
 
 def type_of(kind, fields):
-    """Type of a path of fields in a message type; fails for an unknown field."""
+    """Type of a nested field, given by the field names on its path; fails for an unknown field."""
     for name in fields:
         name, index = re.fullmatch(r'(\w+)(\[\d+\])?', name).groups()
         kinds = message_class(kind).get_fields_and_field_types()

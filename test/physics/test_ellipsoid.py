@@ -1,4 +1,4 @@
-"""Permeable ellipsoid: comparison with integration, limit cases and corrected MITRE12 equations."""
+"""Permeable ellipsoid: comparison with integrals, limiting cases, corrected MITRE12 equations."""
 
 import math
 

@@ -30,7 +30,7 @@ COMPONENTS = {1: ('x', 'y', 'z'), 2: ('xx', 'xy', 'xz', 'yy', 'yz'),
               3: ('xxx', 'xxy', 'xxz', 'xyy', 'xyz', 'yyy', 'yyz')}
 
 
-def only(order, moments):
+def single_order(order, moments):
     """Copy the moments and set those of all orders except `order` to zero."""
     out = np.zeros_like(moments)
     out[..., PARTS[order]] = moments[..., PARTS[order]]
@@ -82,7 +82,7 @@ def test_order_one_is_the_dipole(r, m):
 @given(r=away, moments=moments15)
 def test_field_equals_the_published_one(order, r, moments):
     scale = 1e-7 * 15 / np.linalg.norm(r)**(order + 2)
-    np.testing.assert_allclose(multipole_field(r, only(order, moments)),
+    np.testing.assert_allclose(multipole_field(r, single_order(order, moments)),
                                published_field(r, order, moments), rtol=0, atol=1e-13 * scale)
 
 
@@ -90,7 +90,7 @@ def test_field_equals_the_published_one(order, r, moments):
 def test_field_has_neither_divergence_nor_curl(r, moments):
     # One order at a time: far away, the sum would mask the octupole.
     for order in PARTS:
-        J, _ = multipole_jacobians(r, only(order, moments))
+        J, _ = multipole_jacobians(r, single_order(order, moments))
         assert abs(np.trace(J)) <= 2e-12 * np.abs(J).max()
         assert np.abs(J - J.T).max() <= 1e-12 * np.abs(J).max()
 
@@ -98,8 +98,8 @@ def test_field_has_neither_divergence_nor_curl(r, moments):
 @pytest.mark.parametrize('order', [1, 2, 3])
 @given(r=away, moments=moments15, u=st.floats(0.5, 4.0))
 def test_field_of_each_order_decays_with_its_power_of_the_distance(order, r, moments, u):
-    near = multipole_field(r, only(order, moments))
-    far = multipole_field(u * r, only(order, moments))
+    near = multipole_field(r, single_order(order, moments))
+    far = multipole_field(u * r, single_order(order, moments))
     scale = 1e-7 * np.abs(moments[PARTS[order]]).max() / np.linalg.norm(r)**(order + 2)
     np.testing.assert_allclose(far * u**(order + 2), near, rtol=0, atol=1e-12 * scale)
 
@@ -112,10 +112,10 @@ def test_field_rotates_with_the_scene(r, axis, seed):
     moments = multipole_moments(points, dipoles, 3)
     rotated = multipole_moments(points @ R.T, dipoles @ R.T, 3)
     for order in PARTS:
-        B = multipole_field(r, only(order, moments))
+        B = multipole_field(r, single_order(order, moments))
         scale = 1e-7 * np.abs(moments).max() / np.linalg.norm(r)**(order + 2)
-        np.testing.assert_allclose(multipole_field(R @ r, only(order, rotated)), R @ B, rtol=0,
-                                   atol=2e-12 * scale)
+        np.testing.assert_allclose(multipole_field(R @ r, single_order(order, rotated)), R @ B,
+                                   rtol=0, atol=2e-12 * scale)
 
 
 @pytest.mark.parametrize('order', [1, 2, 3])
@@ -123,7 +123,7 @@ def test_field_rotates_with_the_scene(r, axis, seed):
 def test_jacobians_agree_with_differences(order, r, moments):
     # One order at a time, so that none masks another; the vector ends with that order.
     part = PARTS[order]
-    moments = only(order, moments)[:part.stop]
+    moments = single_order(order, moments)[:part.stop]
     dB_dr, dB_dm = multipole_jacobians(r, moments)
     h = 1e-5 * np.linalg.norm(r)
     column = np.abs(dB_dm[:, part]).max()
@@ -143,15 +143,15 @@ def test_jacobians_agree_with_differences(order, r, moments):
 def test_orders_of_a_shifted_dipole_are_its_taylor_series(r, x, m):
     moments = multipole_moments(x[None], m[None], 3)
     gradient = dipole_jacobians(r, m)[0]
-    np.testing.assert_allclose(multipole_field(r, only(2, moments)), -gradient @ x, rtol=0,
+    np.testing.assert_allclose(multipole_field(r, single_order(2, moments)), -gradient @ x, rtol=0,
                                atol=1e-12 * np.abs(gradient).max() * (1 + np.linalg.norm(x)))
     h = 1e-4 * np.linalg.norm(r)
     size = max(np.linalg.norm(x), 1e-3)
     u = x / size
     second = (dipole_field(r + h * u, m) - 2 * dipole_field(r, m) + dipole_field(r - h * u, m))
     scale = np.linalg.norm(dipole_field(r, m)) * (size / np.linalg.norm(r))**2
-    np.testing.assert_allclose(multipole_field(r, only(3, moments)), 0.5 * second * (size / h)**2,
-                               rtol=0, atol=3e-6 * scale)
+    np.testing.assert_allclose(multipole_field(r, single_order(3, moments)),
+                               0.5 * second * (size / h)**2, rtol=0, atol=3e-6 * scale)
 
 
 @pytest.mark.parametrize('order', [1, 2, 3])

@@ -309,7 +309,7 @@ def test_a_small_rotation_of_a_magnet_follows_the_published_model():
 
 
 def rotation_noise(std_w, std_m, dt, density=0.0):
-    """Return (sampled, modelled) variance along the moment of the neglected rotation terms."""
+    """Variance of the neglected rotation terms along the moment: (sampled, modelled)."""
     model = Magnet(np.zeros(3), density)
     rng = np.random.default_rng(8)
     x = magnet_state(np.array([0.3, -0.4, 1.2]), np.array([0.2, 0.1, 0.0]))

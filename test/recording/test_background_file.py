@@ -126,7 +126,7 @@ def test_a_changed_calibration_discards_stored_backgrounds(tmp_path, change):
 
 
 def test_a_sensor_moved_before_the_restart_is_relearnt(tmp_path):
-    """The background is relearnt even with `relearn_s` = 0, which disables relearning otherwise."""
+    """The background is relearnt even with `relearn_s` = 0, which otherwise disables this."""
     network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
     stage.resume(stored)

@@ -135,7 +135,7 @@ def write_mcap(path, encoding, schema, messages):
 
 
 def fields_of(source):
-    """Read a recording as a list of (topic, time [ns], field (3,))."""
+    """Read a recording as a list of (topic, timestamp [ns], field (3,) [T])."""
     read = mt.read_recording(source.path, NETWORK_FILE).readings
     return [(f'/{name}/imu/mag', stamp, field) for name, stamp, field in zip(
         read.sensor_names(), read.stamp_ns.tolist(), read.field, strict=True)]

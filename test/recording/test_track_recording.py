@@ -15,7 +15,7 @@ TOPICS = {'/mag_1/imu/mag_calibrated', '/mag_2/imu/mag_calibrated', '/tf', '/tf_
 
 @pytest.fixture(scope='module')
 def read(vehicle_replays):
-    """Read a replay; return its `Run`, {topic: [(log time, message)]} and {topic: durability}."""
+    """Read a replay; return `Run`, {topic: [(log time [ns], message)]} and {topic: durability}."""
     run, folder = vehicle_replays['straight_car_right']
     messages, durability = {}, {}
     with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:

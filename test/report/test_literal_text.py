@@ -106,7 +106,7 @@ def test_equal_lanes_share_a_curve_and_a_label():
 
 
 def test_the_first_pose_is_on_the_line_of_the_track():
-    """The marker is at the published pose, not at the best hypothesis of an arrival direction."""
+    """The marker is at the published pose, not at the estimate for one arrival direction."""
     log = log_of_track()
     (axes,) = map_figure(log, NETWORK).axes
     lines = {line.get_label(): line.get_xydata() for line in axes.get_lines()}

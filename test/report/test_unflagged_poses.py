@@ -21,7 +21,7 @@ def counts(n, wrong=0, without_truth=0):
 
 
 def log(off_m=0.0, std_m=0.1, ambiguous=False):
-    """Track at the lateral distance `off_m` from the first vehicle."""
+    """`TrackLog` with poses at the lateral distance `off_m` from the first vehicle."""
     out = TrackLog(1)
     for t in T:
         out.add(track_pose(t, 10.0 * t, off_m, ambiguous=ambiguous,

@@ -105,7 +105,7 @@ def custom_device(name, cls, **changes):
 
 
 class FailingDriver:
-    """Driver whose readings fail."""
+    """Driver that raises `error` at each reading."""
 
     error = RuntimeError
 

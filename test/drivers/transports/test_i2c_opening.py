@@ -213,7 +213,7 @@ def multiplexed_rig():
 
 
 def test_only_one_channel_is_open_at_a_time():
-    """The simulated bus also fails if two chips answer."""
+    """The simulated bus also fails if two chips answer at the same address."""
     clock, bus, device = multiplexed_rig()
     device.open()
     for _ in range(5):

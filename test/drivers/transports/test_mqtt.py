@@ -35,7 +35,7 @@ def broker(tmp_path_factory):
 
 @pytest.fixture
 def topics(monkeypatch):
-    """Factory of transports, which are closed at the end."""
+    """Factory of `MqttTopics`, which are closed at the end of the test."""
     monkeypatch.setattr(mqtt_topics, 'CLOSE_WAIT_S', 0.01)
     transports = []
 
@@ -75,7 +75,7 @@ def wait_until(condition, seconds=5.0):
 
 
 def wait_for_messages(broker, client_id, n):
-    """Wait until a client with `qos` 1 has acknowledged `n` messages, without reading them."""
+    """Wait until the broker has received `n` acknowledgements (QoS 1) from a client."""
     wait_until(lambda: broker.log().count(f'Received PUBACK from {client_id} ') == n)
 
 

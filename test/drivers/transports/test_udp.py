@@ -20,7 +20,7 @@ SETTINGS = UdpSettings(address='127.0.0.1')
 
 @pytest.fixture
 def listen():
-    """Factory of open sockets, which are closed at the end."""
+    """Factory of open `UdpSocket` instances, which are closed at the end of the test."""
     created = []
 
     def make(report=print, **changes):

@@ -69,7 +69,7 @@ def test_time_offsets_are_the_mean_sample_times_of_each_sensor():
 
 @given(st.data())
 def test_frames_do_not_depend_on_the_interleaving_of_the_sensors(data):
-    """Each sensor's samples stay in order; the sensors are mixed within the maximum wait."""
+    """Samples change their order only between sensors, and by no more than the maximum wait."""
     queues = [[s for s in stream(3, 600) if s.sensor == f'mag_{j + 1}'] for j in range(3)]
     mixed = []
     while any(queues):
@@ -316,7 +316,7 @@ def test_frames_and_counts_match_the_reference_at_every_sample(seed):
 @pytest.mark.parametrize('changes', [{}, {'burst': True, 'period_s': 0.5, 'max_wait_s': 2.0},
                                      {'max_wait_s': 3600.0, 'max_buffered': 20}])
 def test_the_cost_of_a_sample_does_not_depend_on_the_number_of_sensors(changes):
-    """The cost is measured in attribute look-ups; samples are lost and one sensor has a gap."""
+    """The cost is the number of attribute look-ups; samples are lost and one sensor has a gap."""
     class CountedAlign(Align):
         lookups = Counter()
         def __getattribute__(self, name):

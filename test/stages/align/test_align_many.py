@@ -63,7 +63,7 @@ class CountedAlignment(core.Alignment):
 
 
 def reasons_of(stage, readings):
-    """Feed readings; return the number of each reason code that compiled code returned."""
+    """Feed readings; return {reason code: how often compiled code returned it}."""
     CountedAlignment.reasons.clear()
     for r in readings:
         stage.feed(r)

@@ -11,8 +11,8 @@ from mag_tracking.stages.align.clock_step import ClockStepFilter
 from support.clock_steps import sample, stream, wild, with_clock_step
 
 LIMIT = 500
-"""Maximum jump. Timestamps in these tests are in milliseconds, although the filter documents
-nanoseconds."""
+"""[ms] Maximum forward jump. Timestamps in these tests are in milliseconds, although the filter
+documents nanoseconds."""
 
 
 def run(clock_filter, arrivals):
@@ -138,7 +138,7 @@ def test_a_clock_ahead_of_all_others_is_rejected_when_the_others_jump():
 
 
 def test_a_clock_that_is_ahead_in_its_first_sample_is_rejected_by_majority():
-    """With two sensors, either clock may be correct and both pass; otherwise, the majority wins."""
+    """Of two clocks, either may be correct, so all samples pass; otherwise, the majority wins."""
     two = ClockStepFilter(2, LIMIT, 10)
     assert run(two, [(0, 0), (1, 5000)]) == ([(0, 0), (1, 5000)], [])
     three = ClockStepFilter(3, LIMIT, 10)
@@ -189,7 +189,7 @@ def test_repeated_timestamps_ahead_of_all_do_not_fill_the_memory():
 @settings(derandomize=True, deadline=None, max_examples=25)
 @given(st.integers(0, 10_000))
 def test_networks_of_slow_sensors_lose_no_samples(seed):
-    """Sensors slower than the limit, at any phase; samples are held for two intervals at most."""
+    """Sampling intervals may exceed `LIMIT`; samples are held for at most two of the longest."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 7))
     steps = [int(s) for s in rng.uniform(300.0, 3000.0, n)]

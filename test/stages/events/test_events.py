@@ -33,7 +33,7 @@ def passing(rng, noise=0.0, height=0.0, left_to_right=True, n=200):
     """Simulate a dipole on a straight path; return (t, field (n, 3), time of the CPA, time scale).
 
     The target passes north of the sensor, and x points east. The unit of length is the lateral
-    distance.
+    distance. The time scale is the distance at the CPA divided by the speed.
     """
     speed, t_cpa = rng.uniform(0.5, 3.0), rng.uniform(-1.0, 1.0)
     span = 6.0 * np.hypot(1.0, height) / speed

@@ -43,9 +43,11 @@ def test_derivatives_match_finite_differences_at_the_times_of_the_sensors(target
         np.testing.assert_allclose(H[:, :, k], numeric, atol=1e-6 * scale)
 
 
-def slow_passes(compensated):
-    """(mean NEES, RMS error [m]) of fast passes by two sensors that are sampled at 12.5 Hz, 40 ms
-    apart."""
+def errors_of_fast_passes(compensated):
+    """(mean NEES, RMS error [m]) of passes at 20 m/s; two sensors sample at 12.5 Hz, 40 ms apart.
+
+    Unless `compensated`, the tracker is not given the time offsets of the sensors.
+    """
     network = line_network(2)
     nees, squares = [], []
     for seed in range(6):
@@ -75,7 +77,7 @@ def slow_passes(compensated):
 
 @pytest.mark.study
 def test_tracks_of_slow_asynchronous_sensors_are_consistent():
-    with_offsets, without = slow_passes(True), slow_passes(False)
+    with_offsets, without = errors_of_fast_passes(True), errors_of_fast_passes(False)
     print(f'with time offsets: NEES {with_offsets[0]:.2f}, RMS {with_offsets[1]:.2f} m; '
           f'without: {without[0]:.2f}, {without[1]:.2f} m')
     assert with_offsets[0] < 1.6
@@ -160,7 +162,7 @@ def test_a_magnet_is_found_again_after_a_long_gap(gap_s):
     assert stage.counts['frames'] == 40
 
 
-def tracks_with_contradiction(manager, sizes):
+def tracks_after_random_fields(manager, sizes):
     """`Track`s from ten frames with a constant field, followed by frames with random fields whose
     RMS values [T] are `sizes`."""
     C = np.repeat(1e-16 * np.eye(3)[None], 2, axis=0)
@@ -176,7 +178,7 @@ def tracks_with_contradiction(manager, sizes):
 
 def test_a_vehicle_that_the_field_contradicts_is_lost_and_not_restarted():
     stage = TrackManager(line_network(2), settings_for('vehicle').track)
-    tracks = tracks_with_contradiction(stage, [1e-4] * 10 + [1.9e-4] * 10)
+    tracks = tracks_after_random_fields(stage, [1e-4] * 10 + [1.9e-4] * 10)
     assert stage.counts['tracks ended: target lost'] == 1
     assert tracks[-1].ended and tracks[-2].ambiguous
     assert stage.counts['tracks'] == 1 and stage.bank is None
@@ -188,7 +190,7 @@ def test_twice_the_field_of_a_lost_vehicle_starts_an_ambiguous_track(lookback_s)
     therefore belong to another target."""
     stage = TrackManager(line_network(2), settings_for(
         'vehicle', {'track.lookback_s': lookback_s}).track)
-    tracks = tracks_with_contradiction(stage, [1e-4] * 19 + [2.1e-4])
+    tracks = tracks_after_random_fields(stage, [1e-4] * 19 + [2.1e-4])
     assert stage.counts['tracks'] == 2
     assert stage.counts[
         'tracks started in a larger field after the target of a detection was lost'] == 1

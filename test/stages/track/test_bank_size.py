@@ -46,8 +46,10 @@ def test_too_many_hypotheses_of_a_magnet_are_rejected(changes, message):
 
 
 def bytes_at_start(n, settings):
-    """Memory [bytes] of the covariances of all hypotheses of a vehicle whose track starts with `n`
-    sensors."""
+    """Memory [bytes] of the covariances of all hypotheses of a vehicle at the start of its track.
+
+    The network has `n` sensors.
+    """
     network = line_network(n)
     target = target_of(settings, network)
     frame = FieldFrame(0, np.full((n, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], n, axis=0),

@@ -9,11 +9,15 @@ from mag_tracking.stages.track.rigid_pass import RigidPass
 FIRST_TWO = np.arange(2)
 
 
-def rigid_pass_of(offset, std=0.02, speed=15.0, misfit=1.0, reference=0, bent=100.0):
-    """`RigidPass` with these clock offsets relative to the sensor `reference`."""
+def rigid_pass_of(offset, std=0.02, speed=15.0, misfit=1.0, reference=0,
+                  bent_cost=100.0):
+    """`RigidPass` with these clock offsets [s] relative to the sensor `reference`.
+
+    `offset` has no entry for the reference.
+    """
     offsets = np.insert(np.atleast_1d(offset).astype(float), reference, 0.0)
     stds = np.where(np.arange(len(offsets)) == reference, 0.0, std)
-    return RigidPass(0, 100.0, bent, 100.0 * misfit, 100, 1.0, reference, offsets, stds,
+    return RigidPass(0, 100.0, bent_cost, 100.0 * misfit, 100, 1.0, reference, offsets, stds,
                      np.zeros(3), np.array([speed, 0.0, 0.0]), np.zeros((0, 6)))
 
 
@@ -92,7 +96,7 @@ def test_an_offset_that_moves_a_target_by_less_than_a_metre_is_ignored():
     assert clocks.largest_offset.sensor == 2
 
 
-@pytest.mark.parametrize('changes', [{'misfit': 2.0}, {'bent': 10.0}, {'speed': 1.0},
+@pytest.mark.parametrize('changes', [{'misfit': 2.0}, {'bent_cost': 10.0}, {'speed': 1.0},
                                      {'offset': 1.9}])
 def test_a_bent_slow_or_unexplained_pass_identifies_no_clock(changes):
     assert comparison_of([rigid_pass_of(**{'offset': 0.45, 'std': 0.01, **changes})] * 5
@@ -105,7 +109,7 @@ def test_corrected_clocks_are_accepted_after_some_passes():
     while clocks.largest_offset is not None:
         clocks.add(rigid_pass_of(0.0), FIRST_TWO)
         n += 1
-    print(f'{n} passes after the clocks were corrected')
+    print(f'corrected clocks accepted after {n} passes')
     assert n < MEMORY_PASSES // 2
 
 
