@@ -122,7 +122,7 @@ def certificate(folder):
 
 
 class ScriptedBroker:
-    """Accepts one connection, and answers each message with the next of the given responses."""
+    """Broker that accepts one connection, and answers each message with the next of `responses`."""
 
     def __init__(self, *responses):
         self._responses = responses

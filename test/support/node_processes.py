@@ -1,4 +1,4 @@
-"""Nodes as separate processes."""
+"""Start, stop and service calls of nodes that run as separate processes."""
 
 import os
 import signal
@@ -17,7 +17,8 @@ USUAL_START_S = 1.8
 
 
 def scaled(limit_s, start_s):
-    """Extend the time limit of an idle machine in proportion to the start-up time `start_s`."""
+    """Extend a time limit for an idle machine in proportion to the measured start-up time
+    `start_s`."""
     return limit_s * max(1.0, start_s / USUAL_START_S)
 
 
@@ -47,7 +48,7 @@ def stop(processes):
     return [p.returncode for p in processes], outputs
 
 
-def without_states(output):
+def without_info_lines(output):
     """Remove the INFO lines from the output of nodes."""
     return ''.join(line for line in output.splitlines(keepends=True)
                    if not line.startswith('[INFO]'))
