@@ -64,7 +64,7 @@ class Broker:
                 return self
             time.sleep(0.01)
         self.kill()
-        raise AssertionError(f'mosquitto does not start:\n{self.log()}')
+        raise AssertionError(f'mosquitto did not start:\n{self.log()}')
 
     def log(self):
         """Output of the broker so far."""

@@ -58,11 +58,11 @@ def call(ros, kind, name, request):
     """Call a service and return the response; repeat the request if no response arrives."""
     node, spin_until = ros
     client = node.create_client(kind, name)
-    assert spin_until(client.service_is_ready), f'there is no {name}'
+    assert spin_until(client.service_is_ready), f'service {name} is not available'
     # A client may find a server before the server knows the client. The middleware then drops
     # the response.
     for _ in range(12):
         future = client.call_async(request)
         if spin_until(future.done, 10.0):
             return future.result()
-    raise AssertionError(f'{name} has not answered')
+    raise AssertionError(f'service {name} has not answered')
