@@ -133,7 +133,8 @@ def test_functions_are_short_and_public_names_have_docstrings(path):
 
 
 def private_uses(tree):
-    """Yield private names that a test imports from the package or reads from other objects."""
+    """Yield private names that a test imports from the package or reads from objects other than
+    `self`."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and (node.module or '').startswith('mag_tracking'):
             yield from (a.name for a in node.names if a.name.startswith('_'))

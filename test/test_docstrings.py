@@ -54,7 +54,7 @@ def numpydoc_issues(path, node, ancestors):
 
 
 def shape_issues(node, doc):
-    """Array arguments and return values whose shape is not documented."""
+    """Issues for array arguments and return values whose shape is not documented."""
     types = {name: p.type for p in doc['Parameters'] for name in re.split(r',\s*', p.name)}
     arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
     missing = [f'no shape: {a.arg}' for a in arguments
@@ -72,7 +72,7 @@ def has_shape(text):
 
 
 def error_issues(node, doc):
-    """Exceptions that a function raises itself but does not document."""
+    """Issues for exceptions that a function raises itself but does not document."""
     raised = {n.exc.func.id for n in ast.walk(node)
               if isinstance(n, ast.Raise) and isinstance(n.exc, ast.Call)
               and isinstance(n.exc.func, ast.Name) and n.exc.func.id.endswith('Error')}

@@ -61,7 +61,7 @@ def test_the_shell_commands_succeed(line, tmp_path, monkeypatch, capsys):
 
 
 def test_the_python_example_runs(tmp_path):
-    """The code is run in the project folder, with another path for the picture."""
+    """The code is run in the project folder, with a temporary path for the picture."""
     assert len(PYTHON_EXAMPLE.split('\n\n')[1].strip().splitlines()) + 1 <= 5
     code = PYTHON_EXAMPLE.replace("'map.png'", repr(str(tmp_path / 'map.png')))
     process = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True,

@@ -41,7 +41,8 @@ def test_licence_and_description_agree():
 
 
 def test_dependencies_of_package_xml_and_wheel_agree():
-    """The apt package `python3-X` is X on PyPI. Comments in package.xml name the others."""
+    """The apt package `python3-X` is X on PyPI. Comments in package.xml name dependencies without
+    one."""
     text = (ROOT / 'package.xml').read_text(encoding='utf-8')
     names = {'python3-serial': 'pyserial', 'python3-yaml': 'PyYAML'}
     declared = {names.get(e.text, e.text.removeprefix('python3-')).lower()

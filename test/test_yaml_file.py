@@ -12,7 +12,8 @@ from mag_tracking.yaml_file import MAX_DEPTH, MAX_NODES, read_yaml
 
 
 def nested_aliases(n, form='[{}]', width=9):
-    """YAML with anchors a0 .. an; `form` formats the `width` aliases of the previous anchor."""
+    """YAML with anchors a0 .. an; each contains `width` aliases of the previous anchor in the
+    format `form`."""
     lines = ['a0: &a0 {x: 1}']
     lines += [f'a{k}: &a{k} ' + form.format(', '.join([f'*a{k - 1}'] * width))
               for k in range(1, n + 1)]

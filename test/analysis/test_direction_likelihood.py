@@ -8,7 +8,7 @@ from mag_tracking.analysis.direction_likelihood import (
     direction_likelihood_ratio,
 )
 from mag_tracking.physics.dipole import dipole_field
-from support.two_way_traffic import calibration, passings, shares
+from support.two_way_traffic import far_sensor_error, passings, shares
 
 RIGHT, LEFT = LaneHypothesis(25.0, 3.5), LaneHypothesis(-25.0, 6.5)
 T = np.arange(-0.75, 0.75, 0.01)
@@ -51,5 +51,5 @@ def test_directions_are_as_accurate_as_in_the_published_traffic(simulator):
     # another vehicle is in the other lane within 0.62 s; in four of these errors, it is a truck.
     assert fractions.near > 0.998 - 3.0 * np.sqrt(0.998 * 0.002 / 511)
     assert fractions.fused > 0.97 - 3.0 * np.sqrt(0.97 * 0.03 / 511)
-    predicted, measured = calibration(vehicles)
+    predicted, measured = far_sensor_error(vehicles)
     assert abs(predicted - measured) < 0.05

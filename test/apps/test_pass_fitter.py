@@ -31,9 +31,9 @@ def test_two_vehicles_are_fitted_together(scenario, simulator):
     matches = assigned_fits(passes, [(world.t, position) for position in world.positions])
     assert sorted(match.vehicle for match in matches) == [0, 1]
     for match in matches:
-        assert '2 vehicles were fitted together' in match.one.notes[-1]
+        assert '2 vehicles were fitted together' in match.fitted_pass.notes[-1]
         # Three standard deviations are allowed, because a driver may brake.
-        found, std = match.one.chosen.speed
+        found, std = match.fitted_pass.chosen.speed
         assert abs(found - match.speed) < max(0.1 * match.speed, 3.0 * std)
 
 
@@ -48,7 +48,8 @@ def test_a_stopped_run_returns_no_fits():
 def test_every_vehicle_of_a_recording_is_fitted(name):
     """All sixteen directions are correct; 90 % of the speeds are within 10 %."""
     passes, matches = fits_of_recording(name)
-    speed_errors = np.array([match.one.chosen.speed[0] / match.speed - 1.0 for match in matches])
+    speed_errors = np.array([match.fitted_pass.chosen.speed[0] / match.speed - 1.0
+                             for match in matches])
     assert len(matches) == len(passes) == 16
     assert (np.abs(speed_errors) < 0.1).mean() >= 0.9, np.round(speed_errors, 2)
 

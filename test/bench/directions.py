@@ -13,7 +13,7 @@ import sys
 from tqdm import tqdm
 
 from bench.figures import Figures
-from support.two_way_traffic import calibration, passings, shares
+from support.two_way_traffic import far_sensor_error, passings, shares
 
 SIMULATORS = ('clouds', 'boxes')
 SEEDS = (1, 2, 3)
@@ -42,7 +42,7 @@ def main():
                 figures.add(f'{simulator}, {method}, {name}', getattr(fractions, name), '',
                             aim if method == 'correlation' else None, True,
                             f' (published {published[name]:.4f})')
-        reported, measured = calibration(vehicles)
+        reported, measured = far_sensor_error(vehicles)
         figures.add(f'{simulator}, far lane: predicted minus measured error probability',
                     abs(reported - measured), '', MAX_DIFFERENCE, False,
                     f' ({reported:.3f} reported, {measured:.3f} measured)')

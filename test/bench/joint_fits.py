@@ -50,10 +50,10 @@ class Tally:
         self.seconds += seconds
 
     def figures(self, figures, label, aim=None):
-        """Print and record figures; return (number of unflagged fits, number of wrong ones)."""
-        error = np.array([of.one.chosen.speed[0] / of.speed - 1.0 for of in self.found])
-        sd = np.array([of.one.chosen.speed[1] / of.speed for of in self.found])
-        unflagged = np.array([not of.one.chosen.ambiguous for of in self.found], dtype=bool)
+        """Print the figures; return (number of unflagged fits, number of wrong unflagged fits)."""
+        error = np.array([of.fitted_pass.chosen.speed[0] / of.speed - 1.0 for of in self.found])
+        sd = np.array([of.fitted_pass.chosen.speed[1] / of.speed for of in self.found])
+        unflagged = np.array([not of.fitted_pass.chosen.ambiguous for of in self.found], dtype=bool)
         wrong = unflagged & (np.abs(error) > MAX_ERROR) & (np.abs(error) > MAX_ERROR_STD * sd)
         n = max(self.n_vehicles, 1)
         figures.add(f'{label}: fitted in the right direction', len(error) / n, '', aim, True,

@@ -47,9 +47,10 @@ def seconds_to_first_reading(world, sensor_back_ns):
     """Seconds from `sensor_back_ns` to the first later reading, at most `MAX_RECOVERY_S`."""
     assert world.wait(lambda: any(
         m.header.stamp.sec * NS + m.header.stamp.nanosec > sensor_back_ns
-        for _, m in world.since(sensor_back_ns, 'driver_node')))
-    delay_s = next(arrival_ns for arrival_ns, m in world.since(sensor_back_ns, 'driver_node')
-                   if m.header.stamp.sec * NS + m.header.stamp.nanosec > sensor_back_ns)
+        for _, m in world.messages_since(sensor_back_ns, 'driver_node')))
+    delay_s = next(
+        arrival_ns for arrival_ns, m in world.messages_since(sensor_back_ns, 'driver_node')
+        if m.header.stamp.sec * NS + m.header.stamp.nanosec > sensor_back_ns)
     delay_s = (delay_s - sensor_back_ns) / NS
     assert delay_s <= MAX_RECOVERY_S
     return delay_s
@@ -68,7 +69,7 @@ def check_recovery(world, vehicle_start_ns, track, lost_ns, address):
     assert world.wait(lambda: ended_tracks(world, vehicle_start_ns))
     assert {t.id for t in world.tracks(vehicle_start_ns)} == {track}
     assert world.tracks(vehicle_start_ns)[-1].stamp_ns > lost_ns + NS
-    assert world.wrong(vehicle_start_ns) == []
+    assert world.wrong_poses(vehicle_start_ns) == []
 
 
 def track_vehicle(world):
@@ -81,7 +82,7 @@ def track_vehicle(world):
         start_ns = time.time_ns()
         assert world.wait(lambda start_ns=start_ns: world.statuses_since(
             start_ns, f'driver_node: {world.link}'))
-        vehicle_start_ns = world.call()
+        vehicle_start_ns = world.start_vehicle()
         world.pause(2.65)
         if world.tracks(vehicle_start_ns):
             first = world.tracks(vehicle_start_ns)[0]
@@ -93,7 +94,7 @@ def track_vehicle(world):
 def track_vehicle_to(world, x):
     """Start vehicles until one is tracked at `x` [m]; return its start [ns]."""
     for _ in range(MAX_VEHICLES):
-        vehicle_start_ns = world.call()
+        vehicle_start_ns = world.start_vehicle()
         world.drive_to(x)
         if world.tracks(vehicle_start_ns):
             return vehicle_start_ns
@@ -101,7 +102,7 @@ def track_vehicle_to(world, x):
 
 
 def test_a_track_survives_a_restart_of_the_broker(site):
-    site.use('mqtt')
+    site.use_link('mqtt')
     vehicle_start_ns, track = track_vehicle(site)
     killed_ns = time.time_ns()
     site.broker.kill()
@@ -115,14 +116,14 @@ def test_a_track_survives_a_restart_of_the_broker(site):
 
 @pytest.mark.parametrize('name', list(TOPICS))
 def test_a_killed_node_recovers_after_its_restart(site, name):
-    site.use('mqtt')
+    site.use_link('mqtt')
     vehicle_start_ns = track_vehicle_to(site, -4.0)
     site.kill(name)
     start_s, recovery = site.recovery(name)
     print(f'{name}: up after {start_s:.2f} s, first output {recovery:.2f} s later')
     assert recovery <= scaled(MAX_RECOVERY_S, start_s)
     assert site.wait(site.roadside.is_gone)
-    assert site.wrong(vehicle_start_ns) == []
+    assert site.wrong_poses(vehicle_start_ns) == []
 
 
 @pytest.mark.parametrize('name, reporter, words', [
@@ -130,8 +131,8 @@ def test_a_killed_node_recovers_after_its_restart(site, name):
     ('detection_node', 'tracker_node: from detection', 'no message from'),
     ('tracker_node', 'detection_node: to tracker', 'tracker_node has disappeared')])
 def test_a_dead_node_is_reported_by_its_peer(site, name, reporter, words):
-    """If the tracker receives no more frames, the track ends."""
-    site.use('mqtt')
+    """A track without frames ends."""
+    site.use_link('mqtt')
     vehicle_start_ns = track_vehicle_to(site, -4.0)
     killed_ns = time.time_ns()
     site.kill(name)
@@ -153,7 +154,7 @@ def test_a_dead_node_is_reported_by_its_peer(site, name, reporter, words):
 
 
 def test_a_dead_driver_is_reported_by_the_calibration(site):
-    site.use('mqtt')
+    site.use_link('mqtt')
     killed_ns = time.time_ns()
     site.kill('driver_node')
     for sensor in ('mag_1', 'mag_2'):
@@ -172,7 +173,7 @@ def test_a_dead_driver_is_reported_by_the_calibration(site):
 
 
 def test_a_track_survives_a_missing_port(site):
-    site.use('serial')
+    site.use_link('serial')
     vehicle_start_ns, track = track_vehicle(site)
     removed_ns = time.time_ns()
     site.roadside.pull_out()
@@ -185,7 +186,7 @@ def test_a_track_survives_a_missing_port(site):
 
 
 def test_two_boards_of_one_name_are_reported(site):
-    site.use('mqtt')
+    site.use_link('mqtt')
     start_ns = time.time_ns()
     assert site.wait(lambda: site.statuses_since(start_ns, 'driver_node: mqtt'))
     assert not site.statuses_since(0, 'driver_node: mqtt', 'sequence restarts')
@@ -201,7 +202,7 @@ def test_two_boards_of_one_name_are_reported(site):
 
 
 def test_a_broker_that_refuses_the_login_is_reported(site):
-    site.use('mqtt')
+    site.use_link('mqtt')
     start_ns = time.time_ns()
     assert site.wait(lambda: site.statuses_since(start_ns, 'driver_node: guarded', 'refused'))
     [(_, status)] = site.statuses_since(start_ns, 'driver_node: guarded')
@@ -209,7 +210,7 @@ def test_a_broker_that_refuses_the_login_is_reported(site):
     assert f'127.0.0.1:{site.guarded.port}' in status.message
     assert 'not authori' in status.message.lower()
     # Other devices are not affected.
-    assert site.wait(lambda: site.since(start_ns, 'driver_node'))
+    assert site.wait(lambda: site.messages_since(start_ns, 'driver_node'))
 
 
 def restart(pipeline, name):

@@ -46,7 +46,7 @@ from mag_tracking.recording.reader import Recording
 from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
 from support.busy_recordings import BUSY, network_of_recording
 from support.marks import studied
-from support.node_processes import MAX_S, call, start, stop, without_states
+from support.node_processes import MAX_S, call, start, stop, without_info_lines
 from support.shared_memory import orphaned_segments, segments_of
 
 pytestmark = pytest.mark.timeout(600)
@@ -366,5 +366,5 @@ def test_ended_nodes_leave_no_shared_memory(ros, signum):
     finally:
         process.send_signal(signum)
         output, _ = process.communicate(timeout=MAX_S)
-    assert (process.returncode, without_states(output)) == (0, '')
+    assert (process.returncode, without_info_lines(output)) == (0, '')
     assert segments and not orphaned_segments(segments)

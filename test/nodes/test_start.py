@@ -12,7 +12,7 @@ from rclpy.node import Node
 
 from mag_tracking.nodes import middleware
 from support.bundled import NETWORK_FILE, ROOT, vehicle_path
-from support.node_processes import environment, without_states
+from support.node_processes import environment, without_info_lines
 from support.ros_domain import RosDomain
 
 pytestmark = pytest.mark.timeout(600)
@@ -88,7 +88,7 @@ def signal_and_wait(process, signum):
     """Send a signal to a process; return (exit status, output)."""
     process.send_signal(signum)
     output = process.communicate(timeout=MAX_START_S)[0]
-    return process.returncode, without_states(output)
+    return process.returncode, without_info_lines(output)
 
 
 @pytest.mark.parametrize('signum, arguments', [

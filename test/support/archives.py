@@ -26,7 +26,7 @@ def archive_recordings(folder):
 
 
 def rows(folder, table):
-    """Read all rows of an archive table, sorted."""
+    """Read all rows of an archive table, sorted, without its columns of times with a time zone."""
     # DuckDB requires another library for times with a time zone.
     columns = [c.name for c in TABLES[table] if c.kind != 't']
     files = folder / ('recordings.parquet' if table == 'recordings' else f'{table}/**/*.parquet')

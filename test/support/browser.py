@@ -62,7 +62,7 @@ class Page:
             self.page.wait_for_timeout(20)
 
     def move_slider(self, t):
-        """Move the slider as a user does, and wait until the page is redrawn."""
+        """Move the slider to time `t` [s] as a user does, and wait until the page is redrawn."""
         drawn = self.value('magTracking.drawn')
         self.page.evaluate(
             't => { const s = document.getElementById("slider"); s.value = t;'
@@ -76,7 +76,7 @@ class Page:
             return pose ? [pose.x[0], pose.y[0]] : null; })()''')
 
     def line_times(self):
-        """Current time [s] at which each plot has its vertical line."""
+        """Times [s] of the vertical lines that mark the current time, one per plot."""
         return self.value('''[...document.querySelectorAll('#field .plot'),
             ...['weights', 'innovation', 'speed'].map(id => document.getElementById(id))]
             .map(plot => plot.layout.shapes[0].x0)''')

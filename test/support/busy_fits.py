@@ -17,9 +17,9 @@ MAX_ASSIGNMENT_M = 8.0
 
 
 class AssignedFit(NamedTuple):
-    """A fit, and the true vehicle that it is assigned to."""
+    """Fit of a pass, and the true vehicle that it is assigned to."""
 
-    one: FittedPass
+    fitted_pass: FittedPass
     vehicle: int
     speed: float
     """[m/s] True speed at the time of the strongest field."""
@@ -34,7 +34,7 @@ def fits_of_world(a_world, orders=ORDERS):
 
 
 def fits_of_recording(name, folder=BUSY, orders=ORDERS):
-    """Fit a recording of several vehicles; return ([FittedPass], [OfVehicle])."""
+    """Fit a recording of several vehicles; return ([FittedPass], [AssignedFit])."""
     network = network_of_recording(name, folder)
     recording = Recording(folder / f'{name}.mcap')
     passes = list(RecordingFit(recording, network, settings_for('vehicle'), orders).passes())
@@ -44,7 +44,7 @@ def fits_of_recording(name, folder=BUSY, orders=ORDERS):
 
 
 def assigned_fits(passes, vehicles):
-    """Assign fits to vehicles [(t (n,) [s], positions (n, 2) [m])]; return [OfVehicle]."""
+    """Assign fits to vehicles [(t (n,) [s], positions (n, 2) [m])]; return [AssignedFit]."""
     candidates = []
     for i, one in enumerate(passes):
         fit = one.chosen

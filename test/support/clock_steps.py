@@ -12,7 +12,8 @@ def sample(t, j):
 
 
 def stream(n, begin, end, step=10, skip=()):
-    """List [(sensor, timestamp)] of the samples of `n` sensors, each with the interval `step`."""
+    """List [(index of the sensor, timestamp)] of the samples of `n` sensors with the interval
+    `step`."""
     return [(j, t + j) for t in range(begin, end, step) for j in range(n) if j not in skip]
 
 

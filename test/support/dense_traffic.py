@@ -9,7 +9,8 @@ from support.spoilt_runs import recorded
 
 
 def traffic(gap, begin=0.0, end=np.inf, size=2e-6, seed=0):
-    """Create a function t [s] -> field (3,) [T] of random vehicles at intervals of about `gap`."""
+    """Create a function t [s] -> field (3,) [T] of random vehicles at intervals of about `gap`
+    [s]."""
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.uniform(0.7, 1.3, 200) * gap) + begin
     times, sizes = times[times < end], size * rng.normal(size=(200, 3))
@@ -17,7 +18,7 @@ def traffic(gap, begin=0.0, end=np.inf, size=2e-6, seed=0):
 
 
 def dense_traffic(seconds):
-    """Fault for `support.spoiler` that adds dense traffic to the first `seconds`."""
+    """Fault for `support.spoiler` that adds dense traffic to the first `seconds` of a recording."""
     def modify(readings):
         t = (readings.stamp_ns - readings.stamp_ns.min()) / NS
         of = [traffic(1.5, begin=-1.0, end=seconds, seed=j) for j in range(len(readings.names))]

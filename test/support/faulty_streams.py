@@ -17,12 +17,12 @@ NS = 1_000_000_000
 
 
 def swap_axes(sample, rng):
-    """Swap two axes."""
+    """Fault that swaps the x and y axes."""
     return [replace(sample, field=sample.field[[1, 0, 2]])]
 
 
 def with_spikes(size):
-    """Add a spike of +/- `size` [T] on every axis to one of twenty readings."""
+    """Fault that adds a spike of +/- `size` [T] on every axis, with a probability of 5 %."""
     def modify(sample, rng):
         spike = size * rng.choice([-1.0, 1.0], 3) if rng.random() < 0.05 else 0.0
         return [replace(sample, field=sample.field + spike)]
@@ -30,7 +30,7 @@ def with_spikes(size):
 
 
 def shift_clock(seconds):
-    """Set the clock back by `seconds`, or ahead if negative."""
+    """Fault that sets the clock back by `seconds`, or ahead if negative."""
     return lambda sample, rng: [replace(sample, stamp_ns=sample.stamp_ns - round(seconds * NS))]
 
 

@@ -28,7 +28,7 @@ class FedBackground(RunningBackground):
             self.evaluate_block()
 
     def note(self, stamp, raw):
-        """Update the quantisation steps; Python version of `core.note_step`."""
+        """Update the quantisation steps with a raw reading; Python version of `core.note_step`."""
         s = self.sensors[0]
         for a in np.flatnonzero(~np.isnan(raw)):
             change = abs(raw[a] - s['raw'][a])

@@ -63,7 +63,7 @@ class Result(NamedTuple):
     """Maximum number of unconsumed bytes."""
 
     def failed(self, chance):
-        """Whether there are more errors than false frames of probability `chance` would cause."""
+        """Whether there are more errors than false frames with probability `chance` can explain."""
         mean = chance * self.suspects
         limit = math.floor(mean + 6.0 * math.sqrt(mean)) if mean > 0.01 else 0
         # A false frame hides at most one true frame, because all frames have the same length.
@@ -144,7 +144,7 @@ def _skipped(expected, reading):
 
 
 def _axes(rng, scale, digits):
-    """Three random axes; in 5 % of cases, one axis is missing."""
+    """Random values of three axes up to +/- `scale`; in 5 % of cases, one of them is NaN."""
     axes = [round(rng.uniform(-scale, scale), digits) for _ in range(3)]
     if rng.random() < 0.05:
         axes[rng.randrange(3)] = math.nan

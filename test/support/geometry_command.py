@@ -23,13 +23,14 @@ def write_table(path, field, positions, axes):
 
 
 def command(table, *options, out):
-    """Run the command on a table; return its exit status."""
+    """Run `board-geometry` on a pose table; return its exit status."""
     return main(['board-geometry', str(table), '--moment', str(MOMENT), '--out', str(out),
                  *map(str, options)])
 
 
 def calibrated_readings(network, readings):
-    """Calibrate raw readings (K, n, 3) with a `Calibrate` stage; NaN where it returns none."""
+    """Calibrate raw readings (K, n, 3) with a `Calibrate` stage; NaN where it returns no
+    reading."""
     stage = Calibrate(network, settings_for('magnet').calibrate)
     out = np.full(readings.shape, np.nan)
     for k, frame in enumerate(readings):

@@ -105,7 +105,8 @@ class FakeBus:
 
 
 def rig(entries, chips=None, clock=None, **changes):
-    """Create (clock, bus, device), by default with one chip per entry and no multiplexer."""
+    """Create (clock, bus, device); by default, each of `entries` ('name:chip:address') has a chip
+    on the bus."""
     clock = clock or Clock()
     if chips is None:
         chips = {}

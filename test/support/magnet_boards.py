@@ -28,7 +28,7 @@ def board(n_side=3, spacing=0.06, noise=1e-7, seed=3):
 
 
 def tracked(n_poses, rng):
-    """Random positions and axes of a tool above the board."""
+    """Random positions (n, 3) [m] and axes (n, 3) of a tracked tool above the board."""
     positions = rng.uniform([0.0, 0.0, 0.05], [0.12, 0.12, 0.13], (n_poses, 3))
     axes = np.array([0.0, 0.0, 1.0]) + 0.6 * rng.uniform(-1.0, 1.0, (n_poses, 3))
     return positions, axes / np.linalg.norm(axes, axis=1)[:, None]

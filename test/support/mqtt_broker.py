@@ -64,7 +64,7 @@ class Broker:
                 return self
             time.sleep(0.01)
         self.kill()
-        raise AssertionError(f'mosquitto does not start:\n{self.log()}')
+        raise AssertionError(f'mosquitto did not start:\n{self.log()}')
 
     def log(self):
         """Output of the broker so far."""
@@ -122,7 +122,7 @@ def certificate(folder):
 
 
 class ScriptedBroker:
-    """Accepts one connection, and answers each message with the next of the given responses."""
+    """Broker that accepts one connection, and answers each message with the next of `responses`."""
 
     def __init__(self, *responses):
         self._responses = responses

@@ -1,4 +1,4 @@
-"""Networks for tests."""
+"""Sensor network along a road, for tests."""
 
 import numpy as np
 

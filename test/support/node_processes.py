@@ -1,4 +1,4 @@
-"""Nodes as separate processes."""
+"""Start, stop and service calls of nodes that run as separate processes."""
 
 import os
 import signal
@@ -17,7 +17,8 @@ USUAL_START_S = 1.8
 
 
 def scaled(limit_s, start_s):
-    """Extend the time limit of an idle machine in proportion to the start-up time `start_s`."""
+    """Extend a time limit for an idle machine in proportion to the measured start-up time
+    `start_s`."""
     return limit_s * max(1.0, start_s / USUAL_START_S)
 
 
@@ -47,7 +48,7 @@ def stop(processes):
     return [p.returncode for p in processes], outputs
 
 
-def without_states(output):
+def without_info_lines(output):
     """Remove the INFO lines from the output of nodes."""
     return ''.join(line for line in output.splitlines(keepends=True)
                    if not line.startswith('[INFO]'))
@@ -57,11 +58,11 @@ def call(ros, kind, name, request):
     """Call a service and return the response; repeat the request if no response arrives."""
     node, spin_until = ros
     client = node.create_client(kind, name)
-    assert spin_until(client.service_is_ready), f'there is no {name}'
+    assert spin_until(client.service_is_ready), f'service {name} is not available'
     # A client may find a server before the server knows the client. The middleware then drops
     # the response.
     for _ in range(12):
         future = client.call_async(request)
         if spin_until(future.done, 10.0):
             return future.result()
-    raise AssertionError(f'{name} has not answered')
+    raise AssertionError(f'service {name} has not answered')

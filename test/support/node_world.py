@@ -111,14 +111,15 @@ class World:
             self._executor.shutdown()
 
     def wait(self, condition, seconds=MAX_S):
-        """Spin at 100 Hz until `condition()` is true or `seconds` have passed; return the value."""
+        """Spin at 100 Hz until `condition()` is true or `seconds` have passed; return its last
+        value."""
         end = time.monotonic() + seconds
         while not (value := condition()) and time.monotonic() < end:
             self._executor.spin_until_future_complete(Future(), 0.01)
         return value
 
     def pause(self, seconds):
-        """Spin for `seconds`."""
+        """Spin for `seconds`, so that messages are received."""
         self.wait(lambda: False, seconds)
 
     def start(self, name):
@@ -142,7 +143,8 @@ class World:
         self.pause(0.05)
 
     def publishers(self):
-        """Identifiers of the discovered publishers of diagnostics, also those of killed nodes."""
+        """Identifiers of the discovered publishers of diagnostics; killed nodes may still be
+        included."""
         return {tuple(p.endpoint_gid) for p in
                 self.node.get_publishers_info_by_topic('/diagnostics')}
 
@@ -165,14 +167,14 @@ class World:
     def _first_ns(self, name, since_ns):
         """Time [ns] of the first output of a node after `since_ns`; None without an output."""
         if name != 'tracker_node':
-            return next((arrival for arrival, _ in self.since(since_ns, name)), None)
+            return next((arrival for arrival, _ in self.messages_since(since_ns, name)), None)
         for arrival, status in self.statuses_since(since_ns, 'tracker_node: track'):
             frames = next((int(v.value) for v in status.values if v.key == 'frames'), 0)
             if frames:
                 return arrival - round(frames * FRAME_S * NS)
         return None
 
-    def use(self, link):
+    def use_link(self, link):
         """Restart the driver with `link`, 'mqtt' or 'serial', and wait for its first output."""
         if link == self.link:
             return
@@ -181,9 +183,9 @@ class World:
             assert codes == [0], outputs
         self.link, began_ns = link, time.time_ns()
         self.start('driver_node')
-        assert self.wait(lambda: self.since(began_ns, 'driver_node'))
+        assert self.wait(lambda: self.messages_since(began_ns, 'driver_node'))
 
-    def since(self, since_ns, name):
+    def messages_since(self, since_ns, name):
         """Messages of a node that arrived after `since_ns`, as [(arrival [ns], message)]."""
         return [entry for entry in self.received[name] if entry[0] > since_ns]
 
@@ -199,25 +201,26 @@ class World:
     def tracks(self, since_ns):
         """List the `Track`s with a timestamp after `since_ns`."""
         # On a busy machine, poses of the previous vehicle arrive while the next one is passing.
-        tracks = (track_of(t) for _, m in self.since(since_ns, 'tracker_node') for t in m.tracks)
+        tracks = (track_of(t) for _, m in self.messages_since(since_ns, 'tracker_node')
+                  for t in m.tracks)
         return [t for t in tracks if t.stamp_ns > since_ns]
 
     def is_quiet(self):
-        """Whether the previous vehicle has left and its detection has ended."""
+        """Whether the latest vehicle has left and the detection has ended."""
         frames = self.received['detection_node']
         return frames and not frames[-1][1].target_present and self.roadside.is_gone()
 
-    def call(self):
+    def start_vehicle(self):
         """Start a vehicle after the previous vehicle has left; return the start time [ns]."""
         assert self.wait(self.is_quiet)
-        self.roadside.call()
+        self.roadside.start_vehicle()
         return time.time_ns()
 
     def drive_to(self, x):
         """Spin until the vehicle is at `x` [m]."""
         assert self.wait(lambda: self.roadside.truth(time.time_ns())[0] >= x)
 
-    def wrong(self, since_ns):
+    def wrong_poses(self, since_ns):
         """List the wrong poses with a timestamp after `since_ns`."""
         return [t for t in self.tracks(since_ns)
                 if not t.ended and is_wrong(t, self.roadside.truth(t.stamp_ns))]
@@ -241,7 +244,7 @@ def world(folder):
         init_ros()
         running_world = World(folder, broker, guarded, roadside, line)
         try:
-            running_world.use('mqtt')
+            running_world.use_link('mqtt')
             for name in list(TOPICS)[1:]:
                 running_world.start(name)
             assert running_world.wait(lambda: running_world.received['detection_node'])

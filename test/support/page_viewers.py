@@ -13,7 +13,7 @@ from websockets.asyncio.client import connect
 
 
 async def receive_all(url, sizes):
-    """Read all messages of one viewer, and append their sizes [bytes] to `sizes`."""
+    """Read all messages as one viewer, and append their sizes [bytes] to `sizes`."""
     async with connect(url.replace('http', 'ws') + 'stream', max_size=None,
                        compression=None) as viewer:
         async for message in viewer:
@@ -21,7 +21,7 @@ async def receive_all(url, sizes):
 
 
 async def main(url, n):
-    """Run `n` viewers until SIGTERM."""
+    """Run `n` viewers until SIGTERM, and print the amount received."""
     sizes = [[] for _ in range(n)]
     tasks = [asyncio.create_task(receive_all(url, one)) for one in sizes]
     asyncio.get_running_loop().add_signal_handler(

@@ -32,7 +32,11 @@ def random_moments(rng, n_dipoles):
 
 
 def random_path(rng, n_dipoles, road):
-    """Random path (6 or 7,) and moments (d, 3), along the road or with any heading."""
+    """Random path and moments (d, 3) [A m²], along the road if `road`, otherwise with any heading.
+
+    The path (6,) consists of position and velocity; (7,) also includes the length of several
+    dipoles.
+    """
     heading = rng.uniform(0.0, 2.0 * np.pi)
     if road:
         heading = np.pi * rng.integers(2) + 0.03 * rng.standard_normal()

@@ -16,7 +16,7 @@ NS = 1_000_000_000
 
 
 class Repetition:
-    """Detects a stuck sensor: a run of equal readings with a probability below 1e-9."""
+    """Detector of a stuck sensor: a run of equal readings with a probability below 1e-9."""
 
     def __init__(self):
         self.last, self.run, self.repeats, self.changes = None, 0, 0.0, 0.0
@@ -41,7 +41,8 @@ class Repetition:
 
 
 class Spikes:
-    """Spike detector, which holds up to three samples with steps far above the eight previous."""
+    """Spike detector. It holds up to three samples after a step far above the previous eight
+    steps."""
 
     def __init__(self, threshold):
         self.threshold = threshold
@@ -53,7 +54,7 @@ class Spikes:
     def feed(self, sample, noise_std, step):
         """Add a sample; return [(sample, is a spike)] of all samples that are now classified."""
         if self.before is None:
-            return self.step(sample)
+            return self.release(sample)
         steps = np.abs(sample.field - self.before.field)
         if noise_std is None and self.steps:
             recent = np.nan_to_num(self.steps[-8:])
@@ -69,18 +70,18 @@ class Spikes:
                 self.held.append((sample, steps))
                 return []
             self.steps = []
-            return self.step(sample)
+            return self.release(sample)
         return self.judge(sample, steps, noise_std)
 
     def judge(self, sample, steps, noise_std):
-        if len(self.steps) >= 8 and self.is_off(sample, steps, noise_std):
+        if len(self.steps) >= 8 and self.is_steep(sample, steps, noise_std):
             self.held.append((sample, steps))
             return []
         self.before = sample
         self.steps.append(steps)
         return [(sample, False)]
 
-    def is_off(self, sample, steps, noise_std):
+    def is_steep(self, sample, steps, noise_std):
         interval = 30.0 * (sample.stamp_ns - self.before.stamp_ns) * 1e-9
         steeper = max(8.0, 130.0 * interval ** 3)
         for axis in range(3):
@@ -90,8 +91,9 @@ class Spikes:
                 return True
         return False
 
-    def step(self, sample):
-        """Release the held samples and `sample` as valid, without a comparison."""
+    def release(self, sample):
+        """Return the held samples and `sample` as valid; the next sample is compared with
+        `sample`."""
         known = [(h, False) for h, _ in self.held] + [(sample, False)]
         self.held, self.before = [], sample
         return known
@@ -125,7 +127,7 @@ class PlainCalibration:
         raw, sample = sample.field, self.corrected(sample)
         if np.isnan(sample.field).all():
             return self.reject('an axis that the correction needs is missing')
-        cause = self.misplaced(sample)
+        cause = self.timestamp_fault(sample)
         if cause:
             return self.reject(cause)
         if self.settings.reject_stuck and self.repetition[name].is_stuck(sample.field):
@@ -141,7 +143,7 @@ class PlainCalibration:
         for _, is_spike in known:
             if is_spike:
                 self.reject('spike')
-        return self.used([s for s, is_spike in known if not is_spike])
+        return self.accept([s for s, is_spike in known if not is_spike])
 
     def reject(self, cause):
         self.counts[f'rejected: {cause}'] += 1
@@ -176,7 +178,7 @@ class PlainCalibration:
         return MagSample(sample.stamp_ns - round(self.network.clock_offset[i] * NS),
                          sample.sensor, field, covariance)
 
-    def misplaced(self, sample):
+    def timestamp_fault(self, sample):
         name, stamp, last = sample.sensor, sample.stamp_ns, self.last_ns.get(sample.sensor)
         if last is not None:
             longest = self.settings.max_forward_jump_s * NS
@@ -198,7 +200,7 @@ class PlainCalibration:
         self.first_ns.setdefault(name, stamp)
         return None
 
-    def used(self, samples):
+    def accept(self, samples):
         out = []
         for s in samples:
             self.accepted[s.sensor] += 1
@@ -231,7 +233,8 @@ class PlainCalibration:
         return [MagSample(sample.stamp_ns, sample.sensor, field, C)]
 
     def is_credible(self, own, noise):
-        """Whether `own` is positive definite and similar to `noise`, within a factor of 25."""
+        """Whether the covariance `own` is positive definite and its variances are within a factor
+        of 25 of `noise`, with similar correlations."""
         present = ~np.isnan(noise.diagonal())
         own, noise = own[np.ix_(present, present)], noise[np.ix_(present, present)]
         if not np.isfinite(own).all() \
@@ -258,4 +261,4 @@ class PlainCalibration:
         held = [h for s in self.spikes.values() for h, _ in s.held]
         for s in self.spikes.values():
             s.clear()
-        return self.used(held)
+        return self.accept(held)

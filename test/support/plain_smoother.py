@@ -63,21 +63,22 @@ def smoothed_covariances(steps: Sequence[Step]) -> list[FloatArray]:
 
 
 def _adjoint_of_update(after, gains):
-    """Propagate `after` (n_hyp, n_x) backwards through an update, in place, sensor by sensor."""
+    """Propagate l, `after` (n_hyp, n_x), backwards through an update, in place, sensor by
+    sensor."""
     for j in range(gains.G.shape[1] - 1, -1, -1):
         v = gains.z[:, j] - np.einsum('pai,pi->pa', gains.G[:, j], after)
         after += np.einsum('pab,pbi,pa->pi', gains.W[:, j], gains.A[:, j], v)
 
 
 def _before(step, after):
-    """Phi' `after` (n_hyp, n_x, m), where Phi is the propagation matrix to the time of `step`."""
+    """Phi' times `after` (n_hyp, n_x, m), where Phi propagates states to the time of `step`."""
     n_t = step.F.shape[-1]
     return np.concatenate([np.swapaxes(step.F, -1, -2) @ after[:, :n_t],
                            step.decay[:, None] * after[:, n_t:]], axis=1)
 
 
 def _information_before_update(after, gains):
-    """Propagate `after` (n_hyp, n_x, n_x) backwards through an update, sensor by sensor."""
+    """Propagate L, `after` (n_hyp, n_x, n_x), backwards through an update, sensor by sensor."""
     for j in range(gains.G.shape[1] - 1, -1, -1):
         G, W_A = gains.G[:, j], gains.W[:, j] @ gains.A[:, j]
         update = np.eye(after.shape[1]) - np.swapaxes(G, 1, 2) @ W_A

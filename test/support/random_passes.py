@@ -79,7 +79,7 @@ class Tracked:
 
 
 def are_wrong(error, error_std):
-    """Whether each error [m] exceeds `WRONG_M` and `WRONG_SD` published standard deviations [m]."""
+    """Whether each error [m] exceeds both `WRONG_M` and `WRONG_SD` times `error_std` [m]."""
     return (error > WRONG_M) & (error > WRONG_SD * error_std)
 
 

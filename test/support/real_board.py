@@ -1,4 +1,4 @@
-"""Real readings of 41 sensors, a magnet and an optical tracker."""
+"""Real readings of 41 sensors, with the poses of a magnet from an optical tracker."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ BOX = np.array([-0.05, -0.05, 0.03]), np.array([0.2, 0.22, 0.3])
 
 
 def board_of_41():
-    """Read the bundled data of the board: (network, field, positions, axes)."""
+    """Read the bundled data of the board: (network, field (K, 41, 3) [T], positions, axes)."""
     sensor_positions = read_sensor_positions(FOLDER / 'sensor_positions_m.csv')
     names = tuple(f'mag_{j}' for j in range(len(sensor_positions)))
     noise = (np.full(3, 4e-8),) * 25 + (np.array([3.2e-7, 3.2e-7, 4.1e-7]),) * 16
@@ -22,12 +22,12 @@ def board_of_41():
     return network, *read_pose_table(FOLDER / 'poses.csv')
 
 
-def errors(geometry, field, positions, axes, poses):
+def errors(geometry, field, positions, axes, to_world):
     """Errors of the estimated positions [m] and axes [deg] of a magnet.
 
-    `poses` transforms positions and axes from the tracker frame to the world frame.
+    The function `to_world` transforms positions and axes from the tracker frame to the world frame.
     """
-    r, u = poses(positions, axes)
+    r, u = to_world(positions, axes)
     estimates = [locate_magnet(geometry.network, B, geometry.moment[0], *BOX, PoseSettings())
                  for B in geometry.signal(field)]
     assert all(p.converged for p in estimates)

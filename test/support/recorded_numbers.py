@@ -15,7 +15,7 @@ S = 10**9
 
 
 def field(k):
-    """Serialised magnetic field with the number `k` as its timestamp."""
+    """Serialised magnetic field message with the number `k` as its timestamp."""
     noise = np.random.default_rng(k).standard_normal(3) * 1e-5
     return encoder(MAGNETIC_FIELD)(sample_dict(MagSample(k, 'mag', noise, None), 'mag_1'))
 

@@ -79,7 +79,7 @@ class Roadside:
         self._table = self._still + np.einsum('njw,jws->njs', body.field(
             network.earth_field, position, heading, network.positions), network.R_ws)
         self._rng = np.random.default_rng(1)
-        self._called, self._start_ns = None, None
+        self._start_round, self._start_ns = None, None
         # `twin`: whether a third board, switched on `TWIN_S` later, also sends as `A`.
         self.plugged, self.twin = True, False
         self._line_lock, self._stopping = threading.Lock(), threading.Event()
@@ -111,32 +111,33 @@ class Roadside:
             self._line.plug_in()
             self.plugged = True
 
-    def call(self):
+    def start_vehicle(self):
         """Start a vehicle; the previous vehicle must have left."""
         assert self.is_gone()
         # It starts in the next round, because the current round may have been sent in part.
-        self._called = round((time.time_ns() - self._start_ns) / 1e9 * RATE_HZ) + 1
+        self._start_round = round((time.time_ns() - self._start_ns) / 1e9 * RATE_HZ) + 1
 
     def is_gone(self):
         """Whether no vehicle is passing."""
-        return self._called is None or self._elapsed(time.time_ns()) > PASSING_S
+        return self._start_round is None or self._elapsed(time.time_ns()) > PASSING_S
 
     def truth(self, stamp_ns):
-        """Position (2,) [m] of the latest vehicle, even after its pass; NaN before the first."""
-        if self._called is None:
+        """Position (2,) [m] of the latest vehicle, even after its pass; NaN before the first
+        vehicle."""
+        if self._start_round is None:
             return np.full(2, np.nan)
         return INITIAL_POSITION + [SPEED * self._elapsed(stamp_ns), 0.0]
 
     def _elapsed(self, stamp_ns):
-        """Time since the start of the vehicle [s]."""
-        return (stamp_ns - self._start_ns) / 1e9 - self._called / RATE_HZ
+        """Time [s] from the start of the latest vehicle to `stamp_ns`."""
+        return (stamp_ns - self._start_ns) / 1e9 - self._start_round / RATE_HZ
 
     def _measure(self):
         """Send rounds of readings, each as soon as it is due."""
         k = 0
         while not self._stopping.wait(max(
                 0.0, k / RATE_HZ - (time.time_ns() - self._start_ns) / 1e9)):
-            row = None if self._called is None else k - self._called
+            row = None if self._start_round is None else k - self._start_round
             is_passing = row is not None and 0 <= row < len(self._table)
             field = self._table[row] if is_passing else self._still
             field = 1e9 * (field + NOISE * self._rng.standard_normal(field.shape))

@@ -10,7 +10,8 @@ N_DOMAINS = 100
 
 
 class RosDomain:
-    """Reserves the first free domain, searching from a number that depends on the process."""
+    """Reservation of the first free domain; the search starts at a number that depends on the
+    process."""
 
     def __init__(self):
         folder = Path(tempfile.gettempdir()) / f'mag_tracking_domains_{os.getuid()}'

@@ -58,7 +58,7 @@ def recorded(reader):
 
 
 def simulate(*arguments, **named):
-    """Call `scenario.simulate`; return a list of `MagSample`, and the truth."""
+    """Call `scenario.simulate`; return a list of `MagSample`, followed by the other results."""
     readings, *truth = scenario.simulate(*arguments, **named)
     return samples_of(readings), *truth
 

@@ -5,7 +5,7 @@ import tty
 
 
 class SerialLine:
-    """Device end of a serial line; the other end is the port `path`."""
+    """Device end of a serial line; the host opens the other end, the port `path`."""
 
     def __init__(self, path):
         self.path = path

@@ -187,7 +187,7 @@ def direction(rng):
 
 
 def hum(rng, simulator, frequency, rate):
-    """World with the field of a power line, which is larger at the nearer sensor."""
+    """World with the field of a power line, which has a different amplitude at each sensor."""
     near = rng.uniform(0.5, 1.0, 2)
     v = rng.uniform(1e-7, 3e-7) * direction(rng)
     omega = 2.0 * np.pi * frequency * rng.uniform(0.9995, 1.0005)
@@ -253,7 +253,7 @@ def distant_body(rng, simulator, body):
 
 
 def train(rng, simulator, y):
-    """World with a train of five wagons of 18 m; a pose at any wagon is correct."""
+    """World with a train of five wagons of 18 m; a pose near the middle of any wagon is correct."""
     speed = rng.uniform(10.0, 20.0)
     path, start_m = lane(rng, speed, start_m=250.0, y=rng.choice([-1.0, 1.0]) * y)
     along = np.array([np.cos(path.heading), np.sin(path.heading)])

@@ -36,7 +36,7 @@ from support.situation_worlds import (
 
 @dataclass(frozen=True)
 class Situation:
-    """Entry of the table of situations."""
+    """Entry of `SITUATIONS`."""
 
     make: object
     """Function from a random generator and the name of a simulator to a `World`."""
@@ -156,7 +156,7 @@ def wrong_of(poses, a_world):
 
 
 def false_disturbances(disturbances, tracks, a_world):
-    """Select the disturbances whose tracks follow a body of a `World` within 5 m."""
+    """Select the disturbances whose tracks follow a body of a `World` (median error below 5 m)."""
     out = []
     for d in disturbances:
         poses = [r for r in tracks if r.id == d.track_id]

@@ -44,7 +44,7 @@ def covariance(variance):
 
 
 def steps(size, sensor=None):
-    """Fault: readings are quantised in steps of `size` [T]."""
+    """Fault: readings of `sensor` (default: all) are quantised in steps of `size` [T]."""
     def modify(readings):
         coarse = size * np.round(readings.field / size)
         return _with(readings, np.where(_of(readings, sensor)[:, None], coarse, readings.field))
@@ -87,7 +87,7 @@ def only_axes(axes):
 
 
 def only_sensor(sensor):
-    """Fault: all sensors except `sensor` are missing."""
+    """Fault: only the readings of `sensor` remain."""
     return lambda readings: readings.part(_of(readings, sensor))
 
 
@@ -123,7 +123,8 @@ def beginning_cut(seconds):
 
 
 def vehicle_at_start(source, begin, seconds):
-    """Fault: the signal of `source`, from `begin` [s] for `seconds`, is added at the start."""
+    """Fault: the signal of the `Readings` `source` from `begin` [s] on is added to the first
+    `seconds`."""
     def modify(readings):
         field, t, t_source = readings.field.copy(), _seconds(readings), _seconds(source)
         for j, name in enumerate(readings.names):
@@ -147,7 +148,8 @@ def wrong_sign(sensor, axis):
 
 
 def hum(amplitude, frequency=50.0):
-    """Fault: a power line adds a field of `amplitude` (3,) [T] at `frequency` [Hz]."""
+    """Fault: a power line adds a field with `amplitude` (3,) [T] and `frequency` [Hz] at all
+    sensors."""
     def modify(readings):
         phase = 2.0 * np.pi * frequency * _seconds(readings)
         return _with(readings, readings.field + np.sin(phase)[:, None] * np.asarray(amplitude))
@@ -155,7 +157,7 @@ def hum(amplitude, frequency=50.0):
 
 
 def drift(rate, sensor=None):
-    """Fault: the background drifts by `rate` [T/s] on all axes."""
+    """Fault: the background of `sensor` (default: all) drifts by `rate` [T/s] on all axes."""
     def modify(readings):
         added = rate * _seconds(readings) * _of(readings, sensor)
         return _with(readings, readings.field + added[:, None])
@@ -163,7 +165,8 @@ def drift(rate, sensor=None):
 
 
 def temperature_step(size, at, time_constant=3.0, sensor=None):
-    """Fault: from `at` [s], the offset of a sensor approaches `size` [T] exponentially."""
+    """Fault: after `at` [s], the offset of `sensor` (default: all) approaches `size` [T]
+    exponentially."""
     def modify(readings):
         since = np.maximum(_seconds(readings) - at, 0.0)
         added = size * -np.expm1(-since / time_constant) * _of(readings, sensor)

@@ -1,4 +1,5 @@
-"""Stopped vehicles in the worlds of `support.situations`: their tracks, and the backgrounds."""
+"""Stopped vehicles in the worlds of `support.situations`: tracks, and recovery of the
+backgrounds."""
 
 import numpy as np
 
@@ -26,7 +27,7 @@ def poses_of(records):
 
 
 def stop_interval(a_world, body=0):
-    """Stop of a body in a `World`: (begin, end) [s]."""
+    """Interval in which a body of a `World` is stopped: (begin, end) [s]."""
     velocity = np.gradient(a_world.positions[body], a_world.t, axis=0)
     still = a_world.t[np.linalg.norm(velocity, axis=1) < MAX_STOPPED_SPEED]
     return still.min(), still.max()

@@ -14,7 +14,7 @@ NOISE = 1.2e-8
 
 
 def drive(network, body, path, changes=None, duration=12.0, flaws=None, seed=0):
-    """Simulate and track a pass; return (`Track` records, pipeline, true positions)."""
+    """Simulate and track a pass; return (`Track` records, pipeline, true positions (n, 2) [m])."""
     samples, t, position, _ = simulate(network, body, path, 100.0, duration,
                                        np.random.default_rng(seed), flaws)
     pipeline = Pipeline(network, settings_for('vehicle', changes))
@@ -26,7 +26,11 @@ def drive(network, body, path, changes=None, duration=12.0, flaws=None, seed=0):
 
 
 def magnet_frames(n=40, dt=0.1, lost=None):
-    """Simulate a magnet that circles above a board of nine sensors: (network, frames, truth)."""
+    """Simulate a magnet that circles above a board of nine sensors: (network, frames, truth).
+
+    The truth (n, 6) is the position [m] and moment [A m²]. Sensors with indices `lost` have no
+    readings.
+    """
     grid = np.array([[x, y, 0.0] for x in (-0.05, 0.0, 0.05) for y in (-0.05, 0.0, 0.05)])
     network = dataclasses.replace(
         line_network(9), positions=grid, background=(np.zeros(3),) * 9,

@@ -117,7 +117,7 @@ def passings(simulator, seed):
 
 
 def field_of(body, arrival, lateral, t):
-    """Field (2, n, 2) [T] of a vehicle at both sensors at times (n,) [s]."""
+    """Field (2, n, 2) [T] of a vehicle on both axes of both sensors at times (n,) [s]."""
     at, is_north, speed = arrival
     sign = 1.0 if is_north else -1.0
     position = np.stack([sign * speed * (t - at), np.full(len(t), -sign * lateral)], axis=1)
@@ -145,8 +145,9 @@ def shares(vehicles, log_odds):
         (np.array([fused for _, fused in log_odds]) > 0.0) == north)))
 
 
-def calibration(vehicles):
-    """Error probability of the far sensor for isolated vehicles: (predicted, measured)."""
+def far_sensor_error(vehicles):
+    """Probability of a wrong direction from the far sensor, isolated vehicles: (predicted,
+    measured)."""
     isolated = [v for v in vehicles if v.headway > 2.0]
     far = [(v.log_odds_of_north()[0][1 - v.near], v.is_north) for v in isolated]
     predicted = [1.0 / (1.0 + np.exp(min(abs(odds), 500.0))) for odds, _ in far]

@@ -63,7 +63,8 @@ class World:
 
 
 def box_two_wheeler(rng, length, moment, iron=1.0):
-    """Motorcycle, bicycle or trolley of boxes: a frame, an engine of weight `iron`, two wheels."""
+    """Motorcycle, bicycle or trolley of boxes: a frame (weight 1), an engine (weight `iron`), two
+    wheels."""
     parts = [((0.0, 0.0, 0.5), (0.5 * length, 0.06, 0.5), 1.0),
              ((0.05 * length, 0.0, 0.4), (0.35, 0.3, 0.3), iron)]
     parts += [((0.35 * end * length, 0.0, 0.3), (0.05, 0.15, 0.5), 0.4) for end in (-1, 1)]

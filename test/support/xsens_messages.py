@@ -18,7 +18,7 @@ FREQUENT_BYTES = (0xFA, 0xFA, 0xFF, 0xFF, 0x36, 0x32, 0x3E)
 
 
 def message(mid, data, extended=None):
-    """Encode a message; if `extended`, its length takes two more bytes."""
+    """Encode a message; if `extended` (default: if necessary), its length takes two more bytes."""
     if extended is None:
         extended = len(data) > 254
     length = b'\xff' + struct.pack('>H', len(data)) if extended else bytes([len(data)])
@@ -65,7 +65,7 @@ FRAME = mtdata2(READING)
 
 
 def random_reals(rng, precision, n=3):
-    """Random numbers of all magnitudes that `precision` represents exactly."""
+    """Random numbers that `precision` represents exactly."""
     bits, fraction = {FLOAT: (25, 20), FP1220: (32, 20), FP1632: (48, 32), DOUBLE: (53, 40)}[
         precision]
     return tuple((rng.getrandbits(bits) - 2**(bits - 1)) / 2**fraction for _ in range(n))
@@ -154,7 +154,8 @@ def lost_and_false(sent, found):
 
 
 def main():
-    """Parse many frames in pieces of 64 bytes, as a serial port returns them."""
+    """Parse many frames in pieces of 64 bytes, as from a serial port; print the errors and the
+    time."""
     from mag_tracking.drivers.framings.xsens import XsensFraming, XsensSettings
 
     parser = argparse.ArgumentParser(description=__doc__)

@@ -1,4 +1,4 @@
-"""The scripts of `make bench` can be imported; they rarely run, so imports are tested here."""
+"""Scripts of `make bench`: they rarely run, so their imports are tested here."""
 
 import importlib.util
 import runpy
@@ -16,7 +16,7 @@ def test_a_bench_script_can_be_imported(path):
 
 
 def test_the_cost_fraction_of_the_disturbance_model_is_measured():
-    """The script refers to the timed methods by strings, and may miss a renamed method."""
+    """The script names the timed methods in strings, so it would miss a renamed method."""
     assert 0.0 < situations.cost() < 1.0
 
 

@@ -97,7 +97,8 @@ def test_vehicles_of_both_simulators_are_tracked(pattern, simulator):
 @pytest.mark.parametrize('simulator', SIMULATORS)
 @pytest.mark.parametrize('kind', ['car', 'truck'])
 def test_one_vehicle_is_rarely_tracked_as_two(kind, simulator):
-    """Duplicate tracks are more frequent for trucks, whose model is less complete."""
+    """Duplicate tracks are more frequent for trucks, because the model of a truck is less
+    complete."""
     network, n = read_network(NETWORK_FILE), 25
     new = []
     for seed in range(n):

@@ -15,7 +15,10 @@ SEEDS = range(40)
 
 
 def counts(found):
-    """Return numbers of (answers, right directions, speeds within 10 %, errors within 3 std)."""
+    """Numbers of (answers, right directions, speeds within 10 %, errors within 3 std).
+
+    `found` is [(true velocity, (velocity, its standard deviation))] [m/s].
+    """
     v = np.array([truth for truth, _ in found])
     answer, std = np.array([a for _, a in found]).T
     return (len(v), int((answer * v > 0).sum()), int((np.abs(answer / v - 1.0) < 0.1).sum()),
@@ -51,7 +54,8 @@ def test_speed_and_direction_of_forty_passes_reach_the_aims():
 @pytest.mark.xfail(strict=True, reason='unknown; perhaps because the filter assumes independent '
                    'model errors at the two sensors')
 def test_the_speed_of_a_track_at_a_close_pair_reaches_the_aims():
-    """Aims for both tracks: speed within 10 % in 90 % of the passes, error within 3 std in 95 %."""
+    """Aims, filtered and smoothed: 90 % of the speeds within 10 %, 95 % of the errors within 3
+    std."""
     found = [estimates_of(seed) for seed in SEEDS]
     for name in ('track', 'smoothed'):
         n, _, near, consistent = counts([(a.truth, getattr(a, name)) for a in found])

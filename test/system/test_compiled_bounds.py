@@ -27,7 +27,7 @@ def build(source):
 
 
 def sanitizer(name):
-    """Path of a sanitizer library of the compiler."""
+    """Path of the compiler's sanitizer library `name`."""
     return subprocess.run(['g++', f'-print-file-name={name}'], capture_output=True, text=True,
                           check=True).stdout.strip()
 

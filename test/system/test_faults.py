@@ -18,9 +18,9 @@ MAX_NEES = chi2.ppf(1.0 - 1e-4, 2)
 
 @functools.cache
 def track_pass(n_sensors, seed, fault=None):
-    """Track a pass; return (pipeline, rows, (begin, end)).
+    """Track a pass; return (pipeline, rows, (begin, end) of the fault [s]).
 
-    A row is (t, error [m], NEES, flagged).
+    A row is (t [s], error [m], NEES, flagged).
     """
     network, samples, truth, times = stream(n_sensors, seed, fault)
     pipeline = Pipeline(network, settings_for('vehicle', POINT))

@@ -222,7 +222,7 @@ def test_the_best_position_of_the_second_sensor_depends_on_the_state(t10, observ
 
 
 def test_the_threshold_and_the_ranges_match_t10(observability_results):
-    """T10 gives a threshold of 11.2 and an SNR of 9.2."""
+    """T10 states a threshold of 11.2 and an SNR of 9.2."""
     n = observability_results
     assert n['threshold'] == pytest.approx(chi2.isf(0.01, 3), rel=1e-9)
     assert ncx2.sf(n['threshold'], 3, n['snr']) == pytest.approx(0.5, rel=1e-6)

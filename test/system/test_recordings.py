@@ -27,24 +27,24 @@ CARS = [name for name in VEHICLES if 'truck' not in name]
 
 
 def all_vehicles(replays):
-    """{name: (Run, folder)} of all vehicles."""
+    """{name: (Run, folder)} of the replays in `VEHICLES`."""
     return {name: replays[name] for name in VEHICLES}
 
 
-MAX_STEP = 1.5
+MAX_STD_RATIO = 1.5
 """Maximum ratio of successive standard deviations of the position. In 0.08 s, a vehicle moves by a
 small fraction of its distance to the sensors. New evidence may reduce the standard deviation by any
 factor."""
 
 
-def step_of(covariances):
-    """Largest ratio of the standard deviations of two successive positions."""
+def largest_std_ratio(covariances):
+    """Largest ratio of the standard deviation of a position to that of the previous position."""
     std = np.sqrt(np.trace(np.array(covariances)[:, :2, :2], axis1=1, axis2=2))
     return (std[1:] / std[:-1]).max()
 
 
-def pass_of(replays, name):
-    """Summary of the only track of a recording, with its errors."""
+def track_summary(replays, name):
+    """Summary of the only track of a recording, which includes its errors."""
     run, _ = replays[name]
     assert len(run.summary['tracks']) == 1, name
     return run.summary['tracks'][0]
@@ -53,7 +53,7 @@ def pass_of(replays, name):
 @pytest.mark.parametrize('name', VEHICLES)
 def test_the_arrival_direction_is_right(vehicle_replays, name):
     assert len(VEHICLES) == 8
-    track = pass_of(vehicle_replays, name)
+    track = track_summary(vehicle_replays, name)
     run, _ = vehicle_replays[name]
     log = run.logs[track['id']]
     best = [max(row, key=lambda a: row[a][0]) for row in log.arrivals]
@@ -86,7 +86,7 @@ RMS_NOT_REACHED = {
 
 @pytest.mark.parametrize('name', expected_to_fail(VEHICLES, RMS_NOT_REACHED))
 def test_the_error_near_the_sensors_is_within_its_limit(vehicle_replays, name):
-    track = pass_of(vehicle_replays, name)
+    track = track_summary(vehicle_replays, name)
     errors = track['truth']
     print(f'{name}: a {track["kind"]}, rms {errors["rms"]}, closest {errors["closest"]:.2f} '
           f'at {errors["closest_distance"]:.1f} m, ANEES {errors["anees"]:.1f}')
@@ -98,18 +98,19 @@ def test_the_error_near_the_sensors_is_within_its_limit(vehicle_replays, name):
 
 @pytest.mark.parametrize('name', CARS)
 def test_the_covariance_of_cars_is_consistent(vehicle_replays, name):
-    assert pass_of(vehicle_replays, name)['truth']['anees'] <= 3.0
+    assert track_summary(vehicle_replays, name)['truth']['anees'] <= 3.0
 
 
 @pytest.mark.parametrize('name', CARS)
 def test_the_error_at_the_cpa_is_within_its_limit(vehicle_replays, name):
-    assert pass_of(vehicle_replays, name)['truth']['closest'] <= (1.0 if 'fast' in name else 0.5)
+    assert track_summary(vehicle_replays, name)['truth']['closest'] <= (
+        1.0 if 'fast' in name else 0.5)
 
 
 def speed_error(vehicle_replays, name):
-    """Relative error of the speed at the most certain pose."""
+    """Relative error of the tracked speed at the most certain pose."""
     run, _ = vehicle_replays[name]
-    log = run.logs[pass_of(vehicle_replays, name)['id']]
+    log = run.logs[track_summary(vehicle_replays, name)['id']]
     stamps, positions, _ = next(iter(run.truth.values()))
     sure = log.most_certain()
     i = int(np.abs(stamps - log.stamp_ns[sure]).argmin())
@@ -141,7 +142,7 @@ SMOOTHED_NOT_REACHED = {
 def test_errors_of_smoothed_poses_are_within_their_limits(vehicle_replays, name):
     """The limits of position errors are the same as for filtered poses."""
     run, folder = vehicle_replays[name]
-    track = pass_of(vehicle_replays, name)
+    track = track_summary(vehicle_replays, name)
     smoothed = track['smoothed']
     errors = smoothed['truth']
     print(f'{name}: smoothed rms {errors["rms"]}, closest {errors["closest"]:.2f}, '
@@ -159,7 +160,7 @@ KINDS = {name: 'truck' if 'truck' in name else 'car' for name in VEHICLES}
 
 @pytest.mark.parametrize('name', VEHICLES)
 def test_the_kind_of_vehicle_is_right(vehicle_replays, name):
-    track = pass_of(vehicle_replays, name)
+    track = track_summary(vehicle_replays, name)
     print(f'{name}: {track["kind"]} {track["kind_weight"]:.3f}, {track["length"]:.1f} m')
     assert track['kind'] == KINDS[name]
 
@@ -184,7 +185,7 @@ def test_a_car_is_tracked_along_a_corridor(tmp_path):
         print(f'corridor, {name}: {along.sum()} poses, RMS {rms:.2f} m, ANEES {anees:.1f}')
         assert np.ptp(true[along, 0]) > 41.0
         assert rms <= 0.6
-        assert step_of(poses.covariance) < MAX_STEP
+        assert largest_std_ratio(poses.covariance) < MAX_STD_RATIO
         # The limits for the other cars; the ANEES of a consistent covariance is 1.
         assert anees <= {'filtered': 3.0, 'smoothed': 4.0}[name]
 
@@ -259,8 +260,9 @@ def test_published_covariances_are_valid(vehicle_replays, magnet_replays):
 def test_published_standard_deviations_do_not_jump(vehicle_replays):
     for name, (run, _) in all_vehicles(vehicle_replays).items():
         for log in (*run.logs.values(), *run.smoothed.values()):
-            print(f'{name}: a standard deviation grows by {step_of(log.covariance):.2f} at most')
-            assert step_of(log.covariance) < MAX_STEP
+            print(f'{name}: the standard deviation grows at most by a factor of '
+                  f'{largest_std_ratio(log.covariance):.2f}')
+            assert largest_std_ratio(log.covariance) < MAX_STD_RATIO
 
 
 def test_every_sample_is_counted(vehicle_replays):

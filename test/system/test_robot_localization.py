@@ -27,7 +27,7 @@ def settings():
 
 
 def poses_of(name, network):
-    """(messages on ~/pose as (stamp_ns, (2,), (2, 2)), truth at these times) of a recording."""
+    """([(stamp_ns, position (2,), covariance (2, 2)) on ~/pose], true positions) of a recording."""
     pipeline = Pipeline(network, settings_for('vehicle', {'track.ambiguous_poses': 'hold'}))
     reader = SampleReader(Recording(vehicle_path(name)), network)
     tracks = [t for batch in reader.readings() for t in pipeline.feed(batch)

@@ -216,7 +216,8 @@ def test_the_existence_probability_of_a_target_decreases_without_a_signal():
 
 
 def test_the_pose_covariance_matches_sampled_states():
-    """Position, rotation and cross terms are compared with states sampled from the Gaussian."""
+    """Position, rotation and cross terms are compared with states sampled from the track's
+    Gaussian."""
     network, frames, _ = magnet_frames(4)
     stage_ = TrackManager(network, settings_for('magnet').track)
     track = [t for f in frames for t in stage_.feed(f)][-1]

@@ -19,7 +19,7 @@ PAGES = ('index', 'getting_started', 'benchmarks', 'limitations', 'changelog', '
 
 
 def sphinx(builder, source, out, *options):
-    """Run a builder; every warning is an error."""
+    """Run a Sphinx builder, with warnings as errors; return the output folder."""
     done = subprocess.run(
         [sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-q', '-b', builder, *options,
          str(source), str(out)], capture_output=True, text=True, timeout=BUILD_TIMEOUT_S,
@@ -80,7 +80,7 @@ def test_every_internal_link_leads_to_a_page_and_an_anchor(site):
 
 @pytest.mark.timeout(BUILD_TIMEOUT_S)
 def test_examples_in_the_text_print_the_documented_output(site, tmp_path):
-    """The generated pages and doctrees of the built site are reused."""
+    """The generated pages and doctrees from the build of `site` are reused."""
     sphinx('doctest', ROOT / 'docs', tmp_path, '-d', str(site / '.doctrees'))
     text = (tmp_path / 'output.txt').read_text(encoding='utf-8')
     n, = re.findall(r'(\d+) tests?\n', text)[:1]

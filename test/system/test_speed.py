@@ -45,13 +45,14 @@ def test_the_tracker_imports_no_rarely_needed_modules():
 
 @pytest.mark.parametrize('n_sensors, min_ratio', [(2, 80.0), (8, 40.0)])
 def test_the_bank_is_many_times_faster_than_a_loop_over_filterpy(n_sensors, min_ratio):
-    """The aims are 350 and 120 (`bench.bench`); limits are lower because other tests may run."""
+    """The aims are 350 and 120 (`bench.bench`); the limits are lower because other tests may run
+    meanwhile."""
     _, _, ratio, *_ = bank_ratio(Peer, n_sensors, False, rounds=4, repeats=20)
     assert ratio >= min_ratio
 
 
 def run(value, more_is_better=False, name='a frame, mean'):
-    """Figures of a benchmark run."""
+    """Figures of a benchmark run with the single figure `name`."""
     return {'replay': {name: {'value': value, 'unit': 'ms', 'aim': None,
                               'more_is_better': more_is_better}}}
 
@@ -78,10 +79,10 @@ def test_figures_are_saved_and_regressions_are_printed(tmp_path, monkeypatch, ca
     monkeypatch.setattr(figures, 'ROOT', tmp_path)
     assert figures.main() == 1 and 'no benchmark has been run' in capsys.readouterr().out
     for value, status in ((4.0, 0), (4.4, 0), (5.0, 1)):
-        kept = figures.Figures('replay')
-        kept.add('a frame, mean', value, 'ms', 4.5)
-        kept.add('times real time', 40.0, '', 50.0, True)
-        assert kept.missed == 1 + (value > 4.5) and kept.save() == 1
+        measured = figures.Figures('replay')
+        measured.add('a frame, mean', value, 'ms', 4.5)
+        measured.add('times real time', 40.0, '', 50.0, True)
+        assert measured.missed == 1 + (value > 4.5) and measured.save() == 1
         assert figures.main() == status
     out = capsys.readouterr().out
     assert 'worse: replay: a frame, mean: 5 ms, the best of the latest runs was 4' in out
@@ -89,8 +90,8 @@ def test_figures_are_saved_and_regressions_are_printed(tmp_path, monkeypatch, ca
             for r in figures.read_history()] == [4.0, 4.4, 5.0]
     # Runs of another machine are not compared.
     monkeypatch.setattr(figures, 'machine', lambda: 'another')
-    kept = figures.Figures('replay')
-    kept.add('a frame, mean', np.nan, 'ms', 9.0)
-    assert kept.missed == 1 and kept.save() == 1 and figures.main() == 0
+    measured = figures.Figures('replay')
+    measured.add('a frame, mean', np.nan, 'ms', 9.0)
+    assert measured.missed == 1 and measured.save() == 1 and figures.main() == 0
     assert 'none were compared: no earlier run on such a machine (another)' in \
         capsys.readouterr().out

@@ -16,7 +16,7 @@ def chromium():
 
 @pytest.fixture(scope='module')
 def records(road_network):
-    """Frames and tracks of a recording, chronological."""
+    """Frames and tracks of a recording, in chronological order."""
     return records_of('straight_car_right', road_network)
 
 

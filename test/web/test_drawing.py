@@ -34,7 +34,7 @@ def show_pose(page, log, k):
 
 
 def trace(page, plot, name):
-    """(x, y) of the trace in `plot` whose name starts with `name`."""
+    """Points (2, n) of the trace in `plot` whose name starts with `name`."""
     found = page.value(f'''(() => {{
         const found = document.getElementById('{plot}').data.find(
           d => (d.name || '').startsWith('{name}'));

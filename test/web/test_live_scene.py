@@ -31,7 +31,7 @@ class Viewer:
 
 
 def follow(scene, records):
-    """Create a viewer that receives frequent updates from the start."""
+    """Feed `records` to `scene`; return a `Viewer` that receives an update every seven records."""
     viewer = Viewer().receive(scene.updates())
     for k in range(0, len(records), 7):
         feed(scene, records[k:k + 7])

@@ -63,7 +63,8 @@ def reading_viewer(server):
 
 
 def read_until(raw, pattern, n=1, seconds=120.0):
-    """Read until a pattern has occurred at least `n` times; return the number of occurrences."""
+    """Read from a socket until `pattern` has occurred at least `n` times; return its number of
+    occurrences."""
     found, rest = 0, b''
     raw.settimeout(seconds)
     while found < n:
@@ -76,7 +77,7 @@ def read_until(raw, pattern, n=1, seconds=120.0):
 
 
 def publish(scene, records, stamp, n=1):
-    """Publish `n` more poses; return the timestamp of the last pose."""
+    """Publish `n` poses after `stamp` [ns]; return the timestamp of the last pose."""
     template = [r for r in records if isinstance(r, FieldFrame)][-1]
     for _ in range(n):
         stamp += 10_000_000
@@ -86,7 +87,7 @@ def publish(scene, records, stamp, n=1):
 
 
 def publish_until(scene, records, condition, quick, seconds=60.0):
-    """Publish poses until the condition holds; return the timestamp of the last pose."""
+    """Publish poses, which `quick` receives, until `condition()`; return the last timestamp."""
     stamp, end = records[-1].stamp_ns, time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end

@@ -144,7 +144,7 @@ def test_the_table_selects_each_track(chromium, vehicle_replays, road_network, t
 
 
 def second_track(log):
-    """Copy of a log with id 2, one minute later and displaced by (1.0, 0.5, 0.0) m."""
+    """Copy of a track log with id 2, one minute later and displaced by (1.0, 0.5, 0.0) m."""
     from copy import deepcopy
 
     later = deepcopy(log)

@@ -39,7 +39,8 @@ CASES = {
 
 
 def case(name, n_sensors=3, n_hyp=6, seed=0):
-    """(compiled filter, plain filter, bank near the sensors, frames, intervals)."""
+    """(compiled filter, plain filter, bank near the sensors, frames, intervals [s]) of
+    `CASES[name]`."""
     target, changes = CASES[name]
     settings = settings_for(target, changes).track
     network, rng = line_network(n_sensors), np.random.default_rng(seed)
@@ -81,7 +82,8 @@ def case(name, n_sensors=3, n_hyp=6, seed=0):
 
 
 def assert_same(a, b, tolerance=1e-9):
-    """Compare states and covariances of two banks, in standard deviations of the second bank."""
+    """Assert equal states and covariances of two banks; `tolerance` is in standard deviations of
+    `b`."""
     std = np.sqrt(np.einsum('pii->pi', b.P))
     std = np.where(std > 0.0, std, 1.0)
     assert np.abs((a.x - b.x) / std).max() <= tolerance
@@ -274,7 +276,7 @@ def test_two_vehicles_without_common_sensors_are_filtered_independently():
 
 
 def joint_bank(a, b, n_t):
-    """Bank of one hypothesis with the targets and sensors of two banks."""
+    """Join the targets and sensors of two banks of one hypothesis; each target has `n_t` states."""
     n_own = (a.x.shape[1] - n_t) // 2 - 3
     columns = [(bank, np.arange(n_t), i * n_t + np.arange(n_t)) for i, bank in enumerate((a, b))]
     for i, bank in enumerate((a, b)):

@@ -22,7 +22,8 @@ FAST_PATH = np.where(np.arange(10) == 3, 60.0, STRAIGHT)
 
 
 def run_check(check, frames, path=STRAIGHT):
-    """[(time [s], doubts, number of fits so far)] after each frame."""
+    """Check a track on `path`; return [(time [s], doubts, number of fits so far)] after each
+    frame."""
     out, n, latest = [], 0, None
     for frame in frames:
         check.add(frame, state_at(frame.stamp_ns / 1e9, path))
@@ -176,7 +177,8 @@ def test_smoothed_states_before_the_fitted_pass_have_the_difference_of_its_start
 
 
 def test_a_fit_keeps_the_time_of_its_own_peak():
-    """Two more sensors measure a stronger field later, so the pass has a later peak."""
+    """Two sensors that the vehicle passes later measure a stronger field, so later fits have a
+    later peak."""
     network = network_of([[0.0, -4.5, 0.0], [0.0, 4.5, 0.0], [12.0, -3.5, 0.0], [12.0, 3.5, 0.0]])
     path = np.where(np.arange(10) == 3, 8.0, np.where(np.arange(10) == 4, 0.0, STRAIGHT))
     check, distances, peaks = CrossCheck(network), [], set()

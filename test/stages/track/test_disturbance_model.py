@@ -14,7 +14,7 @@ NOISE = 4e-9
 
 
 def frames(network, fields, dt=0.08, seed=0):
-    """[`FieldFrame`] of fields (n, n_sensors, 3) [T] in the world frame."""
+    """Create [`FieldFrame`] with noise from fields (n, n_sensors, 3) [T] in the world frame."""
     rng = np.random.default_rng(seed)
     seen = np.einsum('jik,nji->njk', network.R_ws, fields)
     seen = seen + NOISE * rng.standard_normal(seen.shape)
@@ -30,7 +30,8 @@ def total_log_density(model, sequence, dt=0.08):
 
 
 def slow_waves(t, network, own):
-    """Fields (n, n_sensors, 3) [T] of slow waves, independent at each sensor or common to all."""
+    """Fields (n, n_sensors, 3) [T] of slow waves: a different one at each sensor if `own`, else a
+    common one."""
     rng = np.random.default_rng(3)
     size = 2e-7 * rng.standard_normal((len(network), 3))
     if not own:
@@ -108,7 +109,7 @@ def test_the_first_frame_after_a_handover_is_not_compared():
 def test_the_evidence_stays_finite_over_gaps_with_rotated_sensors(gap_s):
     """Each update correlates all components of the field.
 
-    If one half of each covariance were not copied to the other half, rounding errors would make the
+    If one triangle of each covariance were not copied to the other, rounding errors would make the
     covariance indefinite.
     """
     network, rng = line_network(4), np.random.default_rng(2)

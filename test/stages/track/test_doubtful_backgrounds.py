@@ -22,7 +22,8 @@ SETTINGS = settings_for('vehicle', QUICK)
 
 @pytest.fixture(scope='module')
 def pass_frames():
-    """(network, frames after detection) of a pass at 10 m/s; the last sensor is 150 m away."""
+    """(network, frames with detection results) of a pass at 10 m/s; one sensor is 150 m away from
+    the others."""
     network = line_network(3, spacing=150.0, tilt=0.0)
     samples, *_ = simulate(network, random_vehicle(np.random.default_rng(1), length=4.0),
                            Path(np.array([-70.0, -1.2]), 0.0, 10.0), 100.0, 12.0,
@@ -32,7 +33,11 @@ def pass_frames():
 
 
 def run_tracker(pass_frames, times, settings=None):
-    """(TrackManager, poses) with doubtful intervals [s] of sensors."""
+    """(TrackManager, poses) of the pass; `times` is {sensor: [(begin, end) of a doubtful
+    interval]}.
+
+    Times are relative to the first frame [s]; the end is None if the interval continues.
+    """
     network, frames = pass_frames
     manager = TrackManager(network, settings_for('vehicle', {**QUICK, **(settings or {})}).track)
     start = frames[0].stamp_ns
@@ -138,7 +143,8 @@ def test_fixed_lag_poses_after_dense_traffic_are_ambiguous():
 
 
 def test_the_doubt_persists_after_a_jump_back_in_time():
-    """Both copies are in one batch, so calibration restarts before the first frames are tracked."""
+    """The recording is fed twice in one batch, so calibration restarts before the first frames are
+    tracked."""
     readings = after_dense_traffic(UNAMBIGUOUS_WITHOUT_DOUBT[0], 7.0)
     pipeline = Pipeline(read_network(NETWORK_FILE), SETTINGS)
     tracks = poses_of(pipeline.feed(Readings.joined([readings, readings])) + pipeline.flush())

@@ -44,7 +44,7 @@ def test_the_hypothesis_on_the_side_that_fits_better_is_heavier():
 
 
 def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
-    """The configured moment is the sum of hard and soft iron."""
+    """The configured moment is the sum of the moments of hard and soft iron."""
     vehicle = settings_for('vehicle').track.vehicle
     frame = FieldFrame(0, np.full((2, 3), 1e-7), np.repeat(1e-16 * np.eye(3)[None], 2, axis=0),
                        np.full(2, 8), np.zeros(2))
@@ -94,7 +94,8 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
 
 @pytest.mark.parametrize('missing', [None, 0])
 def test_a_vehicle_starts_where_its_field_first_has_the_frame_energy(missing):
-    """At the previous position on the line, the field has less energy than the frame."""
+    """One step further back on its path, the field of the vehicle has less energy than the
+    frame."""
     network = line_network(6)
     vehicle = settings_for('vehicle', POINT).track.vehicle
     std = np.array([1e-8, 2e-8, 4e-8])
@@ -148,7 +149,7 @@ def test_the_start_covariance_includes_the_model_error():
 
 
 def test_residuals_of_the_fit_widen_the_start_covariance():
-    """The errors exceed the declared noise, and the residuals show this."""
+    """The measurement errors exceed the declared noise, which the residuals of the fit reveal."""
     network, frames, truth = magnet_frames(1)
     rng = np.random.default_rng(3)
     nees = []

@@ -1,4 +1,4 @@
-"""Effect on the poses of the limited number of hypotheses in `config/large_network.yaml`."""
+"""Poses with and without the limit on the number of hypotheses in `config/large_network.yaml`."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def drive():
 
 
 def distances(some, others):
-    """Distances (n,) between the poses of two lists of tracks, in standard deviations."""
+    """Horizontal distances (n,) between simultaneous poses, in standard deviations of `others`."""
     at = {t.stamp_ns: t for t in others}
     pairs = [(t, at[t.stamp_ns]) for t in some if t.stamp_ns in at]
     assert len(pairs) == len(some) == len(others) > 0

@@ -128,8 +128,10 @@ def test_a_tracker_without_mounting_angles_publishes_none():
 
 @cache
 def passes(n):
-    """{mounting_std_deg: (mean NEES, RMS error [m])} over `n` passes by sensors tilted by 5
-    degrees."""
+    """{mounting_std_deg: (mean NEES, RMS error [m])} within 5 m of the origin, over `n` passes.
+
+    The sensors have random tilts with a standard deviation of 5 degrees.
+    """
     network = line_network(2, tilt=0.0)
     out = {}
     for mounting in (0.0, 5.0):
@@ -170,7 +172,8 @@ def observation(network, mounting_std_deg=5.0, error_time=0.3):
 
 
 def rotated_network(*rotations, std):
-    """Network of sensors with these orientations and standard deviations."""
+    """Network of sensors with the orientations `rotations` and their standard deviations `std`
+    [rad]."""
     network = line_network(len(rotations), tilt=0.0)
     return replace(network, R_ws=np.array([R.as_matrix() for R in rotations]),
                    orientation_std=tuple(std))

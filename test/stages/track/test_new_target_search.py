@@ -29,7 +29,7 @@ PERIOD = round(0.08 * NS)
 
 
 def searches(nis, n=20, rejected=False, is_long=False):
-    """[(frame, reason)] of searches in a track with normalised innovations squared of `nis`."""
+    """[(frame, reason)] of the searches that are triggered in `n` frames with the NIS `nis`."""
     evidence, found = NewTargetEvidence(), []
     for k in range(n):
         evidence.add(nis, 6, k * PERIOD, rejected, is_long)
@@ -65,7 +65,7 @@ def test_a_less_probable_target_is_accepted_when_it_is_found_twice():
 
 
 def joint_of(velocities, odds, replaced=None, adds=True):
-    """`JointExplanation` of vehicles of seven states with these velocities (n, 2)."""
+    """`JointExplanation` of vehicles with seven states each and these velocities (n, 2) [m/s]."""
     n = len(velocities)
     x = np.zeros((1, n, 7))
     x[0, :, 3:5] = velocities
@@ -109,7 +109,8 @@ def test_a_stationary_vehicle_has_no_direction(standing):
 
 
 def test_directions_of_earlier_vehicles_are_not_compared():
-    """The two earlier vehicles cross. The heading of the new one is within 26 degrees of both."""
+    """The paths of the two earlier vehicles cross. The new vehicle's heading is within 26 degrees
+    of both."""
     before, new = [[10.0, 4.8], [10.0, -4.8]], [10.0, 0.0]
     assert joint_of([*before, new], 16.0).doubtful(7) == ()
     assert joint_of([new, *before], 16.0).doubtful(7) == (0, 1, 2)
@@ -244,7 +245,8 @@ def test_joint_tracks_do_not_depend_on_batches(meeting):
 
 @pytest.fixture(scope='module')
 def following():
-    """(`World`, records) of two cars; the first car is out of reach before the second."""
+    """(`World`, records) of two cars in one direction; the first is out of reach before the
+    second."""
     rng = np.random.default_rng(5)
     scene = world(NETWORKS[4], [passing(rng, 'clouds', 12.0, 1, 6.0),
                                 passing(rng, 'clouds', 15.5, 1, 6.5)], 26.0, rng, rate=50.0)
@@ -253,7 +255,7 @@ def following():
 
 
 def test_smoothed_poses_are_complete_after_one_of_two_vehicles_leaves(following):
-    """The smoothed poses begin before the two vehicles share a state."""
+    """The smoothed poses begin before the two vehicles share a joint state."""
     scene, records = following
     tracks = [r for r in records if isinstance(r, Track)]
     ends = {t.id: t.stamp_ns for t in tracks if t.ended}
@@ -271,7 +273,7 @@ def test_the_vehicle_at_the_earlier_positions_continues_the_track(is_first):
     positions = np.array([[0.0, 0.0], [30.0, 0.0]])
 
     class Known:
-        """Member whose poses were at one of the positions."""
+        """Track member whose earlier poses were at one of `positions`."""
 
         def distance_from(self, stamps, path):
             return float(np.hypot(*(path - positions[0 if is_first else 1]).T).mean())

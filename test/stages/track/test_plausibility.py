@@ -61,9 +61,10 @@ def observation_of(network=NETWORK):
 @pytest.mark.parametrize('y, after, expected', [
     (0.0, 8.0, set()), (8.0, 0.0, {doubts.OFF_THE_ROAD}), (0.0, 8.6, {doubts.OFF_THE_ROAD})])
 def test_a_path_is_evaluated_where_it_is_nearest_to_a_sensor(y, after, expected):
-    """A vehicle may leave the road after it has passed the sensors, up to the second limit.
+    """A vehicle that has passed the sensors may turn off the road, up to the limit
+    `LANE_STDS_LATER`.
 
-    A vehicle that passed off the road stays doubtful, even after it has stopped.
+    A vehicle that was off the road at its closest point stays doubtful, even after it has stopped.
     """
     plausibility, observation = Plausibility(), observation_of()
     for x, aside, speed in ((-20.0, 0.0, 10.0), (0.0, y, 10.0), (20.0, after, 10.0)):
@@ -75,7 +76,8 @@ def test_a_path_is_evaluated_where_it_is_nearest_to_a_sensor(y, after, expected)
 
 
 def test_the_path_of_each_hypothesis_is_stored():
-    """The doubts of a hypothesis include its earlier states, even if it was not published then."""
+    """The doubts about a hypothesis depend on its earlier states, even if these were not
+    published."""
     plausibility, observation = Plausibility(), observation_of()
     paths = {5: ((0.0, 7.0), (4.0, 0.0)), 2: ((0.0, 1.0), (4.0, 7.0))}
     for k in range(2):
@@ -89,9 +91,8 @@ def test_the_path_of_each_hypothesis_is_stored():
 @pytest.mark.parametrize('half_width, edge', [
     (1.0, 6.47), (4.5, 6.47), (5.0, 6.47), (6.0, 8.0), (8.0, 12.0), (9.0, 13.0)])
 def test_a_vehicle_may_pass_outside_a_wide_network(half_width, edge):
-    """The margin is the width by which the network exceeds the road, up to the distance of a lane
-    from the centre.
-    """
+    """The margin outside the sensors is the distance by which they exceed the outermost lane, but
+    at most the distance of this lane from the centre."""
     network = network_of([[0.0, -half_width, 0.0], [0.0, 0.0, 0.0], [0.0, half_width, 0.0]])
     observation = observation_of(network)
     x = np.zeros(observation.n_target + (observation.n_own + 3) * 3)

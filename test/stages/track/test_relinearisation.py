@@ -224,7 +224,8 @@ def test_relinearisation_covers_twice_the_window_at_most(monkeypatch, window_s, 
 
 @pytest.mark.parametrize('n_max, max_elements', [(1, 10**9), (5, 6**2 * 40)])
 def test_only_the_heaviest_hypotheses_are_relinearised(monkeypatch, n_max, max_elements):
-    """A large number of states reduces the number of hypotheses: here to one over forty frames."""
+    """The number of hypotheses also decreases with the numbers of states and frames: here to one
+    for forty frames."""
     monkeypatch.setattr(relinearise, 'MAX_ELEMENTS', max_elements)
     filter_ = LinearFilter()
     bank, *_ = compare_with_plain(filter_, Relinearisation(60.0, 60.0, n_max), prune=False)
@@ -304,8 +305,8 @@ def deterministic_target(n, turns=False):
 
 @pytest.mark.parametrize('turns', [False, True])
 def test_relinearisation_converges_to_a_batch_fit(turns):
-    """Without process noise the first state determines the path. SciPy fits it with the same
-    prior."""
+    """Without process noise the first state determines the path. SciPy fits this state with the
+    same prior."""
     filter_, bank_of, y, expected = deterministic_target(24, turns)
     bank, plain = bank_of(1), bank_of(1)
     assert counts_after(filter_, bank, y, Relinearisation(0.0, 60.0, 1)) == (1, 0)
@@ -354,7 +355,7 @@ def test_a_path_through_a_sensor_is_rejected(monkeypatch):
 @pytest.mark.parametrize('target', matched.TARGETS)
 def test_the_error_of_matched_targets_is_near_its_bound(target, n=60):
     """The worst 5 % of the runs are excluded from the ratio of RMS error to path bound. Without
-    relinearisation, the ratio is 1.4 and 1.8."""
+    relinearisation, the ratios of the two targets are 1.4 and 1.8."""
     with ProcessPoolExecutor(2) as pool:
         error, bound = (np.array(a)[:, matched.STEPS // 2:] for a in zip(
             *pool.map(partial(matched.one_run, target), range(n)), strict=True))

@@ -31,7 +31,7 @@ DT = 0.08
 
 
 class CountingFilter(BankFilter):
-    """Filter that counts its updates of whole banks."""
+    """Filter that counts its updates of banks with several hypotheses."""
 
     n = 0
 
@@ -90,7 +90,8 @@ def same_frame(a, b):
 
 
 def updated_without_rejection(bank_filter, bank, frame):
-    """(log-likelihood, state) of the update without rejection."""
+    """(log-likelihood, state of the bank) after an update without rejection; `bank` is not
+    modified."""
     bank = copy.deepcopy(bank)
     return bank_filter.advance(bank, frame, DT)[1], state(bank)
 
@@ -236,7 +237,8 @@ def test_the_second_of_two_wrong_sensors_is_sought_among_the_others():
 
 
 def test_the_frame_must_fit_the_heaviest_hypothesis():
-    """Another hypothesis explains the frame, but its weight is negligible."""
+    """Another hypothesis explains the frame. A sensor is rejected only if the weight of that
+    hypothesis is negligible."""
     bank_filter, bank, frame, names = situation(n_hyp=2)
     bank.x[1, bank_filter.observation.n_target + 3 * 2:][:3] = FAULT_FIELD
     bad = with_fault(frame, 2)
@@ -246,7 +248,7 @@ def test_the_frame_must_fit_the_heaviest_hypothesis():
 
 
 class RulingOutFilter(BankFilter):
-    """Filter that rules out all hypotheses if a given sensor is present."""
+    """Filter that rules out all hypotheses if the sensor with index `row` is present."""
 
     def __init__(self, row, *args):
         super().__init__(*args)

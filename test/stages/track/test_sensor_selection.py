@@ -91,7 +91,7 @@ def drive(network, changes, speed=20.0, seed=1):
 
 
 def test_a_target_is_tracked_along_forty_sensors():
-    """A track uses six of forty sensors over 180 m at a time; its errors match the covariance."""
+    """A track along 180 m uses six of forty sensors at a time; its errors match the covariance."""
     network = line_network(40, tilt=0.02)
     records, pipeline, truth = drive(network, {'track.max_sensors': 6})
     live = [r for r in records if isinstance(r, Track) and not r.ended]
@@ -148,7 +148,7 @@ def test_further_sensors_join_after_the_frames_before_the_detection(monkeypatch,
 
 @pytest.fixture(scope='module')
 def frames():
-    """(network, frames) of a point target along twelve sensors."""
+    """(network, frames) of a point target that passes twelve sensors."""
     network = line_network(12, tilt=0.02)
     found = [r for r in drive(network, {})[0] if isinstance(r, FieldFrame)]
     return network, found

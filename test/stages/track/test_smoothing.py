@@ -21,7 +21,7 @@ from support.samples import one, simulate
 
 
 def batch_solution(F, Q, H, R, y, x0, P0, missing):
-    """Means and covariances of all states from one least-squares solution.
+    """Means and covariances of the states at all times, from one least-squares solution.
 
     Measurements marked in `missing` are excluded.
     """
@@ -52,8 +52,8 @@ N_X = N_T + (N_OWN + 3) * N_SENSORS
 
 
 def full_jacobian(H):
-    """Derivative (3 n_sensors, n_x) of the fields of all sensors, from the derivative `H` of each
-    sensor."""
+    """Derivative (3 n_sensors, n_x) of all fields by all states, from `H`, the derivative of each
+    sensor's field by the states of the target and of this sensor."""
     out = np.zeros((3 * N_SENSORS, N_X))
     for j in range(N_SENSORS):
         rows = slice(3 * j, 3 * j + 3)
@@ -160,7 +160,7 @@ def run_pass(body, changes, seed=0, speed=10.0):
 
 
 def errors_of(poses, truth):
-    """(horizontal errors (n,) [m], NEES (n,) per axis)."""
+    """(horizontal errors (n,) [m], NEES (n,) per axis) of poses."""
     e = np.array([p.position[:2] for p in poses]) - truth([p.stamp_ns for p in poses])
     C = np.array([p.covariance[:2, :2] for p in poses])
     return np.hypot(*e.T), np.einsum('ni,ni->n', e, np.linalg.solve(C, e[:, :, None])[:, :, 0]) / 2
@@ -172,11 +172,11 @@ def near(poses, truth):
 
 
 def smoothing_study(bodies, changes):
-    """(error ratio of the whole track, error ratio within 5 m of the middle, NEES there) of each
+    """(error ratio of the whole track, error ratio near the sensors, NEES near the sensors) of a
     pass.
 
-    The ratios divide the smoothed by the filtered RMS error. NEES is per axis, of the smoothed
-    poses.
+    Each is an array with one element per body. The ratios divide the smoothed by the filtered RMS
+    error. NEES is per axis, of the smoothed poses.
     """
     ratios, whole, nees = [], [], []
     for seed, body in enumerate(bodies):
@@ -212,7 +212,7 @@ def test_smoothing_reduces_the_error_of_a_matched_target_by_two_fifths():
 
 @cache
 def smoothing_study_of_cars(n):
-    """`smoothing_study` of `n` cars of 4 m."""
+    """`smoothing_study` of `n` cars with a length of 4 m."""
     return smoothing_study(
         [random_vehicle(np.random.default_rng(100 + k), length=4.0) for k in range(n)], {})
 
@@ -234,7 +234,7 @@ def test_smoothed_poses_of_cars_are_more_accurate_and_consistent(n):
 
 
 def test_smoothing_at_the_linearisation_of_the_filter_reproduces_its_pose(monkeypatch):
-    """The last smoothed pose is the last filtered one."""
+    """The last smoothed pose equals the last filtered pose."""
     monkeypatch.setattr(smooth_module.smoothed_track, '__defaults__', (False, 0))
     records, _ = run_pass(point_body([250.0, -150.0, 80.0], 4.0, 0.5),
                           {'track.relinearise_window_s': 0.0})
@@ -322,8 +322,8 @@ def test_smoothing_bridges_missing_frames():
 
 
 def records_with_spike(stage, frames, at, size, n=1):
-    """Records of `stage` for `frames`, with `size` [T] added to an axis of all sensors in `n`
-    frames.
+    """Records of `stage` for `frames`; `size` [T] is added to an axis of all sensors in `n` frames
+    from `at`.
 
     A single sensor that contradicts the others would be rejected.
     """
@@ -338,7 +338,8 @@ def records_with_spike(stage, frames, at, size, n=1):
 
 
 def paths_without_and_with_a_spike(size):
-    """Smoothed poses within 6 m of the sensors, without and with a later spike of `size` [T]."""
+    """Yield smoothed poses within 6 m of the sensors, without and with a later spike of `size`
+    [T]."""
     network, samples, t, position = pass_of(
         random_vehicle(np.random.default_rng(1), length=4.0), seed=1)
     pipeline = Pipeline(network, settings_for('vehicle'))

@@ -31,7 +31,7 @@ def field_of(path, network, t):
 
 
 def search_of(*paths, n_sensors=4, seed=0):
-    """(`SteadySearch`, its grid) for two seconds of frames with these vehicles."""
+    """(`SteadySearch`, its grid) for two seconds of frames with vehicles on `paths`."""
     network, rng = NETWORKS[n_sensors], np.random.default_rng(seed)
     t = np.arange(-24, 1) * 0.08
     field = sum(field_of(path, network, t) for path in paths)

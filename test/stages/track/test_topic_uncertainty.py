@@ -59,7 +59,8 @@ def test_the_covariance_of_the_mixture_matches_samples():
 
 
 def test_the_mixture_is_never_narrower_than_the_pose():
-    """This holds even if innovations or another path widen the covariance of the pose."""
+    """This holds even if large innovations or the difference from another path widen the covariance
+    of the pose."""
     for extra in ({}, {'excess': 7.0}, {'difference': np.array([3.0, 1.0, 0.0, 0.5, 0.0, 0.0])}):
         track = track_of([0.7, 0.3], [0.0, 15.0], [0.0, 3.0], **extra)
         wider = track.topic_uncertainty.covariance - track.covariance

@@ -63,7 +63,7 @@ def test_the_evidence_identifies_the_kind_of_a_vehicle(kind, body):
 @pytest.mark.study
 def test_most_trucks_are_identified_and_the_others_are_uncertain():
     """With other noise, 35 of 40 trucks (seeds 0 to 39) were identified. The limit is the 1 %
-    quantile of a binomial distribution with this rate."""
+    quantile of a binomial distribution with this proportion."""
     n, ends = 16, []
     for seed in range(n):
         body = random_vehicle(np.random.default_rng(seed), **TRUCK)
@@ -233,8 +233,8 @@ def test_soft_iron_has_no_effect_without_an_earth_field():
 
 
 def test_the_predicted_field_excludes_the_model_errors():
-    """Any target would fit with the model errors. Without them, a car that is tracked as a point
-    has large residuals."""
+    """If the predicted field included the model errors, any target would fit. Without them, a car
+    that is tracked as a point has large residuals."""
     residual = {}
     for name, changes in (('point', {**POINT, 'track.vehicle.near_field_lengths': [2.0]}),
                           ('row', {})):

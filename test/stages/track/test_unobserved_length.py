@@ -23,7 +23,8 @@ def at(position, heading=0.0, speed=8.0):
 
 
 def middle_offsets(length, half_std, is_sensed, n=400_000):
-    """Samples of the offset from the middle of a row to the middle of its truck of 9 ± 3 m."""
+    """Samples of the offset [m] from the middle of a row of dipoles to that of its truck of 9 ± 3
+    m."""
     rng = np.random.default_rng(0)
     hidden = 0.5 * (9.0 - length) + half_std * rng.standard_normal(n)
     return hidden * (rng.uniform(-1.0, 1.0, n) if is_sensed else -1.0)
@@ -32,8 +33,8 @@ def middle_offsets(length, half_std, is_sensed, n=400_000):
 @pytest.mark.parametrize('complete', [True, False])
 @pytest.mark.parametrize('length', [5.0, -5.0])
 def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(complete, length):
-    """The variance along the heading includes the part of a truck beyond its row. The covariance of
-    a car is unchanged."""
+    """The variance along the heading accounts for the part of a truck beyond its row of dipoles.
+    The covariance of a car is unchanged."""
     model, x, found = RowVehicle(np.zeros(3), np.ones(3)), at([0.0, 0.0], 0.5 * np.pi), {}
     x[18] = length
     for kind, mean_length, std in (('car', 3.0, 1.0), ('truck', 9.0, 3.0)):
