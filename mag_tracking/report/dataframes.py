@@ -71,7 +71,7 @@ def poses_dataframe(poses: StructArray) -> 'pd.DataFrame':
 
 
 def smoothed_dataframe(smoothed: StructArray) -> 'pd.DataFrame':
-    """Convert smoothed poses to a DataFrame like `poses_smoothed.csv`, with a column `complete`.
+    """Convert smoothed poses to a DataFrame: the columns of `poses_smoothed.csv`, and `complete`.
 
     Parameters
     ----------

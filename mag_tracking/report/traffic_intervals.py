@@ -22,7 +22,7 @@ class TrafficIntervals:
     interval_s : float, s
         Length of an interval.
     counts : Counter
-        Numbers of events by description, updated in place.
+        Number of passages that are counted in a later interval; updated in place.
     """
 
     def __init__(self, line_names: Sequence[str], interval_s: float,
@@ -97,7 +97,7 @@ class TrafficIntervals:
             last_ns = until
 
     def _close(self, begins: list[int]) -> list[TrafficSummary]:
-        """Remove intervals, and return a summary of each interval and line."""
+        """Remove the intervals that start at `begins` [ns], and return a summary for each line."""
         out: list[TrafficSummary] = []
         for begin in sorted(begins):
             end, observed_s = begin + self._length, self._observed.pop(begin) / NS
@@ -111,7 +111,7 @@ class TrafficIntervals:
 
 
 def counts_of(passages: Sequence[VehiclePassage]) -> tuple[TrafficCount, ...]:
-    """Count passages by direction and class, in the forward direction first.
+    """Count passages by direction and class; counts of the forward direction come first.
 
     Parameters
     ----------
