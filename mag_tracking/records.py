@@ -67,7 +67,7 @@ class Readings:
     means that all covariances are unknown."""
 
     def __post_init__(self) -> None:
-        """Check the shapes, because compiled code does not."""
+        """Check the shapes of the arrays, because compiled code does not check them."""
         n = len(self.sensor)
         for name, values, shape in (
                 ('sensor', self.sensor, (n,)), ('stamp_ns', self.stamp_ns, (n,)),
@@ -93,7 +93,7 @@ class Readings:
         return unknown
 
     def rows(self, index: Mapping[str, int]) -> IntArray:
-        """Look up the index of the sensor of each reading.
+        """Look up the sensor index of each reading.
 
         Parameters
         ----------

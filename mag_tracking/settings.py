@@ -142,7 +142,7 @@ def flatten(settings: 'DataclassInstance', prefix: str = '') -> list[Parameter]:
 
 
 def _scalar(name: str, value: object, kind: _Class) -> Scalar:
-    """Check a scalar and convert it to `kind`; raises SettingsError that names the setting."""
+    """Check a scalar and convert it to `kind`; raises a SettingsError that names the setting."""
     if isinstance(value, int) and value.bit_length() > 1000:
         raise SettingsError(f'{name}: an integer of {value.bit_length()} bits is too large; the '
                             'maximum is 1000 bits')
@@ -217,7 +217,7 @@ def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
     ----------
     settings : dataclass instance
     changes : mapping of str to setting
-        Values by dotted or nested name.
+        Values by dotted name, or nested mappings of them.
 
     Returns
     -------
@@ -230,57 +230,57 @@ def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
         If a name is unknown (the message suggests the closest known name), or a value has a wrong
         type, a wrong length, or is out of range.
     """
-    known = {p.name: p for p in flatten(settings)}
+    parameters = {p.name: p for p in flatten(settings)}
     checked = {}
     for name, value in _flattened(changes).items():
-        if value == {} and any(k.startswith(f'{name}.') for k in known):
+        if value == {} and any(k.startswith(f'{name}.') for k in parameters):
             continue
-        if name not in known:
-            raise SettingsError(_unknown_message(name, value, known))
-        checked[name] = _validated(known[name], value)
+        if name not in parameters:
+            raise SettingsError(_unknown_message(name, value, parameters))
+        checked[name] = _validated(parameters[name], value)
     return _rebuild(settings, checked, '')
 
 
-def _unknown_message(name: str, value: object, known: Iterable[str]) -> str:
-    """Error message for the name of a group, or for an unknown name with a suggestion."""
-    members = [k for k in known if k.startswith(f'{name}.')]
+def _unknown_message(name: str, value: object, names: Iterable[str]) -> str:
+    """Error message if `name` is a group of settings, or is unknown (then with a suggestion)."""
+    members = [k for k in names if k.startswith(f'{name}.')]
     if members:
         return (f'{name} is a group of settings, such as {members[0]}; expected a mapping, got '
                 f'{"nothing" if value is None else short_repr(value)}')
-    return f'unknown setting {name}{_suggestion(name, known)}'
+    return f'unknown setting {name}{_suggestion(name, names)}'
 
 
-def _suggestion(name: str, known: Iterable[str]) -> str:
+def _suggestion(name: str, names: Iterable[str]) -> str:
     """Suggestion for an unknown setting: its replacement, its new name or the closest known name.
 
     Empty if there is no suggestion.
     """
-    known = list(known)
+    names = list(names)
     group, dot, leaf = name.rpartition('.')
     if name in REPLACED_SETTINGS:
         return f'; it was replaced by {REPLACED_SETTINGS[name]}, which has another unit'
     renamed = f'{group}{dot}{RENAMED_SETTINGS.get(leaf)}'
-    if renamed in known:
+    if renamed in names:
         return f'; it was renamed to {renamed}'
-    if group in known:
+    if group in names:
         return f'; {group} is a single setting'
-    if group and not any(k.startswith(f'{group}.') for k in known):
-        return _group_suggestion(group, leaf, known)
+    if group and not any(k.startswith(f'{group}.') for k in names):
+        return _group_suggestion(group, leaf, names)
     if not group:
         # A setting without its group.
-        leaves = [k for k in known if k.rpartition('.')[2] == leaf]
+        leaves = [k for k in names if k.rpartition('.')[2] == leaf]
         if leaves:
             return f'; did you mean {" or ".join(leaves)}?'
-    closest = _closest(name, [*known, *dict.fromkeys(k.partition('.')[0] for k in known)])
+    closest = _closest(name, [*names, *dict.fromkeys(k.partition('.')[0] for k in names)])
     return f'; did you mean {closest}?' if closest else ''
 
 
-def _group_suggestion(group: str, leaf: str, known: Iterable[str]) -> str:
+def _group_suggestion(group: str, leaf: str, names: Iterable[str]) -> str:
     """Suggestion for the setting `leaf` of an unknown group; empty if there are no groups."""
-    groups = list(dict.fromkeys(k[:i] for k in known for i, c in enumerate(k) if c == '.'))
+    groups = list(dict.fromkeys(k[:i] for k in names for i, c in enumerate(k) if c == '.'))
     closest_group = _closest(group, groups)
     if closest_group:
-        closest = _closest(leaf, [k.removeprefix(f'{closest_group}.') for k in known
+        closest = _closest(leaf, [k.removeprefix(f'{closest_group}.') for k in names
                                   if k.startswith(f'{closest_group}.')])
         return (f'; there is no group {group}; did you mean {closest_group}'
                 f'{"." + closest if closest else ""}?')
@@ -290,7 +290,7 @@ def _group_suggestion(group: str, leaf: str, known: Iterable[str]) -> str:
 
 
 def _closest(name: str, candidates: Iterable[str]) -> str:
-    """Candidate that is most similar to `name`; empty if none is similar."""
+    """Candidate that is most similar to `name`; an empty string if none is similar."""
     return next(iter(difflib.get_close_matches(name, list(candidates), n=1)), '')
 
 
@@ -407,18 +407,18 @@ def to_yaml(settings: 'DataclassInstance', node: str = '/**') -> str:
     """
     lines = ['# Generated from the settings by `make config`; do not edit.',
              f'{node}:', '  ros__parameters:']
-    group = None
+    previous_group = None
     for p in flatten(settings):
-        head, _, leaf = p.name.rpartition('.')
-        if head != group:
-            lines += [''] if group is not None else []
-            lines += [f'    {head}:'] if head else []
-            group = head
-        pad = '      ' if head else '    '
+        group_name, _, leaf = p.name.rpartition('.')
+        if group_name != previous_group:
+            lines += [''] if previous_group is not None else []
+            lines += [f'    {group_name}:'] if group_name else []
+            previous_group = group_name
+        indent = '      ' if group_name else '    '
         notes = [p.unit] if p.unit else []
         notes += [f'{p.range[0]} .. {p.range[1]}'] if p.range else []
         notes += [', '.join(p.choices)] if p.choices else []
         notes += ['live'] if p.live else []
-        lines.append(f'{pad}# {p.doc}' + (f' [{"; ".join(notes)}]' if notes else ''))
-        lines.append(f'{pad}{leaf}: {_yaml_value(p.value)}')
+        lines.append(f'{indent}# {p.doc}' + (f' [{"; ".join(notes)}]' if notes else ''))
+        lines.append(f'{indent}{leaf}: {_yaml_value(p.value)}')
     return '\n'.join(lines) + '\n'

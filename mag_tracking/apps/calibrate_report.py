@@ -12,7 +12,7 @@ from mag_tracking.quantities import quantity
 from mag_tracking.report.calibration_figures import first_knock
 from mag_tracking.report.figures import SCALE_1D
 from mag_tracking.report.page import ERROR, NOTE, WARNING, Chart, Note, Page, Table, report_html
-from mag_tracking.report.page_charts import axes, curve, plain
+from mag_tracking.report.page_charts import axes, curve, escape_markup
 from mag_tracking.report.palette import SERIES_COLOURS
 
 MAX_KNOCKS = 8
@@ -103,7 +103,7 @@ def _headings(calibration: Calibration, nominal: SensorNetwork) -> Chart:
                       for s in network.orientation_std]
         traces.append({
             'type': 'scatter', 'mode': 'markers', 'x': yaw, 'name': label, 'showlegend': True,
-            'y': [plain(name) for name in nominal.names],
+            'y': [escape_markup(name) for name in nominal.names],
             'error_x': {'type': 'data', 'array': half_width, 'color': SERIES_COLOURS[k]},
             'marker': {'color': SERIES_COLOURS[k], 'size': 8, 'symbol': ('circle', 'square')[k]}})
     return Chart('Rotation about the vertical relative to the network file, 90% intervals', traces,

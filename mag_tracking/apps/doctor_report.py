@@ -9,7 +9,7 @@ from mag_tracking.apps.doctor import Doctor
 from mag_tracking.files import replace_text
 from mag_tracking.quantities import quantity
 from mag_tracking.report.page import ERROR, NOTE, Chart, Note, Page, Table, report_html
-from mag_tracking.report.page_charts import axes, plain
+from mag_tracking.report.page_charts import axes, escape_markup
 from mag_tracking.report.palette import AXIS_COLOURS
 from mag_tracking.stages.health.sensor_health import Finding
 
@@ -59,7 +59,7 @@ def doctor_page(doctor: Doctor, findings: Sequence[Finding], subject: str) -> Pa
 
 def _noise(doctor: Doctor) -> Chart:
     """Chart of the noise of each axis."""
-    names = [plain(name) for name in doctor.sensors]
+    names = [escape_markup(name) for name in doctor.sensors]
     traces = []
     for axis, (letter, colour) in enumerate(zip('xyz', AXIS_COLOURS, strict=True)):
         values = [1e9 * float(h.noise_std[axis]) for h in doctor.sensors.values()]
@@ -73,7 +73,7 @@ def _rates(doctor: Doctor) -> Chart:
     """Chart of the sample rates."""
     rates = [float(h.rate) if h.counts['readings'] else 0.0 for h in doctor.sensors.values()]
     return Chart('Sample rate', [{
-        'type': 'bar', 'x': [plain(name) for name in doctor.sensors],
+        'type': 'bar', 'x': [escape_markup(name) for name in doctor.sensors],
         'y': [v if np.isfinite(v) else None for v in rates], 'showlegend': False}],
         axes('', 'rate [Hz]'))
 

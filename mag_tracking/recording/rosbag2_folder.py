@@ -72,6 +72,7 @@ class UnbufferedWriter:
     Parameters
     ----------
     raw : io.FileIO
+        Unbuffered stream.
 
     Attributes
     ----------
@@ -152,10 +153,10 @@ def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[s
     """
     no_counts: Counter[str] = Counter()
     counts = sum((f.counts for f in files), no_counts)
-    firsts = [f.first_ns for f in files if f.first_ns is not None]
-    lasts = [f.last_ns for f in files if f.last_ns is not None]
+    first_times = [f.first_ns for f in files if f.first_ns is not None]
+    last_times = [f.last_ns for f in files if f.last_ns is not None]
     content = {'rosbag2_bagfile_information': {
-        'version': 9, 'storage_identifier': 'mcap', **_span(firsts, lasts),
+        'version': 9, 'storage_identifier': 'mcap', **_span(first_times, last_times),
         'message_count': counts.total(),
         'topics_with_message_count': [
             {'topic_metadata': {'name': name, 'type': topics[name].type,
@@ -168,24 +169,27 @@ def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[s
         'files': [{'path': f.name, 'message_count': f.counts.total(),
                    **_span([f.first_ns or 0], [f.last_ns or 0])} for f in files],
         'custom_data': None, 'ros_distro': 'jazzy'}}
-    new = folder / '.metadata.yaml.new'
-    new.unlink(missing_ok=True)
-    stream = UnbufferedWriter(opener(new))
+    new_file = folder / '.metadata.yaml.new'
+    new_file.unlink(missing_ok=True)
+    stream = UnbufferedWriter(opener(new_file))
     try:
         stream.write(yaml.safe_dump(content, sort_keys=False).encode())
-        os.replace(new, folder / 'metadata.yaml')
+        os.replace(new_file, folder / 'metadata.yaml')
     finally:
         stream.raw.close()
-        new.unlink(missing_ok=True)
+        new_file.unlink(missing_ok=True)
 
 
 def _qos_profiles(name: str, topic: Topic) -> object:
-    """Parse the QoS profiles of a topic, which are stored as YAML; raises RecordingError."""
+    """Parse the QoS profiles of a topic, stored as YAML; raises RecordingError if invalid."""
     return parse_yaml(topic.qos, f'offered_qos_profiles of {name}', RecordingError)
 
 
-def _span(firsts: Sequence[int], lasts: Sequence[int]) -> dict[str, dict[str, int]]:
-    """Start time and duration from the first to the last message, as entries of the metadata."""
-    first, last = min(firsts, default=0), max(lasts, default=0)
+def _span(first_times: Sequence[int], last_times: Sequence[int]) -> dict[str, dict[str, int]]:
+    """Metadata entries of start time and duration, from the first and last log times [ns] of files.
+
+    Both are 0 if there are no times.
+    """
+    first, last = min(first_times, default=0), max(last_times, default=0)
     return {'starting_time': {'nanoseconds_since_epoch': first},
             'duration': {'nanoseconds': last - first}}

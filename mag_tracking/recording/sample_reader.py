@@ -182,13 +182,17 @@ class SampleReader:
 
     def _records(self, imus: Mapping[str, Sequence[str]], progress: Progress | None
                  ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """Iterate over (record, log time) in the recording. A record is a batch of readings, or an
-        acceleration from a topic in `imus`, {topic: sensors}."""
+        """Iterate over (record, log time [ns]) in the recording.
+
+        A record is a batch of readings, or an acceleration from a topic in `imus`, which maps
+        topics to sensors.
+        """
         return self._records_of(self._recording.messages(progress=progress), imus)
 
     def _records_of(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
                     ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """Decode messages to (record, log time); collect true poses, count unusable messages."""
+        """Decode messages to (record, log time [ns]). Also collect the true poses, and count the
+        messages that cannot be decoded."""
         for message in messages:
             sensor = self._sensors.get(message.topic)
             is_truth = self._truth.accepts(message.topic, message.type)
@@ -214,8 +218,9 @@ class SampleReader:
 
     def _network_readings(self, readings: Readings) -> Readings:
         """Select the readings of the network's sensors, and count readings of other sensors."""
-        known = set(self._sensors.values())
-        is_known = np.array([name in known for name in readings.names], dtype=bool)[readings.sensor]
+        network_sensors = set(self._sensors.values())
+        is_known = np.array([name in network_sensors for name in readings.names],
+                            dtype=bool)[readings.sensor]
         if is_known.all():
             return readings
         self.rejected.update(f'reading of {name}, which is not in the network'
@@ -223,7 +228,7 @@ class SampleReader:
         return readings.part(is_known)
 
     def truth_arrays(self) -> dict[str, Truth]:
-        """Return the true poses read so far, and add their rejected messages to `rejected`.
+        """Return the true poses read so far, and add the counts of rejected poses to `rejected`.
 
         Returns
         -------
@@ -236,9 +241,10 @@ class SampleReader:
 
 
 def _namespace(recording: Recording, network: SensorNetwork) -> str:
-    """Namespace of the network's relative topics in a recording; '/' if it contains none of them.
+    """Namespace of the network's relative topics: the configured one, or the one in the recording.
 
-    Raises RecordingError if several namespaces are possible.
+    '/' if the recording contains none of these topics. Raises RecordingError if it contains them in
+    several namespaces.
     """
     if network.namespace is not None:
         return network.namespace

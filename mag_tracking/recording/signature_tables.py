@@ -83,7 +83,8 @@ def read_signatures(path: str | PathLike[str], is_labelled: bool = True) -> list
 
 
 def _read_by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
-    """Read signatures with one row per sample; other columns identify the signature of a row."""
+    """Read a table with one row per sample. The columns that contain neither field, label, time nor
+    pass identify the signature to which a row belongs."""
     axes = {name: match for name in header if (match := _AXIS_COLUMN.fullmatch(name.lower()))}
     names = [name for name in header if name not in (*axes, LABEL, TIME, PASS)]
     if not axes:
@@ -101,7 +102,7 @@ def _read_by_sample(path: str | PathLike[str], header: list[str], lines: Lines) 
         source = f'{path}: signature {" ".join(key)}'
         label, group = (_unique_value(source, column, rows) for column in (LABEL, PASS))
         t = np.array([number(path, line, TIME, cells[TIME], True) for line, cells in rows])
-        field = np.array([fields.of(line, cells)[0] for line, cells in rows])
+        field = np.array([fields.parse_row(line, cells)[0] for line, cells in rows])
         out.append(fields.signature(t, field, label, source, group))
     if len(out) > 1 and all(len(s.t) == 1 for s in out):
         raise LabelsError(f'{path}: each signature has only one sample; the columns '
@@ -110,7 +111,10 @@ def _read_by_sample(path: str | PathLike[str], header: list[str], lines: Lines) 
 
 
 def _unique_value(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> str:
-    """Return the only value of a column, '' without a column; raises LabelsError if it varies."""
+    """Return the value that all rows have in a column; '' if the column is missing.
+
+    Raises LabelsError if the rows have different values.
+    """
     values = sorted({cells.get(column, '').strip() for _, cells in rows})
     if len(values) > 1:
         raise LabelsError(f'{source} has several values of {column}: {", ".join(values)}')
@@ -118,7 +122,7 @@ def _unique_value(source: str, column: str, rows: list[tuple[int, dict[str, str]
 
 
 def _read_by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
-    """Read signatures with one row per signature, with columns x0, x1, ... (and y0, ...)."""
+    """Read a table with one row per signature and its samples in columns x0, x1, ..., y0, ..."""
     axes: dict[tuple[str, str], list[tuple[int, str]]] = {}
     for name in header:
         match = _SAMPLE_COLUMN.fullmatch(name.lower())
@@ -138,7 +142,7 @@ def _read_by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> 
     out = []
     for line, row in lines:
         cells = dict(zip(header, row, strict=True))
-        field = fields.of(line, cells)
+        field = fields.parse_row(line, cells)
         out.append(fields.signature(np.arange(len(field), dtype=float), field,
                                     cells.get(LABEL, '').strip(), f'{path}: row {line}',
                                     cells.get(PASS, '').strip()))
@@ -159,12 +163,12 @@ class _Fields:
         duplicates = sorted({axis for axis in axes if axes.count(axis) > 1})
         if duplicates:
             raise LabelsError(f'{path}: several columns contain the axis {duplicates[0]}')
-        known = [unit for _, unit, _ in columns if unit]
-        if known and len(known) < len(columns):
+        units = [unit for _, unit, _ in columns if unit]
+        if units and len(units) < len(columns):
             raise LabelsError(f'{path}: only some fields have a unit (_t, _ut or _nt)')
-        self._path, self._columns, self._unit = path, columns, 'T' if known else ''
+        self._path, self._columns, self._unit = path, columns, 'T' if units else ''
 
-    def of(self, line: int, cells: dict[str, str]) -> FloatArray:
+    def parse_row(self, line: int, cells: dict[str, str]) -> FloatArray:
         """Parse the field samples in a row of the table; return an array (n, n_axes)."""
         return np.array([[number(self._path, line, name, cells[name], False)
                           * UNITS.get(unit, 1.0) for name in names]
@@ -199,8 +203,8 @@ def read_intervals(path: str | PathLike[str], first_ns: int) -> list[LabelledInt
     RecordingError
         If the table cannot be read.
     LabelsError
-        If a column or label is missing, an interval ends before it begins, or two intervals of a
-        sensor overlap.
+        If a column or label is missing, an interval does not end after it begins, or two intervals
+        of a sensor overlap.
     """
     header, lines = read_csv(path)
     unit = 'ns' if 'begin_ns' in header else 's'
@@ -214,7 +218,7 @@ def read_intervals(path: str | PathLike[str], first_ns: int) -> list[LabelledInt
         begin, end = (_stamp(path, line, f'{name}_{unit}', cells, first_ns)
                       for name in ('begin', 'end'))
         if end <= begin:
-            raise LabelsError(f'{path}: row {line}: the interval ends before it begins')
+            raise LabelsError(f'{path}: row {line}: the interval must end after it begins')
         if not cells[LABEL].strip():
             raise LabelsError(f'{path}: row {line}: the label is empty')
         out.append(LabelledInterval(begin, end, cells[LABEL].strip(),
@@ -225,7 +229,10 @@ def read_intervals(path: str | PathLike[str], first_ns: int) -> list[LabelledInt
 
 def _stamp(path: str | PathLike[str], line: int, column: str, cells: dict[str, str],
            first_ns: int) -> int:
-    """Convert a cell to a time [ns]; raises RecordingError or LabelsError."""
+    """Convert a cell to ns since 1970; small times [s] are relative to `first_ns`.
+
+    Raises RecordingError or LabelsError if the time is invalid.
+    """
     value = number(path, line, column, cells[column], True)
     if abs(value) > (MAX_TIME_S * NS if column.endswith('_ns') else MAX_TIME_S):
         raise LabelsError(f'{path}: row {line}: {column} is not a valid time')
@@ -291,7 +298,7 @@ def read_model(path: str | PathLike[str]) -> SignatureModel:
         raise RecordingError(f'{path} is not a valid file of trained classes: '
                              'it is not valid JSON') from error
     if isinstance(content, dict) and content.get(_VERSION_ENTRY, VERSION) != VERSION:
-        raise RecordingError(f'{path}: class version {content[_VERSION_ENTRY]} is not supported; '
+        raise RecordingError(f'{path}: format version {content[_VERSION_ENTRY]} is not supported; '
                              f'expected {VERSION}')
     try:
         return _parse_model(content)

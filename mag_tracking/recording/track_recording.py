@@ -94,7 +94,7 @@ class TrackRecording:
                 self._writer.write(self._topics[name], MAGNETIC_FIELD, content, frame.stamp_ns)
 
     def add_track(self, track: Track) -> None:
-        """Write one record of a track, or the end of the track, on all topics.
+        """Write a record of a track to its topics; at the end of the track, write its path.
 
         Parameters
         ----------
@@ -148,7 +148,7 @@ class TrackRecording:
                       for p in poses]}, last_ns)
 
     def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Write a disturbance, at its detection and again at its end.
+        """Write a record of a disturbance: its detection or its end.
 
         Parameters
         ----------

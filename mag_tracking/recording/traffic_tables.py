@@ -93,6 +93,7 @@ def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[s
         Name of the recording.
     passage : VehiclePassage
     class_names : sequence of str
+        Names of the classes, in the order of `passage.class_probabilities`.
     delay : dict
         Values of the columns for the speed from the delay between sensors.
     vehicle : dict
@@ -122,7 +123,9 @@ def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[s
 
 
 def summary_rows(recording: str, summary: TrafficSummary) -> list[dict[str, Any]]:
-    """Rows of `intervals`: one per direction and class, or a single row with count 0.
+    """Rows of the table `intervals` for one traffic summary.
+
+    There is one row per direction and class, or a single row with count 0 if no vehicle passed.
 
     Parameters
     ----------
@@ -135,12 +138,12 @@ def summary_rows(recording: str, summary: TrafficSummary) -> list[dict[str, Any]
     list of dict
         Values by column.
     """
-    head = {'recording': recording, 'begin_ns': summary.begin_ns, 'end_ns': summary.end_ns,
+    common_values = {'recording': recording, 'begin_ns': summary.begin_ns, 'end_ns': summary.end_ns,
             'line': summary.line, 'observed_s': summary.observed_s}
     if not summary.counts:
-        return [{**head, 'direction': '', 'class': '', 'count': 0, 'n_ambiguous': 0,
+        return [{**common_values, 'direction': '', 'class': '', 'count': 0, 'n_ambiguous': 0,
                  'mean_speed': np.nan, 'mean_headway': np.nan}]
-    return [{**head, 'direction': DIRECTIONS[c.forward], 'class': c.vehicle_class,
+    return [{**common_values, 'direction': DIRECTIONS[c.forward], 'class': c.vehicle_class,
              'count': c.count, 'n_ambiguous': c.ambiguous, 'mean_speed': c.mean_speed,
              'mean_headway': c.mean_headway} for c in summary.counts]
 
@@ -185,7 +188,7 @@ def write_traffic(folder: Path, rows: Mapping[str, Sequence[Mapping[str, Any]]],
 
 
 def _csv_value(value: object) -> object:
-    """Format a value as a cell of a CSV file; unknown numbers are empty."""
+    """Format a value as a cell of a CSV file; a number that is not finite becomes an empty cell."""
     if isinstance(value, float):
         return f'{value:.9g}' if np.isfinite(value) else ''
     return value

@@ -135,7 +135,7 @@ def read_truth_table(path: str | PathLike[str]) -> dict[str, Truth]:
     Returns
     -------
     dict of str to Truth
-        Arrays by stem of the file name.
+        One target, named after the file without its suffix.
 
     Raises
     ------
@@ -160,7 +160,10 @@ def read_truth_table(path: str | PathLike[str]) -> dict[str, Truth]:
 
 
 def _stamp(path: str | PathLike[str], line: int, column: str, text: str) -> int:
-    """Convert a cell to a time [ns]; integers in `stamp_ns` stay exact; raises RecordingError."""
+    """Convert a cell to ns since 1970, without rounding for integers in `stamp_ns`.
+
+    Raises RecordingError if the time is invalid.
+    """
     try:
         stamp = int(text) if column == 'stamp_ns' else None
     except ValueError:

@@ -67,7 +67,7 @@ class _EllipsoidFit(Protocol):
 
 def calibration_figure(calibration: _Calibration, nominal: _Network,
                        max_sensors: int = 8) -> Figure:
-    """Plot the knocks before and after clock calibration, and the rotations of the sensors.
+    """Plot the knocks before and after the clock correction, and the yaw of the sensors.
 
     Parameters
     ----------
@@ -146,11 +146,12 @@ def _plot_headings(axes: Axes, calibration: _Calibration, nominal: _Network) -> 
 
 
 def tumble_figure(fits: Mapping[str, _EllipsoidFit], readings: Mapping[str, FloatArray]) -> Figure:
-    """Plot field magnitudes before and after the correction, and the directions of the field.
+    """Plot a tumble calibration: magnitudes before and after correction, and field directions.
 
     Parameters
     ----------
     fits : dict of str to EllipsoidFit
+        Fit of each sensor, by name.
     readings : dict of str to (n, 3) array
         Readings of each sensor, in chronological order.
 

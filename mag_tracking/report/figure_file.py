@@ -12,7 +12,7 @@ _DOTS_PER_INCH = 110
 
 
 def save_figure(figure: Figure, path: str | PathLike[str]) -> None:
-    """Write a figure in the format of the suffix; an existing file or link is replaced.
+    """Write a figure in the format that the file suffix selects; replaces an existing file or link.
 
     Parameters
     ----------

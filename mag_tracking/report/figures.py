@@ -186,21 +186,21 @@ def field_figure(log: TrackLog, network: _Network, max_sensors: int = 8) -> Figu
     measured, predicted = np.array(log.measured), np.array(log.predicted)
     strength = np.nan_to_num(np.nanmax(np.abs(np.where(np.isnan(measured), 0.0, measured)),
                                        axis=(0, 2)))
-    rows = np.sort(np.argsort(-strength, kind='stable')[:max_sensors])
-    columns = 2 if len(rows) > 1 else 1
-    lines = -(-len(rows) // columns)
-    figure = Figure(figsize=(9.5, 1.2 + 2.4 * lines), layout='constrained')
-    grid = figure.subplots(lines, columns, squeeze=False, sharex=True)
+    sensors = np.sort(np.argsort(-strength, kind='stable')[:max_sensors])
+    n_columns = 2 if len(sensors) > 1 else 1
+    n_rows = -(-len(sensors) // n_columns)
+    figure = Figure(figsize=(9.5, 1.2 + 2.4 * n_rows), layout='constrained')
+    grid = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True)
     f, unit = field_unit(strength.max())
     t = log.seconds()
-    for axes in grid.flat[len(rows):]:
+    for axes in grid.flat[len(sensors):]:
         axes.set_visible(False)
-    for axes, j in zip(grid.flat, rows, strict=False):
+    for axes, j in zip(grid.flat, sensors, strict=False):
         for a, colour in enumerate(AXIS_COLOURS):
             axes.plot(t, f * measured[:, j, a], '.', ms=4, color=colour,
-                      label=f'{"xyz"[a]} measured' if j == rows[0] else None)
+                      label=f'{"xyz"[a]} measured' if j == sensors[0] else None)
             axes.plot(t, f * predicted[:, j, a], '-', lw=1.2, color=colour,
-                      label=f'{"xyz"[a]} predicted' if j == rows[0] else None)
+                      label=f'{"xyz"[a]} predicted' if j == sensors[0] else None)
         axes.set_title(literal(network.names[j]), fontsize=9)
         axes.set_ylabel(f'field [{unit}]')
         axes.grid(alpha=0.3)
@@ -208,7 +208,7 @@ def field_figure(log: TrackLog, network: _Network, max_sensors: int = 8) -> Figu
         axes.set_xlabel('time since the first pose [s]')
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=8, ncol=6, loc='outside lower center')
-    selection = '' if len(rows) == len(network) \
-        else f' (the strongest {len(rows)} of {len(network)})'
+    selection = '' if len(sensors) == len(network) \
+        else f' (the strongest {len(sensors)} of {len(network)})'
     figure.suptitle(f'Track {log.id}: measured and predicted field, sensor frame{selection}')
     return figure

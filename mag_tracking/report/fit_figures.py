@@ -89,8 +89,9 @@ class _FittedPass(Protocol):
 def pass_figure(fit: _Fit, title: str, max_sensors: int = 6) -> Figure:
     """Plot the measured and the fitted field, with bands that should contain 90 % of the readings.
 
-    The bands include noise and `PassFit.robust_covariance`. If the normalised cost exceeds 1,
-    errors of the model are treated as additional noise.
+    The bands account for the noise and for the uncertainty of the fitted parameters
+    (`PassFit.robust_covariance`). A normalised cost above 1 scales the noise variance, to account
+    for model errors.
 
     Parameters
     ----------
@@ -163,7 +164,7 @@ def target_alone(fit: _Fit) -> FloatArray:
 def order_figure(passes: Sequence[_FittedPass]) -> Figure:
     """Plot the normalised cost against the number of dipoles, one line per pass.
 
-    A filled symbol marks the chosen order.
+    A filled symbol marks the chosen number of dipoles.
 
     Parameters
     ----------

@@ -160,7 +160,7 @@ def _widest_axes(positions: FloatArray) -> tuple[int, int]:
 
 
 def _round_down(value: float) -> float:
-    """Round down to 1, 2 or 5 times a power of ten; 0 for 0."""
+    """Round down to 1, 2 or 5 times a power of ten; 0 unless `value` is positive."""
     if not value > 0.0:
         return 0.0
     power = 10.0 ** np.floor(np.log10(value))
@@ -169,7 +169,7 @@ def _round_down(value: float) -> float:
 
 def _plot_corrections(axes: Axes, indices: IntArray, magnitude: FloatArray, std: FloatArray,
                       title: str) -> None:
-    """Plot the magnitudes of the corrections, and their uncertainty per axis."""
+    """Plot the magnitude of the correction of each sensor, and its 90 % uncertainty per axis."""
     axes.bar(indices, SCALE_1D * np.sqrt(np.square(std).mean(axis=1)), color='0.85', width=0.8,
              label='uncertainty (90 %, per axis)')
     axes.plot(indices, magnitude, 'o', ms=4, color='tab:blue', label='correction')
@@ -189,7 +189,7 @@ def _plot_residuals(axes: Axes, indices: IntArray, residual: FloatArray, suspect
 
 
 def _plot_pose_residuals(axes: Axes, survey: _Survey) -> None:
-    """Plot the residual of each pose against its row in the table."""
+    """Plot the residual of each magnet pose against its row in the table of poses."""
     suspect = np.isin(survey.rows, survey.suspect_rows)
     residual = survey.geometry.pose_residual
     axes.plot(survey.rows[~suspect], residual[~suspect], '.', ms=4, color='tab:blue')

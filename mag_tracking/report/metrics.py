@@ -24,7 +24,7 @@ class PassErrors(TypedDict):
     closest_distance: float
     """Horizontal distance of this true position from the centre [m]."""
     anees: float
-    """Mean NEES per axis of the poses within the radius, or NEES of the closest pose if none is."""
+    """Mean NEES per axis of the poses within the radius; of the closest pose if there are none."""
     n: int
     """Number of poses whose true position is within the radius."""
 
@@ -66,7 +66,7 @@ def interpolate_truth(truth: Truth, stamps_ns: ArrayLike) -> FloatArray:
 
 def pass_errors(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
                 radius: float = 5.0) -> PassErrors | None:
-    """Return the errors of a vehicle's track.
+    """Return the horizontal errors of a vehicle's track near a point.
 
     Parameters
     ----------
@@ -135,23 +135,23 @@ def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> Unflag
         stamps = np.array(log.stamp_ns, dtype=np.int64)[is_unflagged]
         position = np.array(log.position)[is_unflagged][:, :2]
         P = np.array(log.covariance)[is_unflagged][:, :2, :2]
-        known, wrong = np.zeros(len(stamps), dtype=bool), np.ones(len(stamps), dtype=bool)
+        has_truth, wrong = np.zeros(len(stamps), dtype=bool), np.ones(len(stamps), dtype=bool)
         for truth in truths:
             error = position - interpolate_truth(truth, stamps)[:, :2]
             is_covered = np.isfinite(error).all(axis=1)
             error = np.where(is_covered[:, None], error, 0.0)
             magnitude = np.hypot(*error.T)
             std = np.sqrt(np.einsum('ni,nij,nj->n', error, P, error)) / np.maximum(magnitude, 1e-9)
-            known |= is_covered
+            has_truth |= is_covered
             wrong &= ~is_covered | (magnitude > WRONG_M) & (magnitude > WRONG_STD * std)
-        n, n_wrong = n + int(known.sum()), n_wrong + int((known & wrong).sum())
-        n_without += int((~known).sum())
+        n, n_wrong = n + int(has_truth.sum()), n_wrong + int((has_truth & wrong).sum())
+        n_without += int((~has_truth).sum())
     return {'n': n, 'wrong': n_wrong, 'without_truth': n_without}
 
 
 def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
                radius: float = 5.0) -> IntArray:
-    """Return the indices of the poses whose true position is within a radius of a point.
+    """Return the indices of the poses whose true position is horizontally near a point.
 
     Parameters
     ----------
@@ -159,6 +159,7 @@ def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
     truth : Truth
     centre : (3,) array, m, world frame
     radius : float, m
+        Maximum horizontal distance of the true position from `centre`.
 
     Returns
     -------
@@ -167,10 +168,10 @@ def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
         position.
     """
     true = interpolate_truth(truth, log.stamp_ns)[:, :2]
-    known = np.isfinite(true).all(axis=1)
-    if not known.any():
+    has_truth = np.isfinite(true).all(axis=1)
+    if not has_truth.any():
         return np.zeros(0, dtype=int)
-    distance = np.where(known, np.hypot(*(true - centre[:2]).T), np.inf)
+    distance = np.where(has_truth, np.hypot(*(true - centre[:2]).T), np.inf)
     near = np.flatnonzero(distance < radius)
     return near if len(near) else np.array([np.argmin(distance)])
 

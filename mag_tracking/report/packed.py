@@ -1,4 +1,4 @@
-"""Binary arrays as base64 in JSON, which take a third of the space of decimal numbers."""
+"""Encoding of arrays as base64 in JSON, in a third of the space of decimal numbers."""
 
 import base64
 

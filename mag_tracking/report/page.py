@@ -108,6 +108,6 @@ def _html(title: str, data: Mapping[str, Any]) -> str:
 
 
 def _read(path: Any) -> str:
-    """Read a file of the package."""
+    """Read a text file of the package."""
     text: str = path.read_text(encoding='utf-8')
     return text

@@ -13,7 +13,7 @@ DASHES = ('solid', 'dash', 'dot', 'dashdot', 'longdash')
 """Dash styles, one for each colour."""
 
 
-def plain(text: str) -> str:
+def escape_markup(text: str) -> str:
     """Escape the markup characters of Plotly.
 
     Parameters
@@ -28,7 +28,7 @@ def plain(text: str) -> str:
 
 
 def numbers(values: ArrayLike) -> list[Any]:
-    """Convert an array to nested lists, with None for non-finite values.
+    """Convert an array to nested lists of numbers with ten digits; non-finite values become None.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def numbers(values: ArrayLike) -> list[Any]:
 
 
 def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') -> dict[str, Any]:
-    """Create the trace of a curve.
+    """Create the Plotly trace of a curve.
 
     Parameters
     ----------
@@ -63,14 +63,14 @@ def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') ->
     """
     colour = SERIES_COLOURS[k % len(SERIES_COLOURS)]
     return {'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y),
-            'name': plain(name), 'showlegend': bool(name),
+            'name': escape_markup(name), 'showlegend': bool(name),
             'line': {'color': colour, 'dash': DASHES[k % len(DASHES)], 'width': 2},
             'marker': {'color': colour, 'size': 6}}
 
 
 def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str,
              low: float | None = None, high: float | None = None) -> dict[str, Any]:
-    """Create the trace of a heat map in a perceptually uniform colour scale.
+    """Create the Plotly trace of a heat map.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str
     y : (n_y,) array
     z : (n_y, n_x) array
     scale : str
-        Plotly colour scale.
+        Name of a Plotly colour scale, preferably a perceptually uniform one.
     title : str
         Title of the colour bar.
     low, high : float, optional
@@ -94,7 +94,7 @@ def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str
 
 
 def sensor_trace(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
-    """Create the trace of the sensors on a map.
+    """Create the Plotly trace of the sensors on a map.
 
     Parameters
     ----------
@@ -107,14 +107,14 @@ def sensor_trace(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
     dict
     """
     return {'type': 'scatter', 'mode': 'markers', 'x': numbers(points[:, 0]),
-            'y': numbers(points[:, 1]), 'text': [plain(name) for name in names],
+            'y': numbers(points[:, 1]), 'text': [escape_markup(name) for name in names],
             'hoverinfo': 'text', 'name': 'magnetometers', 'showlegend': False,
             'marker': {'symbol': 'triangle-up', 'size': 11, 'color': '#ffffff',
                        'line': {'color': '#000000', 'width': 1.5}}}
 
 
 def axes(x: str, y: str, is_map: bool = False, log_y: bool = False) -> dict[str, Any]:
-    """Create a layout with axis titles.
+    """Create a Plotly layout with axis titles.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ MAX_TRACKS = 1_000
 """Maximum number of tracks in a report."""
 MIN_POSES, TRACK_SIZE = 4, 2_500
 """Minimum number of poses per track, and approximate size of a track without poses [bytes]."""
-MAX_EXTENT = 6.0
+MAX_MARGIN_RATIO = 6.0
 """Maximum margin of the map around the network, as a multiple of the span of the network."""
 SINGLE_SENSOR_MARGIN_M = 10.0
 """Maximum margin of the map around a network without extent, such as a single sensor [m]."""
@@ -46,7 +46,7 @@ class Sensors(Protocol):
 
 def scene_of(network: Sensors, begin_ns: int, end_ns: int,
              tracks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the content of the map with a time slider as values for JSON.
+    """Return the content of the map with a time slider as JSON-compatible values.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def scene_of(network: Sensors, begin_ns: int, end_ns: int,
     xy = network.positions[:, :2]
     low, high = xy.min(axis=0), xy.max(axis=0)
     span = float((high - low).max())
-    max_margin = MAX_EXTENT * span if span > 0.0 else SINGLE_SENSOR_MARGIN_M
+    max_margin = MAX_MARGIN_RATIO * span if span > 0.0 else SINGLE_SENSOR_MARGIN_M
     margin = 0.15 * span if span > 0.0 else 1.0
     factor, unit = scale_of(span if span > 0.0 else SINGLE_SENSOR_MARGIN_M)
     return {'frame': network.frame, 'begin_ns': str(begin_ns), 'begin': 0.0,
@@ -129,7 +129,7 @@ def max_poses_of(logs: Sequence[TrackLog], max_bytes: int = MAX_BYTES) -> int:
 
 
 def _pose_size(log: TrackLog) -> int:
-    """Size [bytes] in base64 of a pose, including its true and its smoothed position."""
+    """Approximate size of a pose in base64 [bytes], including its true and smoothed positions."""
     n_sensors = min(MAX_SENSORS, len(log.measured[0]))
     n_arrivals = len({name for row in log.arrivals for name in row})
     # Base64 needs four bytes for three.
@@ -160,7 +160,7 @@ def thin_poses(log: TrackLog, max_poses: int) -> list[int]:
 
 def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
                 rows: Sequence[int] | None = None) -> dict[str, Any]:
-    """Return a track as values for JSON.
+    """Return a track as JSON-compatible values.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
 
 def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance: FloatArray,
                  ambiguous: bool, fields: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a fitted pass as a track with constant velocity, in values for JSON.
+    """Return a fitted pass as a track with constant velocity, in JSON-compatible values.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance
 
 def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
                 times: FloatArray | None = None) -> dict[str, Any]:
-    """Return the measured and the predicted field of one sensor as values for JSON.
+    """Return the measured and the predicted field of a sensor as JSON-compatible values.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
 
 
 def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
-    """Return the smoothed or the true path of a track as values for JSON.
+    """Return the smoothed or the true path of a track as JSON-compatible values.
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
 
 
 def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row of a track in the table of tracks as values for JSON.
+    """Return a track's row in the table of tracks as JSON-compatible values.
 
     Parameters
     ----------
@@ -304,7 +304,7 @@ def _columns(times: FloatArray, position: FloatArray, velocity: FloatArray, C: F
 
 
 def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Packed]:
-    """NIS per axis of each pose, and the 90 % band of the NIS of a consistent filter."""
+    """NIS per axis of each pose, and the 90 % band that is expected of a consistent filter."""
     n, axes = degrees_of_freedom, np.maximum(degrees_of_freedom, 1.0)
     low, high = (np.where(n > 0.0, chdtri(axes, p) / axes, np.nan) for p in (0.95, 0.05))
     return {'nis': packed(np.where(n > 0.0, nis / axes, np.nan), 'f4'),
@@ -312,7 +312,8 @@ def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Pa
 
 
 def _arrivals(log: TrackLog, rows: Sequence[int]) -> dict[str, dict[str, Packed]]:
-    """Weight and best hypothesis by arrival direction; 0 and NaN at poses without the direction."""
+    """Weight and best hypothesis of each arrival direction. At a pose for which no hypothesis has
+    this direction, the weight is 0 and the other values are NaN."""
     log_rows = [log.arrivals[k] for k in rows]
     out = {}
     for name in sorted({name for row in log_rows for name in row}):

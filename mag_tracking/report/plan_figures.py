@@ -104,8 +104,8 @@ def _draw_map(plan: _Plan, title: str) -> tuple[Figure, Axes, float, str]:
 
 
 def _levels(values: FloatArray, factor: float) -> FloatArray:
-    """Contour levels of 1, 2 or 5 times a power of ten within the range of the values; one
-    intermediate level if there are none."""
+    """Contour levels within the range of `factor` times `values`: 1, 2 or 5 times powers of ten, or
+    the geometric mean of the range if it contains none of these."""
     powers_of_ten = 10.0 ** np.arange(-6, 7)
     levels = np.sort(np.concatenate([powers_of_ten, 2.0 * powers_of_ten, 5.0 * powers_of_ten]))
     low, high = factor * np.nanmin(values), factor * np.nanmax(values)
@@ -162,7 +162,7 @@ def detection_figure(plan: _Plan) -> Figure:
 
 
 def sensor_figure(plan: _Plan) -> Figure:
-    """Plot the relative reduction of the median bound by an additional sensor at each point.
+    """Plot how much an additional sensor at each point reduces the median position bound [%].
 
     The map is white where no sensor is allowed.
 
@@ -234,7 +234,7 @@ def distinct_lanes(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
 
 
 def lane_figure(plan: _Plan) -> Figure:
-    """Plot the bounds and the probability of detection along the lanes, and the missed passes.
+    """Plot bounds and detection probability along the lanes, and P(missed pass) by distance.
 
     Parameters
     ----------

@@ -94,6 +94,6 @@ def _array(records: Sequence[Track | SmoothedPose | Detection], fields: _Fields)
 
 
 def _value(record: Track | SmoothedPose | Detection, name: str) -> Any:
-    """Value of an array field; several doubts are joined by spaces."""
+    """Value of a record for the array field `name`; doubts are joined by spaces."""
     value = getattr(record, 'id' if name == 'track_id' else name)
     return ' '.join(value) if name == 'doubts' else value

@@ -24,6 +24,7 @@ def field_unit(strongest: float) -> tuple[float, str]:
     Parameters
     ----------
     strongest : float, T
+        Largest magnitude.
 
     Returns
     -------

@@ -7,17 +7,17 @@ MINOR_LABEL_DECADES = 1.5
 """Range of a logarithmic axis [decades] up to which values between powers of ten are labelled."""
 
 
-def legend_beside(axes: Axes, **named: float) -> None:
+def legend_beside(axes: Axes, **kwargs: float) -> None:
     """Draw a legend to the right of the axes, outside the plot area.
 
     Parameters
     ----------
     axes : Axes
-    **named : float
+    **kwargs : float
         Additional arguments of `Axes.legend`.
     """
     axes.legend(fontsize=8, loc='upper left', bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0,
-                **named)
+                **kwargs)
 
 
 def plain_log_ticks(axes: Axes) -> None:

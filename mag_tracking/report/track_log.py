@@ -42,8 +42,8 @@ class SmoothedLog:
         Returns
         -------
         dict of str to float
-            Horizontal speed, magnitude of the moment and standard deviation of the horizontal
-            position.
+            Horizontal speed [m/s], magnitude of the moment [A m²] and standard deviation of the
+            horizontal position [m].
         """
         best = int(np.argmin([np.trace(C[:2, :2]) for C in self.covariance]))
         return {'speed': float(np.hypot(*self.velocity[best][:2])),
@@ -53,7 +53,7 @@ class SmoothedLog:
 
 @dataclass
 class TrackLog:
-    """History of one track. Each list has one element per pose, from the `Track` or its frame."""
+    """History of one track. Each list has one value per pose, of the `Track` or of its frame."""
 
     id: int
     stamp_ns: list[int] = field(default_factory=list)
@@ -191,7 +191,7 @@ class TrackLog:
         final = self.arrivals[-1]
         arrival = max(final, key=lambda name: final[name][0])
         nis = np.array(self.nis) / np.maximum(1, self.degrees_of_freedom)
-        known = np.isfinite(nis)
+        is_measured = np.isfinite(nis)
         return {
             'id': self.id, 'start_ns': self.stamp_ns[0], 'end_ns': self.stamp_ns[-1],
             'poses': len(self.stamp_ns), 'ended': self.ended, 'arrival': arrival,
@@ -208,5 +208,5 @@ class TrackLog:
             'moment': [float(v) for v in self.moment[best]],
             'moment_size': float(np.linalg.norm(self.moment[best])),
             'smallest_sd': float(np.sqrt(min(np.trace(C[:2, :2]) for C in self.covariance))),
-            'nis_per_axis': float(nis[known].mean()) if known.any() else None,
+            'nis_per_axis': float(nis[is_measured].mean()) if is_measured.any() else None,
         }

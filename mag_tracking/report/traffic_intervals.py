@@ -22,7 +22,7 @@ class TrafficIntervals:
     interval_s : float, s
         Length of an interval.
     counts : Counter
-        Numbers of events by description, updated in place.
+        Number of passages that are counted in a later interval; updated in place.
     """
 
     def __init__(self, line_names: Sequence[str], interval_s: float,
@@ -50,7 +50,7 @@ class TrafficIntervals:
         self._passages.append((begin, passage))
         self._observed.setdefault(begin, 0)
 
-    def due(self, before_ns: int, now_ns: int) -> list[TrafficSummary]:
+    def close_until(self, before_ns: int, now_ns: int) -> list[TrafficSummary]:
         """Close the intervals that end by `before_ns`, and return their summaries.
 
         Parameters
@@ -81,7 +81,7 @@ class TrafficIntervals:
         return out
 
     def _begin_of(self, stamp_ns: int) -> int:
-        """Start of the interval that contains a time."""
+        """Start [ns] of the interval that contains a time."""
         return stamp_ns // self._length * self._length
 
     def _observe(self, now_ns: int) -> None:
@@ -97,7 +97,7 @@ class TrafficIntervals:
             last_ns = until
 
     def _close(self, begins: list[int]) -> list[TrafficSummary]:
-        """Remove intervals, and return a summary of each interval and line."""
+        """Remove the intervals that start at `begins` [ns], and return a summary for each line."""
         out: list[TrafficSummary] = []
         for begin in sorted(begins):
             end, observed_s = begin + self._length, self._observed.pop(begin) / NS
@@ -111,7 +111,7 @@ class TrafficIntervals:
 
 
 def counts_of(passages: Sequence[VehiclePassage]) -> tuple[TrafficCount, ...]:
-    """Count passages by direction and class, in the forward direction first.
+    """Count passages by direction and class; counts of the forward direction come first.
 
     Parameters
     ----------

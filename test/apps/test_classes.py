@@ -78,7 +78,7 @@ def test_a_labelled_interval_gives_one_signature_per_sensor(tmp_path):
 
 @pytest.mark.parametrize(('rows', 'error'), [
     ([('car', 5, 9), ('truck', 8, 11)], 'rows 2 and 3 overlap'),
-    ([('', 5, 9)], 'row 2: the label is empty'), ([('car', 9, 5)], 'ends before it begins'),
+    ([('', 5, 9)], 'row 2: the label is empty'), ([('car', 9, 5)], 'must end after it begins'),
     ([('car', 5000, 5009)], 'the interval contains no readings')])
 def test_invalid_intervals_are_reported(tmp_path, rows, error):
     with pytest.raises(LabelsError, match=error):
@@ -188,7 +188,7 @@ def test_an_inconsistent_model_is_refused(tables, tmp_path, capsys):
     assert 'is not a valid file of trained classes: it is not valid JSON' in capsys.readouterr().err
     model.write_text(json.dumps({**valid_model, 'mag_tracking.classes': 99}))
     assert main(['classes', 'predict', str(tables / 'by_row.csv'), '--model', str(model)]) == 1
-    assert 'class version 99 is not supported' in capsys.readouterr().err
+    assert 'version 99 is not supported' in capsys.readouterr().err
     model.write_text(json.dumps(valid_model))
     table = tmp_path / 'table.csv'
     table.write_text((tables / 'by_row.csv').read_text())

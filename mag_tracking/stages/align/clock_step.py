@@ -72,7 +72,7 @@ class ClockStepFilter:
 
     @property
     def is_calm(self) -> bool:
-        """Whether no clock step is suspected. Samples within the limit then bypass the filter."""
+        """Whether no clock step is suspected. Samples that do not jump then bypass the filter."""
         if not self._held and not self._ahead_since:
             return True
         # The entry of a sensor without held samples expires when a newer timestamp is accepted.
@@ -97,7 +97,7 @@ class ClockStepFilter:
         """
         stamp = sample.stamp_ns
         if not self._jumps(i, stamp):
-            passed = self._pass([(i, sample)])
+            passed = self._accept([(i, sample)])
         else:
             self._held.append((i, sample, self.newest))
             if self._ahead_since.get(i, (NEVER,))[0] != self.newest:
@@ -105,7 +105,7 @@ class ClockStepFilter:
             if not (self._majority_follows(stamp) or self._advances_alone(i, stamp)):
                 return [], self._release_expired(i, stamp)
             # Samples that are even further ahead remain held.
-            passed = self._pass(self._release(
+            passed = self._accept(self._release(
                 lambda _, s, __: s.stamp_ns <= stamp + self._max_jump))
         # The sensor agrees with the other sensors again, so its held samples had wrong timestamps.
         # Samples that were not confirmed in time also had wrong timestamps. The first held
@@ -123,23 +123,23 @@ class ClockStepFilter:
         -------
         list of (int, HeldSample)
         """
-        return self._pass(self._release(lambda *_: True))
+        return self._accept(self._release(lambda *_: True))
 
     def _jumps(self, i: int, stamp: int) -> bool:
-        """Whether a timestamp of sensor `i` jumps beyond the limit and must be checked."""
+        """Whether a timestamp of sensor `i` jumps by more than `max_jump` and must be checked."""
         if self.newest == NEVER or stamp <= self.newest + self._max_jump:
             return False
         # With two sensors, the first sample of one is as credible as the samples of the other.
-        return self.latest[i] != NEVER or bool(self._held) or len(self._active()) > 1
+        return self.latest[i] != NEVER or bool(self._held) or len(self._active_sensors()) > 1
 
-    def _pass(self, samples: SensorSamples) -> SensorSamples:
+    def _accept(self, samples: SensorSamples) -> SensorSamples:
         """Record samples as accepted, and return them."""
         for i, sample in samples:
             self.latest[i] = sample.stamp_ns
             self.newest = max(self.newest, sample.stamp_ns)
         return samples
 
-    def _active(self) -> set[int]:
+    def _active_sensors(self) -> set[int]:
         """Indices of the sensors whose latest timestamp is at most `max_jump` before `newest`."""
         return {j for j, latest in enumerate(self.latest.tolist())
                 if latest != NEVER and latest >= self.newest - self._max_jump}
@@ -147,16 +147,19 @@ class ClockStepFilter:
     def _majority_follows(self, stamp: int) -> bool:
         """Whether most of the active sensors have a held sample within `max_jump` of `stamp`."""
         following = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._max_jump}
-        return 2 * len(following) > len(following | self._active())
+        return 2 * len(following) > len(following | self._active_sensors())
 
     def _advances_alone(self, i: int, stamp: int) -> bool:
-        """Whether sensor `i` has advanced by `max_jump` since its jump with no sample accepted."""
+        """Whether sensor `i` has advanced by `max_jump` since its jump.
+
+        The time of the jump is reset whenever a newer timestamp is accepted.
+        """
         return stamp - self._ahead_since[i][1] >= self._max_jump
 
     def _release_expired(self, i: int, stamp: int) -> SensorSamples:
-        """Remove and return samples of sensor `i` that are older than `stamp` by over `max_jump`.
+        """Remove and return held samples of sensor `i` that precede `stamp` by over `max_jump`.
 
-        The oldest sample of the sensor is also removed if more than `max_held` are held.
+        The oldest held sample of the sensor is also removed if it has more than `max_held`.
         """
         own_samples = [s for j, s, _ in self._held if j == i]
         oldest = own_samples[0] if len(own_samples) > self._max_held else None

@@ -44,10 +44,10 @@ def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
 def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
     """Frame period: the setting, or a period derived from the geometry if the setting is 0.
 
-    A frame that is longer than the delay between two sensors mixes their signals, so in a compact
-    network the period is half the shortest delay. In a larger network, tracking
-    does not use this delay. The default period then saves computing time. In burst mode, the period
-    is the maximum duration of a round.
+    A frame that is longer than the delay between two sensors mixes their signals. In a compact
+    network, the derived period is therefore half the shortest delay, within `MIN_AUTO_PERIOD_S` and
+    `DEFAULT_PERIOD_S`. In a larger network, tracking does not use this delay, and the default
+    period saves computing time. In burst mode, the period is the maximum duration of a round.
 
     Parameters
     ----------

@@ -11,9 +11,9 @@ class AlignSettings:
 
     period_s: float = param(
         0.0, 'Frame period. The samples of each sensor within a frame are averaged. 0 '
-        'selects the period automatically: 0.08 s, or in a network that spans less than two metres '
-        'half the time that a target at 20 m/s takes between the two closest sensors (0.02 to '
-        '0.08 s).', 's', (0.0, 60.0))
+        'selects the period automatically: in a network that spans less than two metres, half the '
+        'time that a target at 20 m/s takes between the two closest sensors (0.02 to 0.08 s); '
+        'otherwise 0.08 s.', 's', (0.0, 60.0))
     burst: bool = param(
         False, 'Set to true if the sensors are read one after the other, one sample each. A frame '
         'is then complete as soon as every sensor has delivered a sample, and period_s is the '

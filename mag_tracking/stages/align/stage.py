@@ -100,9 +100,9 @@ class Align:
         if C is None:
             C = self._noise[rows]
         else:
-            unknown = readings.has_unknown_covariance()
-            if unknown.any():
-                C = np.where(unknown[:, None, None], self._noise[rows], C)
+            is_unknown = readings.has_unknown_covariance()
+            if is_unknown.any():
+                C = np.where(is_unknown[:, None, None], self._noise[rows], C)
         return self._hold(rows, plain(readings.stamp_ns, np.int64), plain(readings.field),
                           plain(C), readings)
 

@@ -95,7 +95,7 @@ class BackgroundRestoration:
         Returns
         -------
         str
-            Key of the counter that records the outcome.
+            Outcome, as a key of `Calibrate.counts`.
         """
         stored = self._stored.pop(sensor)
         if 0 < stamp_ns - stored.stamp_ns <= self._max_gap_ns:

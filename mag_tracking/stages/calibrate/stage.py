@@ -69,7 +69,7 @@ class Calibrate:
     Attributes
     ----------
     counts : Counter of str
-        Number of readings, by outcome.
+        Number of readings by outcome, and of events such as time jumps.
     """
 
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
@@ -127,7 +127,7 @@ class Calibrate:
         self._mark_restorable()
 
     def _configure(self, i: int, shift: int) -> None:
-        """Apply the network file to sensor `i`; add `shift` [ns] to the sensor's timestamps."""
+        """Apply the network file to sensor `i`; add `shift` [ns] to its stored timestamps."""
         s, network = self._sensors[i], self._network
         for name in ('first_ns', 'last_ns', 'unconfirmed_ns'):
             if s[name] != NEVER:
@@ -288,7 +288,7 @@ class Calibrate:
         return int(self._sensors['n_held'].sum())
 
     def _reject_held(self, i: int, event: str) -> None:
-        """Reject the held readings of sensor `i`, which no later reading can confirm."""
+        """Reject the held readings of sensor `i`, which no reading after `event` can confirm."""
         self._reject(self._network.names[i], f'possible spike when {event}',
                      int(self._sensors[i]['n_held']))
         clear_spikes(self._sensors[i])
@@ -321,7 +321,7 @@ class Calibrate:
         self._mark_restorable()
 
     def _mark_restorable(self) -> None:
-        """Mark sensors with a stored background, so that their first reading is reported."""
+        """Mark sensors with a stored background: compiled code then reports their first reading."""
         self._sensors['is_restorable'] = [name in self._restoration for name in self._index]
 
     def stored(self, sensor: str) -> StoredBackground | None:
@@ -344,8 +344,8 @@ class Calibrate:
     def idle(self) -> None:
         """Evaluate the completed blocks now, instead of at the next reading of their sensors.
 
-        The result is the same, because in a large network the reading that completes a block is
-        calibrated with the background from before that block.
+        This does not change results: only in a large network are completed blocks deferred, and
+        there the reading that completes a block is calibrated with the previous background.
         """
         for i in np.flatnonzero(self._sensors['is_full']):
             self._background[self._network.names[i]].evaluate_block()

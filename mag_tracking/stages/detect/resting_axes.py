@@ -22,7 +22,7 @@ step of one axis, which background drift can cause, remains below the threshold.
 
 
 class RestingAxes:
-    """Finds axes at rest by their mean squares over frames without a target.
+    """Finds axes at rest by the mean square of their field in frames without a target.
 
     Parameters
     ----------
@@ -43,19 +43,19 @@ class RestingAxes:
         """
         core.learn(plain(field), MEMORY_FRAMES, self._n, self._mean_square)
 
-    def covariance(self, covariance: FloatArray, allowance: float) -> FloatArray:
+    def covariance(self, covariance: FloatArray, background_variance: float) -> FloatArray:
         """Reduce the variances of axes at rest in a covariance, and add the background variance.
 
         Parameters
         ----------
-        covariance : (n_sensors, 3, 3) array, T^2
+        covariance : (n_sensors, 3, 3) array, T²
             Covariance of the frame.
-        allowance : float, T^2
+        background_variance : float, T²
             Variance of the background error, which is added to each axis.
 
         Returns
         -------
-        (n_sensors, 3, 3) array, T^2
+        (n_sensors, 3, 3) array, T²
         """
         return core.scaled(plain(covariance), self._n, self._mean_square, MEMORY_FRAMES / 4,
-                           RESTING_RATIO, VARIANCE_REDUCTION, allowance)
+                           RESTING_RATIO, VARIANCE_REDUCTION, background_variance)

@@ -178,9 +178,9 @@ class _SensorEvents:
         present = ~np.all(np.isnan(field), axis=0)
         closest = closest_point(t, field, noise)
         horizontal = horizontal_field(field, self._R_ws)
-        known = ~np.isnan(horizontal).any(axis=1)
+        is_complete = ~np.isnan(horizontal).any(axis=1)
         left_to_right = _left_to_right(
-            horizontal[known], float(np.nanmean(noise)) if known.any() else 0.0,
+            horizontal[is_complete], float(np.nanmean(noise)) if is_complete.any() else 0.0,
             int(np.count_nonzero(stamp < onset_ns)))
         return PassEvent(
             self._name, self._n, ended, onset_ns, release_ns, int(stamp[peak]), field[peak],
@@ -191,7 +191,10 @@ class _SensorEvents:
 
 
 def _left_to_right(horizontal: FloatArray, noise_std: float, n_quiet: int) -> float:
-    """Probability that the target moves from left to right; 0.5 if unobservable."""
+    """Probability that the target passes the sensor from left to right; 0.5 if unobservable.
+
+    `horizontal` (n, 2) [T] is the horizontal field; its first `n_quiet` samples precede the target.
+    """
     rotation = rotation_of_pass(horizontal, noise_std, n_quiet)
     if rotation is None:
         return 0.5
@@ -214,16 +217,18 @@ def _median_interval(stamp: IntArray) -> float:
 
 
 def _signature(t: FloatArray, field: FloatArray, time: float, scale: float) -> FloatArray:
-    """Field (`SIGNATURE_POINTS`, 3) [T] at equidistant times.
+    """Field (`SIGNATURE_POINTS`, 3) [T] at equidistant times around the closest point of approach.
 
-    NaN outside the readings, or if `scale` is not finite.
+    The times [s] are centred on `time` and proportional to `scale`. The field is NaN outside the
+    readings, or if `scale` is not finite.
     """
     if not np.isfinite(scale):
         return np.full((SIGNATURE_POINTS, 3), np.nan)
     times = time + scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN, SIGNATURE_POINTS)
     out = np.full((SIGNATURE_POINTS, 3), np.nan)
     for a in range(3):
-        known = ~np.isnan(field[:, a])
-        if known.any():
-            out[:, a] = np.interp(times, t[known], field[known, a], left=np.nan, right=np.nan)
+        is_measured = ~np.isnan(field[:, a])
+        if is_measured.any():
+            out[:, a] = np.interp(times, t[is_measured], field[is_measured, a], left=np.nan,
+                                  right=np.nan)
     return out

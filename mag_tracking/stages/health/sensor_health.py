@@ -280,7 +280,7 @@ class SensorHealth:
         """Axes that did not change within the window although another axis changed, such as 'xz'.
 
         For a sensor with coarse resolution, these are axes that have never changed although another
-        axis changed by more than `MIN_MOVED_STEPS` of its steps.
+        axis changed by more than `MIN_MOVED_STEPS` quantisation steps.
         """
         self.update()
         if len(self._fields) < WINDOW:
@@ -297,14 +297,14 @@ class SensorHealth:
         """Delay [s] from timestamp to receipt: median, 5 % and 95 % quantiles; NaN if unknown."""
         self.update()
         if self._delays is None:
-            known = self._received != NEVER
-            delays = (self._received - self._stamps)[known] / NS
+            is_received = self._received != NEVER
+            delays = (self._received - self._stamps)[is_received] / NS
             self._delays = quantiles(delays, 0.5, 0.05, 0.95)
         return self._delays
 
     def findings(self, name: str, noise_std: FloatArray | None = None,
                  max_field: float = 1e-3, is_live: bool = True) -> list[Finding]:
-        """Faults of the sensor, the serious ones first.
+        """Faults of the sensor; serious faults come first.
 
         Parameters
         ----------

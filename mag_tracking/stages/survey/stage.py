@@ -73,7 +73,7 @@ class NetworkSurvey:
     clock of each sensor, relative to the first reading of any sensor."""
 
     def warnings(self) -> list[str]:
-        """Warnings for the user.
+        """Warnings about the fields, orientations and clocks of the sensors.
 
         Returns
         -------
@@ -174,12 +174,13 @@ class Survey:
                                for s in network.orientation_std])
         warnings: dict[str, list[str]] = {name: [] for name in names}
         up_directions = [self._estimate_up(name, warnings[name]) for name in names]
-        level = [levelled(up, R, std) for up, R, std in
-                 zip(up_directions, network.R_ws, stated_std, strict=True)]
-        for name, before, surveyed, std in zip(names, network.R_ws, level, stated_std, strict=True):
+        orientations = [levelled(up, R, std) for up, R, std in
+                        zip(up_directions, network.R_ws, stated_std, strict=True)]
+        for name, before, surveyed, std in zip(
+                names, network.R_ws, orientations, stated_std, strict=True):
             if surveyed is not None:
                 warnings[name] += _tilt_warning(before, surveyed.R_ws, std, surveyed.std)
-        inconsistent = self._disagreements(field, level, stated_std, warnings)
+        inconsistent = self._disagreements(field, orientations, stated_std, warnings)
         bias_std, oriented = self._compass(
             {j: u for j, u in enumerate(up_directions) if u is not None and names[j] not in
              {d.sensor for d in inconsistent}}, field, stated_std, warnings)
@@ -187,7 +188,7 @@ class Survey:
         reference, lags = self._lags(shocks)
         sensors = []
         for j, name in enumerate(names):
-            orientation, by = oriented.get(j, (level[j], 'accelerometer, nominal heading'))
+            orientation, by = oriented.get(j, (orientations[j], 'accelerometer, nominal heading'))
             sensors.append(SensorSurvey(
                 name, orientation, 'nominal orientation' if orientation is None else by,
                 lags.get(name), tuple(warnings[name])))
@@ -195,7 +196,7 @@ class Survey:
                              tuple(inconsistent), bias_std, reference, shocks)
 
     def _estimate_up(self, name: str, warnings: list[str]) -> UpDirection | None:
-        """Estimate the vertical direction of a sensor; None, with a warning, if unavailable."""
+        """Estimate the vertical in the frame of a sensor; None, with a warning, if unavailable."""
         if not self._accelerations[name]:
             warnings.append('no accelerations; the orientation is not surveyed')
             return None
@@ -206,7 +207,7 @@ class Survey:
             warnings.append(f'{error}; the orientation in the network file is retained')
             return None
 
-    def _disagreements(self, field: FloatArray, level: Sequence[Orientation | None],
+    def _disagreements(self, field: FloatArray, orientations: Sequence[Orientation | None],
                        stated_std: FloatArray, warnings: Mapping[str, list[str]]
                        ) -> list[FieldInconsistency]:
         """Find the sensors whose field contradicts the Earth's field.
@@ -214,8 +215,10 @@ class Survey:
         If the Earth's field is unknown, add a warning and return an empty list.
         """
         network = self._network
-        R = np.array([R if o is None else o.R_ws for o, R in zip(level, network.R_ws, strict=True)])
-        std = np.array([s if o is None else o.std for o, s in zip(level, stated_std, strict=True)])
+        R = np.array([R if o is None else o.R_ws
+                      for o, R in zip(orientations, network.R_ws, strict=True)])
+        std = np.array([s if o is None else o.std
+                        for o, s in zip(orientations, stated_std, strict=True)])
         try:
             earth = consensus(field, R) if network.earth_field is None else network.earth_field
         except ValueError as error:
@@ -226,7 +229,11 @@ class Survey:
     def _compass(self, ups: Mapping[int, UpDirection], field: FloatArray, stated_std: FloatArray,
                  warnings: Mapping[str, list[str]]
                  ) -> tuple[float, dict[int, tuple[Orientation, str]]]:
-        """Estimate the compass bias std [T] and {sensor index: (orientation, source)}."""
+        """Estimate the orientations of the sensors with a compass.
+
+        Returns the standard deviation of the compass biases [T], and {sensor index: (orientation,
+        source of the orientation)}.
+        """
         network, bias_std = self._network, self._settings.compass_bias_std
         usable = {j: up for j, up in ups.items() if not np.isnan(field[j]).all()}
         if network.earth_field is None or not usable:
@@ -261,7 +268,7 @@ class Survey:
         return bias_std, out
 
     def _shocks(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Compute the mechanical shock of each sensor over time."""
+        """Mechanical shock of each sensor over time, as in `NetworkSurvey.shocks`."""
         recorded = {name: readings for name, readings in self._accelerations.items() if readings}
         # Times are relative to the first reading, because seconds since 1970 lose digits in a
         # float.
@@ -277,14 +284,14 @@ class Survey:
         The name of the reference is empty if no two sensors measured the same knock.
         """
         max_offset = self._settings.max_clock_offset_s
-        first: dict[str, Lag] = {}
+        first_lags: dict[str, Lag] = {}
         for reference, (t, s) in signals.items():
             lags = {name: knock_lag(t, s, *signals[name], max_offset)
                     for name in signals if name != reference}
             if any(not lag.reason for lag in lags.values()):
                 return reference, lags
-            first = first or lags
-        return '', first
+            first_lags = first_lags or lags
+        return '', first_lags
 
     def _updated_network(self, sensors: Sequence[SensorSurvey], reference: str,
                          date: str) -> SensorNetwork:
@@ -344,7 +351,10 @@ def with_measured_noise(network: SensorNetwork, calibrate: NoiseSource) -> Senso
 
 def _tilt_warning(R: FloatArray, surveyed: FloatArray, std: FloatArray,
                   surveyed_std: FloatArray) -> list[str]:
-    """Warning if the tilt of a sensor differs significantly from the network file."""
+    """List with a warning if the tilt of a sensor differs significantly from the network file.
+
+    `R` and `std` [rad] are from the network file, the others from the survey.
+    """
     tilt = np.arccos(np.clip((R.T @ [0.0, 0.0, 1.0]) @ (surveyed.T @ [0.0, 0.0, 1.0]), -1.0, 1.0))
     limit = 3.0 * np.hypot(std[:2].max(), surveyed_std[:2].max())
     return [f'the tilt differs by {np.degrees(tilt):.0f} degrees from the network file'] \

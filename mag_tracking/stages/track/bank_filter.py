@@ -302,7 +302,7 @@ class BankFilter:
 
     def fields_at(self, x: FloatArray, kind: IntArray, frame: FieldFrame, dt: float
                   ) -> tuple[FloatArray, FloatArray]:
-        """Target fields of a state at the sampling times of a frame, and their derivatives.
+        """Fields of the targets of a state at the sampling times of a frame, and their derivatives.
 
         Backgrounds and model errors are excluded.
 
@@ -366,7 +366,7 @@ class BankFilter:
         are_long: BoolArray = np.any(self._is_long_kind[kind].reshape(len(kind), -1), axis=1)
         return are_long
 
-    def nearly_linear(self, x: FloatArray) -> FloatArray:
+    def linear_range(self, x: FloatArray) -> FloatArray:
         """Displacement of a target over which the field is approximately linear.
 
         Parameters
@@ -415,7 +415,9 @@ class NoTarget:
         self._P = np.tile(background_std**2 * np.eye(3), (n_sensors, 1, 1))
 
     def log_density(self, frame: FieldFrame, dt: float, background_drift: float) -> float:
-        """Update the backgrounds with a frame; return its log-density given the previous frames.
+        """Update the backgrounds with a frame; return the log-density of this frame.
+
+        The density is conditional on the previous frames.
 
         Parameters
         ----------

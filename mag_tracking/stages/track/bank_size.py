@@ -16,8 +16,8 @@ starting hypotheses, and separately to the grid of a magnet. The peak memory is 
 large."""
 START_BYTES = 250_000_000
 """Memory for the covariances with which a track starts [bytes]. If the covariances with all sensors
-need more, the track starts with fewer sensors. The remaining sensors are added after the frames
-before the detection."""
+need more, the track starts with fewer sensors. The remaining sensors are added when the frames
+before the detection have been processed."""
 MIN_SENSORS_AT_START = 4
 """Minimum number of sensors at the start of a track. The sensors nearest to the strongest field are
 used."""
@@ -59,7 +59,7 @@ def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
 
 
 def _vehicle_factors(settings: TrackSettings) -> dict[str, int]:
-    """Numbers whose product is the number of starting hypotheses of a vehicle, by name."""
+    """Number of alternatives by property; their product is the number of starting hypotheses."""
     vehicle = settings.vehicle
     return {**{name: len(getattr(vehicle, name))
                for name in ('kinds', 'arrival_names', 'lateral_offsets', 'speeds')},
@@ -121,6 +121,7 @@ def max_hypotheses(observation: Observation, n_sensors: int) -> int:
     Returns
     -------
     int
+        At least `MIN_HYPOTHESES`, even if they exceed `WIDER_BYTES`.
     """
     size = _FLOAT_BYTES * observation.n_states(n_sensors)**2
     return max(MIN_HYPOTHESES, WIDER_BYTES // size)

@@ -104,7 +104,7 @@ class ClockComparison:
 
     @property
     def largest_offset(self) -> ClockOffset | None:
-        """Clock that causes the largest significant offset; None if no offset is significant."""
+        """Largest significant offset, attributed to a clock; None if no offset is significant."""
         ahead, behind = map(int, np.unravel_index(np.argmax(self._offset_s), self._offset_s.shape))
         if self._offset_s[ahead, behind] == 0.0:
             return None
@@ -169,9 +169,9 @@ class ClockComparison:
             for j in np.flatnonzero(is_known))
 
     def _offsets(self) -> tuple[FloatArray, FloatArray]:
-        """Time (n, n) [s] by which the clock of a row is ahead of that of a column, and its std.
+        """Time by which the clock of each row is ahead of the clock of each column, (n, n) [s].
 
-        The standard deviations (n, n) [s] are infinite on the diagonal.
+        The second array contains the standard deviations (n, n) [s], infinite on the diagonal.
         """
         # The common offset of all clocks is not observable; the prior fixes it.
         prior = np.eye(len(self._vector)) / PRIOR_STD_S**2

@@ -171,7 +171,7 @@ class CrossCheck:
             and -BEFORE_S * NS <= stamp_ns - self.latest.stamp_ns <= AFTER_S * NS
 
     def _difference_at(self, stamp_ns: int, state: FloatArray) -> FloatArray:
-        """Difference (6,) of a state (6,) at a time that the latest fit covers."""
+        """Difference (6,) of a state (6,) from the latest fit, at a time that the fit covers."""
         assert self.latest is not None
         return self.latest.difference(stamp_ns, state)
 

@@ -67,7 +67,9 @@ class DisturbanceModel:
         return float(np.exp(self._log_w[1]))
 
     def log_density(self, frame: FieldFrame, dt: float, model_error: FloatArray) -> float | None:
-        """Update the models with a frame and return its log-density given the previous frames.
+        """Update the models with a frame; return the log-density of this frame.
+
+        The density is conditional on the previous frames.
 
         Parameters
         ----------
@@ -124,7 +126,7 @@ class DisturbanceModel:
 
 
 def _common_field_matrix(network: SensorNetwork) -> FloatArray:
-    """Matrix (3 n_sensors, m) from a common field and the backgrounds to the axes of each sensor.
+    """Matrix (3 n_sensors, m) that maps a common field and the backgrounds to the sensor axes.
 
     The field has a uniform component and, with at least `MIN_GRADIENT_SENSORS` sensors, a gradient.
     Without sources inside the network, the gradient is symmetric and traceless. It has five

@@ -71,6 +71,7 @@ class TrackEvidence:
     bayes_factor : TargetBayesFactor
         Evidence for a target against a disturbance.
     innovations : InnovationConsistency
+        Consistency of the innovations with their covariance.
     largest : (n_sensors,) array, T
         Magnitude of the largest field measured by each sensor.
     """
@@ -145,7 +146,7 @@ class TrackEvidence:
             Whether the frames before the detection do not show the approach of the target.
         network : SensorNetwork
         starts_anywhere : bool
-            As in `Target`.
+            Whether the target may start at any position, as a magnet may.
         """
         # A target that was not seen approaching may already have passed.
         if approach_unobserved and not starts_anywhere:
@@ -261,7 +262,8 @@ class TrackEvidence:
             self.flag(doubts.CONTRADICTION)
         return is_contradiction
 
-    def vehicle_doubts(self, nis: FloatArray, degrees_of_freedom: int, ratio: float) -> set[str]:
+    def vehicle_doubts(self, nis: FloatArray, degrees_of_freedom: int,
+                       min_bayes_factor: float) -> set[str]:
         """Update and return the doubts that follow from the measurements of a vehicle.
 
         Parameters
@@ -269,7 +271,7 @@ class TrackEvidence:
         nis : (n_sensors,) array
             Normalised innovation squared of each sensor in the frame; NaN if missing.
         degrees_of_freedom : int
-        ratio : float
+        min_bayes_factor : float
             Minimum Bayes factor of a target against a disturbance.
 
         Returns
@@ -277,7 +279,7 @@ class TrackEvidence:
         set of str
         """
         reasons = set()
-        if self.bayes_factor.is_recently_disfavoured(ratio):
+        if self.bayes_factor.is_recently_disfavoured(min_bayes_factor):
             reasons.add(doubts.DISTURBANCE_MODEL)
         if self.contradicts(nis, degrees_of_freedom):
             reasons.add(doubts.CONTRADICTION)
@@ -327,7 +329,7 @@ class TrackEvidence:
         return are_doubtful((*self._doubtful_times, *self._smoothed_segments), stamp_ns)
 
     def count_single_sensor_time(self, is_single_sensor: bool, dt: float) -> None:
-        """Update the total time with one measuring sensor, and flag the track if it is too long.
+        """Update the total time with a single measuring sensor; if it is too long, flag the track.
 
         A single sensor determines neither the scale of a track nor which of two mirror images is
         correct. The other sensors do not always correct the error when they measure again.

@@ -43,7 +43,7 @@ class MagnetSettings:
 
 
 def magnet_model(settings: MagnetSettings) -> Magnet:
-    """Return the source model of the settings.
+    """Create the source model of a magnet from its settings.
 
     Parameters
     ----------
@@ -70,6 +70,7 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
     network : SensorNetwork
     frame : FieldFrame
     background_std : float, T
+        Standard deviation of each background, per axis.
     own_covariance : (n_sensors, n_own, n_own) array
         Covariances of the states of each sensor.
     relative_std : float
@@ -118,7 +119,10 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
 def _distinct_optima(settings: MagnetSettings, network: SensorNetwork, start: FloatArray,
                      y: FloatArray, std: FloatArray, is_present: BoolArray
                      ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """States (n, 12), covariances (n, 12, 12) and costs (n,) of the distinct refined optima."""
+    """Refine the grid points `start`, and select the distinct optima.
+
+    Returns the states (n, 12), covariances (n, 12, 12) and costs (n,) of the optima.
+    """
     zero = np.zeros((len(start), 1, 3, 6))
     dr_dx, dm_dx = zero.copy(), zero.copy()
     dr_dx[:, 0, :, :3] = np.eye(3)

@@ -120,7 +120,7 @@ PER_KIND = ('lengths', 'length_stds', 'moments', 'moment_stds', 'difference_stds
 
 
 def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehicle:
-    """Return the source model of the settings; soft iron has no effect without an earth field.
+    """Create the source model of a vehicle; soft iron has no effect without an earth field.
 
     Parameters
     ----------
@@ -134,8 +134,8 @@ def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehic
     Raises
     ------
     SettingsError
-        If lists that belong together differ in length, if a kind is listed twice, or if the
-        length or moment differences of a point have a standard deviation.
+        If lists that belong together differ in length, if a kind is listed twice, or if a kind
+        without length has a standard deviation of the length or of the moment differences.
     """
     for names, item, lists in (('arrival_names', 'arrival name', ('arrival_headings_deg',)),
                                ('kinds', 'kind', PER_KIND)):
@@ -215,13 +215,14 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
     network : SensorNetwork
     frame : FieldFrame
     background_std : float, T
+        Standard deviation of each background, per axis.
     own_covariance : (n_sensors, n_own, n_own) array
         Covariances of the states of each sensor.
 
     Returns
     -------
     FilterBank
-        Labels index `settings.arrival_names`, kinds index `settings.kinds`.
+        Labels are indices into `settings.arrival_names`, kinds are indices into `settings.kinds`.
 
     References
     ----------
@@ -236,11 +237,11 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
         moments = settings.moments[kind] * moment_directions()
         for label, heading in enumerate(np.deg2rad(settings.arrival_headings_deg)):
             R = rotation_about_z(heading)
-            hard = (moments - soft_iron(settings, kind) * _earth_field(network) / MU0) @ R
+            hard_iron = (moments - soft_iron(settings, kind) * _earth_field(network) / MU0) @ R
             velocities = np.array(settings.speeds)[:, None] * R[:, 0]
             starts = _matching_positions(settings, network, measured, R, moments,
                                          settings.heights[kind])
-            states.append(_initial_states(settings, kind, starts, velocities, hard))
+            states.append(_initial_states(settings, kind, starts, velocities, hard_iron))
             by_speed = np.array([
                 starting_covariance(settings, kind, R, v, settings.moment_stds[kind])
                 for v in settings.speeds])
@@ -255,7 +256,7 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
 def _add_turning_hypotheses(bank: FilterBank, model: RowVehicle, fraction: float) -> FilterBank:
     """Bank with a turning copy of each hypothesis; `bank` itself if turning is disabled.
 
-    A `fraction` of the weight belongs to the turning copies.
+    The turning copies have a total weight of `fraction`.
     """
     if not model.turn_acceleration:
         return bank
@@ -284,10 +285,10 @@ class _MeasuredEnergy:
 def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
                         measured: _MeasuredEnergy, R: FloatArray, moments: FloatArray,
                         height: float) -> FloatArray:
-    """First position on each line at which the field of a moment has the measured energy.
+    """First position on each line at which the field of each moment reaches the measured energy.
 
-    The shape is (n_offsets, n_moments, 3). A field that never reaches the energy yields the last
-    position of the line, next to the outermost sensor.
+    The shape is (n_offsets, n_moments, 3). If a field never reaches the energy, the result is the
+    last position of the line, next to the outermost sensor.
     """
     along = (network.positions - network.centre) @ R[:, 0]
     distance = np.linspace(settings.max_start_distance, 0.0, 160) - along.min()
@@ -304,17 +305,17 @@ def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
 
 
 def _initial_states(settings: VehicleSettings, kind: int, positions: FloatArray,
-                    velocities: FloatArray, hard: FloatArray) -> FloatArray:
-    """States (n_offsets * n_speeds * n_moments, n_t) of `RowVehicle`.
+                    velocities: FloatArray, hard_iron: FloatArray) -> FloatArray:
+    """Initial states (n_offsets * n_speeds * n_moments, n_t) for the model `RowVehicle`.
 
     The inputs are `positions` (n_offsets, n_moments, 3), `velocities` (n_speeds, 3) and the total
-    hard iron moments `hard` (n_moments, 3).
+    hard iron moments `hard_iron` (n_moments, 3).
     """
     d = _n_dipoles(settings)
     n_turn = int(settings.turn_acceleration > 0.0)
-    x = np.empty((len(positions), len(velocities), len(hard), 8 + 3 * d + min(d, 2) + n_turn))
+    x = np.empty((len(positions), len(velocities), len(hard_iron), 8 + 3 * d + min(d, 2) + n_turn))
     x[..., :3], x[..., 3:6] = positions[:, None], velocities[:, None]
-    x[..., 6:6 + 3 * d] = np.tile(hard / d, d)
+    x[..., 6:6 + 3 * d] = np.tile(hard_iron / d, d)
     x[..., 6 + 3 * d:] = [*[soft_iron(settings, kind)] * 3, *[settings.lengths[kind]] * (d > 1),
                           *[0.0] * n_turn]
     return x.reshape(-1, x.shape[-1])
@@ -330,7 +331,7 @@ def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, spe
     kind : int
         Index in `settings.kinds`.
     R : (3, 3) array
-        Rotation whose x axis is the arrival direction, world frame.
+        Rotation to the world frame from a frame with the x axis along the arrival heading.
     speed : float, m/s
     moment_std : float, A m²
         Standard deviation of the total hard iron moment, per axis.
@@ -340,9 +341,9 @@ def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, spe
     (n_t, n_t) array
     """
     d = _n_dipoles(settings)
-    soft = 6 + 3 * d
+    soft_index = 6 + 3 * d
     soft_iron_std = settings.induced_share_std * _soft_iron_per_share(settings, kind)
-    n_t = soft + 2 + min(d, 2) + int(settings.turn_acceleration > 0.0)
+    n_t = soft_index + 2 + min(d, 2) + int(settings.turn_acceleration > 0.0)
     P = np.zeros((n_t, n_t))
     P[:3, :3] = R @ np.diag([settings.along_std**2, settings.lateral_std**2,
                              settings.height_stds[kind]**2]) @ R.T
@@ -350,9 +351,9 @@ def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, spe
                                (settings.cross_speed_std * speed) ** 2,
                                settings.climb_std**2]) @ R.T
     mean = np.full((d, d), 1.0 / d)
-    P[6:soft, 6:soft] = np.kron(moment_std**2 / d * mean
+    P[6:soft_index, 6:soft_index] = np.kron(moment_std**2 / d * mean
                                 + settings.difference_stds[kind]**2 * (np.eye(d) - mean), np.eye(3))
-    P[soft:soft + 3, soft:soft + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
+    P[soft_index:soft_index + 3, soft_index:soft_index + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
     if d > 1:
-        P[soft + 3, soft + 3] = settings.length_stds[kind]**2
+        P[soft_index + 3, soft_index + 3] = settings.length_stds[kind]**2
     return P

@@ -222,7 +222,7 @@ class Relinearisation:
                         relinearised.P[is_accepted])
         is_rejected = is_finite & ~is_accepted
         _widen_covariances(bank, leading[is_rejected], relinearised.x[is_rejected],
-                           relinearised.P[is_rejected], bank_filter.nearly_linear)
+                           relinearised.P[is_rejected], bank_filter.linear_range)
         return Counter({ATTEMPTED: len(is_accepted), FAILED: int(np.count_nonzero(~is_accepted))})
 
     @property

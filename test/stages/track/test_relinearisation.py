@@ -46,7 +46,7 @@ class LinearFilter(StepByStep):
     def are_long(self, kind):
         return np.full(len(kind), self.long)
 
-    def nearly_linear(self, x):
+    def linear_range(self, x):
         return np.full(len(x), self.linear)
 
     def predict(self, bank, dt, x_lin=None):
