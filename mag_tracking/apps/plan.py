@@ -156,26 +156,24 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     report_part = progress or (lambda n: None)
     x, y = _grid(area, n_grid)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    sensor_poses = network.positions, network.R_sw
-    prior = target.prior()
     bounds = []
     for heading in sorted({heading % np.pi for _, heading, _ in lanes}):
-        J = pass_information(*sensor_poses, target, sampling, points, heading).sum(axis=2)
-        bounds.append(bounds_of(J, prior)[..., 0])
+        bounds.append(_position_bounds(network, target, sampling, points, heading))
         report_part(1)
     detect = settings.detect
-    probability = detection_probabilities(*sensor_poses, target, sampling, points,
-                                          detect.false_alarm_probability, detect.background_std)
+    probability = detection_probabilities(
+        network.positions, network.R_sw, target, sampling, points, detect.false_alarm_probability,
+        detect.background_std)
     report_part(1)
-    planned_lanes = tuple(_lane(network, target, sampling, *lane, area, settings) for lane in lanes)
+    planned = tuple(_lane(network, target, sampling, *lane, area, settings) for lane in lanes)
     report_part(1)
     # The effect of the additional sensor is evaluated where the lanes are near the network.
     half_length = 0.5 * max(np.ptp(network.positions[:, :2], axis=0).max(), 8.0 * target.height)
     near_lanes = [(lane.heading, lane.points[np.abs(lane.along) <= half_length][::4])
-                  for lane in planned_lanes]
+                  for lane in planned]
     coarse_x, coarse_y = _grid(area, max(11, n_grid // 2))
     candidates = np.stack(np.meshgrid(coarse_x, coarse_y), axis=-1).reshape(-1, 2)
-    is_allowed = np.all([_lane_distances(lane, candidates) >= clearance for lane in planned_lanes],
+    is_allowed = np.all([_lane_distances(lane, candidates) >= clearance for lane in planned],
                         axis=0)
     median_bound = np.full(len(candidates), np.nan)
     without, with_sensor = _added_sensor_bounds(network, target, sampling, near_lanes,
@@ -183,17 +181,24 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     median_bound[is_allowed] = with_sensor
     report_part(1)
     best_index = int(np.nanargmin(median_bound)) if is_allowed.any() else 0
-    lane_observability, closest_bounds = _closest_point_bounds(network, target, sampling,
-                                                               planned_lanes[0], half_length)
+    lane_observability, closest_bounds = _closest_point_bounds(
+        network, target, sampling, planned[0], half_length)
     shape = len(coarse_y), len(coarse_x)
     return Plan(
         network, target, sampling, x, y,
         np.median(np.concatenate(bounds, axis=1), axis=1).reshape(len(y), len(x)),
-        probability.mean(axis=1).reshape(len(y), len(x)), planned_lanes,
+        probability.mean(axis=1).reshape(len(y), len(x)), planned,
         median_bound.reshape(shape), without,
         (float(coarse_x[best_index % shape[1]]), float(coarse_y[best_index // shape[1]])),
         lane_observability, closest_bounds,
-        _miss_probabilities(network, target, sampling, planned_lanes[0], area, settings))
+        _miss_probabilities(network, target, sampling, planned[0], area, settings))
+
+
+def _position_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
+                     points: FloatArray, heading: float) -> FloatArray:
+    """Position bounds [m] of passes through points, for each direction of the moment."""
+    J = pass_information(network.positions, network.R_sw, target, sampling, points, heading)
+    return bounds_of(J.sum(axis=2), target.prior())[..., 0]
 
 
 def _closest_point_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,

@@ -25,5 +25,5 @@ def test_the_questions_of_the_archive_example_run_on_an_empty_archive(tmp_path):
                                                   ROOT / 'examples' / 'archive_questions.py')
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    connection = module.tables_of(tmp_path)
+    connection = module.open_archive(tmp_path)
     assert [len(connection.sql(sql).fetchall()) for sql in module.QUESTIONS.values()] == [0] * 4
