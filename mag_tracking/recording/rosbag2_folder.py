@@ -181,7 +181,7 @@ def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[s
 
 
 def _qos_profiles(name: str, topic: Topic) -> object:
-    """Parse the QoS profiles of a topic, which are stored as YAML; raises RecordingError."""
+    """Parse the QoS profiles of a topic, stored as YAML; raises RecordingError if invalid."""
     return parse_yaml(topic.qos, f'offered_qos_profiles of {name}', RecordingError)
 
 

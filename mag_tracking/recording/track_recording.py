@@ -148,7 +148,7 @@ class TrackRecording:
                       for p in poses]}, last_ns)
 
     def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Write a record of a disturbance, which has one at its detection and one at its end.
+        """Write a record of a disturbance: its detection or its end.
 
         Parameters
         ----------

@@ -123,7 +123,9 @@ def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[s
 
 
 def summary_rows(recording: str, summary: TrafficSummary) -> list[dict[str, Any]]:
-    """Rows of the table `intervals`: one per direction and class; one row with count 0 if empty.
+    """Rows of the table `intervals` for one traffic summary.
+
+    There is one row per direction and class, or a single row with count 0 if no vehicle passed.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ class TrafficIntervals:
         self._passages.append((begin, passage))
         self._observed.setdefault(begin, 0)
 
-    def due(self, before_ns: int, now_ns: int) -> list[TrafficSummary]:
+    def close_until(self, before_ns: int, now_ns: int) -> list[TrafficSummary]:
         """Close the intervals that end by `before_ns`, and return their summaries.
 
         Parameters
@@ -81,7 +81,7 @@ class TrafficIntervals:
         return out
 
     def _begin_of(self, stamp_ns: int) -> int:
-        """Start of the interval that contains a time."""
+        """Start [ns] of the interval that contains a time."""
         return stamp_ns // self._length * self._length
 
     def _observe(self, now_ns: int) -> None:

@@ -29,5 +29,5 @@ class DetectSettings:
         4e-9, 'Standard deviation of the background, due to drift while it is frozen. Its '
         'square is added to the noise variance, so the actual false alarm probability is lower if '
         'the background is exact: with the defaults and two sensors with 12 nT of noise per '
-        'sample, 3.5e-4 per frame of one sample (12.5 Hz) and 1.5e-7 per frame of eight samples (100 Hz). With 0, it '
-        'equals false_alarm_probability.', 'T', (0.0, 1e-3))
+        'sample, 3.5e-4 per frame of one sample (12.5 Hz) and 1.5e-7 per frame of eight samples '
+        '(100 Hz). With 0, it equals false_alarm_probability.', 'T', (0.0, 1e-3))

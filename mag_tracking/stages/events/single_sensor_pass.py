@@ -30,9 +30,10 @@ class ClosestPoint(NamedTuple):
     """Closest point of approach of a pass, estimated from one sensor."""
 
     time: float
-    """[s] Time of the largest field if the closest point is not observable; NaN without samples."""
+    """[s] Time of the closest point; of the largest field if the closest point is not observable.
+    NaN without samples."""
     time_std: float
-    """[s] Standard deviation; inf if the closest point is not observable."""
+    """[s] Standard deviation of `time`; inf if the closest point is not observable."""
     time_scale: float
     """[s] Range at the closest point divided by the speed; NaN if not observable."""
 

@@ -73,7 +73,7 @@ class NetworkSurvey:
     clock of each sensor, relative to the first reading of any sensor."""
 
     def warnings(self) -> list[str]:
-        """Warnings about sensors that contradict the Earth's field, orientations and clocks.
+        """Warnings about the fields, orientations and clocks of the sensors.
 
         Returns
         -------

@@ -171,7 +171,7 @@ class ClockComparison:
     def _offsets(self) -> tuple[FloatArray, FloatArray]:
         """Time by which the clock of each row is ahead of the clock of each column, (n, n) [s].
 
-        The second array contains its standard deviations (n, n) [s], infinite on the diagonal.
+        The second array contains the standard deviations (n, n) [s], infinite on the diagonal.
         """
         # The common offset of all clocks is not observable; the prior fixes it.
         prior = np.eye(len(self._vector)) / PRIOR_STD_S**2

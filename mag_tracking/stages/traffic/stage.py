@@ -159,7 +159,8 @@ class Traffic:
         self._last_ns = frame.stamp_ns
         self._direction.add(frame, self._complete_before(frame.stamp_ns))
         out += self._count_ended(frame.stamp_ns)
-        return [*out, *self._intervals.due(self._complete_before(frame.stamp_ns), frame.stamp_ns)]
+        return [*out, *self._intervals.close_until(
+            self._complete_before(frame.stamp_ns), frame.stamp_ns)]
 
     def idle(self) -> None:
         """Do nothing: no work is deferred."""
