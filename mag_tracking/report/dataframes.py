@@ -109,7 +109,7 @@ def detections_dataframe(detections: StructArray) -> 'pd.DataFrame':
 
 
 def _state_columns(rows: StructArray) -> dict[str, Any]:
-    """Columns of poses and of smoothed poses: time, track, state, standard deviations and moment."""
+    """Columns of poses and smoothed poses: time, track, state, standard deviations and moment."""
     std = np.sqrt(np.diagonal(rows['covariance'], axis1=1, axis2=2))
     columns: dict[str, Any] = {'stamp_ns': rows['stamp_ns'], 'track_id': rows['track_id']}
     for names, values in ((_POSITION, rows['position']), (_VELOCITY, rows['velocity']),
