@@ -169,15 +169,12 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     report_part(1)
     # The effect of the additional sensor is evaluated where the lanes are near the network.
     half_length = 0.5 * max(np.ptp(network.positions[:, :2], axis=0).max(), 8.0 * target.height)
-    near_lanes = [(lane.heading, lane.points[np.abs(lane.along) <= half_length][::4])
-                  for lane in planned]
+    near = [(lane.heading, lane.points[np.abs(lane.along) <= half_length][::4]) for lane in planned]
     coarse_x, coarse_y = _grid(area, max(11, n_grid // 2))
-    candidates = np.stack(np.meshgrid(coarse_x, coarse_y), axis=-1).reshape(-1, 2)
-    is_allowed = np.all([_lane_distances(lane, candidates) >= clearance for lane in planned],
-                        axis=0)
-    median_bound = np.full(len(candidates), np.nan)
-    without, with_sensor = _added_sensor_bounds(network, target, sampling, near_lanes,
-                                                candidates[is_allowed])
+    sites = np.stack(np.meshgrid(coarse_x, coarse_y), axis=-1).reshape(-1, 2)
+    is_allowed = np.all([_lane_distances(lane, sites) >= clearance for lane in planned], axis=0)
+    median_bound = np.full(len(sites), np.nan)
+    without, with_sensor = _added_sensor_bounds(network, target, sampling, near, sites[is_allowed])
     median_bound[is_allowed] = with_sensor
     report_part(1)
     best_index = int(np.nanargmin(median_bound)) if is_allowed.any() else 0

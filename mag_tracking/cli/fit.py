@@ -166,8 +166,7 @@ def _print_pass(fitted_pass: FittedPass) -> None:
             print('        ambiguous: the joint fit of the vehicles is poor')
         elif not fit.reason and fit.ambiguous:
             chi_square, path = min(fit.rivals, key=lambda rival: rival[0])
-            print('        ambiguous: another solution is '
-                  f'{np.exp(-0.5 * chi_square):.2f} times as likely: position '
+            print(f'        ambiguous: {np.exp(-0.5 * chi_square):.2f} times as likely at position '
                   f'({", ".join(f"{v:.2f}" for v in path[:3])}) m'
                   + (f' and length {abs(path[6]):.1f} m' if len(path) > 6 else ''))
     _print_delay(fitted_pass)
