@@ -50,8 +50,8 @@ def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: C
         stuck = [name for name in calibrate.unready() if calibrate.backgrounds()[name].stuck]
         if stuck:
             return f'the readings of {", ".join(stuck)} are constant (run mag-tracking doctor)'
-        unready = ', '.join(calibrate.unready())
-        return (f'no background was learnt for {unready}: no quiet interval lasted for '
+        unready_names = ', '.join(calibrate.unready())
+        return (f'no background was learnt for {unready_names}: no quiet interval lasted for '
                 f'{settings.calibrate.learn_s:g} s (calibrate.learn_s); set background and '
                 'noise_std in the network file')
     excursions = detect.largest_excursions()
@@ -64,9 +64,9 @@ def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: C
 def _likely_cause(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
                   detect: Detect) -> str:
     """Describe the probable cause of the missing detection."""
-    unready = calibrate.unready()
-    if unready:
-        return f'{", ".join(unready)} had no background and could not be used'
+    unready_sensors = calibrate.unready()
+    if unready_sensors:
+        return f'{", ".join(unready_sensors)} had no background and could not be used'
     for name, noise in zip(network.names, network.noise_std, strict=True):
         scatter = calibrate.backgrounds()[name].scatter_std
         is_valid = ~np.isnan(scatter)

@@ -40,10 +40,11 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     if stuck:
         yield Note(WARNING, f'{", ".join(stuck)}: the readings of an axis are constant '
                    '(run mag-tracking doctor)')
-    unready = [name for name, s in sensors.items() if not s['ready'] and not s['stuck']]
-    if unready:
-        yield Note(WARNING, f'no background was learnt for {", ".join(unready)}: the quiet '
-                   'intervals are too short; set background and noise_std in the network file')
+    unready_sensors = [name for name, s in sensors.items() if not s['ready'] and not s['stuck']]
+    if unready_sensors:
+        yield Note(WARNING, f'no background was learnt for {", ".join(unready_sensors)}: the '
+                   'quiet intervals are too short; set background and noise_std in the network '
+                   'file')
     for name, s in sensors.items():
         if s['quiet_stretch_s'] is not None:
             begin, end = s['quiet_stretch_s']

@@ -101,7 +101,7 @@ class _ReadingPrinter:
 
 
 def _sample_line(samples: Sequence[Sample], elapsed_s: float) -> str:
-    """Format rate, mean field and warnings of one sensor's samples from `elapsed_s` [s]."""
+    """Format rate, mean field and warnings of one sensor for the last `elapsed_s` [s]."""
     fields = np.array([field for _, field in samples if field is not None])
     if not len(fields):
         return f'{len(samples) / elapsed_s:7.1f} Hz of accelerations'

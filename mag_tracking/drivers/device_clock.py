@@ -190,8 +190,8 @@ class DeviceClock:
                                 f'max_delay_s, {settings.max_delay_s:g} s')
         if 0 < settings.wrap * settings.tick_s < 4.0 * settings.min_step_s:
             raise SettingsError(
-                f'wrap: the counter wraps every {settings.wrap * settings.tick_s:g} s, less than '
-                f'four times min_step_s, {settings.min_step_s:g} s')
+                f'wrap: the counter wraps every {settings.wrap * settings.tick_s:g} s; expected at '
+                f'least {4.0 * settings.min_step_s:g} s, four times min_step_s')
         self.counts: Counter[str] = Counter()
         self.restarts: Counter[str] = Counter()
         self.drift_ppm = self.spread_s = self.stamp_std = math.nan

@@ -33,7 +33,7 @@ class CountingLine:
     half_width: float
     """Half of the length of the line, m."""
 
-    def forward(self, position: FloatArray) -> float:
+    def forward_distance(self, position: FloatArray) -> float:
         """Signed distance of a position from the line, along the forward direction of the line.
 
         Parameters
@@ -47,7 +47,7 @@ class CountingLine:
         """
         return float((position[:2] - self.point) @ self.direction)
 
-    def lateral(self, position: FloatArray) -> float:
+    def lateral_offset(self, position: FloatArray) -> float:
         """Lateral offset of a position from the midpoint of the line.
 
         Parameters
@@ -146,7 +146,7 @@ class CrossingDetector:
 
     def _is_beyond(self, pose: Pose) -> bool:
         """Whether a pose is on or beyond the line."""
-        return self.line.forward(pose.position) >= 0.0
+        return self.line.forward_distance(pose.position) >= 0.0
 
     def crossing(self) -> Crossing | None:
         """Return the last crossing of the line.
@@ -163,15 +163,16 @@ class CrossingDetector:
             return None
         crossing = self._interpolate() if self._is_beyond(self._first_pose) != self._is_beyond(
             self._last_pose) else self._extrapolate(self._first_pose, self._last_pose)
-        if crossing is None or abs(self.line.lateral(crossing.position)) > self.line.half_width:
+        if crossing is None:
             return None
-        return crossing
+        lateral_offset = self.line.lateral_offset(crossing.position)
+        return None if abs(lateral_offset) > self.line.half_width else crossing
 
     def _interpolate(self) -> Crossing:
         """Interpolate the crossing between the poses before and after the line."""
         assert self._crossing_poses is not None
         before, after = self._crossing_poses
-        distances = [self.line.forward(p.position) for p in self._crossing_poses]
+        distances = [self.line.forward_distance(p.position) for p in self._crossing_poses]
         fraction = distances[0] / (distances[0] - distances[1])
         return Crossing(before.stamp_ns + round(fraction * (after.stamp_ns - before.stamp_ns)),
                         (1.0 - fraction) * before.position + fraction * after.position,
@@ -186,7 +187,7 @@ class CrossingDetector:
             speed = float(pose.velocity[:2] @ self.line.direction)
             if abs(speed) < MIN_SPEED:
                 continue
-            t = -self.line.forward(pose.position) / speed
+            t = -self.line.forward_distance(pose.position) / speed
             if 0.0 <= sign * t <= MAX_EXTRAPOLATION_S:
                 return Crossing(pose.stamp_ns + round(t * NS), pose.position + t * pose.velocity,
                                 speed > 0.0, pose, True)

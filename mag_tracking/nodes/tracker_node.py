@@ -127,7 +127,7 @@ class TrackerNode(StageNode):
                                                    lambda frame: frame.stamp_ns)
         else:
             self.subscription(NetworkFrame, NETWORK_FRAME, self._receive, STREAM_QOS, 'detection')
-        steady_timer(self, 0.25, self.end_without_frames)
+        steady_timer(self, 0.25, self.end_tracks_on_timeout)
         self.subscription(CalibrationState, CALIBRATION_STATE, self._receive_calibration,
                           LATCHED_QOS)
         self.report_state()
@@ -141,7 +141,7 @@ class TrackerNode(StageNode):
         """
         return {'track': self._stage, 'traffic': self._traffic.stage}
 
-    def end_without_frames(self) -> None:
+    def end_tracks_on_timeout(self) -> None:
         """End the tracks if frames no longer arrive.
 
         The time of arrival is used, because timestamps may be wrong. Tracks are not ended during a

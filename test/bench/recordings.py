@@ -1,10 +1,10 @@
-"""Poses without a flag and errors of poses, in recordings and simulated controls.
+"""Number of unambiguous poses and pose errors, in bundled recordings and simulated passes.
 
 All bundled recordings with one vehicle or magnet are replayed, and simulated passes are tracked
-live. The figures are the number of poses without a flag, the number of these within 2 m of the
-truth, and the errors of the first track. With `--against FOLDER`, the package of another checkout
-is measured for comparison. At most 5 % of the correct poses may be lost, and errors may grow by at
-most 3 %.
+live. The figures are the number of unambiguous poses, how many of them are within 2 m of the
+truth, and, for recordings, the errors of the first track. With `--against FOLDER`, the package of
+another checkout is measured for comparison. At most 5 % of the correct poses may be lost, and
+errors may grow by at most 3 %.
 """
 
 import argparse

@@ -13,7 +13,7 @@ def information(k, rank, rng, n=5):
 
 
 def numpy_pseudo_inverse(A):
-    """Pseudo-inverse by NumPy, of the matrix scaled to unit diagonal."""
+    """Pseudo-inverse by NumPy, computed for unit diagonal and scaled back."""
     scale = np.sqrt(np.diagonal(A))
     return np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-11, hermitian=True) / np.outer(
         scale, scale)

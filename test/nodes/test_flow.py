@@ -147,7 +147,7 @@ def test_a_subscriber_that_disappears_is_reported():
 
 
 class StandIn:
-    """Stand-in for a tracker node, with the attributes that `end_without_frames` uses."""
+    """Stand-in for a tracker node, with the attributes that `end_tracks_on_timeout` uses."""
 
     def __init__(self, clock, is_replayed=False):
         self._clock, self.is_replayed, self._is_silent = clock, is_replayed, False
@@ -165,7 +165,7 @@ class StandIn:
             self._clock[0] += 0.25
             if frames:
                 self.flows['detection'].add(0, 3600 * NS, self._clock[0])
-            TrackerNode.end_without_frames(self)
+            TrackerNode.end_tracks_on_timeout(self)
 
 
 def test_a_track_ends_when_frames_stop_not_when_they_are_old(clock):
@@ -184,7 +184,7 @@ def test_a_busy_node_does_not_end_its_track(clock):
     node.run_timer(1.0, frames=True)
     # The timer runs before the queued frames are processed.
     clock[0] += 100.0
-    TrackerNode.end_without_frames(node)
+    TrackerNode.end_tracks_on_timeout(node)
     node.run_timer(5.0, frames=True)
     assert not node.published
 

@@ -20,7 +20,7 @@ WRONG_M, WRONG_SD = 2.0, 3.0
 
 
 def random_course(rng, turns):
-    """Random (`Path`, duration [s], approximate time of the CPA [s]) past sensors at the origin."""
+    """Random course past sensors at the origin: (`Path`, duration [s], time near the CPA [s])."""
     # A turn has a lateral acceleration of 2 to 5 m/s², like a tight turn at a junction.
     lane, radius = rng.uniform(0.8, 1.6), rng.uniform(4.5, 8.0)
     speed = np.sqrt(radius * rng.uniform(2.0, 5.0)) if turns else rng.uniform(7.0, 20.0)

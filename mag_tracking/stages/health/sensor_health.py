@@ -277,7 +277,7 @@ class SensorHealth:
 
     @property
     def dead_axes(self) -> str:
-        """Axes that did not change within the window although another axis changed, such as 'xz'.
+        """Axes, such as 'xz', that did not change within the window although another axis changed.
 
         For a sensor with coarse resolution, these are axes that have never changed although another
         axis changed by more than `MIN_MOVED_STEPS` quantisation steps.

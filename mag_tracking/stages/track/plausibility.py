@@ -36,7 +36,7 @@ class Plausibility:
     def __init__(self) -> None:
         # For each origin of hypotheses: smallest distance to a sensor so far, and whether the
         # hypothesis was off the road at this point.
-        self._nearest: FloatArray = np.zeros(0)
+        self._min_distance: FloatArray = np.zeros(0)
         self._was_off_road: BoolArray = np.zeros(0, dtype=bool)
 
     def evaluate(self, observation: Observation, bank: FilterBank, best: int,
@@ -78,15 +78,16 @@ class Plausibility:
     def _update_road_check(self, bank: FilterBank, settings: VehicleSettings,
                            positions: FloatArray) -> None:
         """Update the smallest distance of each hypothesis to a sensor, and its off-road flag."""
-        n_added = max(int(bank.origin.max()) + 1 - len(self._nearest), 0)
-        self._nearest = np.append(self._nearest, np.full(n_added, np.inf))
+        n_added = max(int(bank.origin.max()) + 1 - len(self._min_distance), 0)
+        self._min_distance = np.append(self._min_distance, np.full(n_added, np.inf))
         self._was_off_road = np.append(self._was_off_road, np.zeros(n_added, dtype=bool))
         distance = np.hypot(*(positions[:, :2, None] - bank.x[:, :2].T).transpose(1, 0, 2))
-        nearest = distance.min(axis=0)
-        is_nearest = (nearest <= self._nearest[bank.origin]) & _is_moving(bank.x)
+        min_distance = distance.min(axis=0)
+        is_nearest = (min_distance <= self._min_distance[bank.origin]) & _is_moving(bank.x)
         is_off_road = _is_off_road(bank.x[is_nearest], settings, positions, LANE_STDS)
         origins = bank.origin[is_nearest]
-        self._nearest[origins], self._was_off_road[origins] = nearest[is_nearest], is_off_road
+        self._min_distance[origins] = min_distance[is_nearest]
+        self._was_off_road[origins] = is_off_road
 
 
 def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray,

@@ -204,9 +204,9 @@ class Relinearisation:
             return Counter()
         leading = self._leading_rows(bank)
         rows = _rows(anchor, bank)[leading]
-        relinearised = anchor.rows(rows)
+        leading_anchor = anchor.rows(rows)
         paths = np.stack([path[rows] for path in self._paths], axis=1)
-        path_result = self._run_along(bank_filter, relinearised, paths, PASSES)
+        path_result = self._run_along(bank_filter, leading_anchor, paths, PASSES)
         is_finite = np.isfinite(path_result.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
         for path, improved in zip(self._paths, np.swapaxes(paths, 0, 1), strict=True):
             path[rows[is_finite]] = improved[is_finite]
@@ -218,11 +218,11 @@ class Relinearisation:
         converged = path_result.max_shift <= CONVERGED
         is_accepted = is_finite & converged & (
             (gain >= 0.0) | ~bank_filter.are_long(bank.kind[leading]))
-        _replace_states(bank, leading[is_accepted], relinearised.x[is_accepted],
-                        relinearised.P[is_accepted])
+        _replace_states(bank, leading[is_accepted], leading_anchor.x[is_accepted],
+                        leading_anchor.P[is_accepted])
         is_rejected = is_finite & ~is_accepted
-        _widen_covariances(bank, leading[is_rejected], relinearised.x[is_rejected],
-                           relinearised.P[is_rejected], bank_filter.linear_range)
+        _widen_covariances(bank, leading[is_rejected], leading_anchor.x[is_rejected],
+                           leading_anchor.P[is_rejected], bank_filter.linear_range)
         return Counter({ATTEMPTED: len(is_accepted), FAILED: int(np.count_nonzero(~is_accepted))})
 
     @property

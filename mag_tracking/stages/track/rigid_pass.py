@@ -299,5 +299,5 @@ def _state_at_zero(path: FloatArray) -> FloatArray:
 
 def _is_of_vehicle(state: FloatArray, positions: FloatArray) -> bool:
     """Whether a state (6,) is within `MAX_DISTANCE` of a sensor (n, 3) and below `MAX_SPEED`."""
-    nearest = np.linalg.norm(state[:3] - positions, axis=1).min()
-    return bool(nearest < MAX_DISTANCE and np.linalg.norm(state[3:]) < MAX_SPEED)
+    min_distance = np.linalg.norm(state[:3] - positions, axis=1).min()
+    return bool(min_distance < MAX_DISTANCE and np.linalg.norm(state[3:]) < MAX_SPEED)

@@ -1,4 +1,4 @@
-"""Samples of a window, prepared for searches for vehicles in addition to known vehicles."""
+"""Searches of a window for vehicles without a track: samples, path prior and start grid."""
 
 from functools import cached_property
 

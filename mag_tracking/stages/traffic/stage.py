@@ -267,7 +267,7 @@ class Traffic:
         passage = VehiclePassage(
             crossing.stamp_ns, self.counts['passages'], line.name, pending.track_id,
             crossing.forward, pending.direction_error, crossing.position,
-            line.lateral(crossing.position), pose.velocity, speed, speed_std,
+            line.lateral_offset(crossing.position), pose.velocity, speed, speed_std,
             heading_of(*velocity_estimate)[1], pose.length, pose.length_std, pose.moment,
             pose.moment_covariance, posterior.name, posterior.probabilities,
             headway if headway >= 0.0 else float('nan'), bool(doubts), doubts)
@@ -278,7 +278,7 @@ class Traffic:
 def _are_same_vehicle(one: _PendingCrossing, other: _PendingCrossing) -> bool:
     """Whether two crossings belong to one vehicle whose track was lost near the line."""
     separation_s = abs(other.crossing.stamp_ns - one.crossing.stamp_ns) / NS
-    separation_m = abs(one.line.lateral(one.crossing.position) - one.line.lateral(
+    separation_m = abs(one.line.lateral_offset(one.crossing.position) - one.line.lateral_offset(
         other.crossing.position))
     return ((one.crossing.is_extrapolated or other.crossing.is_extrapolated)
             and separation_s < REACQUIRED_S and separation_m < REACQUIRED_M

@@ -91,8 +91,8 @@ def test_the_path_of_each_hypothesis_is_stored():
 @pytest.mark.parametrize('half_width, edge', [
     (1.0, 6.47), (4.5, 6.47), (5.0, 6.47), (6.0, 8.0), (8.0, 12.0), (9.0, 13.0)])
 def test_a_vehicle_may_pass_outside_a_wide_network(half_width, edge):
-    """The margin outside the sensors is the distance by which they exceed the outermost lane, but
-    at most the distance of this lane from the centre."""
+    """A vehicle may pass as far outside the outermost sensor as this sensor lies outside the
+    outermost lane. The margin is limited to the distance of this lane from the centre."""
     network = network_of([[0.0, -half_width, 0.0], [0.0, 0.0, 0.0], [0.0, half_width, 0.0]])
     observation = observation_of(network)
     x = np.zeros(observation.n_target + (observation.n_own + 3) * 3)
