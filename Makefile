@@ -1,4 +1,4 @@
-# `make` lists what there is.
+# `make` lists the targets.
 
 PYTHON ?= python3
 # The oldest supported Python: newer ones can install what it can.

@@ -27,6 +27,7 @@ REPLACED_SETTINGS = {'track.vehicle.soft_iron': 'track.vehicle.induced_share',
 """Former settings, and the current settings that replace them in another unit."""
 
 RENAMED_SETTINGS = {
+    'stated_std_deg': 'nominal_std_deg',
     'jump_ahead_s': 'max_forward_jump_s', 'jump_back_s': 'max_backward_jump_s',
     'resume_s': 'max_resume_gap_s', 'ahead_s': 'max_clock_jump_s', 'most_pending': 'max_buffered',
     'most_sensors': 'max_sensors', 'most_together': 'max_joint_targets',

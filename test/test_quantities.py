@@ -47,12 +47,12 @@ SUMMARY = {
 
 
 @pytest.mark.parametrize('n, beginnings', [
-    (1, ('1 track lost its target: ', '1 sensor has an ', '1 track was too long to smooth ')),
+    (1, ('1 track lost its target: ', '1 sensor has an ', '1 track was not smoothed: ')),
     (2, ('2 tracks lost their target: ', '2 sensors have an ',
-         '2 tracks were too long to smooth '))])
+         '2 tracks were not smoothed: '))])
 def test_nouns_in_notes_agree_with_the_number(n, beginnings):
     counts = {f'tracks ended: {LOST}': n,
               'sensors with an orientation uncertainty above 15 degrees': n,
-              'tracks too long to smooth': n}
+              'tracks without smoothing': n}
     texts = [note.text for note in notes_of({**SUMMARY, 'counts': {'track': counts}})]
     assert all(text.startswith(b) for text, b in zip(texts, beginnings, strict=True)), texts

@@ -45,7 +45,8 @@ def direction_likelihood_ratio(t: FloatArray, field: FloatArray, noise_std: floa
 
     References
     ----------
-    [PHD15]_ Paper B eq. (24)-(35), with -||r||² in place of +||r||² in eq. (27), a sign error.
+    [PHD15]_ Paper B eq. (24)-(35), with -||r||² in eq. (27), where the paper prints
+    +||r||².
     """
     first, second = (_minimum_residual(t, field, h) for h in (left_to_right, right_to_left))
     return (second - first) / (2.0 * noise_std**2)

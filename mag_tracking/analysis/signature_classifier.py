@@ -11,6 +11,7 @@ from mag_tracking.analysis.signature import Signature, features
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import LabelsError, MissingDependencyError
 from mag_tracking.inference.log_normal_classes import UNKNOWN
+from mag_tracking.quantities import quantity
 
 VERSION = 1
 """Version of the model file format."""
@@ -245,8 +246,8 @@ def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]'
     """
     counts = Counter(label for label, _ in set(zip(labels, groups, strict=True)))
     if '' in counts:
-        raise LabelsError(f'labels are missing for {counts[""]} targets; label or '
-                          'remove their signatures')
+        raise LabelsError(f'labels are missing for {quantity(counts[""], "target")}; label or '
+                          'remove the signatures')
     if UNKNOWN in counts:
         raise LabelsError(f'the label {UNKNOWN!r} is reserved for unclassified signatures; rename '
                           'the class')

@@ -77,7 +77,7 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
     levels = np.array([level_of(calibrate, name, sensors[name]) for name in network.names])
     # Rounded levels stay equal during small changes, so that no new comparison is needed.
     levels = LEVEL_STEP * np.round(levels / LEVEL_STEP)
-    std = np.array([np.full(3, np.deg2rad(survey.stated_std_deg)) if s is None else s
+    std = np.array([np.full(3, np.deg2rad(survey.nominal_std_deg)) if s is None else s
                     for s in network.orientation_std])
     earth_field = network.earth_field
     if earth_field is None:

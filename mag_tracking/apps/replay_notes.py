@@ -99,11 +99,11 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(WARNING, quantity(n_uncertain, 'sensor has', 'sensors have')
                    + ' an orientation uncertainty of more than 15 degrees in the network file: '
                    'calibrate the network')
-    n_too_long = counts.get('tracks too long to smooth', 0)
-    if n_too_long:
-        yield Note(WARNING, quantity(n_too_long, 'track was', 'tracks were')
-                   + ' too long to smooth (track.max_smoothing_s, or too many frames for the '
-                   'number of sensors)')
+    n_unsmoothed = counts.get('tracks without smoothing', 0)
+    if n_unsmoothed:
+        yield Note(WARNING, quantity(n_unsmoothed, 'track was', 'tracks were')
+                   + ' not smoothed: too long (track.max_smoothing_s), too many frames for the '
+                   'number of sensors, or a change of the sensors')
 
 
 def _truth_notes(summary: Mapping[str, Any]) -> Iterator[Note]:

@@ -45,7 +45,7 @@ def block_of(sensors: StructArray) -> Block:
 
 
 class Blocks(NamedTuple):
-    """k blocks as arrays: time (k,) [s], mean (k, 3) [T], scatter (k, 3, 3) [T²], n (k, 3)."""
+    """Sequence of k blocks; the fields are those of `Block`, stacked."""
 
     time: FloatArray
     mean: FloatArray

@@ -114,7 +114,7 @@ class Orientation:
 
 
 def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatArray,
-                        bias_std: float, stated: FloatArray | None = None) -> Orientation:
+                        bias_std: float, nominal: FloatArray | None = None) -> Orientation:
     """Orientation of a sensor from the up direction and the Earth's field.
 
     Parameters
@@ -126,7 +126,7 @@ def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatAr
     bias_std : float, T
         Standard deviation of the bias of the sensor, including nearby iron, per axis. A bias is
         not distinguishable from a heading error: 0.6 uT rotates a compass by two degrees.
-    stated : (3, 3) array, optional
+    nominal : (3, 3) array, optional
         Nominal orientation, sensor to world. It selects one of several headings that fit equally
         well (two for a sensor with one axis). Default: the best heading is selected.
 
@@ -156,8 +156,8 @@ def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatAr
 
     yaws = [_refined_yaw(fit, start) for start in np.deg2rad(np.arange(0.0, 360.0, 30.0))]
     costs = np.array([np.sum(fit(yaw)[0]**2) for yaw in yaws]) / bias_std**2
-    preference = costs if stated is None else np.array(
-        [abs(yaw_between(rotation_about_z(yaw) @ R_level, stated)) for yaw in yaws])
+    preference = costs if nominal is None else np.array(
+        [abs(yaw_between(rotation_about_z(yaw) @ R_level, nominal)) for yaw in yaws])
     yaw = yaws[int(np.argmin(np.where(costs <= costs.min() + MAX_EQUAL_COST, preference, np.inf)))]
     slope = fit(yaw)[1]
     horizontal, vertical = np.hypot(*B0[:2]), abs(B0[2])
@@ -189,16 +189,16 @@ def _refined_yaw(fit: _Fit, yaw: float) -> float:
     return yaw
 
 
-def levelled(up: UpDirection | None, stated: FloatArray,
-             stated_std: FloatArray) -> Orientation | None:
+def levelled(up: UpDirection | None, nominal: FloatArray,
+             nominal_std: FloatArray) -> Orientation | None:
     """Correct the tilt of a nominal orientation by means of a measured up direction.
 
     Parameters
     ----------
     up : UpDirection or None
-    stated : (3, 3) array
+    nominal : (3, 3) array
         Nominal orientation, sensor to world.
-    stated_std : (3,) array, rad
+    nominal_std : (3,) array, rad
         Standard deviations about the world axes.
 
     Returns
@@ -209,8 +209,8 @@ def levelled(up: UpDirection | None, stated: FloatArray,
     if up is None:
         return None
     correction = rotation_from_quaternion(
-        quaternion_between(stated @ up.direction, [0.0, 0.0, 1.0]))
-    return Orientation(correction @ stated, np.array([up.std, up.std, stated_std[2]]),
+        quaternion_between(nominal @ up.direction, [0.0, 0.0, 1.0]))
+    return Orientation(correction @ nominal, np.array([up.std, up.std, nominal_std[2]]),
                        np.full(3, np.nan), float('nan'))
 
 
@@ -238,7 +238,7 @@ def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
     return float(np.sqrt((weight * bias_std**2 + square) / (weight + n_observed)))
 
 
-def with_stated_heading(orientation: Orientation, stated: FloatArray, stated_std: float,
+def with_nominal_heading(orientation: Orientation, nominal: FloatArray, nominal_std: float,
                         limit: float = 3.0) -> Orientation | None:
     """Fuse the compass heading with a nominal heading.
 
@@ -246,9 +246,9 @@ def with_stated_heading(orientation: Orientation, stated: FloatArray, stated_std
     ----------
     orientation : Orientation
         From accelerometer and compass.
-    stated : (3, 3) array
+    nominal : (3, 3) array
         Nominal orientation, sensor to world.
-    stated_std : float, rad
+    nominal_std : float, rad
         Standard deviation of the nominal heading.
     limit : float
         Maximum difference in standard deviations; beyond it, the nominal heading is rejected.
@@ -258,12 +258,12 @@ def with_stated_heading(orientation: Orientation, stated: FloatArray, stated_std
     Orientation or None
         None if the difference exceeds the limit.
     """
-    difference = yaw_between(orientation.R_ws, stated)
+    difference = yaw_between(orientation.R_ws, nominal)
     compass_std = orientation.std[2]
-    if abs(difference) > limit * np.hypot(compass_std, stated_std):
+    if abs(difference) > limit * np.hypot(compass_std, nominal_std):
         return None
-    stated_weight = compass_std**2 / (compass_std**2 + stated_std**2)
+    nominal_weight = compass_std**2 / (compass_std**2 + nominal_std**2)
     std = np.append(orientation.std[:2],
-                    compass_std * stated_std / np.hypot(compass_std, stated_std))
-    return Orientation(rotation_about_z(stated_weight * difference) @ orientation.R_ws, std,
+                    compass_std * nominal_std / np.hypot(compass_std, nominal_std))
+    return Orientation(rotation_about_z(nominal_weight * difference) @ orientation.R_ws, std,
                        orientation.bias, orientation.rival)

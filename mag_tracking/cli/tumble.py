@@ -48,7 +48,7 @@ def add(commands: Commands) -> None:
     add_recorded_network(p)
     p.add_argument('--sensor', nargs='+', default=[], metavar='NAME',
                    help='sensors that were rotated (default: all)')
-    p.add_argument('--field-size', type=float, metavar='TESLA',
+    p.add_argument('--field-magnitude', type=float, metavar='TESLA',
                    help='magnitude of the ambient field (if it is not given, the mean gain is not '
                    'calibrated)')
     p.add_argument('--out', required=True, type=Path, metavar='FILE',
@@ -59,15 +59,16 @@ def add(commands: Commands) -> None:
 
 def _tumble(args: argparse.Namespace) -> int:
     """Run `mag-tracking tumble`."""
-    if args.field_size is not None and not 1e-6 <= args.field_size <= 1e-3:
-        raise SettingsError(f'--field-size: expected 1e-6 to 1e-3 T, got {args.field_size:g}')
+    magnitude = args.field_magnitude
+    if magnitude is not None and not 1e-6 <= magnitude <= 1e-3:
+        raise SettingsError(f'--field-magnitude: expected 1e-6 to 1e-3 T, got {magnitude:g}')
     network, recording = recorded_network(args), Recording(args.recording)
     check_outputs(args)
     with recorded_signals(signal.SIGINT) as signals:
         with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
                   disable=None) as bar:
             calibrated, fits, readings, _ = tumble(
-                recording, network, args.sensor, utc_timestamp(), args.field_size,
+                recording, network, args.sensor, utc_timestamp(), args.field_magnitude,
                 bar.update, lambda: bool(signals))
     for name, fit in fits.items():
         _print_fit(name, fit)

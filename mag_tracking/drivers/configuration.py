@@ -18,6 +18,7 @@ are listed under its name. The settings of a custom class are listed under `tran
 """
 
 import dataclasses
+import difflib
 import importlib
 import re
 from collections.abc import Collection, Iterable, Mapping
@@ -48,9 +49,9 @@ KINDS = {
 }
 """Class of each kind of transport, framing and device."""
 
-METHODS = {'transport': ('open', 'read', 'close'), 'framing': ('parse',),
-           'device': ('open', 'read', 'close')}
-"""Methods required of a transport, framing and device."""
+REQUIRED_MEMBERS = {'transport': ('is_message_oriented', 'open', 'read', 'close'),
+                    'framing': ('parse',), 'device': ('open', 'read', 'close')}
+"""Members that the class of a transport, framing or device must have besides `SETTINGS`."""
 _ENTRY_KEYS = frozenset(('clock', 'sensor', 'sensors', *KINDS))
 """Keys of a device other than the driver settings and the groups of its kinds."""
 _NAME_PATTERN = re.compile(r'[A-Za-z][A-Za-z0-9_/]*')
@@ -118,7 +119,7 @@ def load_class(role: str, name: object) -> Any:
     except Exception as error:
         raise SettingsError(
             f'{role}: {name} cannot be loaded: {type(error).__name__}: {error}') from error
-    missing_members = [member for member in ('SETTINGS', *METHODS[role])
+    missing_members = [member for member in ('SETTINGS', *REQUIRED_MEMBERS[role])
                        if not hasattr(cls, member)]
     if missing_members:
         raise SettingsError(f'{role}: {name} is incomplete: it lacks {", ".join(missing_members)}')
@@ -153,9 +154,8 @@ def driver_of(name: object, entry: object) -> Driver:
         kinds = [kind for role in KINDS if isinstance(kind := options.get(role), str)]
         _check_places(options, {*_ENTRY_KEYS, *_names(DriverSettings())}, kinds)
         device = _device(options, kinds)
-        clock = replace(_class_defaults(ClockSettings(), device, 'CLOCK'),
-                        _pop_group(options, 'clock', ClockSettings(), kinds))
-        _check_unused_groups(options, kinds)
+        clock = _with_group(_class_defaults(ClockSettings(), device, 'CLOCK'), options, 'clock',
+                            kinds)
         sensors = _pop_sensors(options)
         for unit in ('unit', 'acceleration_unit'):
             if isinstance(options.get(unit), (int, float)) and not isinstance(options[unit], bool):
@@ -177,45 +177,58 @@ def _device(options: dict[str, Any], kinds: Collection[str]) -> Device:
         if 'transport' in options or 'framing' in options:
             raise SettingsError('device cannot be combined with transport or framing; remove '
                                 'either device, or transport and framing')
-        device: Device = _create_part('device', options, kinds)
-        return device
-    for role in ('transport', 'framing'):
+        roles: tuple[str, ...] = ('device',)
+    else:
+        roles = ('transport', 'framing')
+    for role in roles:
         if role not in options:
             raise SettingsError(f'{role} is missing; set it to one of {", ".join(KINDS[role])}, or '
                                 f'set device to one of {", ".join(KINDS["device"])} instead')
-    return FramedDevice(_create_part('transport', options, kinds),
-                        _create_part('framing', options, kinds))
+    classes = {role: load_class(role, options[role]) for role in roles}
+    groups = {role: options[role] if options[role] in KINDS[role] else f'{role}_settings'
+              for role in roles}
+    _check_groups(options, groups, kinds)
+    parts = [_create_part(classes[role], options, groups[role], kinds) for role in roles]
+    for role in roles:
+        del options[role]
+    return parts[0] if roles == ('device',) else FramedDevice(*parts)
 
 
-def _create_part(role: str, options: dict[str, Any], kinds: Collection[str]) -> Any:
-    """Create the transport, framing or device of an entry; remove its settings from `options`."""
-    kind = options.pop(role)
-    cls = load_class(role, kind)
-    group = kind if kind in KINDS[role] else f'{role}_settings'
-    defaults = cls.SETTINGS()
-    return cls(replace(defaults, _pop_group(options, group, defaults, kinds)))
+def _create_part(cls: Any, options: dict[str, Any], group: str, kinds: Collection[str]) -> Any:
+    """Create a transport, framing or device; remove the `group` of its settings from `options`."""
+    settings = _with_group(cls.SETTINGS(), options, group, kinds)
+    try:
+        return cls(settings)
+    except SettingsError as error:
+        raise SettingsError(f'{group}: {error}') from error
 
 
-def _pop_group(options: dict[str, Any], name: str, settings: Any,
-               kinds: Collection[str]) -> Mapping[str, Any]:
-    """Remove and return the group `name` of `options`; raises SettingsError if it is invalid."""
+def _with_group(settings: Any, options: dict[str, Any], name: str, kinds: Collection[str]) -> Any:
+    """Return `settings` with the changes of a group, which is removed from `options`."""
     group = options.pop(name, {})
     if not isinstance(group, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {short_repr(group)}')
     try:
         _check_places(group, _names(settings), kinds)
+        return replace(settings, group)
     except SettingsError as error:
         raise SettingsError(f'{name}: {error}') from error
-    return group
 
 
-def _check_unused_groups(options: Mapping[str, Any], kinds: Collection[str]) -> None:
-    """Raise SettingsError if `options` still contains the group of a kind that is not used."""
-    unused_groups = [name for name, value in options.items()
-                     if isinstance(value, Mapping) and name in settings_by_kind()]
-    if unused_groups:
-        raise SettingsError(f'{unused_groups[0]} is not used by the device, which uses '
-                            f'{" and ".join(kinds)}; remove {unused_groups[0]}, or change the kind')
+def _check_groups(options: Mapping[str, Any], groups: Mapping[str, str], kinds: Collection[str]
+                  ) -> None:
+    """Raise SettingsError if `options` has a group that is unknown, or that no kind uses."""
+    permitted = {*_ENTRY_KEYS, *_names(DriverSettings()), *groups.values()}
+    for name, value in options.items():
+        role = next((role for role in KINDS if name in (*KINDS[role], f'{role}_settings')), '')
+        if name not in permitted and role:
+            raise SettingsError(f'{name} is not used by the device, which uses '
+                                f'{" and ".join(kinds)}; remove {name}, or change {role}')
+        if name not in permitted and isinstance(value, Mapping):
+            similar = difflib.get_close_matches(str(name).lower(), [*groups.values(), 'clock'], n=1)
+            raise SettingsError(f'unknown group {name}' + (
+                f'; did you mean {similar[0]}?' if similar else
+                f'; the groups are {", ".join(groups.values())} and clock'))
 
 
 def _pop_sensors(options: dict[str, Any]) -> dict[str, str]:

@@ -28,7 +28,7 @@ class TargetBayesFactor:
         self._disfavoured_since_ns: int | None = None
         self._recent_sum = SlidingSum(WINDOW_S)
 
-    def add(self, log_ratio: float, stamp_ns: int, ratio: float) -> None:
+    def add(self, log_ratio: float, stamp_ns: int, min_bayes_factor: float) -> None:
         """Update the Bayes factor with a frame.
 
         Parameters
@@ -37,7 +37,7 @@ class TargetBayesFactor:
             Log-density of the frame with a target, minus the log-density with the alternative.
         stamp_ns : int, ns
             Timestamp of the frame.
-        ratio : float
+        min_bayes_factor : float
             Required Bayes factor. The alternative is favoured at or below the reciprocal.
 
         Notes
@@ -49,21 +49,21 @@ class TargetBayesFactor:
             self._is_known = False
             return
         self.log_ratio += log_ratio
-        self._was_favoured = self._was_favoured or self.is_favoured(ratio)
-        if self.log_ratio > -np.log(ratio):
+        self._was_favoured = self._was_favoured or self.is_favoured(min_bayes_factor)
+        if self.log_ratio > -np.log(min_bayes_factor):
             self._disfavoured_since_ns = None
         elif self._disfavoured_since_ns is None:
             self._disfavoured_since_ns = stamp_ns
         self._recent_sum.add(stamp_ns, log_ratio)
 
-    def would_be_favoured(self, log_ratio: float, ratio: float) -> bool:
+    def would_be_favoured(self, log_ratio: float, min_bayes_factor: float) -> bool:
         """Whether a target would be favoured after an assumed increase of its log-likelihood.
 
         Parameters
         ----------
         log_ratio : float, nats
             Assumed increase of the log-likelihood of the whole track.
-        ratio : float
+        min_bayes_factor : float
             Required Bayes factor.
 
         Returns
@@ -72,35 +72,35 @@ class TargetBayesFactor:
             False if the Bayes factor is unknown, or at or below `MIN_LOG_RATIO`.
         """
         return self._is_known and self.log_ratio > MIN_LOG_RATIO \
-            and self.log_ratio + log_ratio >= float(np.log(ratio))
+            and self.log_ratio + log_ratio >= float(np.log(min_bayes_factor))
 
-    def is_favoured(self, ratio: float) -> bool:
+    def is_favoured(self, min_bayes_factor: float) -> bool:
         """Whether the Bayes factor of the whole track favours a target.
 
         Parameters
         ----------
-        ratio : float
+        min_bayes_factor : float
             Required Bayes factor.
 
         Returns
         -------
         bool
         """
-        return self._is_known and self.log_ratio >= float(np.log(ratio))
+        return self._is_known and self.log_ratio >= float(np.log(min_bayes_factor))
 
-    def is_recently_disfavoured(self, ratio: float) -> bool:
+    def is_recently_disfavoured(self, min_bayes_factor: float) -> bool:
         """Whether the Bayes factor of the latest `WINDOW_S` favours the alternative.
 
         Parameters
         ----------
-        ratio : float
+        min_bayes_factor : float
             Required Bayes factor.
 
         Returns
         -------
         bool
         """
-        return bool(self._recent_sum.total < -np.log(ratio))
+        return bool(self._recent_sum.total < -np.log(min_bayes_factor))
 
     def disfavoured_s(self, stamp_ns: int) -> float:
         """Time for which the Bayes factor of the whole track has favoured the alternative.

@@ -73,7 +73,7 @@ def detection_probability(snr: float | FloatArray, threshold: float | FloatArray
 
 
 def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray:
-    """Probability that a pass contains fewer than `run` consecutive detections.
+    """Probability that a pass contains no `run` consecutive detections.
 
     Parameters
     ----------

@@ -43,7 +43,12 @@ class FieldRotation(NamedTuple):
 
     @property
     def error_probability(self) -> float:
-        """Probability that the sign of the correlation is wrong; [PHD15]_ B eq. (17), (18)."""
+        """Probability that the sign of the correlation is wrong.
+
+        References
+        ----------
+        [PHD15]_ Paper B eq. (17), (18).
+        """
         return float(ndtr(-abs(self.correlation) / np.sqrt(self.variance)))
 
     @property

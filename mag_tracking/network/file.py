@@ -20,6 +20,7 @@ from mag_tracking.network.topics import TOPIC_NAME_PATTERN
 from mag_tracking.yaml_file import is_utf8_encodable, read_yaml, short_repr
 
 _SENSOR_NAME_PATTERN = re.compile(r'[A-Za-z0-9_.-]+')
+_KEYS_OF_0_1_0 = {'stated': 'nominal', 'stated_std_deg': 'nominal_std_deg'}
 _FRAME_PATTERN = re.compile(r'[A-Za-z0-9_./-]+')
 _TOP_KEYS = {'frame', 'earth_field', 'site', 'sensors'}
 _SITE_KEYS = ('latitude', 'longitude', 'height', 'date', 'x_azimuth_deg')
@@ -151,22 +152,25 @@ def _parse_calibration(label: str, value: Any) -> CalibrationRecord | None:
     if value is None:
         return None
     label = f'{label}: calibrated'
-    _check_keys(label, value, {'date', 'by', 'clock_offset_std', 'stated', 'stated_std_deg'})
+    if isinstance(value, dict):
+        # Version 0.1.0 wrote `stated` instead of `nominal`.
+        value = {_KEYS_OF_0_1_0.get(key, key): v for key, v in value.items()}
+    _check_keys(label, value, {'date', 'by', 'clock_offset_std', 'nominal', 'nominal_std_deg'})
     for key in ('date', 'by'):
         if not isinstance(value.get(key), str) or not is_utf8_encodable(value[key]):
             raise NetworkError(f"{label}: {key} must be a string ('...'), "
                                f'got {short_repr(value.get(key))}')
-    std, orientation = value.get('clock_offset_std'), value.get('stated')
+    std, orientation = value.get('clock_offset_std'), value.get('nominal')
     std = float('nan') if std is None else float(_parse_vector(label, [std], (1,))[0])
     if std < 0.0:
         raise NetworkError(f'{label}: clock_offset_std: {std} s is negative')
     if orientation is not None:
-        orientation = _parse_vector(f'{label}: stated', orientation, (4,))
-        _parse_rotation(f'{label}: stated', orientation)
+        orientation = _parse_vector(f'{label}: nominal', orientation, (4,))
+        _parse_rotation(f'{label}: nominal', orientation)
         orientation = tuple(orientation.tolist())
-    stated_std = _parse_orientation_std(label, value.get('stated_std_deg'))
+    nominal_std = _parse_orientation_std(label, value.get('nominal_std_deg'))
     return CalibrationRecord(value['date'], value['by'], std, orientation,
-                             None if stated_std is None else tuple(stated_std.tolist()))
+                             None if nominal_std is None else tuple(nominal_std.tolist()))
 
 
 def _parse_rotation(label: str, q: FloatArray) -> FloatArray:
@@ -299,10 +303,10 @@ def _sensor_lines(network: SensorNetwork, i: int) -> list[str]:
                   f'      by: {json.dumps(record.by)}']
         if not np.isnan(record.clock_offset_std):
             lines.append(f'      clock_offset_std: {_yaml_float(record.clock_offset_std)}')
-        if record.stated is not None:
-            lines.append(f'      stated: {_yaml_floats(record.stated)}')
-        if record.stated_std is not None:
-            lines.append(f'      stated_std_deg: {_yaml_floats(np.rad2deg(record.stated_std))}')
+        if record.nominal is not None:
+            lines.append(f'      nominal: {_yaml_floats(record.nominal)}')
+        if record.nominal_std is not None:
+            lines.append(f'      nominal_std_deg: {_yaml_floats(np.rad2deg(record.nominal_std))}')
     return lines
 
 

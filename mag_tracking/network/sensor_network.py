@@ -27,12 +27,12 @@ class CalibrationRecord:
     """Source of the orientation, such as the name of the method."""
     clock_offset_std: float
     """Standard deviation of the clock offset, s. NaN if the offset was not measured."""
-    stated: tuple[float, ...] | None = None
+    nominal: tuple[float, ...] | None = None
     """Orientation entered by hand, (4,) quaternion xyzw, sensor to world frame. None if unknown.
     Each survey uses this orientation as its prior, because the result of a previous survey is not
     independent evidence."""
-    stated_std: tuple[float, ...] | None = None
-    """Standard deviation of `stated` about the world axes, (3,) rad. None if unknown."""
+    nominal_std: tuple[float, ...] | None = None
+    """Standard deviation of `nominal` about the world axes, (3,) rad. None if unknown."""
 
 
 @dataclass(frozen=True)
@@ -166,9 +166,9 @@ class SensorNetwork:
         """
         R_ws, std = self.R_ws.copy(), list(self.orientation_std)
         for j, record in enumerate(self.calibrated):
-            if record is not None and record.stated is not None:
-                R_ws[j] = rotation_from_quaternion(record.stated)
-                std[j] = None if record.stated_std is None else np.array(record.stated_std)
+            if record is not None and record.nominal is not None:
+                R_ws[j] = rotation_from_quaternion(record.nominal)
+                std[j] = None if record.nominal_std is None else np.array(record.nominal_std)
         return replace(self, R_ws=R_ws, orientation_std=tuple(std))
 
     def calibration_record(self, j: int, date: str, by: str,
@@ -193,7 +193,7 @@ class SensorNetwork:
             contains this orientation, the current orientation is recorded.
         """
         previous, std = self.calibrated[j], self.orientation_std[j]
-        if previous is not None and previous.stated is not None:
+        if previous is not None and previous.nominal is not None:
             return replace(previous, date=date, by=by, clock_offset_std=clock_offset_std)
         return CalibrationRecord(date, by, clock_offset_std,
                                  tuple(quaternion_from_rotation(self.R_ws[j]).tolist()),

@@ -1,7 +1,7 @@
 """Monitoring of the inputs and outputs of a node: throughput, latency, missing peer nodes."""
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
@@ -187,5 +187,10 @@ class SubscriberMonitor:
         return DiagnosticStatus(
             level=DiagnosticStatus.ERROR if is_gone else DiagnosticStatus.OK,
             name=f'{node}: to {self.role}', hardware_id='magnetometer network',
-            message=f'{", ".join(missing_nodes)} has disappeared: check that it is running'
-            if is_gone else message)
+            message=_disappeared(missing_nodes) if is_gone else message)
+
+
+def _disappeared(nodes: Sequence[str]) -> str:
+    """Message about nodes that no longer run."""
+    has, it_is = ('has', 'it is') if len(nodes) == 1 else ('have', 'they are')
+    return f'{", ".join(nodes)} {has} disappeared: check that {it_is} running'

@@ -106,4 +106,4 @@ def decaying_turn(x: FloatArray, dt: float, mean_factor: float, final_factor: fl
     F : (n, n_x, n_x) array
         Derivative of `moved` with respect to `x`.
     """
-    return core.turned(np.ascontiguousarray(x, dtype=float), dt, mean_factor, final_factor)
+    return core.propagate_turn(np.ascontiguousarray(x, dtype=float), dt, mean_factor, final_factor)

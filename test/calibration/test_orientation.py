@@ -16,7 +16,7 @@ from mag_tracking.calibration.orientation import (
     levelled,
     pooled_bias_std,
     up_direction,
-    with_stated_heading,
+    with_nominal_heading,
 )
 from mag_tracking.geometry import quaternion_from_rotation, rotation_about_z, yaw_between
 
@@ -261,13 +261,13 @@ def heading_of(yaw_deg, std_deg, R=POSTURES['upright']):
                        np.deg2rad([0.3, 0.4, std_deg]), np.array([1e-7, 0.0, 0.0]), np.nan)
 
 
-@pytest.mark.parametrize('compass, stated, expected, std', [
+@pytest.mark.parametrize('compass, nominal, expected, std', [
     (2.0, 2.0, 3.0, np.sqrt(2.0)), (1.0, 3.0, 0.6, np.sqrt(0.9)), (3.0, 1.0, 5.4, np.sqrt(0.9)),
     (2.0, 180.0, 6.0 * 4.0 / 32404.0, 2.0)])
-def test_headings_are_weighted_by_their_variances(compass, stated, expected, std):
+def test_headings_are_weighted_by_their_variances(compass, nominal, expected, std):
     R = POSTURES['askew']
-    fused = with_stated_heading(heading_of(0.0, compass, R), heading_of(6.0, 0.0, R).R_ws,
-                               np.deg2rad(stated))
+    fused = with_nominal_heading(heading_of(0.0, compass, R), heading_of(6.0, 0.0, R).R_ws,
+                               np.deg2rad(nominal))
     assert np.degrees(yaw_between(R, fused.R_ws)) == pytest.approx(expected, rel=1e-3)
     np.testing.assert_allclose(np.degrees(fused.std), [0.3, 0.4, std], rtol=1e-3)
     # The tilt is measured by the accelerometer.
@@ -275,9 +275,9 @@ def test_headings_are_weighted_by_their_variances(compass, stated, expected, std
     assert fused.bias[0] == 1e-7
 
 
-def test_an_inconsistent_stated_heading_is_not_fused():
+def test_an_inconsistent_nominal_heading_is_not_fused():
     def fused(difference):
-        return with_stated_heading(heading_of(0.0, 3.0), heading_of(difference, 0.0).R_ws,
+        return with_nominal_heading(heading_of(0.0, 3.0), heading_of(difference, 0.0).R_ws,
                                    np.deg2rad(4.0))
     for sign in (1.0, -1.0):
         assert fused(14.9 * sign) is not None

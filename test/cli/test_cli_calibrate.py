@@ -129,8 +129,8 @@ def test_a_flipped_axis_is_named(tmp_path, capsys):
     (['tumble', str(RECORDING), '--sensor', 'mag_9'], 'unknown sensor mag_9'),
     (['calibrate', str(RECORDING), '--figure', 'found.xyz'],
      '--figure: expected a file name ending in .png, .pdf, .svg; got found.xyz'),
-    (['tumble', str(RECORDING), '--field-size', '50'],
-     '--field-size: expected 1e-6 to 1e-3 T, got 50'),
+    (['tumble', str(RECORDING), '--field-magnitude', '50'],
+     '--field-magnitude: expected 1e-6 to 1e-3 T, got 50'),
 ])
 def test_invalid_arguments_are_named(tmp_path, capsys, arguments, message):
     command, *rest = arguments

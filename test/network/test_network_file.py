@@ -66,8 +66,17 @@ sensors:
   c:
     position: [0.0, 9.5, 0.0]
     imu_topic: /imu_of_c
-    calibrated: {date: '2026-05-02', by: as stated}
+    calibrated: {date: '2026-05-02', by: hand}
 """
+
+
+def test_the_nominal_orientation_of_version_0_1_0_is_read(tmp_path):
+    keys = 'by: hand, %s: [0.0, 0.0, 0.0, 1.0], %s_std_deg: 3'
+    old, new = (parse(tmp_path, CALIBRATED_FILE.replace('by: hand', keys % (key, key)))
+                for key in ('stated', 'nominal'))
+    assert old.calibrated[2] == new.calibrated[2]
+    assert new.calibrated[2].nominal == (0.0, 0.0, 0.0, 1.0)
+    np.testing.assert_allclose(new.calibrated[2].nominal_std, np.deg2rad(3.0))
 
 
 def test_the_calibration_of_a_sensor_is_read(tmp_path):
@@ -82,7 +91,7 @@ def test_the_calibration_of_a_sensor_is_read(tmp_path):
                                   [[1.01, 0.02, 0.0], [0.02, 0.98, 0.0], [0.0, -0.01, 1.0]])
     assert n.offset[1] is n.correction[1] is n.calibrated[1] is None
     assert n.calibrated[0] == CalibrationRecord('2026-05-01', 'accelerometer and compass', 2e-5)
-    assert n.calibrated[2].by == 'as stated' and np.isnan(n.calibrated[2].clock_offset_std)
+    assert n.calibrated[2].by == 'hand' and np.isnan(n.calibrated[2].clock_offset_std)
     # The IMU topic is derived from a topic that follows REP-145, and is otherwise unknown.
     assert n.imu_topics == ('a/imu/data_raw', None, '/imu_of_c')
 
@@ -124,7 +133,7 @@ def test_a_written_network_is_read_back(tmp_path, text):
 
 @pytest.mark.parametrize('deg', [1e-5, 0.06, 30.0, 45.0, 180.0])
 def test_any_orientation_std_of_a_survey_is_read_back(tmp_path, deg):
-    """A value of 180 degrees marks an unknown heading; see survey.stated_std_deg."""
+    """A value of 180 degrees marks an unknown heading; see survey.nominal_std_deg."""
     n = parse(tmp_path, VALID_FILE)
     n = replace(n, orientation_std=(np.deg2rad([0.3, 0.3, deg]), None))
     write_network(tmp_path / 'copy.yaml', n)
@@ -160,10 +169,10 @@ def test_a_string_with_special_characters_is_read_back(tmp_path):
     ('imu_topic: /imu_of_c', 'imu_topic: /imu of c', 'is not a valid ROS topic'),
     ('topic: /b/field', 'topic: null', 'topic: None is not a valid ROS topic'),
     ("date: '2026-05-02'", 'date: 2026-05-02', 'date must be a string'),
-    (', by: as stated', '', 'by must be a string'),
-    ('by: as stated', 'by: "\\udc80"', r"calibrated: by must be a string .* got '\\udc80'"),
-    ('by: as stated', 'by: as stated, who: me', "unknown key 'who'"),
-    ("calibrated: {date: '2026-05-02', by: as stated}", 'calibrated: yes', 'expected a mapping'),
+    (', by: hand', '', 'by must be a string'),
+    ('by: hand', 'by: "\\udc80"', r"calibrated: by must be a string .* got '\\udc80'"),
+    ('by: hand', 'by: hand, who: me', "unknown key 'who'"),
+    ("calibrated: {date: '2026-05-02', by: hand}", 'calibrated: yes', 'expected a mapping'),
     ('site: {latitude: 58.4, ', 'site: {', 'site: latitude is missing'),
     ('latitude: 58.4', 'latitude: 98.4', 'site: latitude: 98.4 is outside'),
     ('latitude: 58.4', 'latitude: north', "'north' is a string"),

@@ -141,6 +141,8 @@ def test_a_subscriber_that_disappears_is_reported():
     assert disappeared.level == DiagnosticStatus.ERROR and disappeared.name == 'me: to tracker'
     assert disappeared.message == '/other has disappeared: check that it is running'
     assert status('/other').level == DiagnosticStatus.OK
+    assert status('/other', '/second').message == 'running'
+    assert status().message == '/other, /second have disappeared: check that they are running'
     # A tracker with another name may replace the first; other subscribers may disappear.
     assert status('/second').level == DiagnosticStatus.OK
     assert status('/second', '/rviz').message == status('/second').message == 'running'

@@ -32,7 +32,7 @@ CALLS = {
     'rotated_fields': {
         'h': normal(HYPOTHESES, SENSORS, 3), 'H': normal(HYPOTHESES, SENSORS, 3, STATES),
         'angles': normal(HYPOTHESES, SENSORS, 3)},
-    'turned': {'x': normal(HYPOTHESES, STATES), 'dt': 0.1, 'mean': 1.0, 'fading': 1.0},
+    'propagate_turn': {'x': normal(HYPOTHESES, STATES), 'dt': 0.1, 'mean': 1.0, 'fading': 1.0},
     'row_dipoles': {'x': normal(HYPOTHESES, STATES), 'n_dipoles': DIPOLES,
                     'field_strength': normal(3)},
     'set_moment_noise': {'x': normal(HYPOTHESES, STATES), 'walk': normal(9, 9),
@@ -44,7 +44,7 @@ CALLS = {
     'anderson_residual': {'t': normal(20), 'y': normal(20, 2), 'time': 0.1, 'scale': 1.0},
 }
 INDEPENDENT_AXES = {
-    ('rotated_fields', 'H', 3), ('turned', 'x', 0), ('turned', 'x', 1),
+    ('rotated_fields', 'H', 3), ('propagate_turn', 'x', 0), ('propagate_turn', 'x', 1),
     ('row_dipoles', 'x', 0), ('row_dipoles', 'x', 1), ('row_bases', 'theta', 0),
     ('row_bases', 'offsets', 0), ('steady_bases', 'theta', 0), ('steady_bases', 'theta', 1),
     ('steady_bases', 'offsets', 0), ('steady_derivatives', 'theta', 1),
@@ -115,7 +115,7 @@ def test_a_walk_of_incomplete_moments_is_rejected(k):
 
 def test_a_state_without_turn_rate_is_rejected():
     with pytest.raises(ValueError, match='turn rate'):
-        core.turned(normal(2, 6), 0.1, 1.0, 1.0)
+        core.propagate_turn(normal(2, 6), 0.1, 1.0, 1.0)
 
 
 def test_dipole_constant_equals_mu0_over_4_pi():

@@ -10,5 +10,5 @@ class EventsSettings:
     """Settings of single-sensor pass events."""
 
     max_sensors: int = param(
-        4, 'Maximum number of sensors of a network. In a larger network, detection_node does not '
-        'publish the passes at each sensor on ~/events. 0 disables ~/events.', '', (0, 1000))
+        4, 'Maximum number of sensors of a network for which detection_node publishes the passes '
+        'at each sensor on ~/events. 0 disables ~/events.', '', (0, 1000))

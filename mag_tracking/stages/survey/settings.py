@@ -17,7 +17,7 @@ class SurveySettings:
         0.05, 'Assumed bias of an accelerometer, per axis. 0.05 m/s^2 tilts the estimated '
         'vertical by 0.3 degrees.',
         'm/s^2', (0.0, 5.0))
-    stated_std_deg: float = param(
+    nominal_std_deg: float = param(
         5.0, 'Standard deviation, about each axis, of the orientations in the network file, for '
         'sensors without orientation_std_deg.', 'deg', (0.06, 180.0))
     max_clock_offset_s: float = param(

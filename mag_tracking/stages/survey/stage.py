@@ -22,7 +22,7 @@ from mag_tracking.calibration.orientation import (
     levelled,
     pooled_bias_std,
     up_direction,
-    with_stated_heading,
+    with_nominal_heading,
 )
 from mag_tracking.geometry import yaw_between
 from mag_tracking.network import SensorNetwork
@@ -169,21 +169,21 @@ class Survey:
         """
         network, names = self._network, self._network.names
         field = np.array([fields.get(name, np.full(3, np.nan)) for name in names])
-        stated_std = np.array([np.full(3, np.deg2rad(self._settings.stated_std_deg))
+        nominal_std = np.array([np.full(3, np.deg2rad(self._settings.nominal_std_deg))
                                if s is None else np.maximum(s, MIN_STATED_STD)
                                for s in network.orientation_std])
         warnings: dict[str, list[str]] = {name: [] for name in names}
         up_directions = [self._estimate_up(name, warnings[name]) for name in names]
         orientations = [levelled(up, R, std) for up, R, std in
-                        zip(up_directions, network.R_ws, stated_std, strict=True)]
+                        zip(up_directions, network.R_ws, nominal_std, strict=True)]
         for name, before, surveyed, std in zip(
-                names, network.R_ws, orientations, stated_std, strict=True):
+                names, network.R_ws, orientations, nominal_std, strict=True):
             if surveyed is not None:
                 warnings[name] += _tilt_warning(before, surveyed.R_ws, std, surveyed.std)
-        inconsistent = self._disagreements(field, orientations, stated_std, warnings)
+        inconsistent = self._disagreements(field, orientations, nominal_std, warnings)
         bias_std, oriented = self._compass(
             {j: u for j, u in enumerate(up_directions) if u is not None and names[j] not in
-             {d.sensor for d in inconsistent}}, field, stated_std, warnings)
+             {d.sensor for d in inconsistent}}, field, nominal_std, warnings)
         shocks = self._shocks()
         reference, lags = self._lags(shocks)
         sensors = []
@@ -208,7 +208,7 @@ class Survey:
             return None
 
     def _disagreements(self, field: FloatArray, orientations: Sequence[Orientation | None],
-                       stated_std: FloatArray, warnings: Mapping[str, list[str]]
+                       nominal_std: FloatArray, warnings: Mapping[str, list[str]]
                        ) -> list[FieldInconsistency]:
         """Find the sensors whose field contradicts the Earth's field.
 
@@ -218,7 +218,7 @@ class Survey:
         R = np.array([R if o is None else o.R_ws
                       for o, R in zip(orientations, network.R_ws, strict=True)])
         std = np.array([s if o is None else o.std
-                        for o, s in zip(orientations, stated_std, strict=True)])
+                        for o, s in zip(orientations, nominal_std, strict=True)])
         try:
             earth = consensus(field, R) if network.earth_field is None else network.earth_field
         except ValueError as error:
@@ -226,7 +226,7 @@ class Survey:
             return []
         return disagreements(network.names, field, R, std, earth, self._settings.compass_bias_std)
 
-    def _compass(self, ups: Mapping[int, UpDirection], field: FloatArray, stated_std: FloatArray,
+    def _compass(self, ups: Mapping[int, UpDirection], field: FloatArray, nominal_std: FloatArray,
                  warnings: Mapping[str, list[str]]
                  ) -> tuple[float, dict[int, tuple[Orientation, str]]]:
         """Estimate the orientations of the sensors with a compass.
@@ -254,7 +254,7 @@ class Survey:
             warnings[network.names[j]].append(failures[j])
         out = {}
         for j, orientation in estimates.items():
-            fused = with_stated_heading(orientation, network.R_ws[j], stated_std[j][2])
+            fused = with_nominal_heading(orientation, network.R_ws[j], nominal_std[j][2])
             name = network.names[j]
             if fused is None:
                 difference = np.degrees(yaw_between(network.R_ws[j], orientation.R_ws))

@@ -22,7 +22,7 @@ closest point to any sensor, and at later times, when it may have turned off. On
 on that lane exceeds the first limit."""
 
 MIN_SPEED = 1.0
-"""[m/s] Minimum speed of a vehicle that has a heading."""
+"""[m/s] Minimum speed of a vehicle at which its heading is defined."""
 
 MAX_RELATIVE_MOVE = 0.75
 """Maximum motion of a target within a frame, relative to its distance to the second nearest sensor.

@@ -92,7 +92,7 @@ class TrackSettings:
         'sensors, and two vehicles that are tracked as one. If a straight path explains the pass '
         'but leads to another position, the covariance covers this position, too.', live=True)
     lookback_s: float = param(
-        1.0, 'Duration of the stored frames before the detection with which a track begins. Fields '
+        1.0, 'A track begins with the stored frames of this duration before the detection. Fields '
         'that are too weak for a detection still contain information about the origin of the '
         'target.', 's', (0.0, 60.0))
     end_std: float = param(

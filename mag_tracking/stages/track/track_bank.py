@@ -242,7 +242,7 @@ class TrackBank:
         states, n_excluded = self._whole_track.smoothed(self.bank, best)
         if counts:
             self._counts['frames left out of smoothing'] += n_excluded
-            self._counts['tracks too long to smooth'] += self._whole_track.is_abandoned
+            self._counts['tracks without smoothing'] += self._whole_track.is_abandoned
         return states
 
     def without_target(self, i: int) -> None:

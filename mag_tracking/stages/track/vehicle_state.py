@@ -18,7 +18,7 @@ from mag_tracking.stages.track.initiation_vehicle import (
 )
 
 MIN_MOMENT = 1e-6
-"""[A m^2] Minimum magnitude of a moment that has a direction."""
+"""[A m^2] Minimum magnitude of a moment at which its direction is defined."""
 
 
 @dataclass(frozen=True)

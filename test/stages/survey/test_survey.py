@@ -91,7 +91,7 @@ def test_orientations_and_clock_offsets_are_found():
     assert len(t) == len(s) == 400 and abs(t[0]) < 0.05 and s.max() > 4.0
 
 
-def test_the_stated_heading_is_weighted_by_its_standard_deviation():
+def test_the_nominal_heading_is_weighted_by_its_standard_deviation():
     for deg, low, high in ((0.06, 0.0, 0.05), (60.0, 3.9, 4.1)):
         network = nominal(orientation_std=(np.deg2rad([5.0, 5.0, deg]),) * 3)
         rotations = (*ROTATIONS[:2], Rotation.from_euler('z', 4.0, True))
@@ -103,16 +103,16 @@ def test_the_stated_heading_is_weighted_by_its_standard_deviation():
 
 @pytest.mark.parametrize('yaw', [20.0, 45.0, 90.0, -150.0])
 def test_an_unknown_heading_is_found(yaw):
-    """If stated_std_deg is 180 degrees, the heading in the network file has no weight."""
+    """If nominal_std_deg is 180 degrees, the heading in the network file has no weight."""
     rotations = (ROTATIONS[0], Rotation.from_euler('z', yaw, True), ROTATIONS[2])
-    result, _ = surveyed(rotations=rotations, settings=SurveySettings(stated_std_deg=180.0))
+    result, _ = surveyed(rotations=rotations, settings=SurveySettings(nominal_std_deg=180.0))
     R = result.network.R_ws[1]
     assert np.degrees(np.arctan2(R[1, 0], R[0, 0])) == pytest.approx(yaw, abs=0.5)
 
 
 def test_a_survey_without_a_heading_can_be_written(tmp_path):
     """The network has neither an Earth field nor a known heading."""
-    result, _ = surveyed(nominal(earth=None), settings=SurveySettings(stated_std_deg=180.0))
+    result, _ = surveyed(nominal(earth=None), settings=SurveySettings(nominal_std_deg=180.0))
     write_network(tmp_path / 'network.yaml', result.network)
     assert read_network(tmp_path / 'network.yaml').names == result.network.names
 
@@ -205,7 +205,7 @@ def test_a_tilted_sensor_is_reported_and_levelled():
     assert result.sensors[1].by == 'accelerometer, compass and nominal heading'
 
 
-def test_a_compass_heading_far_from_the_stated_heading_is_reported():
+def test_a_compass_heading_far_from_the_nominal_heading_is_reported():
     rotations = (ROTATIONS[0], Rotation.from_euler('z', 25.0, True), ROTATIONS[2])
     result, _ = surveyed(rotations=rotations)
     assert warnings(result) == {'mag_2': (
@@ -241,13 +241,13 @@ def test_a_vertical_field_gives_one_warning_per_sensor():
         assert len(s.warnings) == 1 and 'heading is not observable' in s.warnings[0]
 
 
-@pytest.mark.parametrize('stated_yaw', [0.0, 165.0, 180.0, 190.0])
+@pytest.mark.parametrize('nominal_yaw', [0.0, 165.0, 180.0, 190.0])
 @pytest.mark.parametrize('offset_deg', [-3.0, 2.0])
-def test_the_stated_heading_decides_between_two_headings_that_fit(stated_yaw, offset_deg):
+def test_the_nominal_heading_decides_between_two_headings_that_fit(nominal_yaw, offset_deg):
     """mag_2 has one horizontal axis, nearly perpendicular to the field, so two headings fit."""
-    yaw = stated_yaw + offset_deg
+    yaw = nominal_yaw + offset_deg
     network = nominal()
-    network.R_ws[1] = rotation_about_z(np.deg2rad(stated_yaw))
+    network.R_ws[1] = rotation_about_z(np.deg2rad(nominal_yaw))
     rotations = (ROTATIONS[0], Rotation.from_euler('z', yaw, True), ROTATIONS[2])
     fields = {name: R.inv().apply(EARTH) for name, R in zip(network.names, rotations, strict=True)}
     fields['mag_2'] = fields['mag_2'] * [1.0, np.nan, np.nan]
@@ -366,7 +366,7 @@ def test_the_result_of_an_earlier_survey_is_not_counted_as_evidence():
         np.testing.assert_allclose(getattr(second.network, name), getattr(first.network, name),
                                    atol=1e-12)
     np.testing.assert_allclose(second.network.orientation_std, first.network.orientation_std)
-    np.testing.assert_allclose(second.network.calibrated[0].stated_std, np.deg2rad([4, 4, 6]))
+    np.testing.assert_allclose(second.network.calibrated[0].nominal_std, np.deg2rad([4, 4, 6]))
 
 
 def test_large_biases_increase_the_heading_uncertainty():

@@ -114,7 +114,7 @@ def test_a_target_is_tracked_along_forty_sensors():
         nearest = present[np.argsort(np.abs(network.positions[present, 0] - t.position[0]))]
         assert used[nearest[:2]].any()
     assert not [r for r in records if isinstance(r, SmoothedPose) and r.complete]
-    assert pipeline.counts()['track']['tracks too long to smooth'] == 1
+    assert pipeline.counts()['track']['tracks without smoothing'] == 1
 
 
 @pytest.mark.parametrize('limit', [8, 16])

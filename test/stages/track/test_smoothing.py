@@ -298,7 +298,7 @@ def test_smoothing_can_be_disabled_and_tracks_that_are_too_long_are_counted():
     records = [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush()
     assert [r for r in records if isinstance(r, Track)]
     assert not [r for r in records if isinstance(r, SmoothedPose)]
-    assert pipeline.track.counts['tracks too long to smooth'] == 1
+    assert pipeline.track.counts['tracks without smoothing'] == 1
 
 
 def test_smoothing_bridges_missing_frames():
