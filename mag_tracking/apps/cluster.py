@@ -24,8 +24,9 @@ CONNECT_TIMEOUT_S = 15.0
 """Maximum time to wait for a response of a scheduler, and then for its first worker [s]."""
 THREAD_START_TIMEOUT_S = 60.0
 """Maximum time for a thread to start [s]."""
-NO_WORKERS_TIMEOUT_S = 60.0
-"""Maximum time without workers after all of them were lost [s]."""
+NO_WORKERS_TIMEOUT_S = 180.0
+"""Maximum time without workers after all of them were lost [s]. A busy computer may need more than
+a minute to start a worker again."""
 POLL_S = 0.3
 """Maximum time to wait for a task before returning to the caller [s]."""
 
