@@ -74,9 +74,9 @@ def test_the_nominal_orientation_of_version_0_1_0_is_read(tmp_path):
     keys = 'by: hand, %s: [0.0, 0.0, 0.0, 1.0], %s_std_deg: 3'
     old, new = (parse(tmp_path, CALIBRATED_FILE.replace('by: hand', keys % (key, key)))
                 for key in ('stated', 'nominal'))
-    assert old.calibrated[2] == new.calibrated[2]
-    assert new.calibrated[2].nominal == (0.0, 0.0, 0.0, 1.0)
-    np.testing.assert_allclose(new.calibrated[2].nominal_std, np.deg2rad(3.0))
+    for record in (old.calibrated[2], new.calibrated[2]):
+        assert record.nominal == (0.0, 0.0, 0.0, 1.0)
+        np.testing.assert_allclose(record.nominal_std, np.deg2rad(3.0))
 
 
 def test_the_calibration_of_a_sensor_is_read(tmp_path):
