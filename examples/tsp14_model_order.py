@@ -76,7 +76,7 @@ def main(argv=None):
     found = {rate: fit_passes(rate) for rate in RATES}
     for rate, fitted in found.items():
         figure, path = order_figure(fitted), args.out / f'figure_7_{rate.replace(" ", "_")}.png'
-        figure.axes[0].set_title(f'TSP14 Figure 7 with simulated passes at {rate} '
+        figure.suptitle(f'TSP14 Figure 7 with simulated passes at {rate} '
                                  '(filled: selected order)')
         figure.savefig(path, dpi=110)
         print(path)

@@ -14,4 +14,4 @@ from mag_tracking.report.fit_figures import order_figure
 rate = next(iter(tsp14.RATES))
 found = tsp14.fit_passes(rate)
 figure = order_figure(found)
-title = figure.axes[0].set_title(f'simulated passes at {rate} (filled: selected order)')
+title = figure.suptitle(f'Simulated passes at {rate} (filled: chosen order)', fontsize=11)

@@ -177,8 +177,8 @@ def sensor_figure(plan: _Plan) -> Figure:
     gain = 1.0 - plan.std_with_added_sensor / plan.std_without_added_sensor
     possible = np.isfinite(gain).any()
     figure, axes, f, unit = _draw_map(
-        plan, f'Improvement by one additional sensor; median bound near the sensors without it: '
-        f'{length_text(plan.std_without_added_sensor)}')
+        plan, 'Improvement by one additional sensor\n(median bound near the sensors without it: '
+        f'{length_text(plan.std_without_added_sensor)})')
     ny, nx = gain.shape
     x, y = np.linspace(plan.x[0], plan.x[-1], nx), np.linspace(plan.y[0], plan.y[-1], ny)
     mesh = axes.pcolormesh(f * x, f * y, 100.0 * gain, cmap='cividis', shading='nearest',
