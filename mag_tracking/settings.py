@@ -272,16 +272,16 @@ def _suggestion(name: str, names: Iterable[str]) -> str:
         leaves = [k for k in names if k.rpartition('.')[2] == leaf]
         if leaves:
             return f'; did you mean {" or ".join(leaves)}?'
-    closest = _closest(name, [*names, *dict.fromkeys(k.partition('.')[0] for k in names)])
+    closest = closest_name(name, [*names, *dict.fromkeys(k.partition('.')[0] for k in names)])
     return f'; did you mean {closest}?' if closest else ''
 
 
 def _group_suggestion(group: str, leaf: str, names: Iterable[str]) -> str:
     """Suggestion for the setting `leaf` of an unknown group; empty if there are no groups."""
     groups = list(dict.fromkeys(k[:i] for k in names for i, c in enumerate(k) if c == '.'))
-    closest_group = _closest(group, groups)
+    closest_group = closest_name(group, groups)
     if closest_group:
-        closest = _closest(leaf, [k.removeprefix(f'{closest_group}.') for k in names
+        closest = closest_name(leaf, [k.removeprefix(f'{closest_group}.') for k in names
                                   if k.startswith(f'{closest_group}.')])
         return (f'; there is no group {group}; did you mean {closest_group}'
                 f'{"." + closest if closest else ""}?')
@@ -290,8 +290,19 @@ def _group_suggestion(group: str, leaf: str, names: Iterable[str]) -> str:
             if top_groups else '')
 
 
-def _closest(name: str, candidates: Iterable[str]) -> str:
-    """Candidate that is most similar to `name`; an empty string if none is similar."""
+def closest_name(name: str, candidates: Iterable[str]) -> str:
+    """Candidate that is most similar to a name.
+
+    Parameters
+    ----------
+    name : str
+    candidates : iterable of str
+
+    Returns
+    -------
+    str
+        Empty if no candidate is similar.
+    """
     return next(iter(difflib.get_close_matches(name, list(candidates), n=1)), '')
 
 

@@ -298,7 +298,7 @@ def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
 
 
 def _draw(fitted_pass: FittedPass, out: Path) -> None:
-    """Draw the chosen fit of a pass; if there is none, draw its fit with the most dipoles."""
+    """Draw the chosen fit of a pass or, without a chosen fit, the fit with the most dipoles."""
     fit = fitted_pass.chosen or next((f for f in reversed(fitted_pass.fits) if len(f.x)), None)
     if fit is None:
         return

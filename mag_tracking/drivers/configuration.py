@@ -18,7 +18,6 @@ are listed under its name. The settings of a custom class are listed under `tran
 """
 
 import dataclasses
-import difflib
 import importlib
 import re
 from collections.abc import Collection, Iterable, Mapping
@@ -32,7 +31,7 @@ from mag_tracking.drivers.reading import Device
 from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.sensor_network import SensorNetwork
-from mag_tracking.settings import replace
+from mag_tracking.settings import closest_name, replace
 from mag_tracking.yaml_file import is_utf8_encodable, read_yaml, short_repr
 
 _PACKAGE = 'mag_tracking.drivers'
@@ -219,15 +218,15 @@ def _check_groups(options: Mapping[str, Any], groups: Mapping[str, str], kinds: 
                   ) -> None:
     """Raise SettingsError if `options` has a group that is unknown, or that no kind uses."""
     permitted = {*_ENTRY_KEYS, *_names(DriverSettings()), *groups.values()}
-    for name, value in options.items():
+    for name in [name for name in options if name not in permitted]:
         role = next((role for role in KINDS if name in (*KINDS[role], f'{role}_settings')), '')
-        if name not in permitted and role:
+        if role:
             raise SettingsError(f'{name} is not used by the device, which uses '
                                 f'{" and ".join(kinds)}; remove {name}, or change {role}')
-        if name not in permitted and isinstance(value, Mapping):
-            similar = difflib.get_close_matches(str(name).lower(), [*groups.values(), 'clock'], n=1)
+        if isinstance(options[name], Mapping):
+            similar = closest_name(str(name).lower(), [*groups.values(), 'clock'])
             raise SettingsError(f'unknown group {name}' + (
-                f'; did you mean {similar[0]}?' if similar else
+                f'; did you mean {similar}?' if similar else
                 f'; the groups are {", ".join(groups.values())} and clock'))
 
 

@@ -154,7 +154,7 @@ class BinaryFraming:
         return Parsed(tuple(readings), consumed, rejected)
 
     def _partial_sync(self, data: bytes, at: int) -> int:
-        """Length of the partial sync at the end of `data[at:]`; 0 if there is none."""
+        """Length of the partial sync at the end of `data[at:]`; 0 without a partial sync."""
         for n in range(min(len(self._sync) - 1, len(data) - at), 0, -1):
             if data.endswith(self._sync[:n]):
                 return n

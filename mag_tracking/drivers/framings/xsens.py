@@ -236,7 +236,7 @@ class XsensFraming:
 
     @staticmethod
     def _next_start(window: bytes, index: int, end: int, complete: bool) -> int:
-        """Index of the next message start from `index` on; -1 if there is none before `end`.
+        """Index of the next message start from `index` on; -1 if no message starts before `end`.
 
         Both bytes of the start must be before `end` if `complete` is set, otherwise only the first.
         """

@@ -138,7 +138,8 @@ def test_a_clock_ahead_of_all_others_is_rejected_when_the_others_jump():
 
 
 def test_a_clock_that_is_ahead_in_its_first_sample_is_rejected_by_majority():
-    """Of two clocks, either may be correct, so all samples pass; otherwise, the majority wins."""
+    """All samples of two clocks pass, because either clock may be correct. The majority of more
+    clocks is considered correct."""
     two = ClockStepFilter(2, LIMIT, 10)
     assert run(two, [(0, 0), (1, 5000)]) == ([(0, 0), (1, 5000)], [])
     three = ClockStepFilter(3, LIMIT, 10)
