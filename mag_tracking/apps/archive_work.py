@@ -163,19 +163,27 @@ def _atomic_folder(final: Path) -> Iterator[Path]:
         yield temporary
         if not final.exists():
             with _output_errors(final):
-                temporary.rename(final)
+                _rename(temporary, final)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextmanager
 def _output_errors(path: Path) -> Iterator[None]:
-    """Convert an OSError to an OutputError that names `path`, unless `path` already exists."""
+    """Convert an OSError to an OutputError that names `path`."""
     try:
         yield
     except OSError as error:
-        if not path.exists():
-            raise OutputError(f'cannot write {path}: {error.strerror}') from error
+        raise OutputError(f'cannot write {path}: {error.strerror}') from error
+
+
+def _rename(temporary: Path, final: Path) -> None:
+    """Rename a folder, unless another worker has created `final`."""
+    try:
+        temporary.rename(final)
+    except OSError:
+        if not final.exists():
+            raise
 
 
 class _Segmenter:

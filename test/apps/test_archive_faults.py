@@ -1,9 +1,11 @@
 """Archives: faults are reported, and lost tasks are repeated."""
 
 import contextlib
+import errno
 import gc
 import json
 import os
+import pickle
 import shutil
 import subprocess
 import threading
@@ -11,10 +13,11 @@ import threading
 import psutil
 import pytest
 
-from mag_tracking.apps import cluster
+from mag_tracking.apps import archive_work, cluster
 from mag_tracking.apps.archive import archive, recordings_of
 from mag_tracking.cli import main
 from mag_tracking.errors import ClusterError, OutputError, RecordingError
+from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.archive_folder import ArchiveFolder, recording_key, recording_state
 from mag_tracking.recording.archive_tables import TABLES
@@ -275,3 +278,16 @@ def test_an_empty_recording_has_null_values(tmp_path):
     archive([tmp_path], NETWORK_FILE, settings_for('vehicle', QUICK), tmp_path / 'out')
     (row,) = rows(tmp_path / 'out', 'recordings')
     assert row[2] is None and row[3] == ''
+
+
+def test_a_full_disk_is_reported_even_if_the_file_has_been_created(tmp_path, monkeypatch):
+    job = archive_work.Job(vehicle_path('straight_car_right'), tmp_path / 'work', tmp_path / 'out',
+                           read_network(NETWORK_FILE), settings_for('vehicle', QUICK))
+    job.work_folder.mkdir()
+    archive_work.cut(job)
+
+    def dump(content, stream):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(pickle, 'dump', dump)
+    with pytest.raises(OutputError, match='No space left on device'):
+        archive_work.track_segment(job, 0)
