@@ -11,10 +11,11 @@
 
 The kind of a transport, framing or device is a name in `KINDS`, or `package.module:Class` for a
 custom class. Such a class has an attribute `SETTINGS` and the methods of `reading.Transport`,
-`Framing` or `Device`. Its optional attributes `CLOCK` and `DRIVER` are mappings of clock and driver
-settings that replace the defaults for every device of that kind. The settings of a kind in `KINDS`
-are listed under its name. The settings of a custom class are listed under `transport_settings`,
-`framing_settings` or `device_settings`.
+`Framing` or `Device`; a transport also has the class attribute `is_message_oriented`. The optional
+attributes `CLOCK` and `DRIVER` are mappings of clock and driver settings that replace the defaults
+for every device of that kind. The settings of a kind in `KINDS` are listed under its name. The
+settings of a custom class are listed under `transport_settings`, `framing_settings` or
+`device_settings`.
 """
 
 import dataclasses
@@ -105,7 +106,7 @@ def load_class(role: str, name: object) -> Any:
     Raises
     ------
     SettingsError
-        If the class cannot be loaded, or lacks `SETTINGS` or a required method.
+        If the class cannot be loaded, or lacks `SETTINGS` or another required member.
     """
     target = KINDS[role].get(name, name) if isinstance(name, str) else ''
     module, colon, class_name = target.partition(':')
@@ -190,7 +191,7 @@ def _device(options: dict[str, Any], kinds: Collection[str]) -> Device:
     parts = [_create_part(classes[role], options, groups[role], kinds) for role in roles]
     for role in roles:
         del options[role]
-    return parts[0] if roles == ('device',) else FramedDevice(*parts)
+    return parts[0] if 'device' in groups else FramedDevice(*parts)
 
 
 def _create_part(cls: Any, options: dict[str, Any], group: str, kinds: Collection[str]) -> Any:
@@ -221,8 +222,9 @@ def _check_groups(options: Mapping[str, Any], groups: Mapping[str, str], kinds: 
     for name in [name for name in options if name not in permitted]:
         role = next((role for role in KINDS if name in (*KINDS[role], f'{role}_settings')), '')
         if role:
+            change = f', or change {role}' if role in groups else ''
             raise SettingsError(f'{name} is not used by the device, which uses '
-                                f'{" and ".join(kinds)}; remove {name}, or change {role}')
+                                f'{" and ".join(kinds)}; remove {name}{change}')
         if isinstance(options[name], Mapping):
             similar = closest_name(str(name).lower(), [*groups.values(), 'clock'])
             raise SettingsError(f'unknown group {name}' + (

@@ -185,8 +185,6 @@ class Driver:
         ------
         ValueError
             If a field does not consist of three numbers.
-        OverflowError
-            If an integer in a field exceeds the range of float64.
         """
         if not self._is_open and not self._try_to_open(timeout_s):
             return EMPTY_RESULT
@@ -297,8 +295,11 @@ class Driver:
                     stamp_ns + offset_ns, sensor,
                     self._acceleration_scale * np.array(reading.acceleration)))
         # A field that overflows is discarded; the acceleration of the same reading is kept.
-        with np.errstate(over='ignore'):
-            field = self._scale * np.array(fields, dtype=float).reshape(len(fields), 3)
+        try:
+            with np.errstate(over='ignore'):
+                field = self._scale * np.array(fields, dtype=float).reshape(len(fields), 3)
+        except OverflowError as error:
+            raise ValueError('a field exceeds the range of float64') from error
         readings = Readings.by_name(sensors, stamps, field)
         infinite: BoolArray = np.any(np.isinf(readings.field), axis=1)
         if infinite.any():
@@ -369,7 +370,7 @@ def _bytes_of(axes: Axes | None) -> bytes:
     # whose full collections would scan all of them.
     try:
         return b'-' if axes is None else _AXES_STRUCT.pack(*axes)
-    except struct.error as error:
+    except (struct.error, OverflowError) as error:
         raise ValueError(f'expected three numbers, got {axes}'[:100]) from error
 
 

@@ -79,6 +79,8 @@ def test_a_framing_provides_defaults_for_clock_and_sequence(tmp_path):
      'and text; remove binary, or change framing'),
     (without(transport='udp'), 'board: serial is not used by the device, which uses udp and text; '
      'remove serial, or change transport'),
+    (without(i2c={}),
+     'board: i2c is not used by the device, which uses serial and text; remove i2c'),
     (without(json=None), 'board: json is not used by the device'),
     (without(framing_settings={'fields': ['x']}), 'board: framing_settings is not used by the'),
     (without(clocks={'tick_s': 1.0}), 'board: unknown group clocks; did you mean clock?'),

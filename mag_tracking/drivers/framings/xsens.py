@@ -210,9 +210,10 @@ class XsensFraming:
 
     def _search_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
                        more: bool) -> _ParseStep | None:
-        """Search `outer` for another data message; None if it contains none.
+        """Search `outer` for another data message.
 
-        Otherwise, return a step that rejects `outer`, or that waits for more bytes.
+        Returns None if `outer` contains no other data message, otherwise a step
+        that rejects `outer`, or that waits for more bytes.
         """
         rejection = _REJECT_STEP._replace(causes=('messages that contain the start of another',))
         index = 0
