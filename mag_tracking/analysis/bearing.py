@@ -7,15 +7,15 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.physics.anderson import closest_approach
 
 MIN_CPA_FRACTION = 1e-3
-"""Minimum CPA range relative to the distance travelled. At a smaller ratio, the path is treated as
-passing through the sensor."""
+"""Minimum CPA range relative to the distance travelled during the pass. At a smaller ratio, the
+path is treated as passing through the sensor."""
 
 MAX_DIRECTION_STD = 0.5
 """[rad] Maximum standard deviation of a direction. Less certain directions are set to NaN."""
 
 
 def scaled_to_range(theta: FloatArray, p: FloatArray, sensor_position: FloatArray,
-                    distance: float) -> tuple[FloatArray, FloatArray] | None:
+                    distance: float, duration: float) -> tuple[FloatArray, FloatArray] | None:
     """Scale a path and its moments to a given CPA range.
 
     At a single sensor, (r, v, m) and (u r, u v, u³ m) have the same field. The paths (r, v) and
@@ -31,6 +31,8 @@ def scaled_to_range(theta: FloatArray, p: FloatArray, sensor_position: FloatArra
         Position of the sensor.
     distance : float, m
         CPA range of the returned path.
+    duration : float, s
+        Duration of the pass.
 
     Returns
     -------
@@ -43,7 +45,7 @@ def scaled_to_range(theta: FloatArray, p: FloatArray, sensor_position: FloatArra
     """
     r, v = theta[:3] - sensor_position, theta[3:6]
     t_cpa, cpa_range, _ = closest_approach(r, v)
-    if cpa_range <= MIN_CPA_FRACTION * np.linalg.norm(t_cpa * v):
+    if cpa_range <= MIN_CPA_FRACTION * duration * np.linalg.norm(v):
         return None
     u = distance / cpa_range
     # The path reversed through the sensor has the same field; use the path above the sensor.

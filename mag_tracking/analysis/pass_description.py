@@ -85,7 +85,8 @@ def _fit_of_one_sensor(data: PassData, n_dipoles: int, minimum: Minimum, p: Floa
     """Create the `PassFit` of a single sensor, for which the scale is not observable."""
     position = data.network.positions[data.sensors[0]]
     # Without a known CPA range, the range is the unit of length.
-    scaled = scaled_to_range(minimum.theta, p, position, cpa_range[0] if cpa_range else 1.0)
+    scaled = scaled_to_range(minimum.theta, p, position, cpa_range[0] if cpa_range else 1.0,
+                             float(np.ptp(data.t)))
     if scaled is None:
         return PassFit(n_dipoles, data, 'the path passes through the sensor (r0 parallel to v0): '
                        'the CPA range is zero and does not define a scale')

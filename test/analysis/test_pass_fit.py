@@ -287,13 +287,13 @@ def test_a_path_through_the_sensor_is_rejected():
     assert 'r0 parallel to v0' in fit_pass(data, 1).reason
 
 
-@pytest.mark.parametrize('time', [-2.0, 2.0])
+@pytest.mark.parametrize('time', [-2.0, 0.0, 2.0])
 def test_only_a_path_with_a_very_small_cpa_range_passes_through_the_sensor(time):
     v = np.array([9.0, 0.0, 0.0])
     for fraction, passes_through in ((0.9, True), (1.1, False)):
-        cpa = np.array([0.0, 0.0, fraction * MIN_CPA_FRACTION * abs(time) * v[0]])
+        cpa = np.array([0.0, 0.0, fraction * MIN_CPA_FRACTION * 3.0 * v[0]])
         theta = np.concatenate([cpa - time * v, v])
-        scaled = scaled_to_range(theta, np.ones(3), np.zeros(3), 1.0)
+        scaled = scaled_to_range(theta, np.ones(3), np.zeros(3), 1.0, 3.0)
         assert (scaled is None) == passes_through
 
 
@@ -328,7 +328,7 @@ def test_two_vehicles_in_one_window_are_rejected():
         first_path[:7] = 0.0, -1.75, 0.5, 9.0, 0.0, 0.0, 3.0
         second_path[:7] = 6.0, 1.75, 0.5, 11.0 * np.cos(heading), 0.0, 0.0, 3.0
         both = superposed(measured(ROAD, first_path, m1, rng),
-                        measured(ROAD, second_path, m2, rng, noise=1e-15))
+                          measured(ROAD, second_path, m2, rng, noise=1e-15))
         assert choose_order([fit_pass(both, d) for d in (1, 2, 3)]) is None
 
 
