@@ -77,7 +77,7 @@ def main(argv=None):
     for rate, fitted in found.items():
         figure, path = order_figure(fitted), args.out / f'figure_7_{rate.replace(" ", "_")}.png'
         figure.suptitle(f'TSP14 Figure 7 with simulated passes at {rate} '
-                                 '(filled: selected order)')
+                        '(filled: selected order)')
         figure.savefig(path, dpi=110)
         print(path)
     print(report(found))

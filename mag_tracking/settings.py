@@ -282,7 +282,7 @@ def _group_suggestion(group: str, leaf: str, names: Iterable[str]) -> str:
     closest_group = closest_name(group, groups)
     if closest_group:
         closest = closest_name(leaf, [k.removeprefix(f'{closest_group}.') for k in names
-                                  if k.startswith(f'{closest_group}.')])
+                                      if k.startswith(f'{closest_group}.')])
         return (f'; there is no group {group}; did you mean {closest_group}'
                 f'{"." + closest if closest else ""}?')
     top_groups = [g for g in groups if '.' not in g]

@@ -19,14 +19,14 @@ one package."""
 
 
 def checked_layers():
-    """Packages of each layer, highest layer first, from the contracts of `lint-imports`."""
+    """Packages and modules of each layer, highest first, from the contracts of `lint-imports`."""
     contracts = api.read_configuration(str(ROOT / 'pyproject.toml'))['contracts_options']
     rows = next(c['layers'] for c in contracts if c['type'] == 'layers')
     return [set(re.split(r'\s*[|:]\s*', row)) for row in rows]
 
 
 def documented_layers():
-    """Packages of each layer, highest layer first, from docs/contributing/architecture.md."""
+    """Packages and modules of each layer, highest first, from docs/contributing/architecture.md."""
     text = (ROOT / 'docs' / 'contributing' / 'architecture.md').read_text()
     rows = re.findall(r'^\| (\d) \| ([^|]+)\|', text, re.M)
     assert [int(n) for n, _ in rows] == list(range(len(rows), 0, -1))
@@ -38,9 +38,9 @@ def test_import_contracts_match_the_documented_layers():
     assert checked_layers() == documented_layers()
 
 
-def test_every_module_has_a_floor():
+def test_every_module_has_a_layer():
     packages = {p.stem if p.is_file() else p.name for p in PACKAGE.iterdir()
-             if p.name != '__pycache__' and (p.suffix == '.py' or p.is_dir())}
+                if p.name != '__pycache__' and (p.suffix == '.py' or p.is_dir())}
     assert packages - {'__init__'} == set.union(*checked_layers())
 
 

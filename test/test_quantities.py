@@ -8,6 +8,8 @@ import mag_tracking as mt
 from mag_tracking.apps.replay_notes import notes_of
 from mag_tracking.quantities import occurrences, quantity
 from mag_tracking.stages.track.evidence import LOST
+from mag_tracking.stages.track.manager import UNCERTAIN_ORIENTATIONS
+from mag_tracking.stages.track.smoothing import NOT_SMOOTHED
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 
 
@@ -52,7 +54,7 @@ SUMMARY = {
          '2 tracks were not smoothed: '))])
 def test_nouns_in_notes_agree_with_the_number(n, beginnings):
     counts = {f'tracks ended: {LOST}': n,
-              'sensors with an orientation uncertainty above 15 degrees': n,
-              'tracks without smoothing': n}
+              UNCERTAIN_ORIENTATIONS: n,
+              NOT_SMOOTHED: n}
     texts = [note.text for note in notes_of({**SUMMARY, 'counts': {'track': counts}})]
     assert all(text.startswith(b) for text, b in zip(texts, beginnings, strict=True)), texts

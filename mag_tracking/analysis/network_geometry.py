@@ -32,7 +32,7 @@ from mag_tracking.settings import param
 
 @dataclass(frozen=True)
 class GeometrySettings:
-    """Prior standard deviations and limits of the fit; zero means exactly known."""
+    """Prior standard deviations, where zero means exactly known, and limits of the fit."""
 
     gain_std: float = param(0.03, 'Standard deviation of the gain of a sensor.', '',
                             (0.0, 1.0))

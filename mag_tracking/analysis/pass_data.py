@@ -38,8 +38,8 @@ class PassData:
 
     @classmethod
     def from_frames(cls, network: SensorNetwork, stamps_ns: Sequence[int],
-                  fields: Sequence[FloatArray], covariances: Sequence[FloatArray],
-                  offsets: Sequence[FloatArray] | None = None) -> 'PassData':
+                    fields: Sequence[FloatArray], covariances: Sequence[FloatArray],
+                    offsets: Sequence[FloatArray] | None = None) -> 'PassData':
         """Create the data of a pass from frames of all sensors.
 
         Parameters

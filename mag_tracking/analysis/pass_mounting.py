@@ -99,7 +99,8 @@ def _track_scatter(gains: Sequence[FloatArray], information_vectors: Sequence[Fl
                    rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     """Scatter (n_sensors,) of the angles of single tracks about the fused angles.
 
-    Chi-square per degree of freedom; NaN for a sensor without degrees of freedom.
+    The scatter is the chi-square per degree of freedom. It is NaN for a sensor without degrees of
+    freedom.
     """
     squares, freedom = np.zeros(len(rotation)), np.zeros(len(rotation))
     for gain, information_vector in zip(gains, information_vectors, strict=True):

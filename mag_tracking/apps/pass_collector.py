@@ -133,7 +133,7 @@ class PassCollector:
         passes += [p for frame in align.flush() for p in self._add_frame(frame)]
         if self._onset_ns is not None and self._last_ns is not None:
             passes.append(self._cut(self._onset_ns, self._last_ns,
-                                 'the recording ends before the target has passed'))
+                                    'the recording ends before the target has passed'))
         return passes
 
     def _add_frame(self, frame: FieldFrame) -> list[tuple[PassData, tuple[str, ...]]]:

@@ -91,7 +91,7 @@ class Plan:
     bounds_at_closest: dict[str, FloatArray]
     """{'with prior' or 'without prior': (3,) bounds of position [m], velocity [m/s] and moment
     [A m²]} at the closest point of the first lane; medians over the directions of the moment."""
-    miss_probability: FloatArray
+    miss_curve: FloatArray
     """(n, 2) lateral distance [m] of a pass with the heading of the first lane, and probability
     that the pass is missed."""
 
@@ -193,7 +193,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
 
 def _position_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                      points: FloatArray, heading: float) -> FloatArray:
-    """Position bounds [m] of passes through points, for each direction of the moment."""
+    """Position bounds (n, n_directions) [m] of passes through points, per moment direction."""
     J = pass_information(network.positions, network.R_sw, target, sampling, points, heading)
     return bounds_of(J.sum(axis=2), target.prior())[..., 0]
 
@@ -333,7 +333,7 @@ def _added_sensor_bounds(network: SensorNetwork, target: PlannedTarget, sampling
 
 def _miss_probabilities(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                         lane: Lane, area: Area, settings: Settings) -> FloatArray:
-    """Compute `Plan.miss_probability`.
+    """Compute `Plan.miss_curve`.
 
     A pass is missed unless `detect.onset_frames` consecutive frames detect the target.
     """

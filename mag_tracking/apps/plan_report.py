@@ -78,7 +78,7 @@ def summary_lines(p: Plan) -> list[str]:
                      f'{GOOD_PD:.0%} {first_text}; position bound at the centre '
                      f'{length_text(lane.filter_std[closest])} (filter), '
                      f'{length_text(lane.pass_std[closest, 0])} (whole pass)')
-    detected_offsets = p.miss_probability[p.miss_probability[:, 1] < 0.01, 0]
+    detected_offsets = p.miss_curve[p.miss_curve[:, 1] < 0.01, 0]
     lines.append(
         f'99% of passes are detected up to {detected_offsets.max():.3g} m from the centre'
         if len(detected_offsets) else 'the detection probability of a pass is below 99% everywhere')
@@ -177,7 +177,7 @@ def _lanes(plan: Plan) -> list[Chart]:
         bounds += [curve(along, f * lane.filter_std, f'{name}: filter so far', 2 * k),
                    curve(along, f * lane.pass_std[:, 0], f'{name}: whole pass', 2 * k + 1)]
         detection.append(curve(along, lane.detection, name, k))
-    missed_passes = plan.miss_probability[plan.miss_probability[:, 1] >= MIN_MISSED]
+    missed_passes = plan.miss_curve[plan.miss_curve[:, 1] >= MIN_MISSED]
     label = f'distance along the lane from the point nearest to the centre [{unit}]'
     return [Chart('Position bound along the lanes', bounds,
                   axes(label, f'standard deviation [{unit}]', log_y=True)),

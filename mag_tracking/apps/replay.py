@@ -352,7 +352,7 @@ def _errors_of(log: TrackLog | SmoothedLog, pipeline: Configured,
                truth: Truth) -> tuple[float, dict[str, Any]] | None:
     """Return (error [m] for the selection of the best-matching target, all errors).
 
-    None if the ground truth does not cover the track.
+    The result is None if the ground truth does not cover the track.
     """
     if pipeline.settings.track.target == 'magnet':
         magnet = magnet_errors(log, truth, pipeline.settings.track.magnet.axis)

@@ -6,7 +6,8 @@ from typing import Any
 from mag_tracking.quantities import quantity
 from mag_tracking.report.page import NOTE, WARNING, Note
 from mag_tracking.stages.track.evidence import LOST
-from mag_tracking.stages.track.manager import NO_SCALE, NO_SCALE_FRAMES
+from mag_tracking.stages.track.manager import NO_SCALE, NO_SCALE_FRAMES, UNCERTAIN_ORIENTATIONS
+from mag_tracking.stages.track.smoothing import NOT_SMOOTHED
 from mag_tracking.units import NS
 
 
@@ -94,12 +95,12 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(WARNING, quantity(n_lost, 'track lost its target', 'tracks lost their target')
                    + ': check the orientations in the network file; other possible causes are '
                    'simultaneous targets, or a kind of target that the settings do not include')
-    n_uncertain = counts.get('sensors with an orientation uncertainty above 15 degrees', 0)
+    n_uncertain = counts.get(UNCERTAIN_ORIENTATIONS, 0)
     if n_uncertain:
         yield Note(WARNING, quantity(n_uncertain, 'sensor has', 'sensors have')
                    + ' an orientation uncertainty of more than 15 degrees in the network file: '
                    'calibrate the network')
-    n_unsmoothed = counts.get('tracks without smoothing', 0)
+    n_unsmoothed = counts.get(NOT_SMOOTHED, 0)
     if n_unsmoothed:
         yield Note(WARNING, quantity(n_unsmoothed, 'track was', 'tracks were')
                    + ' not smoothed: too long (track.max_smoothing_s), too many frames for the '

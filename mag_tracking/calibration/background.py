@@ -179,7 +179,7 @@ class RunningBackground:
     def covariance(self) -> FloatArray | None:
         """Noise covariance of one sample, (3, 3) T²; None if unknown, NaN for an unreported axis.
 
-        Includes the quantisation variance of the sensor.
+        The quantisation variance of the sensor is included.
         """
         return self._level.covariance
 
@@ -210,7 +210,7 @@ class RunningBackground:
     def scatter_std(self) -> FloatArray:
         """Standard deviation of quiet readings, (3,) T; NaN if unknown.
 
-        Includes the quantisation error of the sensor.
+        The quantisation error of the sensor is included.
         """
         variance = self._quiet.scatter() + self._state['step_variance']
         return np.where(variance > 0.0, np.sqrt(variance), np.nan)

@@ -128,7 +128,7 @@ class BackgroundLevel:
     def covariance(self) -> FloatArray | None:
         """Noise covariance of one sample, (3, 3) T²; None if unknown, NaN for an unreported axis.
 
-        Includes the quantisation variance of the sensor.
+        The quantisation variance of the sensor is included.
         """
         if self.noise is None:
             return None

@@ -239,7 +239,7 @@ def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
 
 
 def with_nominal_heading(orientation: Orientation, nominal: FloatArray, nominal_std: float,
-                        limit: float = 3.0) -> Orientation | None:
+                         limit: float = 3.0) -> Orientation | None:
     """Fuse the compass heading with a nominal heading.
 
     Parameters

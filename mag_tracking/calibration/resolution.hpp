@@ -14,7 +14,7 @@ constexpr double MAX_ROUNDING = 3e-7;
 // Minimum noise variance, in squared steps, at which readings cover several steps and averaging is
 // effective. A reading that toggles between two steps has a variance of at most 0.25.
 constexpr double DITHERED = 0.3;
-// [T] Maximum scatter of an axis that has not changed.
+// [T] Minimum standard deviation of the readings of an axis that is not constant.
 constexpr double MIN_STD = 1e-11;
 // [steps] Tolerance of an axis at rest, which may toggle between two adjacent values.
 constexpr double TOGGLE_TOLERANCE = 1.2;

@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parse(arguments: Sequence[str]) -> argparse.Namespace:
-    """Import the parser, which takes almost a second, and parse the command line."""
+    """Import the parser, which is slow to import, and parse the command line."""
     from mag_tracking.cli.commands import parse
 
     return parse(arguments)

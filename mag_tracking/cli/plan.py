@@ -127,7 +127,7 @@ def _write(p: Plan, out: Path) -> None:
         'best_position': list(p.best_position),
         'bounds_at_closest': {k: v.tolist() for k, v in p.bounds_at_closest.items()},
         'unobservable': list(p.observability.unobservable),
-        'miss_probability': p.miss_probability.tolist(),
+        'miss_curve': p.miss_curve.tolist(),
         'lanes': [{'name': lane.name, 'along': lane.along.tolist(),
                    'filter_std': lane.filter_std.tolist(), 'pass_std': lane.pass_std.tolist(),
                    'detection': lane.detection.tolist()} for lane in p.lanes]}

@@ -15,8 +15,8 @@ Records the magnetic fields on the topics of the network, unchanged, until Ctrl-
 sensor_msgs/Imu topics of the sensors (/mag_1/imu/data_raw next to /mag_1/imu/mag) are
 also recorded. DIR becomes a rosbag2 recording: MCAP files and a metadata.yaml.
 Messages that are lost in transport or dropped on a full disk are counted and reported;
-recording resumes in a new file when the disk has space again. A crash loses less than half a second
-of the recording; `mag-tracking repair DIR` then rebuilds the index.
+recording resumes in a new file when the disk has space again. If the recorder is killed, less than
+half a second is lost; `mag-tracking repair DIR` then rebuilds the index.
 
 examples:
   mag-tracking record --network config/network.yaml --out night

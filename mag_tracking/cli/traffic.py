@@ -178,7 +178,7 @@ def _print(name: str, result: TrafficResult, recording: Recording,
         identity = '' if identification is None else f', vehicle {identification.name}'
         print(f'{line_of(vehicle)}{identity}')
     counts = Counter((v.passage.line, DIRECTIONS[v.passage.forward], v.passage.vehicle_class)
-                    for v in result.vehicles)
+                     for v in result.vehicles)
     print(f'{name}: {quantity(len(result.vehicles), "vehicle")}')
     for (line, direction, vehicle_class), n in sorted(counts.items()):
         print(f'  {line}, {direction}, {vehicle_class}: {n}')

@@ -33,7 +33,7 @@ def log_sum_exp(a: ArrayLike, axis: int | None = None) -> FloatArray:
     Returns
     -------
     (...) array
-        Equals -inf if all elements are -inf.
+        -inf if all elements are -inf.
     """
     a = np.asarray(a, dtype=float)
     top = np.max(a, axis=axis, keepdims=True)

@@ -63,7 +63,10 @@ def noise_spectrum(frequency: ArrayLike, background: float, resolution: float,
 
 def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArray], ArrayLike],
                band: Sequence[float]) -> FloatArray:
-    """Deflection of the matched filter: difference of its mean outputs with and without the signal.
+    """Deflection of the matched filter.
+
+    This is the difference of its mean outputs with and without the signal, divided by the standard
+    deviation of the output.
 
     Parameters
     ----------
@@ -79,8 +82,7 @@ def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArra
     Returns
     -------
     (...) array
-        In standard deviations of the output: root of the sum of the squared deflections of the
-        axes. NaN if no axis is measured.
+        Root of the sum of the squared deflections of the axes. NaN if no axis is measured.
 
     Raises
     ------

@@ -80,7 +80,7 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
 
 
 def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
-    """Read when the background of each sensor was last doubtful, from a CalibrationState.
+    """Return the latest doubtful interval of the background of each sensor.
 
     Parameters
     ----------

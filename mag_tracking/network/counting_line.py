@@ -181,7 +181,8 @@ class CrossingDetector:
     def _extrapolate(self, first: Pose, last: Pose) -> Crossing | None:
         """Extrapolate a crossing from the first or the last pose.
 
-        None if the speed is below `MIN_SPEED` or the time exceeds `MAX_EXTRAPOLATION_S`.
+        The result is None if the speed is below `MIN_SPEED` or the time exceeds
+        `MAX_EXTRAPOLATION_S`.
         """
         for pose, sign in ((first, -1.0), (last, 1.0)):
             speed = float(pose.velocity[:2] @ self.line.direction)

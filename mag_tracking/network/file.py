@@ -154,7 +154,8 @@ def _parse_calibration(label: str, value: Any) -> CalibrationRecord | None:
     label = f'{label}: calibrated'
     if isinstance(value, dict):
         # Version 0.1.0 wrote `stated` instead of `nominal`.
-        value = {_KEYS_OF_0_1_0.get(key, key): v for key, v in value.items()}
+        value = {key if (new := _KEYS_OF_0_1_0.get(key, key)) in value else new: v
+                 for key, v in value.items()}
     _check_keys(label, value, {'date', 'by', 'clock_offset_std', 'nominal', 'nominal_std_deg'})
     for key in ('date', 'by'):
         if not isinstance(value.get(key), str) or not is_utf8_encodable(value[key]):

@@ -74,11 +74,11 @@ class ReplayNode(ManagedNode):
                                      'Playback rate relative to the recorded rate.')
         self._loop = fixed_parameter(self, 'loop', False, 'Restart playback at the end.')
         self._start_offset_s = fixed_parameter(self, 'start_offset', 0.0,
-                                       'Start position after the first message [s].')
+                                               'Start position after the first message [s].')
         self._topics = fixed_parameter(self, 'topics', [''], 'Recorded topics to play. If empty, '
                                        'all topics are played.')
         self._start_delay_s = fixed_parameter(self, 'start_delay', 2.0, 'Delay of playback after '
-                                      'activation, for discovery of the subscribers [s].')
+                                              'activation, for discovery of the subscribers [s].')
         self._paused = fixed_parameter(self, 'paused', False, 'Start paused.')
         self._subscriber_timeout_s = fixed_parameter(
             self, 'wait_for_subscribers', 0.0, 'Maximum additional delay until all magnetic field '

@@ -185,7 +185,7 @@ class HealthDiagnostics:
         if not silent_s <= SILENCE_TIMEOUT_S:
             return [*graph_findings, *self._silence_findings(name, silent_s)]
         findings = {f.fault: f for f in (*graph_findings, *self._network_findings[name],
-                                        *self._clock_findings(name))}
+                                         *self._clock_findings(name))}
         # A background that is being learnt is not a fault until the timeout.
         timeout_s = 5.0 + LEARNING_TIMEOUT_FACTOR * self._settings.calibrate.learn_s
         if calibrate.backgrounds()[name].ready:

@@ -110,7 +110,7 @@ class TrackerNode(StageNode):
         self._hypotheses_publisher = self.publisher(HypothesisArray, '~/hypotheses', PUBLISHER_QOS)
         self._path_publisher = self.publisher(Path, '~/path', RESULT_QOS)
         self._smoothed_pose_publisher = self.publisher(PoseWithCovarianceStamped, '~/pose_smoothed',
-                                                     PUBLISHER_QOS)
+                                                       PUBLISHER_QOS)
         self._smoothed_publisher = self.publisher(SmoothedTrack, '~/smoothed', RESULT_QOS)
         self._smoothed_path_publisher = self.publisher(Path, '~/path_smoothed', RESULT_QOS)
         self._disturbance_publisher = self.publisher(DisturbanceMessage, '~/disturbances',

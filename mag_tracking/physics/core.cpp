@@ -117,7 +117,7 @@ py::tuple mounted_fields(const Array& h, const Array& H, const Array& angles) {
     return py::make_tuple(out_h, out_H);
 }
 
-py::tuple propagate_turn(const Array& x, double dt, double mean, double fading) {
+py::tuple propagate_turn(const Array& x, double dt, double mean_factor, double final_factor) {
     const Size n = length_of(x, "x", 2), n_x = x.shape(1);
     if (n_x < 7) throw py::value_error("x: must hold position, velocity and turn rate");
     const double* from = input_of(x, "x", {n, n_x});
@@ -127,7 +127,7 @@ py::tuple propagate_turn(const Array& x, double dt, double mean, double fading) 
     std::fill(F_, F_ + F.size(), 0.0);
     for (Size p = 0; p < n; ++p, from += n_x, to += n_x, F_ += n_x * n_x) {
         Motion motion;
-        turn(from, int(n_x - 1), dt, mean, fading, motion);
+        turn(from, int(n_x - 1), dt, mean_factor, final_factor, motion);
         for (Size i = 0; i < n_x; ++i) F_[i * n_x + i] = 1.0;
         for (int i = 0; i < motion.n; ++i) {
             const int row = motion.rows[i];
@@ -292,7 +292,8 @@ PYBIND11_MODULE(core, module) {
                IN(dm_dx));
     module.def("multipoles", &multipoles, IN(d), IN(moments));
     module.def("rotated_fields", &mounted_fields, IN(h), IN(H), IN(angles));
-    module.def("propagate_turn", &propagate_turn, IN(x), py::arg("dt"), py::arg("mean"), py::arg("fading"));
+    module.def("propagate_turn", &propagate_turn, IN(x), py::arg("dt"),
+               py::arg("mean_factor"), py::arg("final_factor"));
     module.def("row_dipoles", &row_dipoles, IN(x), IN(n_dipoles), IN(field_strength));
     module.def("set_moment_noise", &set_moment_noise, IN(x), IN(walk), py::arg("field_strength2"),
                IN(Q));

@@ -72,9 +72,9 @@ struct RowVehicle {
         }
         const int w = n_states - 1;
         // No decay in backward propagation, which has no process noise: the variance would shrink.
-        const double fading = std::exp(-std::max(dt, 0.0) / turn_time);
-        const double mean = dt > 0.0 ? (1.0 - fading) * turn_time / dt : 1.0;
-        turn(x, w, dt, mean, fading, out);
+        const double final_factor = std::exp(-std::max(dt, 0.0) / turn_time);
+        const double mean_factor = dt > 0.0 ? (1.0 - final_factor) * turn_time / dt : 1.0;
+        turn(x, w, dt, mean_factor, final_factor, out);
     }
 
     // Writes the process noise of a prediction by dt > 0 seconds, from state `x` with covariance
@@ -97,11 +97,11 @@ struct RowVehicle {
         if (turn_acceleration == 0.0) return;
         // A turn rate of zero variance has no noise: the path remains straight.
         const int w = n - 1;
-        const double fading = std::exp(-dt / turn_time);
+        const double final_factor = std::exp(-dt / turn_time);
         const double speed = std::max(std::sqrt(x[3] * x[3] + x[4] * x[4]),
                                       turn_acceleration / max_turn_rate);
         const double rate = turn_acceleration / speed;
-        Q[w * wide + w] = P[w * wide + w] > 0.0 ? (1.0 - fading * fading) * rate * rate : 0.0;
+        Q[w * wide + w] = P[w * wide + w] > 0.0 ? (1.0 - final_factor * final_factor) * rate * rate : 0.0;
     }
 
     // Positions and moments (d, 3) of the dipoles, TSP14 eq. (10b) and ICASSP11 eq. (8), and their

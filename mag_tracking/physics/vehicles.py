@@ -84,7 +84,7 @@ class RowVehicle:
     def _moment_walk(self) -> FloatArray:
         """Random walk covariance of the hard iron moments, (3 d, 3 d) 1/s.
 
-        Normalised by the squared magnitude of the hard and soft iron moments.
+        The covariance is normalised by the squared magnitude of the hard and soft iron moments.
         """
         d = self.n_dipoles
         averaging = np.full((d, d), 1.0 / d)

@@ -1,7 +1,7 @@
 """Recorder of serialised messages in a rosbag2 folder of MCAP files, with limited loss in a crash.
 
-A chunk is completed and passed to the operating system every `FLUSH_INTERVAL_NS`, so less than a
-second is lost if the program is killed. The file then has no index. This package can read it
+A chunk is completed and passed to the operating system every `FLUSH_INTERVAL_NS`, so less than
+half a second is lost if the program is killed. The file then has no index. This package can read it
 directly; other readers require a repair by `recording.repair.repair`.
 """
 

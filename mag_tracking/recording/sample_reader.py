@@ -243,8 +243,8 @@ class SampleReader:
 def _namespace(recording: Recording, network: SensorNetwork) -> str:
     """Namespace of the network's relative topics: the configured one, or the one in the recording.
 
-    '/' if the recording contains none of these topics. Raises RecordingError if it contains them in
-    several namespaces.
+    The result is '/' if the recording contains none of these topics. Raises RecordingError if it
+    contains them in several namespaces.
     """
     if network.namespace is not None:
         return network.namespace

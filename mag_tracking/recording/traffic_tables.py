@@ -139,7 +139,7 @@ def summary_rows(recording: str, summary: TrafficSummary) -> list[dict[str, Any]
         Values by column.
     """
     common_values = {'recording': recording, 'begin_ns': summary.begin_ns, 'end_ns': summary.end_ns,
-            'line': summary.line, 'observed_s': summary.observed_s}
+                     'line': summary.line, 'observed_s': summary.observed_s}
     if not summary.counts:
         return [{**common_values, 'direction': '', 'class': '', 'count': 0, 'n_ambiguous': 0,
                  'mean_speed': np.nan, 'mean_headway': np.nan}]

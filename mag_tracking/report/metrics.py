@@ -24,7 +24,8 @@ class PassErrors(TypedDict):
     closest_distance: float
     """Horizontal distance of this true position from the centre [m]."""
     anees: float
-    """Mean NEES per axis of the poses within the radius; of the closest pose if there are none."""
+    """Mean NEES per axis of the poses within the radius, or of the closest pose if no pose is
+    within the radius."""
     n: int
     """Number of poses whose true position is within the radius."""
 

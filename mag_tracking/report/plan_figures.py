@@ -69,7 +69,7 @@ class _Plan(Protocol):
     def std_with_added_sensor(self) -> FloatArray: ...
 
     @property
-    def miss_probability(self) -> FloatArray: ...
+    def miss_curve(self) -> FloatArray: ...
 
     @property
     def lanes(self) -> Sequence[_Lane]: ...
@@ -262,9 +262,9 @@ def lane_figure(plan: _Plan) -> Figure:
     middle.set_ylabel('P(detection by one frame)')
     middle.set_xlabel(f'distance along the lane [{unit}]')
     legend_beside(middle)
-    drawn_rows = plan.miss_probability[plan.miss_probability[:, 1] >= MIN_MISSED]
+    drawn_rows = plan.miss_curve[plan.miss_curve[:, 1] >= MIN_MISSED]
     bottom.semilogy(f * drawn_rows[:, 0], drawn_rows[:, 1], '.-', color='k')
-    bottom.set_xlim(f * plan.miss_probability[0, 0], 1.02 * f * plan.miss_probability[-1, 0])
+    bottom.set_xlim(f * plan.miss_curve[0, 0], 1.02 * f * plan.miss_curve[-1, 0])
     bottom.set_ylim(0.5 * MIN_MISSED, 2.0)
     bottom.set_xlabel(f'lateral distance of a pass from the centre of the sensors [{unit}]')
     bottom.set_ylabel('P(missed pass)')

@@ -22,7 +22,7 @@ class TrafficIntervals:
     interval_s : float, s
         Length of an interval.
     counts : Counter
-        Number of passages that are counted in a later interval; updated in place.
+        Counts by description. Passages that are counted in a later interval are added.
     """
 
     def __init__(self, line_names: Sequence[str], interval_s: float,

@@ -141,8 +141,8 @@ def test_faulty_readings_result_in_a_reason_or_an_estimate(fault):
         field[100, 0] = np.inf
     if fault == 'equal timestamps':
         for j in (0, 1):
-            sensor_mask = np.flatnonzero(data.sensor == j)
-            t[sensor_mask[100:900]] = t[sensor_mask[100]]
+            rows = np.flatnonzero(data.sensor == j)
+            t[rows[100:900]] = t[rows[100]]
     faulty = dataclasses.replace(data, field=field, t=t)
     if fault == 'few':
         rows = np.flatnonzero(data.t > 2.98)

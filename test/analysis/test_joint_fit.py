@@ -106,7 +106,7 @@ def test_order_of_each_vehicle_is_chosen_separately():
     point, m = random_lane_path(rng, -0.3, 1, 1)
     row, moments = random_lane_path(rng, 0.3, -1, 3)
     data = superposed(measured(ROAD, point, m, rng, seconds=6.0),
-                    measured(ROAD, row, moments, rng, seconds=6.0, noise=1e-15))
+                      measured(ROAD, row, moments, rng, seconds=6.0, noise=1e-15))
     joint_fits = fit_joint(data, tracked_paths(rng, (point, row)), GROUND, (1, 2, 3))
     orders = [choose_order(fits).n_dipoles for fits in joint_fits]
     assert orders[0] == 1 and orders[1] >= 2
@@ -124,7 +124,7 @@ def test_two_following_vehicles_are_not_fitted_as_one_long_row():
     second_path = first_path.copy()
     second_path[0] -= 18.0
     data = superposed(measured(ROAD, first_path, moments, rng, seconds=6.0),
-                    measured(ROAD, second_path, 0.8 * moments, rng, seconds=6.0, noise=1e-15))
+                      measured(ROAD, second_path, 0.8 * moments, rng, seconds=6.0, noise=1e-15))
     alone = [fit_pass(data, n) for n in (1, 2)]
     wrong = choose_order(alone)
     assert wrong is not None and wrong.length[0] > 12.0

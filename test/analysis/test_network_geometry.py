@@ -52,11 +52,11 @@ def test_calibration_reduces_the_prior_errors(boards):
             error.append(e - e.mean(axis=0))
             prior_errors.append(prior_error - prior_error.mean(axis=0))
             std.append(np.sqrt(np.diagonal(g.covariance)[:90]).reshape(9, 10)[:, part])
-        error, prior_errors = (np.sqrt(np.mean(np.square(v))) for v in (error, prior_errors))
-        print(f'remaining error of {part}: {error / prior_errors:.2f}')
-        assert error < max_ratio * prior_errors
+        rms, prior_rms = (np.sqrt(np.mean(np.square(v))) for v in (error, prior_errors))
+        print(f'remaining error of {part}: {rms / prior_rms:.2f}')
+        assert rms < max_ratio * prior_rms
         # The errors are consistent with the estimated stds.
-        assert error < 1.1 * np.sqrt(np.mean(np.square(std)))
+        assert rms < 1.1 * np.sqrt(np.mean(np.square(std)))
 
 
 def test_estimated_poses_are_closer_to_the_truth_than_tracked_ones(boards):

@@ -125,7 +125,7 @@ def test_scatter_of_consistent_tracks_is_about_one():
 
 @pytest.mark.parametrize('n_tracks', [2, 5])
 def test_scatter_of_consistent_weak_tracks_is_not_above_one(n_tracks):
-    """Each track has less information than the prior, and the prior adds no scatter."""
+    """A prior with as much information as a track, or more, adds no scatter."""
     scatter, _ = scatter_and_nees(80, n_tracks, noise=0.15)
     freedom = 3 * (n_tracks - 1)
     high = chi2.ppf(0.999, freedom * len(scatter)) / (freedom * len(scatter))

@@ -26,7 +26,8 @@ PATH = np.array([0.0, -2.0, 0.5, 10.0, 0.0, 0.0, 3.0])
 
 
 def test_reach_covers_the_residuals_of_published_vehicles():
-    """At 4.5 m, a published cost means that (cost - 1) / 87 of the energy is unexplained."""
+    """The costs are those of TSP14 Tables I and II, at 4.5 m. A cost means that (cost - 1) / 87 of
+    the energy is unexplained; for trucks, (cost - 1) / (20 · 87)."""
     cars, trucks = (10, 14, 17), ((302.6, 9.09), (76.7, 11.25))
     for cost in cars:
         assert 1.0 < 4.5 * np.sqrt((cost - 1.0) / 87.0) <= reach(1, 0.0)
@@ -88,7 +89,7 @@ def test_a_single_fit_of_two_vehicles_is_not_trusted():
     first_path[:7] = 0.0, -1.75, 0.5, 9.0, 0.0, 0.0, 3.0
     second_path[:7] = 6.0, 1.75, 0.5, -11.0, 0.0, 0.0, 3.0
     both = superposed(measured(ROAD, first_path, m1, rng),
-                    measured(ROAD, second_path, m2, rng, noise=1e-15))
+                      measured(ROAD, second_path, m2, rng, noise=1e-15))
     fit = fit_pass(both, 3)
     assert 'not one target' in fit.reason and fit.trusted == ()
 

@@ -153,7 +153,7 @@ def test_a_plan_is_consistent(road_plan):
     assert (np.nan_to_num(p.std_with_added_sensor)
             <= p.std_without_added_sensor * (1.0 + 1e-9)).all()
     assert abs(p.best_position[1]) >= 2.0 and np.isnan(p.std_with_added_sensor).any()
-    missed = p.miss_probability[:, 1]
+    missed = p.miss_curve[:, 1]
     assert (np.diff(missed) > -1e-6).all() and missed[0] < 1e-6 < missed[-1]
     assert p.observability.kernel_dimension == 0
     bounds = p.bounds_at_closest

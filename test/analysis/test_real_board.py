@@ -43,7 +43,7 @@ def test_calibration_with_half_of_the_readings_is_accurate_for_the_other_half(re
         sixth_rows = slice(1, None, 6)
         nominal_error, axis_error = errors(nominal, field[sixth_rows], positions[sixth_rows],
                                            axes[sixth_rows], nominal.magnet_poses)
-        print_errors('as stated', nominal_error, axis_error, positions[sixth_rows, 2] < 0.1)
+        print_errors('nominal', nominal_error, axis_error, positions[sixth_rows, 2] < 0.1)
         assert np.median(nominal_error) > 3.0 * np.median(position_error)
 
 

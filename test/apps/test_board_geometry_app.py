@@ -35,9 +35,9 @@ def test_an_earlier_calibration_is_preserved(tmp_path):
     nominal, field, positions, axes, _ = simulated(2)
     calibrated = with_earlier_calibration(nominal)
     geometry = calibrate_geometry(nominal, field, positions, axes, MOMENT, GeometrySettings())
-    write_network(tmp_path / 'stated.yaml', calibrated)
+    write_network(tmp_path / 'nominal.yaml', calibrated)
     table = write_table(tmp_path / 'poses.csv', raw_readings(calibrated, field), positions, axes)
-    assert command(table, '--network', tmp_path / 'stated.yaml', out=tmp_path / 'out.yaml') == 0
+    assert command(table, '--network', tmp_path / 'nominal.yaml', out=tmp_path / 'out.yaml') == 0
     network = read_network(tmp_path / 'out.yaml')
     B = calibrated_readings(network, raw_readings(calibrated, field))
     np.testing.assert_allclose(B, geometry.signal(field), rtol=0, atol=1e-11)
@@ -56,9 +56,9 @@ def test_orientation_stds_are_about_world_axes(tmp_path):
     field[:, 4] = field[:, 4] @ R[4].T @ mounting
     R[4] = mounting
     field[:, 4, 1:] = np.nan
-    write_network(tmp_path / 'stated.yaml', replace(nominal, R_ws=R))
+    write_network(tmp_path / 'nominal.yaml', replace(nominal, R_ws=R))
     table = write_table(tmp_path / 'poses.csv', field, positions, axes)
-    assert command(table, '--network', tmp_path / 'stated.yaml', out=tmp_path / 'out.yaml') == 0
+    assert command(table, '--network', tmp_path / 'nominal.yaml', out=tmp_path / 'out.yaml') == 0
     std = np.rad2deg(read_network(tmp_path / 'out.yaml').orientation_std[4])
     assert std[1] == pytest.approx(2.0, rel=0.05) and std[0] < 1.0 and std[2] < 1.0
 
@@ -73,16 +73,16 @@ def test_a_sensor_without_readings_keeps_its_nominal_geometry(tmp_path, capsys):
     network = replace(calibrated, offset=(*calibrated.offset[:6], None, *calibrated.offset[7:]),
                       correction=(*calibrated.correction[:6], None, *calibrated.correction[7:]))
     readings[:, 6], readings[:, 6, 2] = field[:, 6], np.nan
-    write_network(tmp_path / 'stated.yaml', network)
+    write_network(tmp_path / 'nominal.yaml', network)
     table = write_table(tmp_path / 'poses.csv', readings, positions, axes)
-    assert command(table, '--network', tmp_path / 'stated.yaml', out=tmp_path / 'out.yaml') == 0
+    assert command(table, '--network', tmp_path / 'nominal.yaml', out=tmp_path / 'out.yaml') == 0
     text = capsys.readouterr().out
     assert '39 of 40 poses' in text
     assert 'warning: poses not used (no readings): 1\n' in text
     assert 'warning: mag_4 has no readings; its nominal geometry is kept' in text
     assert ('warning: mag_6 never reported z: the background of these axes is unknown'
             in text)
-    before, after = read_network(tmp_path / 'stated.yaml'), read_network(tmp_path / 'out.yaml')
+    before, after = read_network(tmp_path / 'nominal.yaml'), read_network(tmp_path / 'out.yaml')
     for name in ('positions', 'R_ws', 'noise_std', 'background', 'correction', 'orientation_std'):
         before_4, after_4 = (getattr(network, name)[4] for network in (before, after))
         assert (after_4 is None) == (before_4 is None)

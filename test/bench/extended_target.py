@@ -103,8 +103,8 @@ def simulated(figures, pool, name, kind, changes, flaws, n=40):
     """Track `n` passes of one kind, record the figures and print a line."""
     jobs = [pool.submit(one_pass, seed, kind, changes, flaws) for seed in range(n)]
     found = [job.result() for job in tqdm(jobs, desc=name, disable=None, leave=False)]
-    unflagged = [f for f in found if f is not None and not f[2]]
-    filtered, smoothed = [f[0] for f in unflagged], [f[1] for f in unflagged]
+    unambiguous = [f for f in found if f is not None and not f[2]]
+    filtered, smoothed = [f[0] for f in unambiguous], [f[1] for f in unambiguous]
     closest = np.array([e['closest'] for e in filtered])
     anees, anees_smoothed = (np.array([e['anees'] for e in errors])
                              for errors in (filtered, smoothed))
@@ -114,8 +114,8 @@ def simulated(figures, pool, name, kind, changes, flaws, n=40):
                                ('RMS within 5 m, smoothed', np.median(rms[:, 1]), 'm'),
                                ('error at the closest point', np.median(closest), 'm'),
                                ('ANEES', anees.mean(), '')):
-        figures.record(f'{name}: {label}', value, unit, note=f'{len(unflagged)} of {n} passes')
-    print(f'  {name}: {len(unflagged)} of {n} tracked and unambiguous; RMS error within 5 m '
+        figures.record(f'{name}: {label}', value, unit, note=f'{len(unambiguous)} of {n} passes')
+    print(f'  {name}: {len(unambiguous)} of {n} tracked and unambiguous; RMS error within 5 m '
           f'{np.median(rms[:, 0]):.2f} m, smoothed {np.median(rms[:, 1]):.2f} m (ratio '
           f'{np.median(rms[:, 1] / rms[:, 0]):.2f}); at the closest point '
           f'{np.median(closest):.2f} m, 90 % below {np.quantile(closest, 0.9):.2f} m; '

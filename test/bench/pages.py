@@ -36,9 +36,9 @@ def main():
             p99[n].append(found[0])
             has_losses |= found[1]
     without, with_pages = np.median(p99[0]), np.median(p99[PAGES])
-    print(f'99 % quantile of the latency: {without:.1f} ms without pages, with {PAGES} pages '
-          f'{with_pages:.1f} ms; ratio {with_pages / without:.2f} (aim {MAX_WORSE}); '
-          f'{"with" if has_losses else "without"} losses')
+    print(f'99 % quantile of the latency: {without:.1f} ms without pages, '
+          f'{with_pages:.1f} ms with {PAGES} pages; ratio {with_pages / without:.2f} '
+          f'(aim {MAX_WORSE}); {"with" if has_losses else "without"} losses')
     figures = Figures('pages')
     figures.record(f'99 % latency with {PAGES} pages over that without', with_pages / without,
                    'times', MAX_WORSE)

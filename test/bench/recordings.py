@@ -113,7 +113,7 @@ def measure():
     found |= {f'simulated {name}': figures_of_control(name)
               for name in with_progress_bar((*KINDS, 'car, four sensors'), 'controls')}
     return found | {'all': {f: sum(x.get(f, 0) for x in found.values())
-                             for f in (UNFLAGGED, CORRECT)}}
+                            for f in (UNFLAGGED, CORRECT)}}
 
 
 def measure_checkout(checkout):

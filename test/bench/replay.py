@@ -53,7 +53,7 @@ def speed_of_replay(recording, network_file, folder):
 def frame_times():
     """Track the bundled vehicles; return processing times [s] of frames.
 
-    The first array contains the frames during tracks, the second the frames that start tracks.
+    The first array is of frames during a track, the second of frames that start a track.
     """
     network, frames, starts = read_network(NETWORK_FILE), [], []
     for name in VEHICLES:

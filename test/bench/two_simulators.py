@@ -44,14 +44,14 @@ def count_over(products, one_pass, n, summary):
 
 def summary(figures, simulator, kind, found):
     """Record the figures of one kind and simulator; return a line and whether the aims are met."""
-    unflagged = [f for f in found if (~f.ambiguous).any()]
-    near = [~f.ambiguous & (f.distance < 5.0) for f in unflagged]
-    nees = np.array([f.nees[rows].mean() for f, rows in zip(unflagged, near, strict=True)
+    passes = [f for f in found if (~f.ambiguous).any()]
+    near = [~f.ambiguous & (f.distance < 5.0) for f in passes]
+    nees = np.array([f.nees[rows].mean() for f, rows in zip(passes, near, strict=True)
                      if rows.any()])
-    closest = [f.error[np.argmin(f.distance)] for f in unflagged]
+    closest = [f.error[np.argmin(f.distance)] for f in passes]
     speed_ratio = np.array([f.speed_ratio for f in found])
     within = np.mean(np.abs(speed_ratio - 1.0) < 0.1)
-    n_unflagged, rate = fraction_of_wrong(unflagged)
+    n_unflagged, rate = fraction_of_wrong(passes)
     n_smoothed = sum(f.smoothed_unflagged for f in found)
     smoothed = sum(f.smoothed_wrong for f in found) / max(n_smoothed, 1)
     name = f'{simulator}, {kind}'
@@ -64,9 +64,9 @@ def summary(figures, simulator, kind, found):
     figures.record(f'{name}: smoothed, unflagged and wrong', 100.0 * smoothed, '%',
                    note=f'of {n_smoothed} poses')
     met = not any(missed)
-    return (f'  {simulator}, {kind}: {len(unflagged)} of {len(found)} with unflagged '
+    return (f'  {simulator}, {kind}: {len(passes)} of {len(found)} with unflagged '
             f'poses; {n_unflagged} such poses, unflagged and wrong {rate:.1%} (aim 1 %), in '
-            f'{sum(f.unflagged_and_wrong.any() for f in unflagged)} passes; within 5 m NEES per '
+            f'{sum(f.unflagged_and_wrong.any() for f in passes)} passes; within 5 m NEES per '
             f'axis mean {nees.mean():.1f} (aim {MAX_NEES[kind]:.1f}), median '
             f'{np.median(nees):.1f}; speed '
             f'within 10 % in {within:.0%} (aim 90 %); at the closest point median '

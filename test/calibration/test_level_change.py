@@ -98,7 +98,7 @@ def time_reversed(blocks):
 
 @pytest.mark.parametrize('stops', [True, False])
 def test_a_stopping_vehicle_has_arrived_and_a_starting_one_has_departed(stops):
-    """A change and its time reversal never have the same result, for 80 vehicles of each kind."""
+    """A clear change and its time reversal are never both arrivals or both departures."""
     results = []
     for seed in range(80):
         begin, end = (0.0, 16.0) if stops else (8.0, 30.0)

@@ -267,7 +267,7 @@ def heading_of(yaw_deg, std_deg, R=POSTURES['upright']):
 def test_headings_are_weighted_by_their_variances(compass, nominal, expected, std):
     R = POSTURES['askew']
     fused = with_nominal_heading(heading_of(0.0, compass, R), heading_of(6.0, 0.0, R).R_ws,
-                               np.deg2rad(nominal))
+                                 np.deg2rad(nominal))
     assert np.degrees(yaw_between(R, fused.R_ws)) == pytest.approx(expected, rel=1e-3)
     np.testing.assert_allclose(np.degrees(fused.std), [0.3, 0.4, std], rtol=1e-3)
     # The tilt is measured by the accelerometer.
@@ -278,7 +278,7 @@ def test_headings_are_weighted_by_their_variances(compass, nominal, expected, st
 def test_an_inconsistent_nominal_heading_is_not_fused():
     def fused(difference):
         return with_nominal_heading(heading_of(0.0, 3.0), heading_of(difference, 0.0).R_ws,
-                                   np.deg2rad(4.0))
+                                    np.deg2rad(4.0))
     for sign in (1.0, -1.0):
         assert fused(14.9 * sign) is not None
         assert fused(15.1 * sign) is None

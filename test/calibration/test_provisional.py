@@ -133,7 +133,7 @@ def test_an_axis_that_stops_reporting_does_not_delay_the_others():
 
 
 def test_a_former_background_is_restored_within_seconds():
-    """A car parks for two minutes; the former level is restored 6 s after its departure."""
+    """A car parks for two minutes. The former level is restored within 6 s of its departure."""
     def parked(t):
         return np.array([2e-6, 0.0, 1e-6]) * (20.0 < t < 140.0)
     assert (np.abs(run_on(parked, 130.0).level(130.0) - EARTH - parked(130.0)) < SIGMA).all()

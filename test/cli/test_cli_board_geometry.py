@@ -23,11 +23,11 @@ def calibrated(tmp_path_factory):
     """(written network, output, folder) of a calibration with every other pose."""
     folder = tmp_path_factory.mktemp('geometry')
     nominal, field, positions, axes = board_of_41()
-    write_network(folder / 'stated.yaml', nominal)
+    write_network(folder / 'nominal.yaml', nominal)
     table = write_table(folder / 'poses.csv', field[::2], positions[::2], axes[::2])
     run = subprocess.run(
         [sys.executable, '-m', 'mag_tracking.cli', 'board-geometry', table, '--network',
-         folder / 'stated.yaml', '--moment', str(MOMENT), '--out', folder / 'board.yaml',
+         folder / 'nominal.yaml', '--moment', str(MOMENT), '--out', folder / 'board.yaml',
          '--figure', folder / 'board.png'], capture_output=True, text=True, check=True)
     return read_network(folder / 'board.yaml'), run.stdout, folder
 
@@ -99,12 +99,12 @@ def test_inconsistent_sensors_and_poses_are_named(tmp_path, capsys, monkeypatch)
     field[:, 2] = field[:, 2][:, [1, 0, 2]]
     field[3] = np.nan
     positions[7, 0] += 0.02
-    write_network(tmp_path / 'stated.yaml', nominal)
+    write_network(tmp_path / 'nominal.yaml', nominal)
     table = write_table(tmp_path / 'poses.csv', field, positions, axes)
     figures, save = [], Figure.savefig
     monkeypatch.setattr(Figure, 'savefig', lambda figure, *a, **k: figures.append(figure)
                         or save(figure, *a, **k))
-    assert command(table, '--network', tmp_path / 'stated.yaml', '--figure',
+    assert command(table, '--network', tmp_path / 'nominal.yaml', '--figure',
                    tmp_path / 'board.png', out=tmp_path / 'out.yaml') == 0
     text = capsys.readouterr().out
     assert 'noise): mag_2\n' in text
@@ -122,23 +122,23 @@ def test_inconsistent_sensors_and_poses_are_named(tmp_path, capsys, monkeypatch)
 
 def test_a_reversed_magnet_is_refused(tmp_path, capsys):
     nominal, field, positions, axes, _ = simulated(9)
-    write_network(tmp_path / 'stated.yaml', nominal)
+    write_network(tmp_path / 'nominal.yaml', nominal)
     table = write_table(tmp_path / 'poses.csv', field, positions, -axes)
-    assert command(table, '--network', tmp_path / 'stated.yaml', '--figure',
+    assert command(table, '--network', tmp_path / 'nominal.yaml', '--figure',
                    tmp_path / 'board.png', out=tmp_path / 'out.yaml') == 1
     out, err = capsys.readouterr()
     assert 'calibration rejected: the readings do not fit the model: the normalised cost is' in err
     assert 'network written to' not in out
-    assert {p.name for p in tmp_path.iterdir()} == {'stated.yaml', 'poses.csv'}
+    assert {p.name for p in tmp_path.iterdir()} == {'nominal.yaml', 'poses.csv'}
 
 
 def test_settings_are_read_from_a_file(tmp_path, capsys):
     nominal, field, positions, axes, _ = simulated(9)
-    write_network(tmp_path / 'stated.yaml', nominal)
+    write_network(tmp_path / 'nominal.yaml', nominal)
     table = write_table(tmp_path / 'poses.csv', field, positions, axes)
     params = tmp_path / 'params.yaml'
     params.write_text('{rotation_std_deg: 0.0, moment_std: 0.02}')
-    common = '--network', tmp_path / 'stated.yaml', '--params', params
+    common = '--network', tmp_path / 'nominal.yaml', '--params', params
     assert command(table, *common, out=tmp_path / 'out.yaml') == 0
     network = read_network(tmp_path / 'out.yaml')
     np.testing.assert_allclose(network.R_ws, nominal.R_ws, atol=1e-12)
@@ -186,9 +186,9 @@ def test_invalid_files_are_named(tmp_path, capsys):
     assert command(tmp_path / 'none.csv', '--sensors', POSITIONS_FILE, out=out) == 1
     assert 'cannot read' in capsys.readouterr().err
     nominal, field, positions, axes, _ = simulated(1, n_poses=5)
-    write_network(tmp_path / 'stated.yaml', nominal)
+    write_network(tmp_path / 'nominal.yaml', nominal)
     write_table(short_table, field, np.tile(nominal.positions[0], (5, 1)), axes)
-    assert command(short_table, '--network', tmp_path / 'stated.yaml', out=out) == 1
+    assert command(short_table, '--network', tmp_path / 'nominal.yaml', out=out) == 1
     assert 'few.csv: pose 0: [0.0, 0.0, 0.0] m is the position of a sensor' \
         in capsys.readouterr().err
     assert not out.exists()
@@ -203,11 +203,11 @@ def test_unknown_poses_are_estimated(tmp_path, capsys):
     """The table has no columns of poses."""
     nominal, field, positions, axes, _ = simulated(21)
     field[4] = np.nan
-    write_network(tmp_path / 'stated.yaml', nominal)
+    write_network(tmp_path / 'nominal.yaml', nominal)
     table = write_table(tmp_path / 'poses.csv', field, 0.0 * positions, axes)
     table.write_text('\n'.join(','.join(line.split(',')[:-6])
                                for line in table.read_text().splitlines()))
-    assert command(table, '--network', tmp_path / 'stated.yaml', *BOX_OPTIONS,
+    assert command(table, '--network', tmp_path / 'nominal.yaml', *BOX_OPTIONS,
                    out=tmp_path / 'out.yaml') == 0
     text = capsys.readouterr().out
     n = int(text.split(' of 40 poses')[0].split()[-1])
@@ -242,7 +242,7 @@ def test_ctrl_c_while_writing_loses_no_file(tmp_path, monkeypatch):
     """The interrupt occurs between writing the network file and the figure."""
     from mag_tracking.cli import board_geometry as geometry
     nominal, field, positions, axes, _ = simulated(9)
-    write_network(tmp_path / 'stated.yaml', nominal)
+    write_network(tmp_path / 'nominal.yaml', nominal)
     table = write_table(tmp_path / 'poses.csv', field, positions, axes)
 
     def interrupted(*args):
@@ -252,7 +252,7 @@ def test_ctrl_c_while_writing_loses_no_file(tmp_path, monkeypatch):
     monkeypatch.setattr(geometry, 'write_network', interrupted)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        assert command(table, '--network', tmp_path / 'stated.yaml', '--figure',
+        assert command(table, '--network', tmp_path / 'nominal.yaml', '--figure',
                        tmp_path / 'board.pdf', out=tmp_path / 'out.yaml') == 0
     finally:
         signal.signal(signal.SIGINT, before)

@@ -187,9 +187,9 @@ def test_tumbling_removes_background_and_noise_of_raw_readings(tmp_path, capsys)
     network = read_network(NETWORK_FILE)
     given_network = replace(network, background=(np.full(3, 1e-5),) * 2,
                             noise_std=(np.full(3, 1e-8),) * 2)
-    write_network(tmp_path / 'stated.yaml', given_network)
+    write_network(tmp_path / 'nominal.yaml', given_network)
     recording = write_recording(tmp_path / 'hand', tumbled())
-    assert main(['tumble', str(recording), '--network', str(tmp_path / 'stated.yaml'), '--sensor',
+    assert main(['tumble', str(recording), '--network', str(tmp_path / 'nominal.yaml'), '--sensor',
                  'mag_1', '--out', str(tmp_path / 'out.yaml')]) == 0
     calibrated = read_network(tmp_path / 'out.yaml')
     assert calibrated.background[0] is None and calibrated.noise_std[0] is None

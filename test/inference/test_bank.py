@@ -234,12 +234,11 @@ def test_keep_leaves_the_remaining_hypotheses_unchanged(removed):
 
 
 def test_an_initial_bank_returns_the_rows_of_its_source_bank():
-    """Later changes of the source bank and of a returned bank have no effect."""
+    """Changes of the source bank, or of a copy that shares its arrays, have no effect."""
     from_targets = random_bank(5, 4)
     own_covariance = np.array([np.diag([1.0, 2.0]), np.diag([3.0, 4.0])])
     bank = FilterBank.from_targets(from_targets.x, from_targets.P, from_targets.label, 2, 1e-8,
-                                   own_covariance,
-                                   from_targets.kind)
+                                   own_covariance, from_targets.kind)
     before, start = bank.copy(), InitialBank.of(bank, 4)
     other = copy(start)
     bank.x[:], bank.P[:] = np.nan, np.nan

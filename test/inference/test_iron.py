@@ -8,7 +8,8 @@ from mag_tracking.inference.iron import hard_and_soft_iron
 from mag_tracking.physics.dipole import MU0
 from support.vehicle_5 import TABLE
 
-INDUCTION = np.array([2e-6, 1.55e-5, -4.9e-5]) / MU0
+H = np.array([2e-6, 1.55e-5, -4.9e-5]) / MU0
+"""(3,) A/m, ambient field strength B0/mu0, world frame."""
 HARD, SOFT = np.array([-200.0, 120.0, -270.0]), 4.0
 
 
@@ -16,7 +17,7 @@ def moments_at(headings):
     """Moments (n, 3) [A m^2] of a vehicle with the iron HARD and SOFT."""
     c, s = np.cos(headings), np.sin(headings)
     x, y, z = HARD
-    return np.stack([c * x - s * y, s * x + c * y, z + 0.0 * c], axis=1) + SOFT * INDUCTION
+    return np.stack([c * x - s * y, s * x + c * y, z + 0.0 * c], axis=1) + SOFT * H
 
 
 def test_fit_reproduces_the_published_iron():
@@ -30,7 +31,7 @@ def test_fit_reproduces_the_published_iron():
 
 def test_exact_moments_give_exact_iron():
     headings = np.deg2rad([0.0, 80.0, 200.0])
-    fit = hard_and_soft_iron(moments_at(headings), headings, INDUCTION)
+    fit = hard_and_soft_iron(moments_at(headings), headings, H)
     np.testing.assert_allclose(fit.hard, HARD, rtol=1e-10)
     assert fit.soft == pytest.approx(SOFT, rel=1e-10)
     assert np.abs(fit.residuals).max() < 1e-9
@@ -44,7 +45,7 @@ def test_covariance_agrees_with_the_errors(stated):
     nees, costs = [], []
     for _ in range(400):
         noise = rng.standard_normal((8, 3)) * np.sqrt(np.diagonal(C[0]))
-        fit = hard_and_soft_iron(moments_at(headings) + noise, headings, INDUCTION,
+        fit = hard_and_soft_iron(moments_at(headings) + noise, headings, H,
                                  C if stated else None)
         e = np.append(fit.hard - HARD, fit.soft - SOFT)
         nees.append(e @ np.linalg.solve(fit.covariance, e))
@@ -60,7 +61,7 @@ def test_covariance_agrees_with_the_errors(stated):
 
 
 @pytest.mark.parametrize('headings, field_strength', [
-    ([0.3], INDUCTION), ([0.3, 0.3, 0.3 + 2.0 * np.pi], INDUCTION),
+    ([0.3], H), ([0.3, 0.3, 0.3 + 2.0 * np.pi], H),
     ([0.3, 1.3, 2.3], [0.0, 0.0, -39.0]), ([0.3, 1.3, 2.3], np.zeros(3))])
 def test_inseparable_hard_and_soft_iron_is_rejected(headings, field_strength):
     headings = np.array(headings)
@@ -72,10 +73,10 @@ def test_invalid_arguments_raise_value_error():
     headings = np.array([0.0, 1.0, 2.0])
     m = moments_at(headings)
     with pytest.raises(ValueError, match=r'expected moments \(n, 3\)'):
-        hard_and_soft_iron(m[:2], headings, INDUCTION)
+        hard_and_soft_iron(m[:2], headings, H)
     with pytest.raises(ValueError, match='must be finite'):
-        hard_and_soft_iron(m * [np.nan, 1.0, 1.0], headings, INDUCTION)
+        hard_and_soft_iron(m * [np.nan, 1.0, 1.0], headings, H)
     with pytest.raises(ValueError, match=r'expected covariances \(3, 3, 3\)'):
-        hard_and_soft_iron(m, headings, INDUCTION, np.eye(3))
+        hard_and_soft_iron(m, headings, H, np.eye(3))
     with pytest.raises(ValueError, match='not positive definite'):
-        hard_and_soft_iron(m, headings, INDUCTION, -np.tile(np.eye(3), (3, 1, 1)))
+        hard_and_soft_iron(m, headings, H, -np.tile(np.eye(3), (3, 1, 1)))

@@ -71,12 +71,17 @@ sensors:
 
 
 def test_the_nominal_orientation_of_version_0_1_0_is_read(tmp_path):
-    keys = 'by: hand, %s: [0.0, 0.0, 0.0, 1.0], %s_std_deg: 3'
-    old, new = (parse(tmp_path, CALIBRATED_FILE.replace('by: hand', keys % (key, key)))
-                for key in ('stated', 'nominal'))
-    for record in (old.calibrated[2], new.calibrated[2]):
+    def keys(name):
+        return f'{name}: [0.0, 0.0, 0.0, 1.0], {name}_std_deg: 3'
+
+    for name in ('stated', 'nominal'):
+        network = parse(tmp_path, CALIBRATED_FILE.replace('by: hand', f'by: hand, {keys(name)}'))
+        record = network.calibrated[2]
         assert record.nominal == (0.0, 0.0, 0.0, 1.0)
         np.testing.assert_allclose(record.nominal_std, np.deg2rad(3.0))
+    both = CALIBRATED_FILE.replace('by: hand', f'by: hand, {keys("nominal")}, {keys("stated")}')
+    with pytest.raises(NetworkError, match="unknown key 'stated'"):
+        parse(tmp_path, both)
 
 
 def test_the_calibration_of_a_sensor_is_read(tmp_path):

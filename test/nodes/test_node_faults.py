@@ -44,14 +44,17 @@ def ended_tracks(world, since_ns):
 
 
 def seconds_to_first_reading(world, sensor_back_ns):
-    """Seconds from `sensor_back_ns` to the first later reading, at most `MAX_RECOVERY_S`."""
+    """Return the time [s] from `sensor_back_ns` to the arrival of the first later reading.
+
+    Asserts that it is at most `MAX_RECOVERY_S`.
+    """
     assert world.wait(lambda: any(
         m.header.stamp.sec * NS + m.header.stamp.nanosec > sensor_back_ns
         for _, m in world.messages_since(sensor_back_ns, 'driver_node')))
-    delay_s = next(
+    first_ns = next(
         arrival_ns for arrival_ns, m in world.messages_since(sensor_back_ns, 'driver_node')
         if m.header.stamp.sec * NS + m.header.stamp.nanosec > sensor_back_ns)
-    delay_s = (delay_s - sensor_back_ns) / NS
+    delay_s = (first_ns - sensor_back_ns) / NS
     assert delay_s <= MAX_RECOVERY_S
     return delay_s
 

@@ -32,7 +32,8 @@ CALLS = {
     'rotated_fields': {
         'h': normal(HYPOTHESES, SENSORS, 3), 'H': normal(HYPOTHESES, SENSORS, 3, STATES),
         'angles': normal(HYPOTHESES, SENSORS, 3)},
-    'propagate_turn': {'x': normal(HYPOTHESES, STATES), 'dt': 0.1, 'mean': 1.0, 'fading': 1.0},
+    'propagate_turn': {'x': normal(HYPOTHESES, STATES), 'dt': 0.1, 'mean_factor': 1.0,
+                       'final_factor': 1.0},
     'row_dipoles': {'x': normal(HYPOTHESES, STATES), 'n_dipoles': DIPOLES,
                     'field_strength': normal(3)},
     'set_moment_noise': {'x': normal(HYPOTHESES, STATES), 'walk': normal(9, 9),

@@ -139,8 +139,8 @@ def test_a_sensor_moved_before_the_restart_is_relearnt(tmp_path):
     np.testing.assert_allclose(np.mean([c.field for c in out], axis=0), STEP, atol=1e-8)
 
 
-def test_a_confirmed_background_is_not_relearnt(tmp_path):
-    """A target that arrives later and stays must not become part of the background."""
+def test_a_confirmed_background_is_kept_without_relearning(tmp_path):
+    """With `relearn_s` = 0, a target that arrives later and stays is not relearnt."""
     network, stored = write_and_read_back(tmp_path / 'kept.json')
     stage = Calibrate(network, CalibrateSettings(relearn_s=0.0))
     stage.resume(stored)

@@ -62,7 +62,7 @@ def plan():
     lanes = [SimpleNamespace(name=name, along=T, filter_std=(k + 1.0) * ONES,
                              pass_std=ONES[:, None], detection=ONES)
              for k, name in enumerate(NAMES)]
-    return SimpleNamespace(x=T, lanes=lanes, miss_probability=np.stack([T, 0.1 * ONES], axis=1))
+    return SimpleNamespace(x=T, lanes=lanes, miss_curve=np.stack([T, 0.1 * ONES], axis=1))
 
 
 def calibration():

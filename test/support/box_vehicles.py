@@ -71,8 +71,8 @@ def magnetised(rng, parts, length, moment):
     # Approximation: demagnetisation along a side is inversely proportional to the side length.
     N = (1.0 / sides) / (1.0 / sides).sum(axis=1, keepdims=True)
     susceptibility = 1.0 / (N + 1.0 / CHI)
-    susceptibility *= fraction[:, None] / susceptibility.mean(axis=1, keepdims=True)
-    induced = susceptibility * moment / 1.4 * MU0 / 50e-6
+    shares = susceptibility * fraction[:, None] / susceptibility.mean(axis=1, keepdims=True)
+    induced = shares * moment / 1.4 * MU0 / 50e-6
     while True:
         common = rng.standard_normal(3)
         along = common / np.linalg.norm(common) + 0.6 * rng.standard_normal((len(fraction), 3))

@@ -151,7 +151,7 @@ def two_cars(rng, simulator, pattern, network=ROAD):
     return world(network, movers, 2.0 * start_m / speed + 4.0, rng, FLAWS[simulator])
 
 
-def faulty_pass(rng, simulator, *faults):
+def fault_world(rng, simulator, *faults):
     """World with a car that passes sensors with faults of `support.spoiler`."""
     clean = straight(rng, simulator, car(rng, simulator), rng.uniform(7.0, 20.0))
     return replace(clean, readings=spoiler.apply(clean.readings, *faults))

@@ -16,7 +16,7 @@ from support.situation_worlds import (
     departing_car,
     distant_body,
     drifting_sensors,
-    faulty_pass,
+    fault_world,
     hum,
     knocked_sensor,
     parked_and_passing_car,
@@ -56,9 +56,9 @@ SITUATIONS = {
     'a car, four sensors': Situation(
         lambda r, s: straight(r, s, car(r, s), r.uniform(7.0, 20.0), FOUR), group='control'),
     'a car of 60 m/s': Situation(lambda r, s: straight(r, s, car(r, s), 60.0)),
-    'clocks 50 ms apart': Situation(lambda r, s: faulty_pass(r, s, spoiler.delayed('mag_2', 0.05))),
-    'clocks 100 ms apart': Situation(lambda r, s: faulty_pass(r, s, spoiler.delayed('mag_2', 0.1))),
-    'clocks 200 ms apart': Situation(lambda r, s: faulty_pass(r, s, spoiler.delayed('mag_2', 0.2))),
+    'clocks 50 ms apart': Situation(lambda r, s: fault_world(r, s, spoiler.delayed('mag_2', 0.05))),
+    'clocks 100 ms apart': Situation(lambda r, s: fault_world(r, s, spoiler.delayed('mag_2', 0.1))),
+    'clocks 200 ms apart': Situation(lambda r, s: fault_world(r, s, spoiler.delayed('mag_2', 0.2))),
     'over a sensor': Situation(lambda r, s: straight(
         r, s, car(r, s), r.uniform(7.0, 20.0), y=r.choice([-4.5, 4.5]) + r.uniform(-0.4, 0.4))),
     'stops for 5 s': Situation(lambda r, s: stopping_car(r, s, 5.0)),
@@ -84,11 +84,11 @@ SITUATIONS = {
     # The stop is longer than `relearn_s`, so the vehicle has become part of the background.
     'was parked for minutes, leaves': Situation(lambda r, s: stopping_car(r, s, 150.0)),
     'parked beside a passing car': Situation(parked_and_passing_car),
-    'one sensor alone': Situation(lambda r, s: faulty_pass(r, s, spoiler.only_sensor('mag_1'))),
-    'one axis flipped': Situation(lambda r, s: faulty_pass(r, s, spoiler.wrong_sign('mag_2', 'y'))),
-    'clipped at half its peak': Situation(lambda r, s: faulty_pass(r, s, spoiler.clipped(0.5))),
-    'warming by 10 nT/s': Situation(lambda r, s: faulty_pass(r, s, spoiler.drift(1e-8))),
-    'a temperature step': Situation(lambda r, s: faulty_pass(
+    'one sensor alone': Situation(lambda r, s: fault_world(r, s, spoiler.only_sensor('mag_1'))),
+    'one axis flipped': Situation(lambda r, s: fault_world(r, s, spoiler.wrong_sign('mag_2', 'y'))),
+    'clipped at half its peak': Situation(lambda r, s: fault_world(r, s, spoiler.clipped(0.5))),
+    'warming by 10 nT/s': Situation(lambda r, s: fault_world(r, s, spoiler.drift(1e-8))),
+    'a temperature step': Situation(lambda r, s: fault_world(
         r, s, spoiler.temperature_step(3e-7, 4.0))),
     'two that meet': Situation(lambda r, s: two_cars(r, s, 'meet'), aim=0.05, group='several'),
     'one overtakes': Situation(lambda r, s: two_cars(r, s, 'overtake'), aim=0.05, group='several'),

@@ -113,7 +113,7 @@ def test_markup_in_health_notes_is_shown_literally(chromium, scene, server):
 
 @needs_browser
 def test_a_target_that_stays_for_hours_needs_bounded_memory(chromium, scene, server, records):
-    """The memory of the browser is bounded, and so is the memory of the server without viewers."""
+    """The poses in the browser and the snapshot of the server are bounded."""
     template = [r for r in records if isinstance(r, FieldFrame)][-1]
     pose, stamp = poses(records)[30], template.stamp_ns
 

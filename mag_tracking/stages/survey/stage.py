@@ -34,7 +34,7 @@ MAX_GAP_S = 3600.0
 """[s] Maximum gap between accelerations. After a longer gap or a backward jump, earlier readings
 belong to another recording and are discarded."""
 
-MIN_STATED_STD = 1e-3
+MIN_NOMINAL_STD = 1e-3
 """[rad] Minimum standard deviation of an orientation in the network file."""
 
 
@@ -170,7 +170,7 @@ class Survey:
         network, names = self._network, self._network.names
         field = np.array([fields.get(name, np.full(3, np.nan)) for name in names])
         nominal_std = np.array([np.full(3, np.deg2rad(self._settings.nominal_std_deg))
-                               if s is None else np.maximum(s, MIN_STATED_STD)
+                               if s is None else np.maximum(s, MIN_NOMINAL_STD)
                                for s in network.orientation_std])
         warnings: dict[str, list[str]] = {name: [] for name in names}
         up_directions = [self._estimate_up(name, warnings[name]) for name in names]

@@ -16,8 +16,8 @@ starting hypotheses, and separately to the grid of a magnet. The peak memory is 
 large."""
 START_BYTES = 250_000_000
 """Memory for the covariances with which a track starts [bytes]. If the covariances with all sensors
-need more, the track starts with fewer sensors. The remaining sensors are added when the frames
-before the detection have been processed."""
+need more, the track starts with fewer sensors. The remaining sensors are added after the frames
+before the detection if few hypotheses are then probable, otherwise later."""
 MIN_SENSORS_AT_START = 4
 """Minimum number of sensors at the start of a track. The sensors nearest to the strongest field are
 used."""

@@ -10,7 +10,7 @@ from mag_tracking.event_records import Disturbance
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.records import FieldFrame
 
-P_FALSE_ALARM = 1e-6
+FALSE_ALARM_PROBABILITY = 1e-6
 """Probability that the noise of a sensor alone marks it as affected in a frame."""
 
 
@@ -84,7 +84,7 @@ class Disturbances:
         if self._current is not None:
             energy, n_axes = whitened_energy(frame.field, frame.covariance)
             self._largest = np.maximum(self._largest, field_magnitudes(frame))
-            self._sensed |= energy > chdtri(np.maximum(n_axes, 1), P_FALSE_ALARM)
+            self._sensed |= energy > chdtri(np.maximum(n_axes, 1), FALSE_ALARM_PROBABILITY)
 
     def end(self, stamp_ns: int) -> list[Disturbance]:
         """End the current disturbance, at the release of the detection or at a gap in the frames.

@@ -351,8 +351,9 @@ def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, spe
                                (settings.cross_speed_std * speed) ** 2,
                                settings.climb_std**2]) @ R.T
     mean = np.full((d, d), 1.0 / d)
-    P[6:soft_index, 6:soft_index] = np.kron(moment_std**2 / d * mean
-                                + settings.difference_stds[kind]**2 * (np.eye(d) - mean), np.eye(3))
+    among_dipoles = (moment_std**2 / d * mean
+                     + settings.difference_stds[kind]**2 * (np.eye(d) - mean))
+    P[6:soft_index, 6:soft_index] = np.kron(among_dipoles, np.eye(3))
     P[soft_index:soft_index + 3, soft_index:soft_index + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
     if d > 1:
         P[soft_index + 3, soft_index + 3] = settings.length_stds[kind]**2

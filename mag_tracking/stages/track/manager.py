@@ -29,6 +29,9 @@ from mag_tracking.units import NS
 NO_SCALE = 'detections not tracked (scale not observable with one sensor)'
 NO_SCALE_FRAMES = 'frames in which no track could start (scale not observable with one sensor)'
 
+UNCERTAIN_ORIENTATIONS = ('sensors with an orientation uncertainty above '
+                          f'{np.degrees(MAX_ROTATION):g} degrees')
+
 DISTURBANCE_TRACKS = 'tracks explained by a disturbance'
 
 STARTED_IN_TAIL = 'tracks started in a larger field after the target of a detection was lost'
@@ -86,7 +89,7 @@ class TrackManager:
         n_uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
                           for s in network.orientation_std)
         if n_uncertain:
-            self.counts['sensors with an orientation uncertainty above 15 degrees'] = n_uncertain
+            self.counts[UNCERTAIN_ORIENTATIONS] = n_uncertain
 
     def use_network(self, network: SensorNetwork) -> None:
         """Apply another calibration of the same sensors as soon as no track is running.

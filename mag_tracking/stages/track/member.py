@@ -254,7 +254,7 @@ class Member:
     def _overfits(self, update: BankUpdate, view: MemberView) -> bool:
         """Update and return the doubt that the filter fits the frames better than its path."""
         overfits = self.evidence.update_filter_doubt(view.gain, update.frame.stamp_ns,
-                                               update.settings.relinearise_window_s)
+                                                     update.settings.relinearise_window_s)
         if overfits:
             self._counts['doubtful poses: the filter fits better than its path'] += 1
         return overfits

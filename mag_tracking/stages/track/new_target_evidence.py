@@ -1,4 +1,4 @@
-"""When to compare a track with other explanations of its frames, and when to accept one."""
+"""Criteria for comparing a track with other explanations, and for accepting an explanation."""
 
 import numpy as np
 from scipy.special import chdtrc
@@ -6,7 +6,7 @@ from scipy.special import chdtrc
 from mag_tracking.inference.sliding_sum import SlidingSum
 from mag_tracking.units import NS
 
-P_FALSE_ALARM = 1e-3
+FALSE_ALARM_PROBABILITY = 1e-3
 """Probability per test that noise alone triggers a comparison with other explanations."""
 
 WINDOW_S, MIN_INTERVAL_S = 0.25, 0.15
@@ -76,7 +76,7 @@ class NewTargetEvidence:
         elapsed_s = np.inf if self._last_comparison_ns is None \
             else (stamp_ns - self._last_comparison_ns) / NS
         reason = None
-        if self._was_rejected or chdtrc(max(freedom, 1.0), total) <= P_FALSE_ALARM:
+        if self._was_rejected or chdtrc(max(freedom, 1.0), total) <= FALSE_ALARM_PROBABILITY:
             reason = IMPROBABLE if elapsed_s >= MIN_INTERVAL_S else None
         elif self._is_long and elapsed_s >= self._long_interval_s:
             reason = LONG_VEHICLE
@@ -86,7 +86,9 @@ class NewTargetEvidence:
         return reason
 
     def accepts(self, log_odds: float) -> bool:
-        """Whether another explanation is accepted, at once or in two successive comparisons.
+        """Record a comparison, and return whether the other explanation is accepted.
+
+        It is accepted immediately, or in two successive comparisons.
 
         Parameters
         ----------

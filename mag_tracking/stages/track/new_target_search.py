@@ -333,7 +333,7 @@ class NewTargetSearch:
             np.array([starts[k].x for k in rows]), np.array([starts[k].P for k in rows]),
             np.full(n, -np.log(n)), bank.label[rows], bank.kind[rows], np.arange(n), bank.nis[rows])
         latest = FilterBank(bank.x[rows], bank.P[rows], log_w[rows] - log_sum_exp(log_w[rows]),
-                         anchor.label.copy(), anchor.kind.copy(), np.arange(n), bank.nis[rows])
+                            anchor.label.copy(), anchor.kind.copy(), np.arange(n), bank.nis[rows])
         n_frames = len(self._window.frames)
         per_frame = log_likelihood[rows] / n_frames
         window = Window(anchor, self._window.is_updated, self._window.frames,

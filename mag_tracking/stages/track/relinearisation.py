@@ -204,9 +204,10 @@ class Relinearisation:
             return Counter()
         leading = self._leading_rows(bank)
         rows = _rows(anchor, bank)[leading]
-        leading_anchor = anchor.rows(rows)
+        leading_bank = anchor.rows(rows)
         paths = np.stack([path[rows] for path in self._paths], axis=1)
-        path_result = self._run_along(bank_filter, leading_anchor, paths, PASSES)
+        # This also moves the bank from the anchor to the last frame.
+        path_result = self._run_along(bank_filter, leading_bank, paths, PASSES)
         is_finite = np.isfinite(path_result.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
         for path, improved in zip(self._paths, np.swapaxes(paths, 0, 1), strict=True):
             path[rows[is_finite]] = improved[is_finite]
@@ -218,11 +219,11 @@ class Relinearisation:
         converged = path_result.max_shift <= CONVERGED
         is_accepted = is_finite & converged & (
             (gain >= 0.0) | ~bank_filter.are_long(bank.kind[leading]))
-        _replace_states(bank, leading[is_accepted], leading_anchor.x[is_accepted],
-                        leading_anchor.P[is_accepted])
+        _replace_states(bank, leading[is_accepted], leading_bank.x[is_accepted],
+                        leading_bank.P[is_accepted])
         is_rejected = is_finite & ~is_accepted
-        _widen_covariances(bank, leading[is_rejected], leading_anchor.x[is_rejected],
-                           leading_anchor.P[is_rejected], bank_filter.linear_range)
+        _widen_covariances(bank, leading[is_rejected], leading_bank.x[is_rejected],
+                           leading_bank.P[is_rejected], bank_filter.linear_range)
         return Counter({ATTEMPTED: len(is_accepted), FAILED: int(np.count_nonzero(~is_accepted))})
 
     @property
@@ -338,7 +339,7 @@ def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArr
 
 
 def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
-                       nearly_linear: Callable[[FloatArray], FloatArray]) -> None:
+                       linear_range: Callable[[FloatArray], FloatArray]) -> None:
     """Replace covariances `rows` in place where `P` has a larger position variance.
 
     The new covariance includes the difference between `x` and the state of the bank. It is not
@@ -349,7 +350,7 @@ def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: Float
     own_variance, path_variance, wide_variance = (
         np.einsum('nii->n', C[:, :3, :3]) for C in (bank.P[rows], P, wide_P))
     is_wider = (path_variance > own_variance) \
-        & (wide_variance < np.square(nearly_linear(bank.x[rows])))
+        & (wide_variance < np.square(linear_range(bank.x[rows])))
     bank.P[rows[is_wider]] = wide_P[is_wider]
 
 

@@ -178,7 +178,10 @@ class RigidPass:
 
     @property
     def needs_clock_offsets(self) -> bool:
-        """Whether clock offsets are significant and displace the target by over `MIN_DISTANCE`."""
+        """Whether clock offsets explain the pass better than a path without them, straight or bent.
+
+        They must be significant, at most `MAX_OFFSET`, and displace the target by `MIN_DISTANCE`.
+        """
         offset = float(np.nanmax(np.abs(self.offset)))
         if not self.is_explained or offset > MAX_OFFSET or offset * self.speed < MIN_DISTANCE:
             return False

@@ -107,7 +107,7 @@ class RunningTrack:
 
     @property
     def _final_sensors(self) -> SensorSubset:
-        """Sensors that the track uses once the bank is small enough for all of them."""
+        """Sensors that the track uses after the frames before the detection."""
         return self._bank.later_sensors or self._bank.sensors
 
     def configure(self, settings: TrackSettings) -> None:

@@ -143,7 +143,10 @@ def _leader(bank: FilterBank, log_likelihood: FloatArray) -> int | None:
 
 
 def _misfit(bank: FilterBank, frame: FieldFrame, log_likelihood: FloatArray) -> float:
-    """Normalised innovation squared per axis of the leading hypothesis; infinite without one."""
+    """Normalised innovation squared per axis of the leading hypothesis.
+
+    Infinite if no hypothesis leads.
+    """
     leader = _leader(bank, log_likelihood)
     n_axes = np.count_nonzero(~np.isnan(frame.field))
     return np.inf if leader is None else float(np.nansum(bank.nis[leader])) / n_axes

@@ -23,6 +23,9 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.units import NS
 
+NOT_SMOOTHED = 'tracks without smoothing'
+"""Key of the number of tracks that could not be smoothed as a whole."""
+
 State: TypeAlias = tuple[FloatArray, FloatArray]
 """State (n_x,) and covariance (n_x, n_x)."""
 

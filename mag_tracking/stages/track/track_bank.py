@@ -19,7 +19,12 @@ from mag_tracking.stages.track.relinearisation import Relinearisation, Window
 from mag_tracking.stages.track.sensor_rejection import SensorRejection
 from mag_tracking.stages.track.sensor_selection import SensorSubset, exchange_sensor_states
 from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.stages.track.smoothing import FixedLag, TrackState, WholeTrack
+from mag_tracking.stages.track.smoothing import (
+    NOT_SMOOTHED,
+    FixedLag,
+    TrackState,
+    WholeTrack,
+)
 from mag_tracking.stages.track.target import Target
 from mag_tracking.units import NS
 
@@ -242,7 +247,7 @@ class TrackBank:
         states, n_excluded = self._whole_track.smoothed(self.bank, best)
         if counts:
             self._counts['frames left out of smoothing'] += n_excluded
-            self._counts['tracks without smoothing'] += self._whole_track.is_abandoned
+            self._counts[NOT_SMOOTHED] += self._whole_track.is_abandoned
         return states
 
     def without_target(self, i: int) -> None:

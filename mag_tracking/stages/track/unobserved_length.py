@@ -8,7 +8,8 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.stages.track.sensor_selection import offset_from_nearest
 
 MAX_CAR_ROW = 4.0
-"""[m] Maximum length of the row of dipoles of a car. Longer vehicles also extend beyond the row."""
+"""[m] Maximum length of the row of dipoles of a car. The iron of longer vehicles extends beyond the
+row."""
 
 MIN_SPEED_STDS = 3.0
 """A vehicle has a heading if its speed exceeds this number of standard deviations."""

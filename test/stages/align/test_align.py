@@ -257,8 +257,8 @@ class PlainAlign:
         return out
 
     def complete(self, end, oldest):
-        newest, last, all_sensors = (
-            max(self.seen), max(self.taken.values(), default=0), range(self.n))
+        newest, last = max(self.seen), max(self.taken.values(), default=0)
+        all_sensors = range(self.n)
 
         def is_active(j, at):
             return (self.latest[j] >= at - self.max_wait if j in self.latest

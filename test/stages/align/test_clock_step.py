@@ -190,7 +190,7 @@ def test_repeated_timestamps_ahead_of_all_do_not_fill_the_memory():
 @settings(derandomize=True, deadline=None, max_examples=25)
 @given(st.integers(0, 10_000))
 def test_networks_of_slow_sensors_lose_no_samples(seed):
-    """Sampling intervals may exceed `LIMIT`; samples are held for at most two of the longest."""
+    """Sampling intervals may exceed `LIMIT`. A sample is held for at most twice the longest."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 7))
     steps = [int(s) for s in rng.uniform(300.0, 3000.0, n)]

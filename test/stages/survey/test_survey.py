@@ -130,7 +130,7 @@ def test_tilt_and_clock_offset_are_found_without_an_earth_field():
     assert 'three sensors' in result.sensors[0].warnings[0]
 
 
-def test_a_sensor_without_accelerations_keeps_its_stated_orientation():
+def test_a_sensor_without_accelerations_keeps_its_nominal_orientation():
     result, _ = surveyed(change=lambda readings: readings.pop('mag_2'))
     assert warnings(result) == {
         'mag_2': ('no accelerations; the orientation is not surveyed',)}
@@ -216,7 +216,7 @@ def test_a_compass_heading_far_from_the_nominal_heading_is_reported():
     assert result.sensors[1].by == 'accelerometer, nominal heading'
 
 
-def test_a_sensor_with_a_flipped_axis_keeps_its_stated_heading():
+def test_a_sensor_with_a_flipped_axis_keeps_its_nominal_heading():
     fields = {name: R.inv().apply(EARTH) for name, R in
               zip(('mag_1', 'mag_2', 'mag_3'), ROTATIONS, strict=True)}
     fields['mag_3'] = fields['mag_3'] * [1.0, 1.0, -1.0]
@@ -234,7 +234,7 @@ def test_a_sensor_with_a_flipped_axis_keeps_its_stated_heading():
 
 def test_a_vertical_field_gives_one_warning_per_sensor():
     fields = {name: R.inv().apply([0.0, 0.0, -5e-5]) for name, R in
-          zip(('mag_1', 'mag_2', 'mag_3'), ROTATIONS, strict=True)}
+              zip(('mag_1', 'mag_2', 'mag_3'), ROTATIONS, strict=True)}
     result, _ = surveyed(nominal(earth=np.array([0.0, 0.0, -5e-5])), fields=fields)
     for s in result.sensors:
         assert s.by == 'accelerometer, nominal heading'

@@ -264,7 +264,7 @@ def test_two_vehicles_without_common_sensors_are_filtered_independently():
         log_likelihood = joint.advance(together, FieldFrame(
             k, field, C, np.ones(4), np.zeros(4), True), 0.1)[1]
         separate = [f.advance(b, FieldFrame(k, field[rows], C[rows], np.ones(2), np.zeros(2), True),
-                             0.1)[1] for f, b, rows in zip(
+                              0.1)[1] for f, b, rows in zip(
                                  filters, banks, (slice(0, 2), slice(2, 4)), strict=True)]
         assert log_likelihood[0] == pytest.approx(separate[0][0] + separate[1][0], rel=1e-9)
         for i, bank in enumerate(banks):

@@ -163,7 +163,7 @@ def bank_after_one_frame(extra, linear):
 
 
 @pytest.mark.parametrize('extra, is_wider', [(0.5, True), (-1e-3, False)])
-def test_a_converged_path_replaces_the_state_and_a_smaller_covariance(extra, is_wider):
+def test_a_converged_path_replaces_the_state_and_only_widens_the_covariance(extra, is_wider):
     filter_, bank, relinearisation = bank_after_one_frame(extra, np.inf)
     x, P = bank.x.copy(), bank.P.copy()
     assert relinearisation.relinearise_leading(filter_, bank)[relinearise.FAILED] == 0
@@ -321,7 +321,7 @@ def test_relinearisation_converges_to_a_batch_fit(turns):
 def test_the_smoother_converges_to_a_batch_fit(turns):
     filter_, bank_of, y, expected = deterministic_target(24, turns)
     states, n_excluded = smoothed_track(filter_, bank_of(1), frames_of(y),
-                                      [0.0] + [PERIOD] * (len(y) - 1), relinearisations=9)
+                                        [0.0] + [PERIOD] * (len(y) - 1), relinearisations=9)
     x, P = states[-1]
     assert not n_excluded
     assert np.abs((x - expected) / np.sqrt(np.diagonal(P))).max() < 1e-2

@@ -17,6 +17,7 @@ from mag_tracking.stages.track.sensor_selection import (
     nearest_sensors,
     part_of_frame,
 )
+from mag_tracking.stages.track.smoothing import NOT_SMOOTHED
 from support.bundled import POINT
 from support.networks import line_network
 from support.samples import one, simulate
@@ -114,7 +115,7 @@ def test_a_target_is_tracked_along_forty_sensors():
         nearest = present[np.argsort(np.abs(network.positions[present, 0] - t.position[0]))]
         assert used[nearest[:2]].any()
     assert not [r for r in records if isinstance(r, SmoothedPose) and r.complete]
-    assert pipeline.counts()['track']['tracks without smoothing'] == 1
+    assert pipeline.counts()['track'][NOT_SMOOTHED] == 1
 
 
 @pytest.mark.parametrize('limit', [8, 16])
@@ -165,7 +166,7 @@ def track_frames(frames, changes, doubtful=None, start=slice(None)):
 
 
 def test_sensors_that_join_without_measurements_change_nothing(monkeypatch, frames):
-    """This shows that the states are predicted only once to the frame in which the sensors join."""
+    """The states are predicted only once to the frame in which the sensors join."""
     network, all_frames = frames
     first = next(f for f in all_frames if f.target_present)
     near = nearest_sensors(network.positions, network.positions[
@@ -221,7 +222,7 @@ def test_the_first_pose_is_flagged_for_a_sensor_that_joins_with_it(monkeypatch, 
 def test_a_network_of_at_most_max_sensors_is_used_completely():
     network = line_network(6, tilt=0.02)
     limited, unlimited = ([r for r in drive(network, {'track.max_sensors': n})[0]
-                    if isinstance(r, Track)] for n in (6, 1000))
+                           if isinstance(r, Track)] for n in (6, 1000))
     assert len(limited) == len(unlimited) > 20
     for a, b in zip(limited, unlimited, strict=True):
         np.testing.assert_array_equal(a.position, b.position)

@@ -12,6 +12,7 @@ from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.simulation.scenario import Path, point_body, random_vehicle
 from mag_tracking.stages.track import smoothing as smooth_module
 from mag_tracking.stages.track.manager import TrackManager
+from mag_tracking.stages.track.smoothing import NOT_SMOOTHED
 from support import plain_kalman
 from support.bundled import POINT
 from support.marks import studied
@@ -298,7 +299,7 @@ def test_smoothing_can_be_disabled_and_tracks_that_are_too_long_are_counted():
     records = [r for s in samples for r in pipeline.feed(one(s))] + pipeline.flush()
     assert [r for r in records if isinstance(r, Track)]
     assert not [r for r in records if isinstance(r, SmoothedPose)]
-    assert pipeline.track.counts['tracks without smoothing'] == 1
+    assert pipeline.track.counts[NOT_SMOOTHED] == 1
 
 
 def test_smoothing_bridges_missing_frames():

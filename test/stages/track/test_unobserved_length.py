@@ -12,7 +12,7 @@ P = 0.04 * np.eye(19)
 SMALL, CAR, TRUCK = range(3)
 
 
-def default_unobserved_length():
+def unobserved_length_of_kinds():
     return UnobservedLength([0.0, 3.0, 9.0], [0.0, 1.0, 3.0])
 
 
@@ -52,7 +52,7 @@ def test_the_middle_of_a_long_vehicle_is_less_certain_than_that_of_its_iron(comp
 
 @pytest.mark.parametrize('length', [4.0, 8.9])
 def test_a_truck_that_has_been_sensed_may_have_its_iron_at_either_end(length):
-    unobserved_length = default_unobserved_length()
+    unobserved_length = unobserved_length_of_kinds()
     for beyond in (-9.0, 8.0):
         unobserved_length.update(at([beyond, 0.0]), P, np.zeros((1, 3)), True)
         expected = np.square(middle_offsets(length, 1.5, beyond > 0.0)).mean()
@@ -61,7 +61,7 @@ def test_a_truck_that_has_been_sensed_may_have_its_iron_at_either_end(length):
 
 
 def test_only_the_spread_of_lengths_remains_for_a_row_longer_than_its_kind():
-    unobserved_length = default_unobserved_length()
+    unobserved_length = unobserved_length_of_kinds()
     found = [unobserved_length.covariance(at([-9.0, 0.0]), P, length, TRUCK)[0, 0]
              for length in (9.0, 15.0)]
     np.testing.assert_allclose(found, 1.5**2)
@@ -70,7 +70,7 @@ def test_only_the_spread_of_lengths_remains_for_a_row_longer_than_its_kind():
 def test_an_approaching_car_may_be_the_front_of_a_truck():
     """The variance matches a mixture in which one vehicle in three is a truck with its middle 3 m
     further back."""
-    added = default_unobserved_length().covariance(at([-20.0, 0.0]), P, 3.0, CAR)
+    added = unobserved_length_of_kinds().covariance(at([-20.0, 0.0]), P, 3.0, CAR)
     rng = np.random.default_rng(0)
     is_truck = rng.random(400_000) < 1.0 / 3.0
     behind = is_truck * 0.5 * (9.0 + 3.0 * rng.standard_normal(len(is_truck)) - 3.0)
@@ -80,7 +80,7 @@ def test_an_approaching_car_may_be_the_front_of_a_truck():
 
 @pytest.mark.parametrize('heading', [0.0, 2.0, np.pi])
 def test_a_car_is_certain_once_a_truck_would_have_been_sensed(heading):
-    unobserved_length, forward = default_unobserved_length(), np.array(
+    unobserved_length, forward = unobserved_length_of_kinds(), np.array(
         [np.cos(heading), np.sin(heading)])
     for beyond, is_uncertain in ((-9.0, True), (2.9, True), (3.1, False), (8.0, False)):
         x = at(beyond * forward, heading)
@@ -89,7 +89,7 @@ def test_a_car_is_certain_once_a_truck_would_have_been_sensed(heading):
 
 
 def test_the_distance_along_the_path_counts_around_a_corner():
-    unobserved_length = default_unobserved_length()
+    unobserved_length = unobserved_length_of_kinds()
     for position, heading, is_uncertain in (([-4.0, 1.0], 0.0, True), ([1.0, 1.0], 0.0, True),
                                             ([2.0, 0.0], -1.5, True), ([2.0, -2.0], -1.5, False)):
         x = at(position, heading)
@@ -98,7 +98,7 @@ def test_the_distance_along_the_path_counts_around_a_corner():
 
 
 def test_only_a_sensor_near_the_path_confirms_the_length():
-    unobserved_length, far = default_unobserved_length(), np.array(
+    unobserved_length, far = unobserved_length_of_kinds(), np.array(
         [[-100.0, 500.0, 0.0], [0.0, 3.0, 0.0]])
     unobserved_length.update(at([-20.0, 0.0]), P, far, True)
     assert unobserved_length.covariance(at([-20.0, 0.0]), P, 3.0, CAR).any()
@@ -109,7 +109,7 @@ def test_only_a_sensor_near_the_path_confirms_the_length():
 
 
 def test_a_vehicle_that_stops_keeps_its_heading():
-    unobserved_length = default_unobserved_length()
+    unobserved_length = unobserved_length_of_kinds()
     unobserved_length.update(at([-5.0, 0.0]), P, SENSORS, True)
     moving = unobserved_length.covariance(at([-4.0, 0.0]), P, 3.0, CAR)
     for heading in (0.0, 2.0, 4.0):

@@ -36,7 +36,7 @@ def drive(begin_s, end_s, at_s, v=10.0, y=-1.5, **changes):
 
 
 def counted(*drives, settings=None, last_s=30.0, field_at=None, network=NETWORK, first_s=0.0):
-    """Feed the tracks `drives` to the counting, frame by frame; return (records, `Traffic`)."""
+    """Feed the tracks of drives to `Traffic`, frame by frame; return (records, `Traffic`)."""
     stage, out = Traffic(network, settings or TrafficSettings()), []
     for k in range(round(first_s / STEP), round(last_s / STEP) + 1):
         field = None if field_at is None else field_at(k * STEP)
