@@ -35,8 +35,8 @@ def test_a_pose_table_becomes_a_recording(tmp_path):
     (HEADER + '1e30' + ROW[1:], '1,2,3\n', 'id contains values that are not integers up to'),
     (HEADER + ROW.replace('0.5', '-5'), '1,2,3\n', 'timestamp contains values outside'),
     (HEADER + ROW.replace('0.5', '1e300'), '1,2,3\n', 'timestamp contains values outside'),
-    (HEADER + ROW, '1,2,nan\n', 'values that are not finite'),
-    (HEADER + ROW, '1,2\n', 'background.csv: expected 3 columns, got 2'),
+    (HEADER + ROW, '1,2,nan\n', 'background.csv: row 1: Bz is not a finite number'),
+    (HEADER + ROW, '1,2\n', 'background.csv: row 1: expected 3 columns, got 2'),
     (HEADER + ROW, '1,2,3\n4,5,6\n', r'numbers of sensors: .*background.csv has 2, .* has 1$')])
 def test_an_invalid_pose_table_is_refused(tmp_path, table, background, message):
     with pytest.raises(RecordingError, match=message):
