@@ -73,6 +73,22 @@ def time_unit(text: str) -> str | None:
     return _TIME_OF.get(_plain_name(text).lower())
 
 
+def unit_since_1970(value: float) -> str | None:
+    """Find the unit in which a number is a time of this century since 1970.
+
+    Parameters
+    ----------
+    value : float
+
+    Returns
+    -------
+    str or None
+        's', 'ms', 'us' or 'ns'.
+    """
+    return next((unit for unit in ('s', 'ms', 'us', 'ns')
+                 if 9e8 <= value * TIME_UNITS[unit] / NS <= LATEST_NS / NS), None)
+
+
 def _plain_name(text: str) -> str:
     """Remove brackets and white space from the name of a unit, and write the micro sign as u."""
     # The first replacement repairs UTF-8 that was decoded as Latin-1.

@@ -88,6 +88,8 @@ class _ReadingPrinter:
                            if not count.startswith('samples: '))
         state = self.driver.fault or ('open' if self.driver.is_open else 'opening')
         out = [f'{self.driver.name}: {state}' + (f'  ({errors})' if errors else '')]
+        out += [f'  {cause}, such as {example}'
+                for cause, example in self.driver.examples().items()]
         for sensor, queue in self._samples.items():
             samples = [queue.popleft() for _ in range(len(queue))]
             if not samples:

@@ -9,17 +9,17 @@ import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
 
 from mag_tracking.arrays import BoolArray
 from mag_tracking.drivers.device_clock import ArrivalClock, ClockSettings, DeviceClock
-from mag_tracking.drivers.reading import Arrival, Axes, Device, Reading
+from mag_tracking.drivers.reading import Arrival, Axes, Device, DeviceDate, Reading
 from mag_tracking.drivers.sequence import SequenceCheck
 from mag_tracking.drivers.settings import (
     ACCELERATION_UNITS,
-    FIELD_UNITS,
     STAMPED_BY,
     DriverSettings,
     scale_of,
@@ -27,6 +27,7 @@ from mag_tracking.drivers.settings import (
 from mag_tracking.drivers.single_source import SingleSource
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample, Readings
+from mag_tracking.units import field_scale
 
 POLL_S = 0.2
 """[s] Interval at which `serve` checks whether to stop."""
@@ -92,7 +93,7 @@ class Driver:
         self.driver_counts: Counter[str] = Counter()
         self._device, self._settings = device, settings
         self._clock_settings = clock_settings
-        self._scale = scale_of(settings.unit, FIELD_UNITS, 'unit')
+        self._scale = field_scale(settings.unit)
         self._acceleration_scale = scale_of(
             settings.acceleration_unit, ACCELERATION_UNITS, 'acceleration_unit')
         if settings.stamp_by not in STAMPED_BY:
@@ -163,6 +164,19 @@ class Driver:
             total.update(clock.counts.copy())
             total.update(clock.restarts.copy())
         return total
+
+    def examples(self) -> dict[str, str]:
+        """Rejected lines and device times, and what to change.
+
+        Returns
+        -------
+        dict of str to str
+            First example and remedy, by cause; the cause is a key of `counts`.
+        """
+        found = dict(getattr(self._device, 'examples', {}))
+        for clock in self.clocks().values():
+            found.update(clock.examples)
+        return found
 
     def poll(self, timeout_s: float) -> PollResult:
         """Return the samples received since the last call.
@@ -351,7 +365,9 @@ class Driver:
                 self.driver_counts['readings beyond the maximum number of sources'] += 1
                 return None
             uses_arrivals = stamp_by == 'arrival' or stamp_by == 'auto' and ticks is None
-            clock = (ArrivalClock if uses_arrivals else DeviceClock)(self._clock_settings)
+            settings = self._clock_settings if not isinstance(ticks, DeviceDate) else replace(
+                self._clock_settings, tick_s=1e-6, wrap=0)
+            clock = (ArrivalClock if uses_arrivals else DeviceClock)(settings)
             self._clocks[arrival.source] = clock
         if ticks is None and isinstance(clock, DeviceClock):
             self.driver_counts['readings without a device time'] += 1

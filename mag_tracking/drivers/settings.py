@@ -7,9 +7,8 @@ import numpy as np
 
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
+from mag_tracking.units import FIELD_UNITS, field_scale
 
-FIELD_UNITS = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7}
-"""Factor from each unit to tesla."""
 ACCELERATION_UNITS = {'m/s2': 1.0, 'g': 9.80665, 'mg': 9.80665e-3}
 """Factor from each unit to m/s²."""
 STAMPED_BY = ('auto', 'ticks', 'sequence', 'arrival')
@@ -21,7 +20,8 @@ class DriverSettings:
     """Settings common to all drivers."""
 
     unit: str = param(
-        'T', 'Unit of the field: T, mT, uT, nT, G, mG, or a number (tesla per count).')
+        'T', 'Unit of the field: T, mT, uT, nT, G, mG, counts per unit such as 1090/G, or a number '
+        '(tesla per count).')
     acceleration_unit: str = param(
         'm/s2', 'Unit of the acceleration: m/s2, g, mg, or a number (m/s^2 per count).')
     stamp_by: str = param(
@@ -62,8 +62,11 @@ def scale_of(unit: str, units: Mapping[str, float], name: str) -> float:
     Raises
     ------
     SettingsError
-        If `unit` is neither a known unit nor a finite number other than 0.
+        If `unit` is neither a known unit nor a finite number other than 0, or a field of more than
+        1 T per count.
     """
+    if units is FIELD_UNITS:
+        return field_scale(unit, name)
     if unit in units:
         return units[unit]
     try:

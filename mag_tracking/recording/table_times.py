@@ -9,7 +9,7 @@ from fractions import Fraction
 from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.recording.table_text import is_missing, is_number, plain_number
 from mag_tracking.time_text import DATE_ORDERS, DAY_NS, FORMS, date_order, parse_time
-from mag_tracking.units import LATEST_NS, NS, TIME_UNITS, time_scale, time_unit
+from mag_tracking.units import LATEST_NS, NS, TIME_UNITS, time_scale, time_unit, unit_since_1970
 
 PLAUSIBLE_STEP_S = (1e-4, 0.67)
 """Range of intervals between readings that need no question about the unit of the time [s]."""
@@ -20,12 +20,10 @@ _DIGITS_OF_A_DATE = re.compile(
     '(?:19|20)[0-9]{2}[01][0-9][0-3][0-9][0-2][0-9][0-5][0-9][0-5][0-9](?:[.]?[0-9]+)?').fullmatch
 """yyyymmddhhmmss and decimals."""
 _EPOCHS = (
-    ('s', 9e8, 2.147e9, 0, 's since 1970'), ('ms', 9e11, 2.147e12, 0, 'ms since 1970'),
-    ('us', 9e14, 2.147e15, 0, 'us since 1970'), ('ns', 9e17, 2.147e18, 0, 'ns since 1970'),
     ('d', 36526, 58484, 25569 * DAY_NS, 'days since 1900 (spreadsheet)'),
     ('d', 730486, 752444, 719529 * DAY_NS, 'days since the year 0 (MATLAB)'),
     ('s', 3.03e9, 4.23e9, 2082844800 * NS, 's since 1904 (LabVIEW)'))
-"""Unit, range of values in this century, time to subtract [ns], and name of each epoch."""
+"""Unit, range of values in this century, time to subtract [ns], and name of epochs before 1970."""
 _COUNTER_LIMITS = (2**16, 2**31, 2**32)
 _DAY_LIMITS_S = (86400, 7 * 86400)
 
@@ -181,7 +179,10 @@ def _unit_of(where: str, values: Sequence[int | None], step: int, unit: str, hea
     stated = unit or header_unit
     step_s = step / _SUB
     known = (time_unit(stated) or stated) if stated else ''
-    for name, first, last, offset, title in _EPOCHS:
+    epochs = list(_EPOCHS)
+    if (since := unit_since_1970(low)) and since == unit_since_1970(high):
+        epochs.append((since, low, high, 0, f'{since} since 1970'))
+    for name, first, last, offset, title in epochs:
         seconds = step_s * TIME_UNITS[name] / NS
         if first <= low <= high <= last and known in ('', name) and (
                 not step or 1e-4 <= seconds <= 100.0 or known):
