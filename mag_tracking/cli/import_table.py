@@ -5,7 +5,7 @@ import datetime
 from pathlib import Path
 
 from mag_tracking.cli.options import Commands, add_command
-from mag_tracking.cli.table_options import add_table_options, table_options
+from mag_tracking.cli.table_options import add_table_options, print_notes, table_options
 from mag_tracking.errors import SettingsError
 from mag_tracking.quantities import quantity
 from mag_tracking.units import NS
@@ -69,7 +69,7 @@ def _import(args: argparse.Namespace) -> int:
         print(f'{quantity(n, "reading")} written to {recording}, network to {network}')
         return 0
     recordings, content = import_field_table(args.table, table_options(args), args.out)
-    print(f'{args.table}: {"; ".join(content.notes)}')
+    print_notes(args.table, content.notes)
     for recording, readings in zip(recordings, content.sessions, strict=True):
         first, last = (int(t) for t in readings.stamp_ns[[0, -1]])
         print(f'{quantity(len(readings), "reading")} written to {recording}: '

@@ -1,6 +1,8 @@
 """Options that describe a table of readings, for `import` and `tumble`."""
 
 import argparse
+from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mag_tracking.errors import SettingsError
@@ -78,3 +80,19 @@ def table_options(args: argparse.Namespace, sensor: str | None = None) -> 'Table
         args.sensor if sensor is None else sensor, sensors,
         args.separator, args.decimal, args.header, args.encoding, args.date_order, args.rate,
         args.wrap, args.jumps)
+
+
+def print_notes(table: Path, notes: Iterable[str]) -> None:
+    """Print what was found out about a table, with each warning on its own line.
+
+    Parameters
+    ----------
+    table : Path
+    notes : iterable of str
+        Notes of a `FieldTable`.
+    """
+    notes = list(notes)
+    print(f'{table}: {"; ".join(n for n in notes if not n.startswith("warning"))}')
+    for note in notes:
+        if note.startswith('warning'):
+            print(f'  {note}')

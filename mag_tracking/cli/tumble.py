@@ -16,7 +16,7 @@ from mag_tracking.cli.options import (
     recorded_network,
     utc_timestamp,
 )
-from mag_tracking.cli.table_options import add_table_options, table_options
+from mag_tracking.cli.table_options import add_table_options, print_notes, table_options
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
@@ -108,7 +108,7 @@ def _source(args: argparse.Namespace, network: SensorNetwork) -> Recording | lis
     candidates = args.sensor or network.names
     table = read_field_table(args.recording, table_options(
         args, candidates[0] if len(candidates) == 1 else ''), with_times=False)
-    print(f'{args.recording}: {"; ".join(table.notes)}')
+    print_notes(args.recording, table.notes)
     return table.sessions
 
 

@@ -24,13 +24,14 @@ from mag_tracking.recording.table_text import find_decimal, parse_number
 from mag_tracking.recording.table_times import check_range, read_times, span_text
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Readings
-from mag_tracking.units import NS
+from mag_tracking.units import NS, time_unit
 
 SUFFIXES = ('.csv', '.tsv', '.txt')
 """File name extensions of tables."""
 USUAL_FIELD_T = (1e-5, 2e-4)
 """Range of the median magnitude of a field that is not influenced by magnets [T]."""
-_NANOSECONDS = re.compile('n(ano)?s(ec(ond)?)?s?', re.IGNORECASE).fullmatch
+_DECIMALS = {'ms': 3, 'us': 6, 'ns': 9}
+"""Number of decimals of a second in a column of this unit."""
 
 _Path: TypeAlias = str | PathLike[str]
 
@@ -170,13 +171,17 @@ class _Rows:
         self.texts.append(self._time_text([cells[j] for j in self.columns.time]))
 
     def _time_text(self, parts: Sequence[str]) -> str:
-        """Join the cells of the time; seconds and nanoseconds become one number."""
-        if len(parts) == 2 and parts[0].isdecimal() and parts[1].isdecimal() and len(
-                parts[1]) <= 9:
-            name = self.table.header[self.columns.time[1]] if self.table.header else ''
-            if len(parts[0]) in (9, 10) or _NANOSECONDS(re.split('[^A-Za-z]', name)[-1]):
-                return f'{parts[0]}.{parts[1].zfill(9)}'
-        return ' '.join(parts)
+        """Join the cells of the time; a last column of ms, us or ns becomes decimals."""
+        if len(parts) < 2 or not parts[-1].isdecimal() or '.' in parts[-2]:
+            return ' '.join(parts)
+        name = self.table.header[self.columns.time[-1]] if self.table.header else ''
+        unit = time_unit(re.split('[^A-Za-z]', name)[-1]) or ''
+        if not self.table.header and len(parts) == 2 and len(parts[0]) == 10:
+            # Seconds since 1970 and nanoseconds, as `ros2 topic echo --csv` writes them.
+            unit = 'ns'
+        if len(parts[-1]) > _DECIMALS.get(unit, 0):
+            return ' '.join(parts)
+        return f'{" ".join(parts[:-1])}.{parts[-1].zfill(_DECIMALS[unit])}'
 
 
 def _decimal(table: Table, columns: Columns, options: TableOptions) -> str:
@@ -210,7 +215,8 @@ def _stamps(rows: _Rows, decimal: str, options: TableOptions
     where = f'{path}: {columns.time_name}'
     times = read_times(where, rows.texts, rows.keys, decimal, options.time_unit,
                        columns.time_unit, options.date_order)
-    ordered = order_times(where, times, rows.keys, rows.lines, options.wrap, options.jumps)
+    ordered = order_times(where, times, rows.texts, rows.keys, rows.lines, options.wrap,
+                          options.jumps)
     for k, value in enumerate(times.values):
         if value is None:
             rows.table.bad.append((rows.lines[k], f'{columns.time_name}: {rows.texts[k][:30]!r} is '
@@ -311,6 +317,7 @@ def describe(readings: Readings) -> list[str]:
         One line per sensor, and a warning if all fields have an unusual magnitude.
     """
     out, magnitudes = [], []
+    spans: dict[str, tuple[int, int]] = {}
     begin = int(readings.stamp_ns.min())
     for k, name in enumerate(readings.names):
         own = readings.part(readings.sensor == k)
@@ -328,6 +335,11 @@ def describe(readings: Readings) -> list[str]:
             magnitudes.append(float(np.nanmedian(np.linalg.norm(own.field, axis=1))))
             line += f', median field {1e6 * magnitudes[-1]:.4g} uT'
         out.append(line)
+        spans[name] = int(own.stamp_ns[0]), int(own.stamp_ns[-1])
+    last, first = max(spans, key=lambda n: spans[n][0]), min(spans, key=lambda n: spans[n][1])
+    if spans[last][0] > spans[first][1]:
+        out.append(f'warning: the readings of {last} begin after those of {first} have ended; the '
+                   'clocks of the sensors may differ')
     if magnitudes and not any(USUAL_FIELD_T[0] <= m <= USUAL_FIELD_T[1] for m in magnitudes):
         out.append(f'warning: the median field is {1e6 * magnitudes[0]:.4g} uT, but the Earth\'s '
                    'field is 20 to 70 uT; check --unit (for raw counts, such as --unit 1090/G)')

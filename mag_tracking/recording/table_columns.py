@@ -10,6 +10,7 @@ from mag_tracking.recording.table_layout import Table
 from mag_tracking.settings import closest_name
 from mag_tracking.units import FIELD_UNITS, field_scale, field_unit, time_unit
 
+_HEADER_HINT = '; if this is not the header, give --header with the number of its line'
 DEFAULT_SENSOR = 'mag_1'
 """Name of the only sensor of a table that does not name it."""
 IGNORED = '-'
@@ -216,8 +217,8 @@ def _index(table: Table, column: str) -> int:
                              'sensor=2 x=3 y=4 z=5, or --header with the number of the header line')
     similar = closest_name(column, header)
     hint = f'; did you mean {similar}?' if similar else ''
-    raise RecordingError(f'{table.path}: column {column} is missing; the columns are '
-                         f'{", ".join(header)}{hint}')
+    raise RecordingError(f'{table.path}: column {column} is missing; the columns in line '
+                         f'{table.header_line} are {", ".join(header)}{hint or _HEADER_HINT}')
 
 
 def split_unit(name: str) -> tuple[str, str]:

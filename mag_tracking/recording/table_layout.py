@@ -34,6 +34,8 @@ class Table:
     """Names of the columns; None without a header line."""
     units: list[str]
     """Cells of the line of units; empty without one."""
+    header_line: int
+    """Number of the header line; 0 without one."""
     rows: list[tuple[int, list[str]]]
     """Line number and cells of each row."""
     separator: str
@@ -95,14 +97,16 @@ def read_table(path: Path, separator: str = '', header: int | None = None,
     if len(separator) > 1:
         raise RecordingError(f'--separator: expected one character or one of '
                              f'{", ".join(_SEPARATOR_NAMES)}, got {separator!r}')
-    sample = [lines[k] for k in numbers[:SAMPLE_LINES] if not lines[k].startswith(COMMENTS)]
-    if len(sample) < 2 and header != 0:
+    if len(numbers) < 2 and header != 0:
         raise RecordingError(f'{path} has no rows')
-    separator = separator or find_separator(sample) or ''
+    # Preamble and header come first.
+    sample = numbers[max(len(numbers) // 4, header != 0):]
+    sample = sample[::max(1, len(sample) // SAMPLE_LINES)]
+    separator = separator or find_separator([lines[k] for k in sample]) or ''
     if not separator:
         raise RecordingError(f'{path} is not a table: no separator splits line {numbers[0] + 1}, '
                              f'{lines[numbers[0]][:40]!r}; give --separator')
-    n, first = _first_row(path, lines, numbers, separator, header)
+    n, first = _first_row(path, lines, numbers, sample, separator, header)
     above = [k for k in numbers if k < first]
     names, units, header_line = _header(lines, above, separator, n, header)
     if names is not None and header_line is not None:
@@ -111,27 +115,32 @@ def read_table(path: Path, separator: str = '', header: int | None = None,
              *([] if found_encoding in ('utf-8', 'utf-8-sig') else [f'encoding {found_encoding}']),
              f'header in line {header_line + 1}' if header_line is not None else 'no header',
              *(['line of units'] if units else [])]
-    table = Table(path, names, units, [], separator, notes)
+    table = Table(path, names, units, 0 if header_line is None else header_line + 1, [], separator,
+                  notes)
     n_preamble = len(above) - (header_line is not None) - bool(units)
     table.ignored.update({'preamble line': n_preamble} if n_preamble > 0 else {})
     _read_rows(table, lines, [k for k in numbers if k >= first], n)
     return table
 
 
-def _first_row(path: Path, lines: list[str], numbers: list[int], separator: str,
-               header: int | None) -> tuple[int, int]:
+def _first_row(path: Path, lines: list[str], numbers: list[int], sample: list[int],
+               separator: str, header: int | None) -> tuple[int, int]:
     """Return (number of cells of a row, index of the first line with a row)."""
     if header is not None and not 0 <= header <= len(lines):
         raise RecordingError(f'--header: the file has {len(lines)} lines, got {header}')
-    rows = {k: split_line(lines[k], separator) for k in numbers[:SAMPLE_LINES]
-            if k >= (header or 0)}
-    data = {k: len(cells) for k, cells in rows.items() if _is_row(cells)}
-    if not data:
+    widths = Counter(len(cells) for cells in (split_line(lines[k], separator) for k in sample)
+                     if _is_row(cells))
+    if not widths:
         raise RecordingError(f'{path} has no rows of numbers separated by '
                              f'{SEPARATORS.get(separator, separator)}; if the separator is '
                              'another one, give --separator')
-    n = Counter(data.values()).most_common(1)[0][0]
-    return n, next(k for k, width in data.items() if width == n)
+    # Lines of a preamble may outnumber the rows, but have fewer cells.
+    n = max(widths, key=lambda width: width * widths[width])
+    rows = ((k, split_line(lines[k], separator)) for k in numbers if k >= (header or 0))
+    first = next((k for k, cells in rows if len(cells) == n and _is_row(cells)), None)
+    if first is None:
+        raise RecordingError(f'{path} has no rows of {n} cells after line {header}, the header')
+    return n, first
 
 
 def _is_row(cells: Sequence[str]) -> bool:
@@ -144,7 +153,8 @@ def _is_row(cells: Sequence[str]) -> bool:
 def _header(lines: list[str], above: list[int], separator: str, n: int, header: int | None
             ) -> tuple[list[str] | None, list[str], int | None]:
     """Return (names of the columns, line of units, index of the header line)."""
-    candidates = above if header is None else [k for k in above if k >= header - 1]
+    candidates = [k for k in above if not _is_row(split_line(lines[k], separator))
+                  ] if header is None else [k for k in above if k >= header - 1]
     if header == 0 or not candidates:
         return None, [], None
     cells = _header_cells(lines[candidates[-1]], separator)

@@ -19,6 +19,11 @@ MAX_EQUAL_FRACTION = 0.5
 """Maximum fraction of times that equal the previous time of the sensor."""
 
 
+_REMEDY = ('. If the clock restarted or was set, give --jumps split (each part becomes a '
+           'recording); if the counter returns to 0 after N, --wrap N; if the rows are out of '
+           'order, --jumps sort')
+
+
 @dataclass
 class OrderedTimes:
     """Times that do not run backwards within a session."""
@@ -33,8 +38,8 @@ class OrderedTimes:
     """Indices of rows whose time contradicts those before and after."""
 
 
-def order_times(where: str, times: Times, keys: Sequence[int], lines: Sequence[int],
-                wrap: int = 0, jumps: str = '') -> OrderedTimes:
+def order_times(where: str, times: Times, texts: Sequence[str], keys: Sequence[int],
+                lines: Sequence[int], wrap: int = 0, jumps: str = '') -> OrderedTimes:
     """Unwrap times that run backwards, or divide them into sessions.
 
     Times are sorted only on request.
@@ -45,6 +50,8 @@ def order_times(where: str, times: Times, keys: Sequence[int], lines: Sequence[i
         File and column, for error messages.
     times : Times
         Rows without a time are left out.
+    texts : sequence of str
+        Cells of the times, for error messages.
     keys : sequence of int
         Series (sensor) of each row.
     lines : sequence of int
@@ -85,7 +92,10 @@ def order_times(where: str, times: Times, keys: Sequence[int], lines: Sequence[i
             wraps[limit] += 1
         elif change < 0 or change * times.scale > MAX_GAP_NS:
             if not jumps:
-                _refuse(where, times, raw[last[key]], value, lines[last[key]], lines[k])
+                direction = 'runs backwards' if change < 0 else 'jumps ahead'
+                raise RecordingError(
+                    f'{where}: row {lines[k]}: the time {direction}, from {texts[last[key]]} in '
+                    f'row {lines[last[key]]} to {texts[k]}{_REMEDY}')
             if jumps == 'split':
                 session[key] += 1
                 offset[key] = 0
@@ -138,16 +148,6 @@ def _outliers(raw: dict[int, int], rows: Sequence[int], keys: Sequence[int], tol
             raw[before] - tolerance <= raw[k] <= raw[after] + tolerance]
 
 
-def _refuse(where: str, times: Times, before: int, value: int, line_before: int, line: int) -> None:
-    """Raise RecordingError because the time runs backwards, or jumps ahead by years."""
-    direction = 'runs backwards' if value < before else 'jumps ahead'
-    raise RecordingError(
-        f'{where}: row {line}: the time {direction}, from {before / times.unit:.12g} in row '
-        f'{line_before} to {value / times.unit:.12g}. If the clock restarted or was set, give '
-        '--jumps split (each part becomes a recording); if the counter returns to 0 after N, '
-        '--wrap N; if the rows are out of order, --jumps sort')
-
-
 def equal_fraction(values: Sequence[int], keys: Sequence[int]) -> float:
     """Fraction of times that equal the previous time of the same series.
 
@@ -198,8 +198,9 @@ def check_resolution(where: str, texts: Sequence[str], values: Sequence[int], ke
     cause = next((f'a spreadsheet rounded them to {text}; write the column with all digits '
                   '(as a number, not in scientific notation)' for text in texts
                   if 'e+' in text.lower()), '')
-    cause = cause or ('all times are equal' if n_distinct == 1 else 'their resolution is too coarse'
-                      ) + '; write more digits of the time'
+    coarse = 'all times are equal' if n_distinct == 1 else \
+        'their resolution is too coarse, or rows are repeated'
+    cause = cause or f'{coarse}; write more digits of the time'
     raise RecordingError(
         f'{where}: {100.0 * equal:.0f} % of the times equal the previous time of the sensor, such '
         f'as {texts[0]}: {cause}, or give the rate of the readings with --rate HZ, which spaces '

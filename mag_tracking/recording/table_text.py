@@ -135,15 +135,13 @@ def find_separator(lines: Sequence[str]) -> str | None:
     Parameters
     ----------
     lines : sequence of str
-        First lines of a table, without empty lines and comments.
+        Lines of a table, most of them rows.
 
     Returns
     -------
     str or None
         None if no separator splits the lines.
     """
-    # Preamble and header come first.
-    lines = lines[len(lines) // 4 if len(lines) > 3 else len(lines) > 1:]
     best: tuple[float, str | None] = (0.0, None)
     for separator in SEPARATORS:
         rows = [split_line(line, separator) for line in lines]

@@ -24,8 +24,10 @@ _EPOCHS = (
     ('d', 730486, 752444, 719529 * DAY_NS, 'days since the year 0 (MATLAB)'),
     ('s', 3.03e9, 4.23e9, 2082844800 * NS, 's since 1904 (LabVIEW)'))
 """Unit, range of values in this century, time to subtract [ns], and name of epochs before 1970."""
-_COUNTER_LIMITS = (2**16, 2**31, 2**32)
-_DAY_LIMITS_S = (86400, 7 * 86400)
+_COUNTER_LIMITS = (2**15, 2**16, 2**20, 2**24, 2**31, 2**32)
+_CLOCK_LIMITS_S = (60, 3600, 86400, 7 * 86400)
+_TIME_OF_DAY = re.compile('[0-2][0-9][0-5][0-9][0-5][0-9](?:[.][0-9]+)?').fullmatch
+"""hhmmss and decimals, as in NMEA 0183."""
 
 
 @dataclass
@@ -119,15 +121,20 @@ def read_times(where: str, texts: Sequence[str], keys: Sequence[int], decimal: s
     n_numbers = sum(is_number(t) for t in texts)
     if n_numbers and all(_DIGITS_OF_A_DATE(t) or is_missing(t) for t in texts):
         texts, n_numbers = [f'{t[:8]} {t[8:14]}.{t[14:].lstrip(".")}' for t in texts], 0
+    if n_numbers == len(texts) and all(map(_TIME_OF_DAY, texts)) and any(
+            40.0 < float(b) - float(a) < 42.0 or float(b) - float(a) < -235950.0
+            for a, b in zip(texts, texts[1:], strict=False)):
+        # As a number of seconds, the time would jump by 41 s after each minute.
+        n_numbers = 0
     if 2 * n_numbers < sum(not is_missing(t) for t in texts):
         return _read_dates(where, texts, order)
     values = [_exact(t, decimal) for t in texts]
     # Several readings may share a coarse time.
     step = round(step_of(values, keys) * min(1.0, len(set(values)) * len(set(keys)) / len(values)))
-    scale, offset, name = _unit_of(where, values, step, unit, header_unit)
+    scale, offset, notes = _unit_of(where, values, step, unit, header_unit)
     limits = (*(n * _SUB for n in _COUNTER_LIMITS),
-              *(round(s * NS / scale) for s in _DAY_LIMITS_S))
-    return Times(values, scale, offset, _SUB, limits, [f'time in {name}'])
+              *(round(s * NS / scale) for s in _CLOCK_LIMITS_S))
+    return Times(values, scale, offset, _SUB, limits, notes)
 
 
 def _read_dates(where: str, texts: Sequence[str], order: str) -> Times:
@@ -135,8 +142,8 @@ def _read_dates(where: str, texts: Sequence[str], order: str) -> Times:
     found = order or date_order(texts)
     if found is None:
         raise RecordingError(
-            f'{where}: the order of day and month is ambiguous in {texts[0]!r}; give '
-            '--date-order dmy or --date-order mdy (or ymd)')
+            f'{where}: the order of day, month and year is ambiguous in {texts[0]!r}; give '
+            '--date-order dmy, mdy or ymd')
     values: list[int | None] = []
     kinds = set()
     fault = ''
@@ -172,8 +179,8 @@ def _exact(text: str, decimal: str) -> int | None:
 
 
 def _unit_of(where: str, values: Sequence[int | None], step: int, unit: str, header_unit: str
-             ) -> tuple[Fraction, int, str]:
-    """Return (ns per unit of `values`, time to subtract [ns], name of the unit)."""
+             ) -> tuple[Fraction, int, list[str]]:
+    """Return (ns per unit of `values`, time to subtract [ns], notes about the unit)."""
     numbers = [v / _SUB for v in values if v is not None]
     low, high = (min(numbers), max(numbers)) if numbers else (0.0, 0.0)
     stated = unit or header_unit
@@ -186,16 +193,18 @@ def _unit_of(where: str, values: Sequence[int | None], step: int, unit: str, hea
         seconds = step_s * TIME_UNITS[name] / NS
         if first <= low <= high <= last and known in ('', name) and (
                 not step or 1e-4 <= seconds <= 100.0 or known):
-            return Fraction(TIME_UNITS[name], _SUB), offset, title
+            return Fraction(TIME_UNITS[name], _SUB), offset, [f'time in {title}']
     if stated:
         scale = time_scale(stated, '--time-unit')
-        rate = _rates(step_s * float(scale) / NS, (high - low) * float(scale) / NS)
+        notes = [f'time in {stated}{"" if unit else " (header)"}']
         others = _plausible(step_s, high - low)
-        is_odd = step and not 1e-4 <= step_s * float(scale) / NS <= 2.0 and others
-        return scale / _SUB, 0, f'{stated}' + (' (header)' if not unit else '') + (
-            f' (warning: {rate}; in {others}?)' if is_odd else '')
+        if step and not 1e-4 <= step_s * float(scale) / NS <= 2.0 and others:
+            rate = _rates(step_s * float(scale) / NS, (high - low) * float(scale) / NS)
+            notes.append(f'warning: in {stated}, the times give {rate}; --time-unit may be wrong: '
+                         f'{others}')
+        return scale / _SUB, 0, notes
     if not step or PLAUSIBLE_STEP_S[0] <= step_s <= PLAUSIBLE_STEP_S[1]:
-        return Fraction(NS, _SUB), 0, 's'
+        return Fraction(NS, _SUB), 0, ['time in s']
     others = _plausible(step_s, high - low)
     raise RecordingError(
         f'{where}: as seconds, the times give {_rates(step_s, high - low)}. If that is right, give '

@@ -71,6 +71,8 @@ LAYOUTS = {
     'trailing commas of rows': (text(cells()).replace('\n', ',\n').replace(',\n', '\n', 1), {}),
     'blank lines': (text(cells()).replace('\n', '\n\n'), {}),
     'preamble': ('Logger 1.2\nserial, 12\n\n' + text(cells()), {}),
+    'long preamble': ('Setting: value, 1\n' * 900 + text(cells()), {}),
+    'cut first row': (text([['0.0', '1'], *cells()]), {}),
     'comments': ('# logger\n' + text(cells()[:200]) + '# pause\n' + text(cells()[200:], None), {}),
     'header as comment': ('# ' + text(cells()), {}),
     'no header': (text(cells(), None), {'columns': ['time=1', 'sensor=2', 'x=3', 'y=4', 'z=5']}),
@@ -113,7 +115,7 @@ TIMES = {
     '%d.%m.%Y %H:%M:%S.%f': EPOCH_S, '%d %B %Y %H:%M:%S.%f': EPOCH_S,
     '%d-%b-%Y %H:%M:%S.%f': EPOCH_S, '%b %d, %Y %I:%M:%S.%f %p': EPOCH_S,
     '%Y%m%dT%H%M%S.%f': EPOCH_S, '%Y%m%d%H%M%S%f': EPOCH_S, '%H:%M:%S.%f': MIDNIGHT_S,
-    '%I:%M:%S.%f %p': MIDNIGHT_S}
+    '%I:%M:%S.%f %p': MIDNIGHT_S, '%H%M%S.%f': MIDNIGHT_S}
 
 
 @pytest.mark.parametrize('form', TIMES)
@@ -143,8 +145,9 @@ def test_times_that_are_numbers_are_exact_and_unwrapped(name, tmp_path):
     check(read(tmp_path, text(cells(form)), columns=COLUMNS, unit='uT', **options), epoch_s)
 
 
-@pytest.mark.parametrize('bits, unit, tick_s', [(16, 'ms', 1e-3), (31, 'us', 1e-6)])
-def test_counters_of_16_and_31_bits_are_unwrapped(bits, unit, tick_s, tmp_path):
+@pytest.mark.parametrize('bits, unit, tick_s', [
+    (16, 'ms', 1e-3), (24, 'us', 1e-6), (31, 'us', 1e-6)])
+def test_counters_of_few_bits_are_unwrapped(bits, unit, tick_s, tmp_path):
     first = 2**bits - round(5.0 / tick_s)
 
     def form(t):
@@ -167,6 +170,13 @@ def test_date_and_time_may_be_two_columns(tmp_path):
         lambda t: f'{EPOCH_S + t:.4f}00000')]
     check(read(tmp_path, text(rows, ['sec', 'nanosec', *HEADER[1:]]),
                columns=['time=sec+nanosec', *COLUMNS[1:]], unit='uT'), EPOCH_S)
+
+
+def test_a_column_of_milliseconds_follows_the_time(tmp_path):
+    rows = [[*row[0].split(), f'{round(1000 * t) % 1000}', *row[1:]] for (t, _), row in zip(
+        SECONDS, cells(utc('%Y-%m-%d %H:%M:%S')), strict=True)]
+    check(read(tmp_path, text(rows, ['Date', 'Time', 'ms', *HEADER[1:]]),
+               columns=['time=Date+Time+ms', *COLUMNS[1:]], unit='uT'), EPOCH_S, 1e-3)
 
 
 def test_columns_of_several_sensors_are_found_by_their_names(tmp_path):
