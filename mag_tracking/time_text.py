@@ -12,6 +12,8 @@ DATE_ORDERS = ('dmy', 'mdy', 'ymd')
 FORMS = ('2026-05-03T23:56:01.250Z (ISO 8601), 2026-05-03 23:56:01.250, 03.05.2026 23:56:01.250, '
          '05/03/2026 11:56:01.250 PM, 03 May 2026 23:56:01.250 and 23:56:01.250')
 """Examples of the accepted forms, for messages."""
+MAX_LENGTH = 80
+"""Maximum length of a time."""
 DAY_NS = 86400 * NS
 """Nanoseconds per day."""
 _MONTHS = {name: k + 1 for k, name in enumerate(
@@ -58,7 +60,10 @@ def parse_time(text: str, order: str = 'dmy') -> tuple[int, bool, bool]:
     ValueError
         If the text is not a valid time. The message says why.
     """
-    text = text.strip()
+    # Matching takes long if white space is long, and a time is short.
+    text = ' '.join(text.split())
+    if len(text) > MAX_LENGTH:
+        raise ValueError('it is too long for a time')
     if match := _CTIME(text):
         text = f'{match[2]} {match[1]} {match[4]} {match[3]}'
     day, rest = 0, text
@@ -147,7 +152,8 @@ def date_order(texts: Iterable[str]) -> str | None:
     orders = set(DATE_ORDERS)
     # Most rows have the date of the previous row.
     for first, separator, second, third in {
-            m.group(1, 2, 3, 4) for text in texts if (m := _DATE(text.strip())) and m[1]}:
+            m.group(1, 2, 3, 4) for text in texts
+            if (m := _DATE(' '.join(text[:MAX_LENGTH].split()))) and m[1]}:
         if len(first) > 2 or not orders:
             orders &= {'ymd'}
             continue

@@ -10,6 +10,8 @@ from mag_tracking.recording.table_layout import Table
 from mag_tracking.settings import closest_name
 from mag_tracking.units import FIELD_UNITS, field_scale, field_unit, time_unit
 
+MAX_NAME = 200
+"""Length of a column name above which no unit is looked for."""
 _HEADER_HINT = '; if this is not the header, give --header with the number of its line'
 DEFAULT_SENSOR = 'mag_1'
 """Name of the only sensor of a table that does not name it."""
@@ -174,7 +176,8 @@ def find_columns(table: Table, assigned: Sequence[str], unit: str, sensor: str) 
             units.add(stated)
             if not unit and not stated:
                 raise RecordingError(
-                    f'{table.path}: --unit is missing: column {column} states no unit of the field')
+                    f'{table.path}: --unit is missing: column {column} states no unit of the '
+                    f'field; give {", ".join(FIELD_UNITS)}, or counts per unit such as 1090/G')
             scale = scales[''] if unit else FIELD_UNITS[stated]
             found.append(Axis(name, 'xyz'.index(axis), j, scale))
     if unit and any(u and abs(FIELD_UNITS[u] / scales[''] - 1.0) > 1e-9 for u in units):
@@ -235,7 +238,7 @@ def split_unit(name: str) -> tuple[str, str]:
     unit : str
         Empty if there is none.
     """
-    match = _UNIT_AT_END(name)
+    match = _UNIT_AT_END(name) if len(name) < MAX_NAME else None
     if match and match[1]:
         return match[1], match[2]
     # A single letter without brackets is rather a part of the name.

@@ -33,6 +33,8 @@ _LOOSE = re.compile(
     r'|(?<![\w$-])(nan|None|True|False)(?![\w$-])')
 """Strings, and what JavaScript and Python write otherwise than JSON: strings in single quotes, keys
 without quotes, other constants."""
+MAX_LOOSE = 1024
+"""Maximum length of an object that is not JSON."""
 _CONSTANTS = {'nan': 'NaN', 'None': 'null', 'True': 'true', 'False': 'false'}
 
 @dataclass(frozen=True)
@@ -149,6 +151,9 @@ class JsonFraming:
             try:
                 return self._decode(text)
             except json.JSONDecodeError:
+                # The time for the substitution grows with the square of the length.
+                if len(text) > MAX_LOOSE:
+                    raise
                 return self._decode(_LOOSE.sub(_strict, text))
         except RecursionError:
             raise Rejected('that are nested too deeply') from None
