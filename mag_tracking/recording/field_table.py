@@ -24,12 +24,15 @@ from mag_tracking.recording.table_text import find_decimal, parse_number
 from mag_tracking.recording.table_times import check_range, read_times, span_text
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Readings
+from mag_tracking.time_text import DAY_NS
 from mag_tracking.units import NS, time_unit
 
 SUFFIXES = ('.csv', '.tsv', '.txt')
 """File name extensions of tables."""
 USUAL_FIELD_T = (1e-5, 2e-4)
 """Range of the median magnitude of a field that is not influenced by magnets [T]."""
+MAX_RELATIVE_NS = 10 * 365 * DAY_NS
+"""Maximum span of times that are not since 1970 [ns]."""
 _DECIMALS = {'ms': 3, 'us': 6, 'ns': 9}
 """Number of decimals of a second in a column of this unit."""
 
@@ -226,6 +229,11 @@ def _stamps(rows: _Rows, decimal: str, options: TableOptions
     rows.table.check_bad_rows(len(ordered.rows))
     keys = [rows.keys[k] for k in ordered.rows]
     stamps = times.stamps(ordered.values)
+    low, high = min(stamps, default=0), max(stamps, default=0)
+    if low < 0 and high - low < MAX_RELATIVE_NS:
+        # The origin of such times is a trigger or the overflow of a signed counter.
+        stamps = [stamp - low for stamp in stamps]
+        times.notes.append(f'times from {low / NS:.6g} s, shifted to 0')
     for k, stamp in zip(ordered.rows, stamps, strict=True):
         check_range(where, rows.lines[k], stamp)
     if options.rate is None:

@@ -126,6 +126,7 @@ def test_dates_and_times_of_day_are_read_across_midnight(form, tmp_path):
 
 NUMBERS = {
     'seconds': (lambda t: f'{t:.4f}', {}, 0),
+    'seconds from a trigger': (lambda t: f'{t - 5:.4f}', {}, 0),
     's since 1970': (lambda t: f'{EPOCH_S + t:.4f}', {}, EPOCH_S),
     'us since 1970': (lambda t: str(EPOCH_S * 10**6 + round(t * 1e6)), {}, EPOCH_S),
     'ns since 1970': (lambda t: str(EPOCH_S * NS + round(t * NS)), {}, EPOCH_S),
@@ -205,6 +206,11 @@ def test_unusable_rows_are_counted_with_the_first_of_them(tmp_path):
         assert fact in notes
 
 
+def test_readings_of_a_sensor_are_ignored_as_stated(tmp_path):
+    table = read(tmp_path, text(cells()), columns=COLUMNS, unit='uT', sensors={'2': '-'})
+    check(table, sensors=(0,))
+
+
 def restarted(t):
     """Time in ms of a device that restarts after 6 s."""
     return str(round(1000 * t) if t < 6.0 else round(1000 * t) - 5900)
@@ -259,7 +265,7 @@ def milliseconds(t):
     (text(cells(), ['t', 'time', 'x', 'y', 'z']), {'columns': ()}, ['t and time', '--columns']),
     (text([[*row[:2], 'b', *row[3:]] if k % 5 == 0 else row for k, row in enumerate(cells())]), {},
      ["row 2: bx is 'b'", '100 of 500']),
-    (text(cells(lambda t: f'{t - 5:.4f}')), {}, ['row 2', '-5 s']),
+    (text(cells(lambda t: f'{(t - 5) * 1e9:.4f}')), {'time_unit': 's'}, ['row 2', '-5e+09 s']),
     (b'PK\x03\x04rest', {}, ['Excel']), (b'', {}, ['no rows']), (text([]), {}, ['no rows']),
     (text(cells()), {'columns': ['time=t', 'sensor=id', 'a.x=bx']}, ["'a.x'"]),
     (text(cells()), {'columns': ['time=t', 'time=id', 'x=bx']}, ["'time=id'"])])
