@@ -30,6 +30,8 @@ from mag_tracking.settings import param
 _NUMBER = re.compile(rb'[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?').fullmatch
 _MISSING = re.compile(rb'(?:[+-]?nan)?', re.IGNORECASE).fullmatch
 _INFINITE = re.compile(rb'[+-]?inf(?:inity)?', re.IGNORECASE).fullmatch
+DATE = 'date'
+"""Field that is joined with the ticks."""
 MAX_SHOWN = 100
 """Maximum length of a rejected line in a message [bytes]."""
 _INTEGER = re.compile(rb'[+-]?[0-9]{1,20}').fullmatch
@@ -41,7 +43,8 @@ class TextSettings:
 
     fields: tuple[str, ...] = param(
         (), 'Values of a line, in the order sent. Each is sensor, ticks, sequence, x, y, z, ax, '
-        'ay, az, or - to skip a value. x.A is an axis of sensor A, for lines with several sensors.')
+        'ay, az, or - to skip a value. x.A is an axis of sensor A, for lines with several sensors. '
+        'If date and time of day are two values, they are date and ticks.')
     each: tuple[str, ...] = param(
         (), 'Axes of one sensor, for lines with several identical sensors. They are repeated '
         '`count` times after `fields`.')
@@ -180,7 +183,14 @@ class TextFraming:
 
     def __init__(self, settings: TextSettings) -> None:
         self._lines = Lines(settings.end, settings.max_length)
-        self._layout = FieldLayout(settings.fields, settings.each, settings.count)
+        fields = settings.fields
+        self._date: tuple[int, int] | None = None
+        if DATE in fields:
+            if 'ticks' not in fields:
+                raise SettingsError('fields: date needs ticks, the time of day')
+            self._date = fields.index(DATE), fields.index('ticks')
+        self._layout = FieldLayout([SKIP if name == DATE else name for name in fields],
+                                   settings.each, settings.count)
         self._prefix = decode_escapes('prefix', settings.prefix)
         self._comment = decode_escapes('comment', settings.comment)
         self._has_checksum = check_choice('checksum', settings.checksum, ('none', 'nmea')) == 'nmea'
@@ -231,6 +241,9 @@ class TextFraming:
         values = line[len(self._prefix):].split(self._separator)
         if len(values) != len(self._converters):
             raise Rejected('with an unexpected number of fields', self._width_remedy(line, values))
+        if self._date is not None:
+            date, time = self._date
+            values[time] = values[date] + b' ' + values[time]
         return self._layout.readings(
             [convert(text) for convert, text in zip(self._converters, values, strict=True)])
 

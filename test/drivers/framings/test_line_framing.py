@@ -254,6 +254,15 @@ def test_a_device_time_may_be_a_date(text, microseconds):
         assert isinstance(reading.ticks, DeviceDate)
 
 
+def test_date_and_time_of_day_may_be_two_values():
+    framing = text_framing(fields=('date', 'ticks', *XYZ), separator=' ')
+    (reading,) = framing.parse(b'2026-05-03  23:56:01.25 1 2 3\n').readings
+    assert reading == READING._replace(ticks=1_777_852_561_250_000)
+    assert framing.parse(b'2026-05-03 noon 1 2 3\n').rejected
+    with pytest.raises(SettingsError, match='date needs ticks'):
+        text_framing(fields=('date', *XYZ))
+
+
 def test_decimal_commas_are_read_as_stated():
     line = b'1,5;2,0;-3,25e1\n'
     parsed = text_framing(separator=';', decimal=',').parse(line)
