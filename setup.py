@@ -93,8 +93,24 @@ setup(
         # `colcon test` runs pytest only if the extra "test" lists it.
         'test': [
             # CircuitPython drivers as users install them.
+            'adafruit-circuitpython-bno055',
+            'adafruit-circuitpython-bno08x',
+            'adafruit-circuitpython-fxos8700',
+            'adafruit-circuitpython-icm20x',
+            'adafruit-circuitpython-lis2mdl',
             'adafruit-circuitpython-lis3mdl',
+            'adafruit-circuitpython-lsm303agr-mag',
+            'adafruit-circuitpython-lsm303dlh-mag',
+            'adafruit-circuitpython-lsm9ds0',
+            'adafruit-circuitpython-lsm9ds1',
+            'adafruit-circuitpython-mlx90393',
+            'adafruit-circuitpython-mlx90395',
             'adafruit-circuitpython-mmc56x3',
+            'adafruit-circuitpython-qmc5883p',
+            'adafruit-circuitpython-tlv493d',
+            'adafruit-circuitpython-tmag5273',
+            'circuitpython-qmc5883l',
+            'circuitpython-rm3100',
             # Readers of archives.
             'duckdb',
             'filterpy',
