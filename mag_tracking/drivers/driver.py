@@ -15,6 +15,7 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray
 from mag_tracking.drivers.device_clock import ArrivalClock, ClockSettings, DeviceClock
+from mag_tracking.drivers.field_strength import FieldStrength
 from mag_tracking.drivers.reading import Arrival, Axes, Device, Reading
 from mag_tracking.drivers.sequence import SequenceCheck
 from mag_tracking.drivers.settings import (
@@ -114,6 +115,7 @@ class Driver:
         # were measured together and have the same timestamp.
         self._measurement: tuple[ArrivalClock | DeviceClock, float | None, int] | None = None
         self._measured_ns: int | None = None
+        self._strength = FieldStrength()
         self._known_sensors: dict[tuple[str, str], str] = {}
         self._sample_counts = {s: f'samples: {s}' for s in sensors.values()}
 
@@ -322,6 +324,9 @@ class Driver:
         if infinite.any():
             self.driver_counts['readings that overflow in tesla'] += int(infinite.sum())
             readings = readings.part(~infinite)
+        for sensor in self._strength.add(readings):
+            self.driver_counts[f"sensors below 10 uT, weaker than the Earth's field; check the "
+                               f'unit: {sensor}'] += 1
         self.driver_counts.update([self._sample_counts[readings.names[j]]
                                    for j in readings.sensor.tolist()])
         return readings, accelerations

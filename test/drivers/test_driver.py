@@ -371,6 +371,14 @@ def test_two_sources_of_one_sensor_are_named_and_the_steadier_one_is_used(
     assert len(poll_samples(driver, 0.0)) == 1 and driver.fault == ''
 
 
+def test_a_sensor_weaker_than_the_earth_is_counted_once():
+    # The field of the first source is 0.
+    driver, *_ = contested({'': 'mag_1'}, (20.0, FIELD, ''), seconds=12)
+    assert [n for cause, n in driver.counts().items() if 'unit: mag_1' in cause] == [1]
+    driver, *_ = contested({'': 'mag_1'}, (20.0, FIELD, ''), seconds=4)
+    assert driver.counts() == {'samples: mag_1': 80}
+
+
 def test_a_field_and_an_acceleration_may_come_from_different_sources():
     driver, _, n = contested({'A': 'mag_1'}, (20.0, FIELD._replace(sensor='A'), 'a/mag'),
                              (20.0, Reading('A', None, (0.0, 0.0, 1.0)), 'a/acc'), seconds=5)
