@@ -17,8 +17,8 @@ on. Its z axis therefore reads 11 % less than x and y. The CircuitPython class L
 gains of that chip.
 
 Sources: HMC5883L data sheet 900405 Rev E (2013), tables 2 to 21; HMC5983 data sheet 900425 (2012),
-whose registers differ in bit 7 of configuration register A; LSM303DLHC data sheet DocID018771 Rev 2
-(2013), table 75.
+whose registers differ in bit 7 of configuration register A; LSM303DLHC data sheet, ST DocID018771,
+register CRB_REG_M.
 """
 
 import errno
