@@ -37,24 +37,25 @@ class _Sender:
         # Standard deviation over mean of the readings per second. It is near 0 for a steady source,
         # and more than 1 for a source that sends a reading every few seconds.
         self.unsteadiness = math.inf
-        self._second = self._n_in_second = 0
+        self._end_ns, self._n_in_second = now_ns + NS, 0
         self._counts: deque[int] = deque(maxlen=WINDOW)
 
     def add(self, now_ns: int) -> None:
         """Add a reading."""
-        self.advance(now_ns)
+        if now_ns >= self._end_ns:
+            self.advance(now_ns)
         self._n_in_second += 1
         self.n += 1
-        self.last_ns = max(self.last_ns, now_ns)
+        self.last_ns = now_ns
 
     def advance(self, now_ns: int) -> None:
         """Complete the seconds before `now_ns`, and update the steadiness."""
-        second = (now_ns - self.first_ns) // NS
-        if second <= self._second:
+        n_complete = (now_ns - self._end_ns) // NS + 1
+        if n_complete <= 0:
             return
         self._counts.append(self._n_in_second)
-        self._counts.extend([0] * min(second - self._second - 1, WINDOW))
-        self._second, self._n_in_second = second, 0
+        self._counts.extend([0] * min(n_complete - 1, WINDOW))
+        self._end_ns, self._n_in_second = self._end_ns + n_complete * NS, 0
         mean = sum(self._counts) / len(self._counts)
         self.unsteadiness = math.inf
         if mean and len(self._counts) >= MIN_SECONDS:
@@ -65,7 +66,7 @@ class _Sender:
     def rate_hz(self) -> float:
         """Mean rate of the readings; 0 for a single reading."""
         elapsed_ns = self.last_ns - self.first_ns
-        return (self.n - 1) * NS / elapsed_ns if elapsed_ns else 0.0
+        return (self.n - 1) * NS / elapsed_ns if elapsed_ns > 0 else 0.0
 
     def is_silent(self, now_ns: int) -> bool:
         """Whether the source can be forgotten."""
@@ -91,7 +92,7 @@ class SingleSource:
     def __init__(self) -> None:
         self.changes = 0
         self._selected: Source | None = None
-        # In the order of the latest readings.
+        # In the order of the latest readings, except for the selected source.
         self._senders: OrderedDict[Source, _Sender] = OrderedDict()
 
     @property
@@ -116,10 +117,11 @@ class SingleSource:
         if sender is None:
             sender = self._senders[source] = _Sender(now_ns)
             self._drop_oldest()
-        else:
-            self._senders.move_to_end(source)
         sender.add(now_ns)
-        if source != self._selected and self._is_better(sender, now_ns):
+        if source == self._selected:
+            return True
+        self._senders.move_to_end(source)
+        if self._is_better(sender, now_ns):
             self.changes += self._selected is not None
             self._selected = source
         return source == self._selected
