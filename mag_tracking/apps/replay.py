@@ -109,7 +109,8 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
         raise OutputError(f'{out} is the folder of the recording; choose another output folder')
     # Topic names contain no dot: a name with a dot is a file, even if it does not exist.
     is_table = truth is not None and (Path(truth).is_file() or '.' in truth)
-    table = read_truth_table(truth) if truth is not None and is_table else None
+    table = read_truth_table(truth, settings.track.magnet.axis) \
+        if truth is not None and is_table else None
     reader = SampleReader(recording, network, truth if table is None else None)
     pipeline = Pipeline(network, settings)
     prescan = prescan_of(recording, network, settings.calibrate, stopped)
