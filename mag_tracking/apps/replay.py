@@ -37,6 +37,7 @@ from mag_tracking.report.metrics import (
 )
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.stages.align.frame_period import frame_period_warning
+from mag_tracking.stages.track.plausibility import lane_note
 from mag_tracking.stages.track.settings import acceleration_density
 
 SUSPECT_MOUNTING_RATIO = 2.0
@@ -276,6 +277,7 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
             'no_detection_reason': reason,
             'close_network': len(pipeline.network) > 1 and pipeline.network.is_compact,
             'frames_too_long': frame_period_warning(pipeline.settings.align, pipeline.network),
+            'lanes': lane_note(pipeline.settings.track.vehicle, pipeline.network),
             'clocks_apart': pipeline.track.clock_warning,
             'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks,
             'disturbances': disturbances,
