@@ -124,6 +124,7 @@ def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, peak_time: float)
     F[:, :3, 3:] = t[:, None, None] * np.eye(3)
     state = F @ fit.x[:6]
     C = F @ fit.robust_covariance[:6, :6] @ F.transpose(0, 2, 1)
+    C[:, :3, :3] += fit.position_covariance - fit.robust_covariance[:3, :3]
     target_field = target_alone(fit)
     other_field = fit.predicted - target_field
     fields = [field_entry(int(j), (data.field - other_field)[data.sensor == j],

@@ -86,6 +86,8 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(NOTE, 'all sensors are within two metres: range and moment are poorly '
                    'observable, and all tracks are ambiguous; use the speed and direction from the '
                    'delays between the sensors')
+    if summary['lanes'] and summary['target'] == 'vehicle' and counts.get('tracks', 0):
+        yield Note(NOTE, summary['lanes'])
     if summary['frames_too_long']:
         yield Note(WARNING, summary['frames_too_long'])
     if summary['clocks_apart']:
