@@ -5,11 +5,11 @@ import errno
 import gc
 import json
 import os
-import pickle
 import shutil
 import subprocess
 import threading
 
+import numpy as np
 import psutil
 import pytest
 
@@ -280,14 +280,43 @@ def test_an_empty_recording_has_null_values(tmp_path):
     assert row[2] is None and row[3] == ''
 
 
-def test_a_full_disk_is_reported_even_if_the_file_has_been_created(tmp_path, monkeypatch):
+@pytest.fixture
+def job(tmp_path):
+    """Tasks of a bundled recording, of which the first has been executed."""
     job = archive_work.Job(vehicle_path('straight_car_right'), tmp_path / 'work', tmp_path / 'out',
                            read_network(NETWORK_FILE), settings_for('vehicle', QUICK))
     job.work_folder.mkdir()
     archive_work.cut(job)
+    return job
 
-    def dump(content, stream):
+
+def test_damaged_intermediate_results_are_reported(job):
+    """A file of Python objects is damaged, too: to read it would execute code."""
+    chunk = job.cut_folder / 'segment-0' / '0.npz'
+    with np.load(chunk) as arrays:
+        content = dict(arrays)
+    for damaged in ({'stamp_ns': content['stamp_ns']},
+                    content | {'field': np.array([object])},
+                    content | {'text': np.array('{"doubts"')}):
+        np.savez(chunk, **damaged)
+        with pytest.raises(RecordingError, match='0.npz is damaged'):
+            archive_work.track_segment(job, 0)
+    np.savez(chunk, **content)
+    archive_work.track_segment(job, 0)
+    result = job.segment_folder(0) / 'tracked.json'
+    for text in ('', '[]', '{"n_tracks": 1}', result.read_text().replace('rows', 'sensors')
+                 .replace('n_passes', 'passes')):
+        result.write_text(text)
+        with pytest.raises(RecordingError, match='tracked.json is damaged'):
+            archive_work.join(job)
+    (job.cut_folder / 'columns.json').write_text('{"frames": 1}')
+    with pytest.raises(RecordingError, match='columns.json is damaged'):
+        archive_work.cut(job)
+
+
+def test_a_full_disk_is_reported_even_if_the_file_has_been_created(job, monkeypatch):
+    def no_space(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    monkeypatch.setattr(pickle, 'dump', dump)
+    monkeypatch.setattr(os, 'fsync', no_space)
     with pytest.raises(OutputError, match='No space left on device'):
         archive_work.track_segment(job, 0)
