@@ -93,6 +93,11 @@ def work_file_errors(path: Path) -> Iterator[None]:
     ----------
     path : Path
         The file.
+
+    Raises
+    ------
+    RecordingError
+        If reading fails.
     """
     try:
         yield
