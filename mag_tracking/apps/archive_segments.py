@@ -101,7 +101,8 @@ def work_file_errors(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except (OSError, ValueError, TypeError, LookupError, EOFError, BadZipFile) as error:
+    except (OSError, ValueError, TypeError, LookupError, EOFError, RecursionError,
+            BadZipFile) as error:
         raise RecordingError(f'{path} is damaged ({error}); delete the folder "unfinished" of the '
                              'archive and run the same command again') from error
 

@@ -56,6 +56,30 @@ def columns_of(kind: str, unit: str, /, **meanings: str) -> tuple[Column, ...]:
     return tuple(Column(name, kind, unit, meaning) for name, meaning in meanings.items())
 
 
+def check_row(row: Mapping[str, Any], columns: Iterable[Column]) -> None:
+    """Check a row of texts, integers and times that was read from a file.
+
+    Parameters
+    ----------
+    row : mapping
+        Values by column. Integers and times may be None.
+    columns : iterable of Column
+
+    Raises
+    ------
+    ValueError
+        If a column is missing, or its value has another type or is out of range.
+    """
+    for column in columns:
+        if column.name not in row:
+            raise ValueError(f'{column.name} is missing')
+        value = row[column.name]
+        is_valid = isinstance(value, str) if column.kind == 's' else value is None or (
+            isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63)
+        if not is_valid:
+            raise ValueError(f'invalid {column.name}: {value!r:.40}')
+
+
 def import_pyarrow() -> Any:
     """Import pyarrow with its Parquet module.
 
