@@ -31,6 +31,8 @@ never for tracking."""
 BATCH_SIZE = 256
 """Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
 few readings. The caller can stop only between batches."""
+MAX_UNKNOWN_SENSORS = 20
+"""Number of sensors outside the network whose readings are counted by sensor."""
 
 
 class SampleReader:
@@ -77,6 +79,7 @@ class SampleReader:
                                  f'{recording.types.get(truth, "not in the recording")}; '
                                  f'topics with poses: {", ".join(pose_topics) or "none found"}')
         self.rejected: Counter[str] = Counter()
+        self._unknown_sensors: set[str] = set()
         self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
         if recording.types and not self._is_batched \
                 and not any(t in recording.types for t in self._sensors):
@@ -116,7 +119,9 @@ class SampleReader:
         """
         for block in self._recording.blocks(progress=progress):
             for first in range(0, len(block), BATCH_SIZE):
-                readings = self._block_readings(block.part(slice(first, first + BATCH_SIZE)))
+                # A recording may have thousands of other topics.
+                part = block.part(slice(first, first + BATCH_SIZE)).with_used_kinds()
+                readings = self._block_readings(part)
                 if len(readings):
                     yield readings
 
@@ -223,8 +228,11 @@ class SampleReader:
                             dtype=bool)[readings.sensor]
         if is_known.all():
             return readings
-        self.rejected.update(f'reading of {name}, which is not in the network'
-                             for name in readings.part(~is_known).sensor_names())
+        for name in readings.part(~is_known).sensor_names():
+            if len(self._unknown_sensors) < MAX_UNKNOWN_SENSORS:
+                self._unknown_sensors.add(name)
+            label = name if name in self._unknown_sensors else 'another sensor'
+            self.rejected[f'reading of {label}, which is not in the network'] += 1
         return readings.part(is_known)
 
     def truth_arrays(self) -> dict[str, Truth]:
