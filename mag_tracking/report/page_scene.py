@@ -14,7 +14,7 @@ from mag_tracking.units import NS
 
 MAX_SENSORS = 8
 """Maximum number of sensors per track; those with the strongest fields are included."""
-MAX_BYTES = 4_000_000
+MAX_BYTES = 2_300_000
 """Approximate size limit of the track data [bytes]. Larger reports show fewer poses per track."""
 MAX_TRACKS = 1_000
 """Maximum number of tracks in a report."""

@@ -3,10 +3,14 @@
 import contextlib
 import shutil
 import time
+from urllib.parse import urlsplit
 
 import pytest
 
 NAMES = ('chromium', 'chromium-browser', 'google-chrome', 'chrome')
+BUTTONS = {'Download plot as a PNG', 'Zoom', 'Pan', 'Zoom in', 'Zoom out', 'Reset axes', 'Play',
+           'Latest', 'Show this track'}
+"""Labels of all buttons of the pages. None of them sends data to another machine."""
 
 
 def chromium():
@@ -42,7 +46,10 @@ class Page:
         self.page.on('console', self._record_message)
         self.page.on('pageerror', lambda error: self.page_errors.append(str(error)))
         self.requests = []
-        self.page.on('request', lambda request: self.requests.append(request.url))
+        # The context also reports the requests of windows that the page opens.
+        self.page.context.on('request', lambda request: self.requests.append(request.url))
+        self.page.on('websocket', lambda socket: self.requests.append(socket.url))
+        self.url = url
         self.page.goto(url)
 
     def _record_message(self, message):
@@ -60,6 +67,20 @@ class Page:
         while not self.value(expression):
             assert time.monotonic() < end, f'{expression} has not become true'
             self.page.wait_for_timeout(20)
+
+    def assert_private(self):
+        """Assert that all buttons are known, and that none of them requests another origin."""
+        found = self.value('''[...document.querySelectorAll('button, a[href], form, [role=button]')]
+            .map(e => e.dataset.title || e.title || e.ariaLabel || e.textContent)''')
+        assert {*found} <= BUTTONS
+        self.value('''[...document.querySelectorAll('button')]
+            .filter(e => e.checkVisibility()).forEach(e => e.click())''')
+        self.page.wait_for_timeout(100)
+        assert len(self.page.context.pages) == 1
+        own = urlsplit(self.url)
+        assert [url for url in self.requests if urlsplit(url).scheme not in ('blob', 'data')
+                and (urlsplit(url).netloc != own.netloc
+                     or own.scheme == 'file' and url != self.url)] == []
 
     def move_slider(self, t):
         """Move the slider to time `t` [s] as a user does, and wait until the page is redrawn."""

@@ -47,6 +47,15 @@ def test_the_page_shows_all_tracked_poses(chromium, scene, server, records):
 
 
 @needs_browser
+def test_no_button_contacts_another_origin(chromium, scene, server, records):
+    feed(scene, records)
+    page = Opened(chromium, server.url)
+    page.wait('magTracking.connected && magTracking.drawn > 0')
+    page.assert_private()
+    page.page.close()
+
+
+@needs_browser
 @pytest.mark.alone
 def test_the_median_delay_of_a_pose_is_below_200_ms(chromium, scene, server, records):
     page = Opened(chromium, server.url)

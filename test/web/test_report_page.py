@@ -18,7 +18,10 @@ from support.bundled import QUICK, vehicle_path
 pytestmark = needs_browser
 
 RECORDING = 'junction_left_turns_to_rear'
-MAX_MB = 10.0
+MAX_PASS_MB = 2.0
+"""Maximum size of the report of a pass of 14 s."""
+MAX_MB = 4.0
+"""Maximum size of a report, however many tracks it shows."""
 MARKUP = '</script><script>window.broken = true</script><b>left</b>'
 
 
@@ -91,7 +94,14 @@ def test_the_slider_updates_map_curves_and_text(shared_page, report):
         assert ('ambiguous' in text) == (row['ambiguous'] == '1')
 
 
-def test_the_page_loads_no_other_file_and_logs_no_error(shared_page, report):
+def test_no_button_contacts_another_origin(chromium, report):
+    page = Opened(chromium, report[0].as_uri())
+    page.wait('magTracking.drawn > 0')
+    page.assert_private()
+    page.page.close()
+
+
+def test_all_controls_work_without_an_error(shared_page, report):
     t = columns(shared_page, 't')
     for share in np.linspace(0.0, 1.0, 7):
         shared_page.move_slider(t[0] + share * (t[-1] - t[0]))
@@ -107,8 +117,7 @@ def test_the_page_loads_no_other_file_and_logs_no_error(shared_page, report):
     shared_page.wait('magTracking.plays')
     shared_page.wait(f'!magTracking.plays && magTracking.t >= {t[-1]}')
     assert shared_page.page_errors == []
-    assert shared_page.requests == [report[0].as_uri()]
-    assert report[0].stat().st_size < MAX_MB * 1e6
+    assert report[0].stat().st_size < MAX_PASS_MB * 1e6
 
 
 def test_the_page_fits_the_width_of_a_phone(chromium, report):

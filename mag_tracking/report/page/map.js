@@ -11,8 +11,10 @@ const SCALE_2D = Math.sqrt(-2 * Math.log(0.1)), SCALE_1D = 1.645;
 // Minimum weight of a hypothesis that is drawn, and maximum number of sensors with labels.
 const MIN_DRAWN = 0.01, MAX_LABELS = 24;
 const FONT = {size: 13, color: '#1b1b1b'};
-const CONFIG = {responsive: true, displaylogo: false,
-  modeBarButtonsToRemove: ['select2d', 'lasso2d', 'sendDataToCloud']};
+// The buttons are listed, because Plotly adds buttons of its own, such as the upload of a chart to a
+// server. Without an address, no upload is possible.
+const CONFIG = {responsive: true, displaylogo: false, plotlyServerURL: '', showSendToCloud: false,
+  modeBarButtons: [['toImage'], ['zoom2d', 'pan2d'], ['zoomIn2d', 'zoomOut2d', 'resetScale2d']]};
 
 // Outline [xs, ys] of the 90 % region of a position.
 function ellipse(x, y, xx, xy, yy) {
