@@ -171,13 +171,10 @@ def test_malformed_messages_are_named_on_the_page(ros):
     try:
         url = address(watch)
         publish_malformed_messages(*ros)
-        notes, tracks = [], []
-        for message in messages_of(url, lambda _: len(tracks) and any(
-                f'tracks: {len(MALFORMED_TRACKS) + 1} invalid' in text for text in notes)):
-            if message['type'] == 'health':
-                notes = [note['text'] for note in message['notes']]
-            tracks += message.get('tracks', message.get('scene', {}).get('tracks', ()))
-        assert any('smoothed: 1 invalid' in text for text in notes)
+        *_, last = messages_of(url, lambda m: f'tracks: {len(MALFORMED_TRACKS) + 1} invalid'
+                               in json.dumps(m))
+        assert any('smoothed: 1 invalid' in note['text'] for note in last['notes'])
+        tracks = next(messages_of(url, lambda m: m['type'] == 'scene'))['scene']['tracks']
         assert len(tracks) == 1
     finally:
         assert terminate(watch) == 0
