@@ -12,7 +12,7 @@ from typing import Any
 
 from mag_tracking.report.json_text import json_text
 
-SCRIPTS = ('scene', 'map', 'curves', 'tables', 'live', 'main', 'start')
+SCRIPTS = ('scene', 'map', 'body', 'overview', 'curves', 'tables', 'live', 'main', 'start')
 """Script files, in loading order."""
 REPORT = 'report.html'
 """File name of the report in a result folder."""

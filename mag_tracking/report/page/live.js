@@ -51,7 +51,8 @@ function addRows(message) {
   for (const rows of message.tracks) {
     const track = scene.tracks.find(other => other.key === rows.key);
     if (track) append(track, rows); else scene.tracks.push(rows);
-    extendReach(scene, track || rows);
+    extendReach(scene, scene.reach, rows);
+    if (!track) showPanels(scene);
     if (!track || rows.ended) page.tableDue = 0;
   }
   for (const one of message.smoothed) {

@@ -61,8 +61,8 @@ function showCharts(charts) {
     const out = card(chart.title), plot = element('div', null, {className: 'plot'});
     out.append(plot);
     holder.append(out);
-    Plotly.newPlot(plot, chart.traces, {font: FONT, margin: {l: 65, r: 15, t: 10, b: 50},
-      hovermode: 'closest', legend: {orientation: 'h', y: 1.02, yanchor: 'bottom'},
+    Plotly.newPlot(plot, chart.traces, {...LAYOUT, margin: {l: 65, r: BUTTONS_PX, t: 10, b: 50},
+      legend: {orientation: 'h', y: 1.02, yanchor: 'bottom'},
       ...chart.layout}, CONFIG);
   }
 }
