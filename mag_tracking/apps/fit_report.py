@@ -143,10 +143,10 @@ def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, peak_time: float)
 
 def _road(passes: Sequence[FittedPass], network: SensorNetwork) -> Road:
     """Road along the unambiguous fits."""
-    paths = [(fit.x[:2] + np.outer(fit.data.t[[0, -1]], fit.x[3:5])) for fit in
-             (fitted.chosen for fitted in passes) if fit is not None and not fit.ambiguous]
+    fits = [fitted.chosen for fitted in passes if fitted.chosen is not None]
     return road_of(network.positions[:, :2], [
-        np.linspace(*ends, N_POSES) for ends in paths])
+        fit.x[:2] + np.outer(np.linspace(fit.data.t.min(), fit.data.t.max(), N_POSES), fit.x[3:5])
+        for fit in fits if not fit.ambiguous])
 
 
 def _order_chart(passes: Sequence[FittedPass]) -> Chart:

@@ -2,10 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mag_tracking.arrays import BoolArray, FloatArray
+
+ComplexArray: TypeAlias = NDArray[np.complex128]
 
 LANE_WIDTH_M = 3.5
 """Width of a lane [m]."""
@@ -83,11 +87,17 @@ def _axis(sensors: FloatArray, centre: FloatArray, paths: Sequence[FloatArray]) 
     distance = np.concatenate([np.hypot(*(path[1:] - centre).T) for path in paths])
     # Opposite directions are the same axis, so the angles are doubled.
     doubled = steps**2 / np.abs(steps) * np.exp(-0.5 * (distance / scale)**2)
-    candidates = np.exp(2j * np.radians(np.arange(0.0, 180.0, 5.0)))
-    is_near = np.abs(np.angle(doubled * candidates.conj()[:, None])) < 2.0 * MAX_ANGLE
-    sums = np.where(is_near, doubled, 0.0).sum(axis=1)
-    angle = 0.5 * float(np.angle(sums[np.argmax(np.abs(sums))]))
+    axis = max(np.exp(2j * np.radians(np.arange(0.0, 180.0, 5.0))),
+               key=lambda direction: abs(_mean_near(doubled, direction, MAX_ANGLE)))
+    for window in (MAX_ANGLE, MAX_ANGLE / 3.0):
+        axis = _mean_near(doubled, axis, window)
+    angle = 0.5 * float(np.angle(axis))
     return np.array([np.cos(angle), np.sin(angle)])
+
+
+def _mean_near(doubled: ComplexArray, direction: complex, window: float) -> complex:
+    """Sum of the steps, with doubled angles, that are within `window` [rad] of a direction."""
+    return complex(doubled[np.abs(np.angle(doubled / direction)) < 2.0 * window].sum())
 
 
 def _follows(path: FloatArray, axis: FloatArray) -> BoolArray:

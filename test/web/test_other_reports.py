@@ -31,7 +31,8 @@ def open_page(chromium, path):
 
 
 def check_and_close(page):
-    """Check that the page logged no error and contacts no other origin, and close the page."""
+    """Check that the page is complete, logged no error and contacts no other origin; close it."""
+    page.assert_complete()
     page.assert_private()
     assert page.page_errors == []
     page.page.close()

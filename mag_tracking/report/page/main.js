@@ -3,8 +3,8 @@
 
 const page = {scene: null, t: 0, follows: false, choice: STRONGEST, current: undefined,
   plays: false, drawn: 0, tableDue: 0};
-// Interval between updates of the track table of a live page [ms].
-const TABLE_MS = 1000;
+// Intervals between updates of the track table and of the curves of a live page [ms].
+const TABLE_MS = 1000, CURVES_MS = 250;
 // Width and height of the axis labels and margins of a map [px].
 const MAP_FRAME_PX = 90;
 // Margin of a live map and maximum height of the side view, relative to the extent of the map.
@@ -26,11 +26,11 @@ function begin(data) {
 
 function setScene(packed) {
   const scene = page.scene = decodedAll(packed);
-  const z = Array.from(scene.sensors.z), [x0, x1] = scene.reach;
-  const side = (low, high, n) => [x0, x1, Math.min(...z) - n * (high - low),
-    Math.max(...z) + n * (high - low)];
-  scene.network_reach = {map: scene.reach, side: side(x0, x1, MARGIN)};
-  scene.most_side = side(scene.most_reach[0], scene.most_reach[1], MAX_HEIGHT);
+  const z = Array.from(scene.sensors.z);
+  const side = ([x0, x1, y0, y1], n) => [x0, x1, Math.min(...z) - n * Math.max(x1 - x0, y1 - y0),
+    Math.max(...z) + n * Math.max(x1 - x0, y1 - y0)];
+  scene.network_reach = {map: scene.reach, side: side(scene.reach, MARGIN)};
+  scene.most_side = side(scene.most_reach, MAX_HEIGHT);
   scene.reach = copyOf(scene.network_reach);
   if (page.live) {
     // The targets are still to come.
@@ -116,7 +116,7 @@ function rangeOf(track, t) {
   return [beginOf(track) - margin, endOf(track) + margin];
 }
 
-let curvesDue = 0;
+let curvesDue = 0, lastCurves = null;
 function draw() {
   const scene = page.scene, t = page.t, track = currentTrack(scene, t);
   at('slider').value = t;
@@ -132,8 +132,13 @@ function draw() {
   if (page.follows ? performance.now() > curvesDue : key !== page.current) {
     drawCurves(track, t);
     drawOverview(scene, track);
-    if (page.follows) curvesDue = performance.now() + 250;
-  } else if (!page.follows) {
+    if (page.follows) curvesDue = performance.now() + CURVES_MS;
+    clearTimeout(lastCurves);
+  } else if (page.follows) {
+    // The curves of the last message, if no other message follows.
+    clearTimeout(lastCurves);
+    lastCurves = setTimeout(() => moveTo(page.t), CURVES_MS);
+  } else {
     moveLines(t);
   }
   page.current = key;

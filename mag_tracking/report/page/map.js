@@ -49,11 +49,11 @@ function line(xs, ys, name, style, more) {
     hoverinfo: name ? 'name' : 'skip', showlegend: Boolean(name), ...more};
 }
 
-// Labels of the sensors; sensors one above the other share a label.
-function labelsOf(sensors, factor) {
+// Labels of the sensors; sensors at one place of the map share a label.
+function labelsOf(x, y, sensors) {
   const groups = new Map();
   sensors.names.forEach((name, j) => {
-    const place = `${(factor * sensors.x[j]).toFixed(1)} ${(factor * sensors.y[j]).toFixed(1)}`;
+    const place = `${x[j].toFixed(1)} ${y[j].toFixed(1)}`;
     groups.set(place, [...(groups.get(place) || []), j]);
   });
   const labels = sensors.names.map(() => '');
@@ -63,11 +63,12 @@ function labelsOf(sensors, factor) {
   return labels;
 }
 
-function sensorTrace(scene, f, height) {
+// Sensors on a map whose vertical axis is 'y', or 'z' in the side view.
+function sensorTrace(scene, f, vertical) {
   const sensors = scene.sensors, scaled = values => Array.from(values, v => f * v);
+  const x = scaled(sensors.x), y = scaled(sensors[vertical]);
   return {type: 'scatter', mode: sensors.names.length > MAX_LABELS ? 'markers' : 'markers+text',
-    x: scaled(sensors.x), y: scaled(height ? sensors.z : sensors.y),
-    text: height ? undefined : labelsOf(sensors, f), hovertext: sensors.names.map(plain),
+    x: x, y: y, text: labelsOf(x, y, sensors), hovertext: sensors.names.map(plain),
     textposition: 'top center', hoverinfo: 'text', name: 'magnetometers', cliponaxis: false,
     marker: {symbol: 'triangle-up', size: 11, color: '#333333'}};
 }
@@ -106,7 +107,7 @@ function mapTraces(scene, t) {
     traces.push(...pathTraces(track, k, f, named, 'y'), ...timeMarks(track, reach, f));
     if (there.includes(track)) traces.push(...nowTraces(scene, track, k, f, named));
   }
-  traces.push(sensorTrace(scene, f, false));
+  traces.push(sensorTrace(scene, f, 'y'));
   return traces;
 }
 
@@ -179,17 +180,18 @@ function reachAt(scene, track) {
   return track.reach;
 }
 
-// Fractions of a range: distance from its end at which it is extended, and margin beyond the value.
-const NEAR_END = 0.02, MARGIN = 0.1;
+// Fractions of a range: distance from its end at which it is extended, and margin beyond the value. The
+// margin of a live page is larger, so that a pass changes it once at most.
+const NEAR_END = 0.02, MARGIN = 0.1, LIVE_STEP = 0.4;
 
 // Extend the range from `range[i]` to `range[i + 1]` to `value` ± `half` with a margin, up to `edge`.
 function hold(range, i, value, half, edge) {
-  const span = range[i + 1] - range[i];
+  const span = range[i + 1] - range[i], margin = (page.live ? LIVE_STEP : MARGIN) * span;
   if (value - half < range[i] + NEAR_END * span) {
-    range[i] = Math.min(range[i], Math.max(value - half - MARGIN * span, edge[i]));
+    range[i] = Math.min(range[i], Math.max(value - half - margin, edge[i]));
   }
   if (value + half > range[i + 1] - NEAR_END * span) {
-    range[i + 1] = Math.max(range[i + 1], Math.min(value + half + MARGIN * span, edge[i + 1]));
+    range[i + 1] = Math.max(range[i + 1], Math.min(value + half + margin, edge[i + 1]));
   }
 }
 

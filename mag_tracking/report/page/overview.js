@@ -52,7 +52,7 @@ function overviewTraces(scene, current) {
   const [xs, ys] = current ? pathOf(current, f) : [[], []];
   return [...roadTraces(scene, f), ...groups.values(), ...ends.values(),
     line(xs, ys, 'current track', {color: BLACK, width: 3.5}, {hoverinfo: 'skip'}),
-    sensorTrace(scene, f, false)];
+    sensorTrace(scene, f, 'y')];
 }
 
 function drawOverview(scene, current) {
@@ -82,7 +82,7 @@ function drawSide(scene, current, t) {
         {fill: 'toself', fillcolor: 'rgba(0,0,0,0.12)'}),
       ...bodyTraces(reach.map, c, k, f, named, 'z'));
   }
-  traces.push(sensorTrace(scene, f, true));
+  traces.push(sensorTrace(scene, f, 'z'));
   Plotly.react('side', traces, mapLayout(scene, reach.side, page.live || current?.key, 'z'), CONFIG);
   showLegend('side-legend', traces);
 }
