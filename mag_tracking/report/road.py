@@ -82,7 +82,7 @@ def _thinned(path: FloatArray) -> FloatArray:
 
 def _axis(sensors: FloatArray, centre: FloatArray, paths: Sequence[FloatArray]) -> FloatArray:
     """Unit vector along the road: most frequent direction of the paths near the sensors."""
-    scale = max(0.5 * float(np.ptp(sensors, axis=0).max()), LANE_WIDTH_M)
+    scale = max(0.25 * float(np.ptp(sensors, axis=0).max()), LANE_WIDTH_M)
     steps = np.vstack([np.diff(path, axis=0) for path in paths]) @ np.array([1.0, 1j])
     distance = np.concatenate([np.hypot(*(path[1:] - centre).T) for path in paths])
     # Opposite directions are the same axis, so the angles are doubled.
