@@ -38,8 +38,8 @@ setup(
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     ext_modules=CORES,
     options={'build_ext': {'parallel': os.cpu_count()}},
-    package_data={NAME: ['py.typed', 'nodes/*.xml', 'report/page/*', '*/core.pyi',
-                         'stages/*/core.pyi']},
+    package_data={NAME: ['py.typed', 'nodes/*.xml', 'report/page/*', 'report/plotly/*',
+                         '*/core.pyi', 'stages/*/core.pyi']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -57,7 +57,6 @@ setup(
         'mcap-ros2-support',
         'numpy',
         'paho-mqtt>=2',
-        'plotly',
         'pygeomag',
         'pyserial',
         'PyYAML',
