@@ -2,9 +2,11 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.message_arrays import magnetic_fields
 from mag_tracking.messages.schema import acceleration_of, reading_of, readings_of
@@ -21,6 +23,7 @@ from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.recording.raw_message import RawMessage
 from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sensor_topics import FrameCheck, fault_of, unstamped_topics
 from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
 from mag_tracking.report.metrics import Truth
@@ -31,6 +34,8 @@ never for tracking."""
 BATCH_SIZE = 256
 """Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
 few readings. The caller can stop only between batches."""
+MAX_TOPICS = 10
+"""Number of topics that an error lists."""
 
 
 class SampleReader:
@@ -46,15 +51,15 @@ class SampleReader:
     Attributes
     ----------
     rejected : Counter
-        Number of messages and readings that cannot be used, by cause.
+        Number of messages and readings that cannot be used, or not as they are, by cause.
     namespace : str
         Namespace of the network's relative topics in the recording.
 
     Raises
     ------
     RecordingError
-        If the recording contains no topic of the network, its namespace is ambiguous, or `truth`
-        is not a topic with poses.
+        If the recording contains no topic of the network, its namespace is ambiguous, `truth` is
+        not a topic with poses, or the messages of the sensors have another type or encoding.
     """
 
     def __init__(self, recording: Recording, network: SensorNetwork,
@@ -80,15 +85,16 @@ class SampleReader:
         self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
         if recording.types and not self._is_batched \
                 and not any(t in recording.types for t in self._sensors):
-            field_topics = sorted(t for t, k in recording.types.items() if k == MAGNETIC_FIELD)
             raise RecordingError(
                 f'{recording.path} has none of the network\'s topics ({", ".join(self._sensors)}); '
-                f'topics with magnetic fields: {", ".join(field_topics) or "none found"}')
+                + _candidates(recording.types))
         for topic in self._sensors:
             kind = recording.types.get(topic)
             if kind not in (None, MAGNETIC_FIELD):
-                raise RecordingError(f'{recording.path}: {topic} carries {kind}, '
-                                     f'not {MAGNETIC_FIELD}')
+                raise RecordingError(f'{recording.path}: {topic} carries {kind}, not '
+                                     f'{MAGNETIC_FIELD} in tesla: convert the messages')
+        self._unstamped = unstamped_topics(recording, self._sensors)
+        self._frames = FrameCheck(recording.path)
 
     def missing_topics(self) -> list[str]:
         """List the network's topics that are not in the recording.
@@ -119,6 +125,8 @@ class SampleReader:
                 readings = self._block_readings(block.part(slice(first, first + BATCH_SIZE)))
                 if len(readings):
                     yield readings
+            # The bytes of this chunk are freed before the next chunk is read.
+            del block
 
     def _block_readings(self, block: MessageBlock) -> Readings:
         """Decode the readings in a block, in order of log time, and collect the true poses."""
@@ -131,9 +139,11 @@ class SampleReader:
         sensors = tuple(dict.fromkeys(names.values()))
         sensor_index = np.zeros(max(names, default=0) + 1, dtype=np.int64)
         sensor_index[list(names)] = [sensors.index(name) for name in names.values()]
+        self._check_frames(block, rows, fields.frame[fields.is_decoded])
         C = fields.covariance
         batch = Readings(
-            sensors, sensor_index[block.channel[rows]], fields.stamp_ns[fields.is_decoded],
+            sensors, sensor_index[block.channel[rows]],
+            self._stamps(block, rows, fields.stamp_ns[fields.is_decoded]),
             fields.field[fields.is_decoded], None if C is None else C[fields.is_decoded])
         other_messages = np.setdiff1d(np.arange(len(block)),
                                       np.append(rows, self._truth.add_block(block)))
@@ -145,6 +155,29 @@ class SampleReader:
                     parts += [batch.part(slice(n_added, n)), record]
                     n_added = n
         return Readings.joined([*parts, batch.part(slice(n_added, None))])
+
+    def _check_frames(self, block: MessageBlock, rows: IntArray, frames: IntArray) -> None:
+        """Check the frames, numbered (k,), of the messages `rows` (k,) of a block."""
+        expected = np.full(max(block.kinds, default=0) + 1, -1, dtype=np.int64)
+        for number, kind in block.kinds.items():
+            expected[number] = self._frames.number(kind.topic)
+        for i in np.flatnonzero(frames != expected[block.channel[rows]]):
+            message = block.message(int(rows[i]))
+            self._frames.check(message.topic, decode(message).header.frame_id, int(frames[i]))
+
+    def _stamps(self, block: MessageBlock, rows: IntArray, stamps_ns: IntArray) -> IntArray:
+        """Timestamps of the messages `rows` (k,) of a block; log times on unstamped topics."""
+        for number, kind in block.kinds.items() if self._unstamped else ():
+            if kind.topic in self._unstamped:
+                is_zero = (block.channel[rows] == number) & (stamps_ns == 0)
+                stamps_ns = np.where(is_zero, block.log_time_ns[rows], stamps_ns)
+                self._count_unstamped(kind.topic, int(is_zero.sum()))
+        return stamps_ns
+
+    def _count_unstamped(self, topic: str, n: int) -> None:
+        """Count messages whose log time is used."""
+        if n:
+            self.rejected[f'message with header.stamp 0 on {topic}, read with its log time'] += n
 
     def readings_as_received(self, progress: Progress | None = None
                              ) -> Iterator[tuple[Readings, int]]:
@@ -201,10 +234,12 @@ class SampleReader:
             if sensor is None and imu_sensors is None and not is_truth and not is_batch:
                 continue
             try:
+                if sensor is not None and message.type != MAGNETIC_FIELD:
+                    raise RecordingError(f'{message.topic} carries {message.type}')
                 content = decode(message)
                 readings = readings_of(content) if is_batch else None
             except RecordingError:
-                self.rejected[f'undecodable message on {message.topic}'] += 1
+                self.rejected[fault_of(message)] += 1
                 continue
             if is_truth:
                 self._truth.add(message.topic, content)
@@ -214,7 +249,12 @@ class SampleReader:
                 for name in imu_sensors:
                     yield acceleration_of(content, name), message.log_time_ns
             elif sensor is not None:
-                yield reading_of(content, sensor), message.log_time_ns
+                self._frames.check(message.topic, content.header.frame_id)
+                reading = reading_of(content, sensor)
+                if message.topic in self._unstamped and reading.stamp_ns[0] == 0:
+                    reading = replace(reading, stamp_ns=np.array([message.log_time_ns]))
+                    self._count_unstamped(message.topic, 1)
+                yield reading, message.log_time_ns
 
     def _network_readings(self, readings: Readings) -> Readings:
         """Select the readings of the network's sensors, and count readings of other sensors."""
@@ -238,6 +278,14 @@ class SampleReader:
         self.rejected.update(self._truth.rejected)
         self._truth.rejected.clear()
         return self._truth.arrays()
+
+
+def _candidates(types: Mapping[str, str]) -> str:
+    """Format the topics with magnetic fields, or all topics if there are none."""
+    fields = sorted(topic for topic, kind in types.items() if kind == MAGNETIC_FIELD)
+    topics = [f'{topic} ({kind})' for topic, kind in sorted(types.items())[:MAX_TOPICS]]
+    return f'topics with magnetic fields: {", ".join(fields)}' if fields else \
+        f'topics with magnetic fields: none found; topics: {", ".join(topics)}'
 
 
 def _namespace(recording: Recording, network: SensorNetwork) -> str:
