@@ -97,8 +97,10 @@ def chunk_content(stream: BinaryIO, chunk: Record, limit: int) -> bytes:
     ------
     RefusedDataError
         If the content exceeds the limit, or its compression is not supported.
-    ValueError, EOFError, or another of DECODE_ERRORS
-        If the chunk is damaged.
+    ValueError
+        If the chunk is damaged. Other DECODE_ERRORS may occur as well.
+    EOFError
+        If its content is too long.
     """
     is_cut = chunk.end > file_size(stream)
     stream.seek(chunk.begin)

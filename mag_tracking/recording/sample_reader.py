@@ -10,6 +10,7 @@ from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.message_arrays import magnetic_fields
 from mag_tracking.messages.schema import acceleration_of, reading_of, readings_of
+from mag_tracking.messages.shapes import MagneticField
 from mag_tracking.messages.types import (
     FIELD_READINGS,
     IMU,
@@ -23,7 +24,7 @@ from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.recording.raw_message import RawMessage
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sensor_topics import FrameCheck, fault_of, unstamped_topics
+from mag_tracking.recording.sensor_topics import FrameCheck, examine_topics, fault_of
 from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
 from mag_tracking.report.metrics import Truth
@@ -83,18 +84,27 @@ class SampleReader:
                                  f'topics with poses: {", ".join(pose_topics) or "none found"}')
         self.rejected: Counter[str] = Counter()
         self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
-        if recording.types and not self._is_batched \
-                and not any(t in recording.types for t in self._sensors):
-            raise RecordingError(
-                f'{recording.path} has none of the network\'s topics ({", ".join(self._sensors)}); '
-                + _candidates(recording.types))
-        for topic in self._sensors:
-            kind = recording.types.get(topic)
-            if kind not in (None, MAGNETIC_FIELD):
-                raise RecordingError(f'{recording.path}: {topic} carries {kind}, not '
-                                     f'{MAGNETIC_FIELD} in tesla: convert the messages')
-        self._unstamped = unstamped_topics(recording, self._sensors)
         self._frames = FrameCheck(recording.path)
+        self._unstamped, self._shared = self._examine_topics(network)
+
+    def _examine_topics(self, network: SensorNetwork) -> tuple[frozenset[str], frozenset[str]]:
+        """Find the topics without timestamps and those of several sensors; check the types."""
+        types = self._recording.types
+        topics = [topic for topic in self._sensors if topic in types]
+        for topic in topics:
+            if types[topic] != MAGNETIC_FIELD:
+                raise RecordingError(f'{self._recording.path}: {topic} carries {types[topic]}, not '
+                                     f'{MAGNETIC_FIELD} in tesla: convert the messages')
+        if self._is_batched:
+            return frozenset(), frozenset()
+        found = examine_topics(self._recording, topics or [
+            topic for topic, kind in types.items() if kind == MAGNETIC_FIELD])
+        shared = found.shared(network.names)
+        if types and not topics and not shared:
+            raise RecordingError(
+                f'{self._recording.path} has none of the network\'s topics '
+                f'({", ".join(self._sensors)}); {_candidates(types, found.frames)}')
+        return found.unstamped, shared
 
     def missing_topics(self) -> list[str]:
         """List the network's topics that are not in the recording.
@@ -102,9 +112,9 @@ class SampleReader:
         Returns
         -------
         list of str
-            Empty if one topic carries the readings of all sensors.
+            Empty if one topic carries the readings of several sensors.
         """
-        if self._is_batched:
+        if self._is_batched or self._shared:
             return []
         return [t for t in self._sensors if t not in self._recording.types]
 
@@ -131,7 +141,8 @@ class SampleReader:
     def _block_readings(self, block: MessageBlock) -> Readings:
         """Decode the readings in a block, in order of log time, and collect the true poses."""
         names = {number: self._sensors[kind.topic] for number, kind in block.kinds.items()
-                 if kind.topic in self._sensors and kind.type == MAGNETIC_FIELD and kind.is_cdr}
+                 if kind.topic in self._sensors and kind.type == MAGNETIC_FIELD and kind.is_cdr
+                 and kind.topic not in self._shared}
         rows = np.flatnonzero(np.isin(block.channel, list(names)))
         fields = magnetic_fields(block.data, block.begin[rows], block.end[rows])
         rows = rows[fields.is_decoded]
@@ -231,10 +242,11 @@ class SampleReader:
             is_truth = self._truth.accepts(message.topic, message.type)
             is_batch = message.topic == self._batch_topic and message.type == FIELD_READINGS
             imu_sensors = imus.get(message.topic) if message.type == IMU else None
-            if sensor is None and imu_sensors is None and not is_truth and not is_batch:
+            is_shared = message.topic in self._shared
+            if sensor is None and not (is_shared or imu_sensors or is_truth or is_batch):
                 continue
             try:
-                if sensor is not None and message.type != MAGNETIC_FIELD:
+                if (sensor is not None or is_shared) and message.type != MAGNETIC_FIELD:
                     raise RecordingError(f'{message.topic} carries {message.type}')
                 content = decode(message)
                 readings = readings_of(content) if is_batch else None
@@ -248,13 +260,23 @@ class SampleReader:
             elif imu_sensors is not None:
                 for name in imu_sensors:
                     yield acceleration_of(content, name), message.log_time_ns
-            elif sensor is not None:
-                self._frames.check(message.topic, content.header.frame_id)
-                reading = reading_of(content, sensor)
-                if message.topic in self._unstamped and reading.stamp_ns[0] == 0:
-                    reading = replace(reading, stamp_ns=np.array([message.log_time_ns]))
-                    self._count_unstamped(message.topic, 1)
-                yield reading, message.log_time_ns
+            elif sensor is not None or is_shared:
+                frame = content.header.frame_id
+                if not is_shared:
+                    self._frames.check(message.topic, frame)
+                yield from self._single(content, frame if sensor is None or is_shared else sensor,
+                                        message)
+
+    def _single(self, content: MagneticField, sensor: str, message: RawMessage
+                ) -> Iterator[tuple[Readings, int]]:
+        """Convert a decoded message, unless its sensor is not in the network."""
+        reading = reading_of(content, sensor)
+        if message.topic in self._unstamped and reading.stamp_ns[0] == 0:
+            reading = replace(reading, stamp_ns=np.array([message.log_time_ns]))
+            self._count_unstamped(message.topic, 1)
+        reading = self._network_readings(reading)
+        if len(reading):
+            yield reading, message.log_time_ns
 
     def _network_readings(self, readings: Readings) -> Readings:
         """Select the readings of the network's sensors, and count readings of other sensors."""
@@ -280,9 +302,12 @@ class SampleReader:
         return self._truth.arrays()
 
 
-def _candidates(types: Mapping[str, str]) -> str:
-    """Format the topics with magnetic fields, or all topics if there are none."""
-    fields = sorted(topic for topic, kind in types.items() if kind == MAGNETIC_FIELD)
+def _candidates(types: Mapping[str, str], frames: Mapping[str, set[str]]) -> str:
+    """Format the topics with magnetic fields and several `frames`, or all topics if there are
+    none."""
+    fields = [topic + (f' (with the frame_ids {", ".join(sorted(frames[topic]))})'
+                       if len(frames.get(topic, ())) > 1 else '')
+              for topic, kind in sorted(types.items()) if kind == MAGNETIC_FIELD]
     topics = [f'{topic} ({kind})' for topic, kind in sorted(types.items())[:MAX_TOPICS]]
     return f'topics with magnetic fields: {", ".join(fields)}' if fields else \
         f'topics with magnetic fields: none found; topics: {", ".join(topics)}'

@@ -1,8 +1,10 @@
 """Checks of the topics of sensors: readable messages, timestamps, and one sensor per topic."""
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import stamp_ns
@@ -20,8 +22,33 @@ N_FRAME_CHANGES = 3
 restarted with another frame changes it once or twice."""
 
 
-def unstamped_topics(recording: Recording, topics: Collection[str]) -> frozenset[str]:
-    """Find the topics whose messages have no timestamp, from the first messages.
+class TopicFindings(NamedTuple):
+    """Properties of the topics of sensors."""
+
+    unstamped: frozenset[str]
+    """Topics whose first two messages have the timestamp 0. One such message may be the first of
+    a simulation."""
+    frames: dict[str, set[str]]
+    """The frame_ids of the first messages of each topic."""
+
+    def shared(self, names: Collection[str]) -> frozenset[str]:
+        """Find the topics with the readings of several sensors, named by their frame_id.
+
+        Parameters
+        ----------
+        names : collection of str
+            Names of the sensors.
+
+        Returns
+        -------
+        frozenset of str
+        """
+        return frozenset(topic for topic, frames in self.frames.items()
+                         if len(frames) > 1 and frames <= set(names))
+
+
+def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindings:
+    """Examine the first messages of a recording.
 
     Parameters
     ----------
@@ -31,9 +58,7 @@ def unstamped_topics(recording: Recording, topics: Collection[str]) -> frozenset
 
     Returns
     -------
-    frozenset of str
-        Topics whose first two messages have the timestamp 0. One such message may be the first
-        of a simulation.
+    TopicFindings
 
     Raises
     ------
@@ -43,25 +68,26 @@ def unstamped_topics(recording: Recording, topics: Collection[str]) -> frozenset
     n_zero: Counter[str] = Counter()
     n_read: Counter[str] = Counter()
     faults: Counter[str] = Counter()
-    for k, block in enumerate(recording.blocks()):
-        for message in block:
-            if message.topic not in topics:
-                continue
-            try:
-                stamp = stamp_ns(decode(message).header.stamp)
-            except (RecordingError, AttributeError):
-                faults[fault_of(message)] += 1
-                continue
-            n_zero[message.topic] += stamp == 0 and n_read[message.topic] < 2
-            n_read[message.topic] += 1
-            if n_read.total() + faults.total() >= N_FIRST_MESSAGES:
-                break
-        if n_read.total() + faults.total() >= N_FIRST_MESSAGES or k >= MAX_FIRST_BLOCKS:
-            break
+    frames: dict[str, set[str]] = {}
+    for message in islice(_first_messages(recording, topics), N_FIRST_MESSAGES):
+        try:
+            header = decode(message).header
+        except (RecordingError, AttributeError):
+            faults[fault_of(message)] += 1
+            continue
+        n_zero[message.topic] += stamp_ns(header.stamp) == 0 and n_read[message.topic] < 2
+        n_read[message.topic] += 1
+        frames.setdefault(message.topic, set()).add(header.frame_id)
     if faults and not n_read:
         (cause, _), = faults.most_common(1)
         raise RecordingError(f'{recording.path}: no message of the sensors can be read: {cause}')
-    return frozenset(topic for topic, n in n_zero.items() if n == 2)
+    return TopicFindings(frozenset(topic for topic, n in n_zero.items() if n == 2), frames)
+
+
+def _first_messages(recording: Recording, topics: Collection[str]) -> Iterator[RawMessage]:
+    """Iterate over the messages on some topics in the first blocks of a recording."""
+    for block in islice(recording.blocks(), MAX_FIRST_BLOCKS):
+        yield from (message for message in block if message.topic in topics)
 
 
 def fault_of(message: RawMessage) -> str:
@@ -130,4 +156,5 @@ class FrameCheck:
             names = ', '.join(sorted(set(frames)))
             raise RecordingError(
                 f'{self._path}: {topic} carries several sensors, with the frame_ids {names}: '
-                'record each sensor on a topic of its own, as <sensor>/imu/mag')
+                'name the sensors of the network file as the frame_ids, or record each sensor on a '
+                'topic of its own')

@@ -229,6 +229,27 @@ def test_protobuf_messages_of_a_magnetic_field_are_read(source, expected, tmp_pa
     np.testing.assert_array_equal(found.poses, expected.poses)
 
 
+@pytest.mark.parametrize('part, cause', [
+    ('timestamp', 'message without header.stamp or timestamp'),
+    ('magnetic_field', 'message without magnetic_field')])
+def test_protobuf_messages_without_a_part_are_rejected_by_its_name(part, cause, tmp_path):
+    """Protobuf does not encode default values, so a message that was not set reads as zero."""
+    Magnetic, descriptors = protobuf_class()
+    messages = []
+    for k in range(100):
+        m = Magnetic()
+        # The value 0 of a field that was set is a reading.
+        m.timestamp.seconds, m.magnetic_field.x = 1_790_000_000 + k, 1e-5 if k else 0.0
+        if k % 4 == 1:
+            m.ClearField(part)
+        messages.append(('/mag_1/imu/mag', k, m.SerializeToString()))
+    found = mt.read_recording(write_mcap(
+        tmp_path / 'p.mcap', 'protobuf', ('lab.Magnetic', 'protobuf', descriptors), messages),
+        NETWORK_FILE)
+    assert found.rejected == {f'{cause} on /mag_1/imu/mag': 25}
+    assert len(found.readings) == 75 and found.readings.stamp_ns.min() == 1_790_000_000 * 10**9
+
+
 def test_a_table_of_readings_becomes_a_recording(source, expected, tmp_path, capsys):
     rows = fields_of(source)
     table = tmp_path / 'long.csv'
