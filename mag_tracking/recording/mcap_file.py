@@ -20,6 +20,7 @@ from mag_tracking.recording.expansion import RefusedDataError, check_size, large
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.mcap_records import (
     MAGIC,
+    MIN_BYTES_PER_MESSAGE,
     Record,
     chunk_content,
     file_size,
@@ -32,9 +33,6 @@ from mag_tracking.units import LATEST_NS
 
 UNCHUNKED_SIZE = 1 << 20
 """Number of bytes of consecutive records outside of chunks that are read at once."""
-MIN_BYTES_PER_MESSAGE = 128
-"""The largest number of messages in a chunk is its largest size divided by this number, because
-the position of each message also takes memory."""
 _DEFINITION_TYPES: dict[int, type[Schema] | type[Channel]] = {
     Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
 

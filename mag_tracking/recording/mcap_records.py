@@ -18,6 +18,9 @@ from mag_tracking.recording.expansion import check_size, expanded
 
 MAGIC = b'\x89MCAP0\r\n'
 """First and last bytes of a file."""
+MIN_BYTES_PER_MESSAGE = 128
+"""The largest number of messages in a chunk is its largest size divided by this number, because
+the position of each message also takes memory."""
 RECORD_HEADER = struct.Struct('<BQ')
 """Operation code and length of the content of a record."""
 _FOOTER = struct.Struct('<BQQQI8s')
@@ -77,6 +80,56 @@ def records(stream: BinaryIO, begin: int, end: int) -> Iterator[Record]:
         begin = record.end
 
 
+class ChunkHeader(NamedTuple):
+    """Fields of a chunk before its content."""
+
+    start_ns: int
+    """Log time of the first message [ns]."""
+    end_ns: int
+    """Log time of the last message [ns]."""
+    uncompressed_size: int
+    """Declared size of the content, bytes."""
+    crc: int
+    """CRC of the content; 0 if unknown."""
+    compression: str
+    size: int
+    """Size of the compressed content, bytes."""
+
+
+def chunk_header(stream: BinaryIO, chunk: Record) -> ChunkHeader:
+    """Read the header of a chunk; the position is then the beginning of its content.
+
+    Parameters
+    ----------
+    stream : binary stream
+    chunk : Record
+
+    Returns
+    -------
+    ChunkHeader
+
+    Raises
+    ------
+    ValueError
+        If there is no chunk at this position, or its header is damaged.
+    EOFError
+        If its content is longer than the chunk.
+    """
+    stream.seek(chunk.begin)
+    opcode, length = RECORD_HEADER.unpack(stream.read(RECORD_HEADER.size))
+    if opcode != Opcode.CHUNK or chunk.begin + RECORD_HEADER.size + length != chunk.end:
+        raise ValueError('no chunk at the indexed offset')
+    start_ns, end_ns, uncompressed, crc, name_length = _CHUNK_HEADER.unpack(
+        stream.read(_CHUNK_HEADER.size))
+    if name_length > _MAX_NAME:
+        raise ValueError('the name of the compression is too long')
+    compression = stream.read(name_length).decode()
+    (size,) = struct.unpack('<Q', stream.read(8))
+    if stream.tell() + size > chunk.end:
+        raise EOFError('the content exceeds its chunk')
+    return ChunkHeader(start_ns, end_ns, uncompressed, crc, compression, size)
+
+
 def chunk_content(stream: BinaryIO, chunk: Record, limit: int) -> bytes:
     """Read and decompress the records in a chunk.
 
@@ -99,24 +152,12 @@ def chunk_content(stream: BinaryIO, chunk: Record, limit: int) -> bytes:
         If the content exceeds the limit, or its compression is not supported.
     ValueError
         If the chunk is damaged. Other DECODE_ERRORS may occur as well.
-    EOFError
-        If its content is too long.
     """
     is_cut = chunk.end > file_size(stream)
-    stream.seek(chunk.begin)
-    opcode, length = RECORD_HEADER.unpack(stream.read(RECORD_HEADER.size))
-    if opcode != Opcode.CHUNK or chunk.begin + RECORD_HEADER.size + length != chunk.end:
-        raise ValueError('no chunk at the indexed offset')
-    *_, crc, name_length = _CHUNK_HEADER.unpack(stream.read(_CHUNK_HEADER.size))
-    if name_length > _MAX_NAME:
-        raise ValueError('the name of the compression is too long')
-    compression = stream.read(name_length).decode()
-    (size,) = struct.unpack('<Q', stream.read(8))
-    if stream.tell() + size > chunk.end:
-        raise EOFError('the content exceeds its chunk')
-    check_size(min(size, file_size(stream) - stream.tell()), limit)
-    data = expanded(compression, stream.read(size), limit, is_cut)
-    if crc and not is_cut and zlib.crc32(data) != crc:
+    header = chunk_header(stream, chunk)
+    check_size(min(header.size, file_size(stream) - stream.tell()), limit)
+    data = expanded(header.compression, stream.read(header.size), limit, is_cut)
+    if header.crc and not is_cut and zlib.crc32(data) != header.crc:
         raise ValueError('the CRC of the chunk is wrong')
     return data
 
