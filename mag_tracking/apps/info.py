@@ -17,6 +17,8 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sensor_topics import fault_of
 from mag_tracking.units import NS
 
+BATCH_SIZE = 4096
+"""Number of messages that are decoded at once."""
 GAP_INTERVALS, MIN_GAP_S = 10.0, 1.0
 """A gap is longer than this number of median intervals, and than this time [s]."""
 _BINS_PER_OCTAVE = 16
@@ -146,8 +148,10 @@ def time_topics(recording: Recording, progress: Callable[[int], object] | None =
     timings: dict[Source, Timing] = {}
     faults: Counter[str] = Counter()
     for block in recording.blocks(progress=progress):
-        for source, times, log_times in _times_of(block, faults):
-            timings.setdefault(source, Timing()).add(times, log_times)
+        for first in range(0, len(block), BATCH_SIZE):
+            for source, times, log_times in _times_of(
+                    block.part(slice(first, first + BATCH_SIZE)), faults):
+                timings.setdefault(source, Timing()).add(times, log_times)
         # The bytes of this chunk are freed before the next chunk is read.
         del block
     return timings, faults

@@ -15,7 +15,7 @@ LARGEST_CHUNK_MB = 256.0
 """Largest size of a decompressed chunk, message or record that is read [MB]."""
 LARGEST_CHUNK_VARIABLE = 'MAG_TRACKING_LARGEST_CHUNK_MB'
 """Environment variable that replaces `LARGEST_CHUNK_MB`, in commands, nodes and workers."""
-_STEP = 16 << 20
+_STEP = 4 << 20
 """Number of bytes that are decompressed at once."""
 _MAGIC = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
 

@@ -31,6 +31,9 @@ from mag_tracking.recording.mcap_records import (
 from mag_tracking.recording.message_block import ChannelKind, MessageBlock
 from mag_tracking.units import LATEST_NS
 
+MAX_MERGED_SIZE = 64 << 20
+"""Size of a chunk above which its messages are not sorted among those of other chunks, because
+that takes several times the memory [bytes]."""
 UNCHUNKED_SIZE = 1 << 20
 """Number of bytes of consecutive records outside of chunks that are read at once."""
 _DEFINITION_TYPES: dict[int, type[Schema] | type[Channel]] = {
@@ -217,11 +220,17 @@ class McapFile:
         with open(self._path, 'rb') as stream:
             for part, next_start_ns in zip(parts, [*starts, LATEST_NS + 1], strict=False):
                 try:
-                    pending = pending.merged(self._block(stream, part.record))
+                    block = self._block(stream, part.record)
                 except DECODE_ERRORS as error:
                     self._count_lost_part(part, error)
+                    block = MessageBlock.of_messages([])
                 if progress:
                     progress(min(part.record.end, file_size(stream)) - part.record.begin)
+                if len(block.data) > MAX_MERGED_SIZE:
+                    yield pending
+                    pending, next_start_ns = block, LATEST_NS + 1
+                else:
+                    pending = pending.merged(block)
                 n = int(np.searchsorted(pending.log_time_ns, next_start_ns))
                 block, pending = pending.part(slice(n)), pending.part(slice(n, None)).compacted()
                 yield block

@@ -31,9 +31,10 @@ from mag_tracking.arrays import IntArray
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path, new_binary_file
 from mag_tracking.recording import core
+from mag_tracking.recording.bag_file import ROS1_MAGIC, SQLITE_MAGIC
 from mag_tracking.recording.decode_errors import DECODE_ERRORS
 from mag_tracking.recording.expansion import largest_chunk
-from mag_tracking.recording.file_kind import describe_file
+from mag_tracking.recording.file_kind import HEAD_SIZE, describe_file
 from mag_tracking.recording.mcap_records import (
     MAGIC,
     MIN_BYTES_PER_MESSAGE,
@@ -227,7 +228,10 @@ def finish_file(path: str | PathLike[str]) -> list[str]:
             fcntl.flock(raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise OutputError(f'{path} is being recorded: stop the recording first') from None
-        if stream.read(len(MAGIC)) != MAGIC:
+        head = stream.read(HEAD_SIZE)
+        if head.startswith((SQLITE_MAGIC, ROS1_MAGIC)):
+            raise RecordingError(f'{path} is a bag: only MCAP files can be repaired')
+        if not head.startswith(MAGIC):
             raise RecordingError(describe_file(path))
         if read_summary(stream) is not None:
             return []
