@@ -161,7 +161,9 @@ def _files(path: Path) -> list[Path]:
             raise RecordingError(f'{metadata} is not rosbag2 metadata: relative_file_paths is '
                                  'missing or not a list') from error
     if not files:
-        raise RecordingError(f'{path} contains no recording ({", ".join(SUFFIXES)})')
+        others = sorted(f for f in path.iterdir() if f.is_file())
+        hint = f'; {describe_file(others[0])}' if others else ''
+        raise RecordingError(f'{path} contains no recording ({", ".join(SUFFIXES)}){hint}')
     return [_listed_file(file) for file in files]
 
 

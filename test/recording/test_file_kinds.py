@@ -144,3 +144,9 @@ def test_null_in_a_database_is_counted_or_named(statement, tmp_path, capsys):
         assert len(list(Recording(path).messages())) == 75
     elif status:
         assert str(path) in error and error.count('\n') == 1
+
+
+def test_a_folder_without_a_recording_names_its_file(tmp_path):
+    (tmp_path / 'field.csv').write_bytes(TABLE)
+    with pytest.raises(RecordingError, match='no recording.*field.csv.*table'):
+        Recording(tmp_path)
