@@ -51,6 +51,7 @@ setup(
     # ROS and mag_tracking_msgs are not listed: they may be installed from apt, and pip would look
     # for mag-tracking-msgs on PyPI, where it does not exist.
     install_requires=[
+        'lz4',
         'matplotlib',
         'mcap',
         'mcap-protobuf-support',

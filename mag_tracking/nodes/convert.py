@@ -7,6 +7,7 @@ a recording, so the functions that read a recording also read ROS messages.
 
 import functools
 import importlib
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,6 +17,8 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.records import Hypothesis, Track
+
+_TYPE_NAME = re.compile(r'[A-Za-z]\w*/msg/[A-Za-z]\w*')
 
 
 def message_class(type_name: str) -> Any:
@@ -29,8 +32,10 @@ def message_class(type_name: str) -> Any:
     Returns
     -------
     type or None
-        None if the type is not installed.
+        None if the type is not installed, or the name is not that of a ROS type.
     """
+    if not _TYPE_NAME.fullmatch(type_name):
+        return None
     package, _, name = type_name.split('/')
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name, None)

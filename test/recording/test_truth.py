@@ -84,7 +84,7 @@ def test_poses_are_read_in_blocks_and_sorted_by_timestamp():
         message('/ground_truth/car/pose', 10, 'utm'), message('/elsewhere', 40),
         message('/ground_truth/truck/pose', 50)])
     assert sorted(topics.add_block(block).tolist()) == [0, 1, 4]
-    coded = MessageBlock(block.data, {n: kind._replace(is_cdr=False)
+    coded = MessageBlock(block.data, {n: kind._replace(encoding='json')
                                       for n, kind in block.kinds.items()}, block.channel,
                          block.log_time_ns, block.begin, block.end)
     assert not len(topics.add_block(coded))
