@@ -218,7 +218,7 @@ class Doctor:
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self.network, self._settings = network, settings
         self.sensors = {name: SensorHealth() for name in network.names}
-        self.calibrate = Calibrate(network, settings.calibrate)
+        self.calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
         self._clock_ns = dict(zip(network.names, network.clock_offset_ns.tolist(), strict=True))
         self._frozen_since_ns: dict[str, int] = {}
         self._missed = MissedTargets(network.names)
