@@ -1,11 +1,14 @@
 """Comparison of the backgrounds of a network with the Earth's field while they are learnt."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.agreement import FieldInconsistency, consensus, disagreements
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted, updated
 from mag_tracking.network import SensorNetwork
+from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.stages.survey.settings import SurveySettings
 
 MIN_CHANGE = 1e-7
@@ -41,6 +44,23 @@ def compared_with_earth(network: SensorNetwork, survey: SurveySettings,
         earth_field = consensus(levels, network.R_ws)
     return disagreements(network.names, levels, network.R_ws, std, earth_field,
                          survey.compass_bias_std, survey.offset_std)
+
+
+def earth_field_findings(inconsistencies: Iterable[FieldInconsistency]) -> list[Finding]:
+    """Findings about sensors that contradict the Earth's field.
+
+    Parameters
+    ----------
+    inconsistencies : iterable of FieldInconsistency
+
+    Returns
+    -------
+    list of Finding
+        Serious if the sensor misleads.
+    """
+    return [Finding(d.misleads, d.sensor, str(d).removeprefix(f'{d.sensor} ')
+                    + ('; all its tracks are ambiguous' if d.misleads else ''), d.advice,
+                    Cause.CONTRADICTS_EARTH) for d in inconsistencies]
 
 
 class FieldComparison:
