@@ -157,7 +157,8 @@ def count_traffic(recording: Recording, network: SensorNetwork, settings: Settin
                          tuple(collector.summaries), dict(pipeline.traffic.counts), rejections,
                          tuple(reader.missing_topics()), tuple(pipeline.calibrate.unready()),
                          tuple(map(str, earth_field_findings(
-                             pipeline.calibrate.field_inconsistencies()))), reason, no_track_reason(pipeline.counts()['track']))
+                             pipeline.calibrate.field_inconsistencies()))), reason,
+                         no_track_reason(pipeline.counts()['track']))
 
 
 class _TrafficCollector:
