@@ -138,7 +138,8 @@ class SampleRates:
         """
         n_long = np.count_nonzero(self._intervals_s > self._max_interval_s, axis=1)
         n_known = np.minimum(self._next, N_INTERVALS)
-        return (n_long >= MIN_INTERVALS) & (2 * n_long > n_known)
+        are_slow: BoolArray = (n_long >= MIN_INTERVALS) & (2 * n_long > n_known)
+        return are_slow
 
     @property
     def warning(self) -> str:
