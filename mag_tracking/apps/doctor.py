@@ -6,20 +6,20 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 
 from mag_tracking.apps.doctor_covariances import covariance_findings
-from mag_tracking.apps.doctor_rejections import rejection_advice
+from mag_tracking.apps.doctor_rejections import rejection_findings
 from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.agreement import consensus, disagreements
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
-from mag_tracking.quantities import occurrences, quantity
+from mag_tracking.quantities import occurrences
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings
 from mag_tracking.stages.align.frame_period import frame_period_warning
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.health.sensor_health import Finding, SensorHealth
-from mag_tracking.stages.stage import rejected
+from mag_tracking.stages.health.diagnosis import Cause, Finding
+from mag_tracking.stages.health.sensor_health import SensorHealth
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NS
 
@@ -85,10 +85,11 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
             earth_field = consensus(levels, network.R_ws)
         except ValueError as error:
             return [*findings, Finding(False, 'network', f'sensors were not compared: {error}',
-                                       'add earth_field or site to the network file')]
+                                       'add earth_field or site to the network file',
+                                       Cause.NOT_COMPARED)]
     return findings + [
         Finding(True, d.sensor, str(d).removeprefix(f'{d.sensor} '),
-                'fix the sensor, or its orientation in the network file')
+                'fix the sensor, or its orientation in the network file', Cause.CONTRADICTS_EARTH)
         for d in disagreements(network.names, levels, network.R_ws, std, earth_field,
                                survey.compass_bias_std)]
 
@@ -107,7 +108,8 @@ def _clock_findings(network: SensorNetwork,
         if abs(delay - reference) > MAX_CLOCK_DIFFERENCE_S:
             yield Finding(True, name, f'its timestamps differ by {reference - delay:+.4g} s from '
                           'the timestamps of other sensors', 'synchronise its clock (chrony, PTP); '
-                          'knocks correct only offsets below survey.max_clock_offset_s')
+                          'knocks correct only offsets below survey.max_clock_offset_s',
+                          Cause.CLOCK_DIFFERS)
 
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
@@ -132,24 +134,26 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
     if last is not None and not background.ready and background.stuck:
         yield Finding(True, name, 'its readings do not change, and the sensor is not used', 'move '
                       'iron near it to check whether it is stuck or too coarse; to use it, set '
-                      'background and noise_std in the network file')
+                      'background and noise_std in the network file', Cause.CONSTANT)
     elif last is not None and not background.ready:
         yield Finding(True, name, 'no background was learnt', 'keep targets away during the '
-                      'first seconds, or set background and noise_std in the network file')
+                      'first seconds, or set background and noise_std in the network file',
+                      Cause.NO_BACKGROUND)
     if background.doubtful:
         yield Finding(False, name, 'its background is doubtful, which makes tracks ambiguous',
                       'keep targets away during the first seconds, or set background and '
-                      'noise_std in the network file')
+                      'noise_std in the network file', Cause.DOUBTFUL_BACKGROUND)
     if background.n_relearnt > n_reported:
         n_times = occurrences(background.n_relearnt - n_reported)
         yield Finding(False, name, f'its background was relearnt {n_times} after a lasting change '
                       'of the field', 'check for a parked vehicle or an object near it; '
-                      'calibrate.relearn_s: 0 disables relearning')
+                      'calibrate.relearn_s: 0 disables relearning', Cause.RELEARNT_BACKGROUND)
     if last is not None and frozen_since_ns is not None \
             and (last - frozen_since_ns) / NS > MAX_FROZEN_S:
         yield Finding(False, name, 'its background has been frozen for '
                       f'{(last - frozen_since_ns) / NS:.0f} s', 'remove any target near it; if the '
-                      'field has changed permanently, call the service calibrate')
+                      'field has changed permanently, call the service calibrate',
+                      Cause.FROZEN_BACKGROUND)
 
 
 class MissedTargets:
@@ -195,7 +199,7 @@ class MissedTargets:
                 if n >= MIN_MISSED_TARGETS:
                     yield Finding(True, name, f'its readings did not change while {other} detected '
                                   f'{n} targets', 'move iron near the sensor to check whether it '
-                                  'is stuck, too far away, or too coarse')
+                                  'is stuck, too far away, or too coarse', Cause.MISSED_TARGETS)
 
 
 class Doctor:
@@ -249,7 +253,7 @@ class Doctor:
         Returns
         -------
         list of Finding
-            Serious findings first.
+            Without ranking; see `stages.health.diagnosis.ranked`.
         """
         found: list[Finding] = []
         for j, (name, health) in enumerate(self.sensors.items()):
@@ -257,17 +261,15 @@ class Doctor:
                                      self._settings.calibrate.max_field)
             found += background_findings(name, self.calibrate, self._frozen_since_ns.get(name))
             found += covariance_findings(name, self.network.absolute_topics[j], self.calibrate)
+            found += rejection_findings(name, self.calibrate)
         found += self._missed.findings()
         found += network_findings(self.network, self._settings.survey, self.calibrate,
                                   self.sensors)
-        for cause, n in rejected(self.calibrate.counts).items():
-            found.append(Finding(
-                n > 100, 'calibrate', f'{quantity(n, "reading")} rejected: {cause}',
-                rejection_advice(cause)))
         warning = frame_period_warning(self._settings.align, self.network)
         if warning:
-            found.append(Finding(True, 'align', warning, 'set align.period_s to 0 (automatic)'))
-        return sorted(found, key=lambda f: not f.serious)
+            found.append(Finding(True, 'align', warning, 'set align.period_s to 0 (automatic)',
+                                 Cause.FRAMES_TOO_LONG))
+        return found
 
 
 def examine(recording: Recording, network: SensorNetwork, settings: Settings,
@@ -303,9 +305,29 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
         doctor.feed(readings, received_ns)
         if stopped is not None and stopped():
             break
-    damage = [Finding(True, recording.path.name, f'{cause}: {n}', 'the recording is damaged; '
-                      'mag-tracking repair adds the missing index of a truncated file, but '
-                      'cannot restore lost data') for cause, n in recording.losses.items()]
-    damage += [Finding(False, 'recording', f'{cause}: {n}', 'the recording is damaged, or '
-                       'a message type is unsupported') for cause, n in reader.rejected.items()]
-    return doctor, damage
+    return doctor, recording_findings(recording, reader)
+
+
+def recording_findings(recording: Recording, reader: SampleReader) -> list[Finding]:
+    """Report the parts of a recording that could not be read.
+
+    Parameters
+    ----------
+    recording : Recording
+    reader : SampleReader
+        Reader at the end of the recording.
+
+    Returns
+    -------
+    list of Finding
+    """
+    name, found = recording.path.name, []
+    for counts, advice, cause in (
+            (recording.losses, 'the recording is damaged; mag-tracking repair adds the missing '
+             'index of a truncated file, but cannot restore lost data', Cause.DAMAGED_RECORDING),
+            (reader.rejected, 'the recording is damaged, or a message type is unsupported',
+             Cause.UNDECODABLE)):
+        if counts:
+            found.append(Finding(cause is Cause.DAMAGED_RECORDING, name, ', '.join(
+                f'{fault}: {n}' for fault, n in counts.items()), advice, cause))
+    return found

@@ -26,6 +26,7 @@ from mag_tracking.stages.calibrate.restoration import (
     stored_background,
 )
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.stages.health.diagnosis import Cause
 from mag_tracking.units import NEVER, NS
 
 MAX_SYNCHRONOUS = 16
@@ -35,17 +36,17 @@ are staggered, because evaluating all blocks at once would delay the readings.""
 OVERRULED = 'message covariances overruled by the measured noise'
 """Key in the counts for message covariances that were replaced by the measured noise."""
 
-CAUSES = {
-    core.NO_AXIS: 'no axis reported (all NaN)',
-    core.INFINITE: 'infinite value',
-    core.BAD_COVARIANCE: 'covariance is not positive definite',
-    core.AXIS_MISSING: 'an axis that the correction needs is missing',
-    core.TOO_FAR_AHEAD: 'timestamp too far ahead',
-    core.DUPLICATE: 'duplicate timestamp',
-    core.OUT_OF_ORDER: 'out of order',
-    core.STUCK: 'stuck sensor (repeated reading)',
+REJECTIONS = {
+    core.NO_AXIS: (Cause.NO_AXIS, 'no axis reported (all NaN)'),
+    core.INFINITE: (Cause.INFINITE, 'infinite value'),
+    core.BAD_COVARIANCE: (Cause.WRONG_COVARIANCE, 'covariance is not positive definite'),
+    core.AXIS_MISSING: (Cause.MISSING_AXIS, 'an axis that the correction needs is missing'),
+    core.TOO_FAR_AHEAD: (Cause.TOO_FAR_AHEAD, 'timestamp too far ahead'),
+    core.DUPLICATE: (Cause.DUPLICATE_STAMPS, 'duplicate timestamp'),
+    core.OUT_OF_ORDER: (Cause.BACKWARD_STAMPS, 'out of order'),
+    core.STUCK: (Cause.STUCK, 'stuck sensor (repeated reading)'),
 }
-"""Cause of rejection for each reason code, except causes that name a value."""
+"""Cause and description of the rejection for each reason code; `TOO_LARGE` depends on a setting."""
 
 
 class Calibrate:
@@ -75,15 +76,17 @@ class Calibrate:
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
                  background_type: type[RunningBackground] = RunningBackground) -> None:
         self.counts: Counter[str] = Counter()
-        self._per_sensor: dict[str, Counter[str]] = {name: Counter() for name in network.names}
+        self._rejections: dict[str, Counter[tuple[Cause, str]]] = {
+            name: Counter() for name in network.names}
         self._settings, self._sensors = settings, new_sensors(len(network))
         self._batches = np.zeros(1, core.BATCH)
         self._limits = np.array([(
             settings.max_field, settings.max_forward_jump_s * NS, settings.max_backward_jump_s * NS,
             settings.reject_stuck, settings.spike_std, settings.decimate_to_hz > 0.0,
             settings.trust_covariances)], core.LIMITS)
-        self._causes = {**CAUSES, core.TOO_LARGE: f'above {settings.max_field:g} T (gauss or '
-                        'microtesla published as tesla?)'}
+        self._causes = {**REJECTIONS, core.TOO_LARGE: (
+            Cause.TOO_LARGE, f'above {settings.max_field:g} T (gauss or microtesla published as '
+            'tesla?)')}
         self._network, self._background_type = network, background_type
         self._index = {name: i for i, name in enumerate(network.names)}
         self._background: dict[str, RunningBackground] = {}
@@ -180,7 +183,10 @@ class Calibrate:
         -------
         Counter of str
         """
-        return self._per_sensor[sensor] + Counter(accepted=int(self._state_of(sensor)['accepted']))
+        rejections = self._rejections[sensor]
+        counts = {f'rejected: {description}': n for (_, description), n in rejections.items()}
+        return Counter(counts) + Counter(accepted=int(self._state_of(sensor)['accepted']),
+                                         rejected=rejections.total())
 
     def _state_of(self, sensor: str) -> Record:
         """State of a sensor: its element of the array that compiled code updates."""
@@ -227,7 +233,7 @@ class Calibrate:
         """Handle an event of sensor `i` that the compiled code has reported."""
         batch, name = self._batches[0], self._network.names[i]
         if batch['n_spikes']:
-            self._reject(name, 'spike', int(batch['n_spikes']))
+            self._reject(name, (Cause.SPIKES, 'spike'), int(batch['n_spikes']))
             batch['n_spikes'] = 0
         if reason == core.BLOCK_COMPLETE:
             self._background[name].evaluate_block()
@@ -289,7 +295,7 @@ class Calibrate:
 
     def _reject_held(self, i: int, event: str) -> None:
         """Reject the held readings of sensor `i`, which no reading after `event` can confirm."""
-        self._reject(self._network.names[i], f'possible spike when {event}',
+        self._reject(self._network.names[i], (Cause.SPIKES, f'possible spike when {event}'),
                      int(self._sensors[i]['n_held']))
         clear_spikes(self._sensors[i])
 
@@ -367,11 +373,24 @@ class Calibrate:
             clear_spikes(s)
         return self._finish(out)
 
-    def _reject(self, sensor: str, cause: str, n: int = 1) -> None:
-        """Count `n` rejected readings of a sensor by cause."""
+    def _reject(self, sensor: str, cause: tuple[Cause, str], n: int = 1) -> None:
+        """Count `n` rejected readings of a sensor by cause and description."""
         if n:
-            self.counts[f'rejected: {cause}'] += n
-            self._per_sensor[sensor].update({'rejected': n, f'rejected: {cause}': n})
+            self.counts[f'rejected: {cause[1]}'] += n
+            self._rejections[sensor][cause] += n
+
+    def rejections_of(self, sensor: str) -> 'Counter[tuple[Cause, str]]':
+        """Number of rejected readings of a sensor, by cause and description.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        Counter of (Cause, str)
+        """
+        return self._rejections[sensor].copy()
 
     def forget(self, sensors: Collection[str] = ()) -> None:
         """Discard the backgrounds of sensors and learn them again.
