@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from numpy.typing import ArrayLike
 from rclpy.node import Node
 
-from mag_tracking.apps.doctor import background_findings, network_findings
+from mag_tracking.apps.doctor import background_findings, network_findings, rate_findings
 from mag_tracking.apps.doctor_covariances import covariance_findings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute
@@ -197,6 +197,8 @@ class HealthDiagnostics:
                                          self._settings.calibrate.max_field,
                                          not self._is_replayed):
                     in_windows.setdefault(f.cause, f)
+        findings += rate_findings(name, self._reported_window(name).rate, self._network,
+                                  self._settings.track)
         return ranked([*findings, *in_windows.values()])
 
     def _silence_findings(self, name: str, silent_s: float) -> list[Finding]:
