@@ -119,7 +119,7 @@ class Pipeline:
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self.network = network
         self.settings = settings
-        self.calibrate = Calibrate(network, settings.calibrate)
+        self.calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
         self.align = Align(network, settings.align)
         self.detect = Detect(network, settings.detect)
         self.track = TrackManager(network, settings.track)
@@ -145,7 +145,7 @@ class Pipeline:
             Resulting records, in order of processing.
         """
         calibrated = self._calibrate.feed(readings)
-        self.track.set_doubtful_times(self.calibrate.doubtful_intervals())
+        self.track.set_input_doubts(self.calibrate.input_doubts())
         return self._process_calibrated(calibrated)
 
     def flush(self) -> list[Output]:

@@ -10,14 +10,14 @@ frames.
 import dataclasses
 import pickle
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes
+from mag_tracking.calibration.doubtful_times import InputDoubts
 from mag_tracking.errors import OutputError
 from mag_tracking.records import FieldFrame
 from mag_tracking.units import NS
@@ -29,8 +29,8 @@ CHUNK_FRAMES = 2000
 MIN_QUIET_S = 1.0
 """Minimum duration without a target that ends a segment [s]."""
 
-Doubts = Mapping[str, DoubtfulTimes]
-"""{sensor: times at which its background is doubtful}."""
+Doubts = InputDoubts
+"""{reason: {sensor: times at which its readings are doubtful}}."""
 NumberedPass = tuple[int, PassData, tuple[str, ...]]
 """Index of a pass in its recording (from 1), measurements of the pass, and notes for the user."""
 

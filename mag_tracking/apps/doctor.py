@@ -9,7 +9,6 @@ from mag_tracking.apps.doctor_covariances import covariance_findings
 from mag_tracking.apps.doctor_rejections import rejection_findings
 from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.agreement import consensus, disagreements
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.quantities import occurrences
@@ -17,6 +16,10 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings
 from mag_tracking.stages.align.frame_period import frame_period_warning
+from mag_tracking.stages.calibrate.field_comparison import (
+    compared_with_earth,
+    earth_field_findings,
+)
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.clocks import clock_findings
 from mag_tracking.stages.health.diagnosis import Cause, Finding
@@ -78,21 +81,12 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
     levels = np.array([level_of(calibrate, name, sensors[name]) for name in network.names])
     # Rounded levels stay equal during small changes, so that no new comparison is needed.
     levels = LEVEL_STEP * np.round(levels / LEVEL_STEP)
-    std = np.array([np.full(3, np.deg2rad(survey.nominal_std_deg)) if s is None else s
-                    for s in network.orientation_std])
-    earth_field = network.earth_field
-    if earth_field is None:
-        try:
-            earth_field = consensus(levels, network.R_ws)
-        except ValueError as error:
-            return [*findings, Finding(False, 'network', f'sensors were not compared: {error}',
-                                       'add earth_field or site to the network file',
-                                       Cause.NOT_COMPARED)]
-    return findings + [
-        Finding(True, d.sensor, str(d).removeprefix(f'{d.sensor} '),
-                'fix the sensor, or its orientation in the network file', Cause.CONTRADICTS_EARTH)
-        for d in disagreements(network.names, levels, network.R_ws, std, earth_field,
-                               survey.compass_bias_std)]
+    try:
+        return findings + earth_field_findings(compared_with_earth(network, survey, levels))
+    except ValueError as error:
+        return [*findings, Finding(False, 'network', f'sensors were not compared: {error}',
+                                   'add earth_field or site to the network file',
+                                   Cause.NOT_COMPARED)]
 
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
@@ -228,7 +222,7 @@ class Doctor:
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self.network, self._settings = network, settings
         self.sensors = {name: SensorHealth() for name in network.names}
-        self.calibrate = Calibrate(network, settings.calibrate)
+        self.calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
         self._clock_ns = dict(zip(network.names, network.clock_offset_ns.tolist(), strict=True))
         self._frozen_since_ns: dict[str, int] = {}
         self._missed = MissedTargets(network.names)

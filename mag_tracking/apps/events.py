@@ -100,7 +100,7 @@ def find_events(recording: Recording, network: SensorNetwork, settings: Settings
         If the recording has none of the network's topics.
     """
     reader = SampleReader(recording, network)
-    calibrate = Calibrate(network, settings.calibrate)
+    calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
     stage = Events(network, settings.align, settings.detect)
     prescan_of(recording, network, settings.calibrate, stopped).apply(calibrate)
     pass_events: list[PassEvent] = []

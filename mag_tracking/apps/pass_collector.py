@@ -41,8 +41,8 @@ class PassCollector:
                  on_frame: Callable[[FieldFrame], object] | None = None) -> None:
         self._network, self._settings, self._on_frame = network, settings, on_frame
         self._max_field = settings.calibrate.max_field
-        self._stages = (Calibrate(network, settings.calibrate), Align(network, settings.align),
-                        Detect(network, settings.detect))
+        self._stages = (Calibrate(network, settings.calibrate, survey=settings.survey),
+                        Align(network, settings.align), Detect(network, settings.detect))
         # Raw and calibrated readings, in network time, from `PAD_S` before the onset or, without a
         # detection, before the latest frame.
         self._raw: deque[Readings] = deque()

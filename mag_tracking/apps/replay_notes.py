@@ -11,6 +11,7 @@ from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.report.page import NOTE, WARNING, Note
+from mag_tracking.stages.calibrate.field_comparison import earth_field_findings
 from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.evidence import LOST
@@ -46,6 +47,7 @@ def replay_findings(recording: Recording, reader: SampleReader, pipeline: Pipeli
         found += rejection_findings(name, calibrate)
         found += background_findings(name, calibrate, None)
         found += covariance_findings(name, topic, calibrate)
+    found += earth_field_findings(calibrate.field_inconsistencies())
     for stage, counts in pipeline.counts().items():
         if stage != 'calibrate' and (causes := rejected(counts)):
             found.append(Finding(False, stage, ', '.join(

@@ -8,9 +8,15 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray, Record
 from mag_tracking.calibration import core
+from mag_tracking.calibration.agreement import FieldInconsistency
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted
+from mag_tracking.calibration.doubtful_times import (
+    CONTRADICTS_EARTH_FIELD,
+    DOUBTFUL_BACKGROUND,
+    DoubtfulTimes,
+    shifted,
+)
 from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.level_change import SharedChanges
 from mag_tracking.calibration.screening import clear_spikes
@@ -19,6 +25,7 @@ from mag_tracking.errors import NetworkError
 from mag_tracking.inference.axes import are_valid_covariances
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
+from mag_tracking.stages.calibrate.field_comparison import FieldComparison
 from mag_tracking.stages.calibrate.output_buffer import OutputBuffer
 from mag_tracking.stages.calibrate.restoration import (
     BackgroundRestoration,
@@ -27,6 +34,7 @@ from mag_tracking.stages.calibrate.restoration import (
 )
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.health.diagnosis import Cause
+from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NEVER, NS
 
 MAX_SYNCHRONOUS = 16
@@ -66,6 +74,8 @@ class Calibrate:
     settings : CalibrateSettings
     background_type : type, optional
         Class that estimates the background of each sensor.
+    survey : SurveySettings, optional
+        Settings of the comparison of the backgrounds with the Earth's field.
 
     Attributes
     ----------
@@ -74,7 +84,8 @@ class Calibrate:
     """
 
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
-                 background_type: type[RunningBackground] = RunningBackground) -> None:
+                 background_type: type[RunningBackground] = RunningBackground,
+                 survey: SurveySettings | None = None) -> None:
         self.counts: Counter[str] = Counter()
         self._rejections: dict[str, Counter[tuple[Cause, str]]] = {
             name: Counter() for name in network.names}
@@ -92,6 +103,7 @@ class Calibrate:
         self._background: dict[str, RunningBackground] = {}
         self._changes = SharedChanges()
         self._restoration = BackgroundRestoration(settings.max_resume_gap_s)
+        self._comparison = FieldComparison(network, survey or SurveySettings())
         self.update_network(network)
 
     def update_network(self, network: SensorNetwork) -> None:
@@ -113,6 +125,7 @@ class Calibrate:
             raise NetworkError(f'the new network has the sensors {", ".join(network.names)}; '
                                f'expected {", ".join(self._index)}')
         previous, self._network = self._network if self._background else None, network
+        self._comparison.use(network)
         self._decimators = {name: Decimator(self._settings.decimate_to_hz)
                             for name in network.names}
         for i, name in enumerate(network.names):
@@ -137,6 +150,7 @@ class Calibrate:
                 s[name] += shift
         background = self._background[network.names[i]]
         background.doubtful_times = shifted(background.doubtful_times, shift)
+        self._comparison.shift(network.names[i], shift)
         offset, correction = network.offset[i], network.correction[i]
         s['clock_offset_ns'] = network.clock_offset_ns[i]
         s['offset'] = 0.0 if offset is None else offset
@@ -162,15 +176,48 @@ class Calibrate:
         """
         return [name for name, b in self._background.items() if not b.ready]
 
-    def doubtful_intervals(self) -> dict[str, DoubtfulTimes]:
-        """Intervals in which a background was provisional or may have contained a target's field.
+    def input_doubts(self) -> dict[str, dict[str, DoubtfulTimes]]:
+        """Intervals in which the background of a sensor was doubtful.
+
+        A background is doubtful while it is provisional or may contain the field of a target, and
+        while it contradicts the Earth's field.
 
         Returns
         -------
-        dict of str to DoubtfulTimes
-            Intervals ((begin, end) [ns], ...) of each sensor that has any.
+        dict of str to dict of str to DoubtfulTimes
+            {reason: {sensor: intervals}}, for each sensor that has any.
         """
-        return {n: b.doubtful_times for n, b in self._background.items() if b.doubtful_times}
+        out = {DOUBTFUL_BACKGROUND: {n: b.doubtful_times for n, b in self._background.items()
+                                     if b.doubtful_times},
+               CONTRADICTS_EARTH_FIELD: self._comparison.doubtful_times()}
+        return {reason: by_sensor for reason, by_sensor in out.items() if by_sensor}
+
+    def latest_doubt(self, sensor: str) -> tuple[int, int | None] | None:
+        """Latest interval in which the background of a sensor was doubtful.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        (begin, end), int, ns, or None
+            Open intervals (end None) come first. None if there is no interval.
+        """
+        times = [interval for by_sensor in (
+            self._background[sensor].doubtful_times, self._comparison.times_of(sensor))
+            for interval in by_sensor[-1:]]
+        return max(times, key=lambda t: (t[1] is None, t[0]), default=None)
+
+    def field_inconsistencies(self) -> list[FieldInconsistency]:
+        """Sensors whose background contradicts the Earth's field so much that tracks are wrong.
+
+        Returns
+        -------
+        list of FieldInconsistency
+            The latest inconsistency of each sensor that had any, in the order of the network.
+        """
+        return self._comparison.inconsistencies()
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
         """Number of accepted and rejected readings of a sensor, in total and by cause of rejection.
@@ -236,7 +283,7 @@ class Calibrate:
             self._reject(name, (Cause.SPIKES, 'spike'), int(batch['n_spikes']))
             batch['n_spikes'] = 0
         if reason == core.BLOCK_COMPLETE:
-            self._background[name].evaluate_block()
+            self._evaluate_block(i)
         elif reason == core.JUMPED_BACK:
             self._background[name].forget()
             self._reject_held(i, 'time jumped back')
@@ -272,11 +319,19 @@ class Calibrate:
     def _calibrate_reading(self, i: int, stamp: int, field: FloatArray, validity: int,
                            covariance: FloatArray, out: OutputBuffer) -> None:
         """Calibrate one reading of sensor `i`, and append the result to `out`."""
-        background = self._background[self._network.names[i]]
-        background.evaluate_block()
+        self._evaluate_block(i)
         while not core.use_reading(self._sensors, self._limits, self._batches, i, stamp,
                                    plain(field), validity, plain(covariance), *out.arrays):
-            background.evaluate_block()
+            self._evaluate_block(i)
+
+    def _evaluate_block(self, i: int) -> None:
+        """Evaluate the latest complete block of sensor `i`, unless it has been evaluated."""
+        name, s = self._network.names[i], self._sensors[i]
+        if s['is_full']:
+            self._background[name].evaluate_block()
+            if self._background[name].ready:
+                self._comparison.update(i, self.background(name), int(s['first_ns']),
+                                        int(s['last_ns']))
 
     def _finish(self, out: OutputBuffer) -> list[Readings]:
         """Count the calibrated readings of a batch and return them."""
@@ -354,7 +409,7 @@ class Calibrate:
         there the reading that completes a block is calibrated with the previous background.
         """
         for i in np.flatnonzero(self._sensors['is_full']):
-            self._background[self._network.names[i]].evaluate_block()
+            self._evaluate_block(int(i))
 
     def flush(self) -> list[Readings]:
         """Calibrate and return the readings that are still held.

@@ -5,12 +5,11 @@ is updated with each frame. It ends with the release of the detection, or when i
 """
 
 from collections import Counter, deque
-from collections.abc import Mapping
 
 import numpy as np
 
 from mag_tracking.arrays import BoolArray
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes, are_doubtful
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, InputDoubts, are_doubtful
 from mag_tracking.errors import NetworkError
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
@@ -89,8 +88,8 @@ class TrackManager:
         self._next_network: SensorNetwork | None = None
         self._disturbances = Disturbances(network.names)
         self._rates = SampleRates(network, settings)
-        self._doubtful_times: Mapping[str, DoubtfulTimes] = {}
-        self._doubtful_by_sensor: dict[int, DoubtfulTimes] = {}
+        self._input_doubts: InputDoubts = {}
+        self._doubtful_rows: dict[str, dict[int, DoubtfulTimes]] = {}
         n_uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
                           for s in network.orientation_std)
         if n_uncertain:
@@ -124,24 +123,27 @@ class TrackManager:
         for track in self._tracks:
             track.configure(settings)
 
-    def set_doubtful_times(self, times: Mapping[str, DoubtfulTimes]) -> None:
-        """Set the times at which the backgrounds of the sensors are doubtful.
+    def set_input_doubts(self, doubts: InputDoubts) -> None:
+        """Set the times at which the readings of the sensors are doubtful.
 
         Tracks with frames at these times are marked as doubtful.
 
         Parameters
         ----------
-        times : dict of str to DoubtfulTimes
-            Doubtful intervals by sensor name; they replace all previous intervals.
+        doubts : {reason: {sensor: DoubtfulTimes}}
+            Doubtful intervals; they replace all previous intervals.
         """
-        if times != self._doubtful_times:
-            self._doubtful_times = times
-            self._doubtful_by_sensor = {self._network.index(name): t for name, t in times.items()}
+        if doubts != self._input_doubts:
+            self._input_doubts = doubts
+            self._doubtful_rows = {reason: {self._network.index(name): t for name, t in
+                                            by_sensor.items()}
+                                   for reason, by_sensor in doubts.items()}
 
-    def _doubtful_sensors(self, *frames: FieldFrame) -> list[int]:
-        """Indices of the sensors that measured with a doubtful background in any of the frames."""
-        return [j for j, times in self._doubtful_by_sensor.items()
-                if any(f.n_samples[j] and are_doubtful(times, f.stamp_ns) for f in frames)]
+    def _doubtful_sensors(self, *frames: FieldFrame) -> dict[str, list[int]]:
+        """Indices of the sensors with doubtful readings in any of the frames, by reason."""
+        return {reason: [j for j, times in by_row.items()
+                         if any(f.n_samples[j] and are_doubtful(times, f.stamp_ns) for f in frames)]
+                for reason, by_row in self._doubtful_rows.items()}
 
     @property
     def clock_warning(self) -> str:
@@ -257,7 +259,7 @@ class TrackManager:
         doubtful = self._doubtful_sensors(frame)
         self._max_energy = max(self._max_energy, _energy(frame))
         for track in self._tracks:
-            track.flag_doubtful_backgrounds(doubtful)
+            track.flag_doubtful_sensors(doubtful)
         out = [record for track in self._tracks for record in track.step(frame, dt)]
         return out + self._delete_ended(frame.stamp_ns)
 
@@ -316,7 +318,7 @@ class TrackManager:
                              self.counts, self._clocks, later_sensors)
         self._next_id += 1
         self._tracks.append(track)
-        track.flag_doubtful_backgrounds(self._doubtful_sensors(*recent, frame))
+        track.flag_doubtful_sensors(self._doubtful_sensors(*recent, frame))
         out = track.begin(
             frame, recent,
             approach_unobserved=is_in_tail or bool(recent) and _n_sensors(*recent) < 2)

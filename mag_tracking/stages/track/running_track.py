@@ -8,7 +8,7 @@ Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -123,20 +123,21 @@ class RunningTrack:
             for member in self.members:
                 member.use(self._bank.sensors)
 
-    def flag_doubtful_backgrounds(self, sensors: Sequence[int]) -> None:
-        """Mark the track as doubtful if it uses a sensor with a doubtful background.
+    def flag_doubtful_sensors(self, sensors: Mapping[str, Sequence[int]]) -> None:
+        """Mark the track as doubtful if it uses a sensor with doubtful readings.
 
         Parameters
         ----------
-        sensors : sequence of int
-            Indices of the sensors with a doubtful background.
+        sensors : mapping of str to sequence of int
+            Indices of the sensors with doubtful readings, by reason.
         """
-        if not np.isin(self._final_sensors.rows, sensors).any():
-            return
-        for member in self.members:
-            if doubts.DOUBTFUL_BACKGROUND not in member.evidence.doubts:
-                self.counts['tracks with a doubtful background'] += 1
-                member.evidence.flag(doubts.DOUBTFUL_BACKGROUND)
+        for reason, rows in sensors.items():
+            if not np.isin(self._final_sensors.rows, rows).any():
+                continue
+            for member in self.members:
+                if reason not in member.evidence.doubts:
+                    self.counts[f'tracks with doubtful readings: {reason}'] += 1
+                    member.evidence.flag(reason)
 
     def begin(self, frame: FieldFrame, recent: list[FieldFrame], approach_unobserved: bool = False
               ) -> list[TrackRecord]:
