@@ -31,19 +31,19 @@ class ClockSpan(NamedTuple):
     first_received_ns: int
     last_received_ns: int
 
-    def extended(self, stamps: IntArray, received: IntArray) -> 'ClockSpan':
-        """Extend the span by later readings.
+    def until(self, later: 'ClockSpan') -> 'ClockSpan':
+        """Span from the begin of this span to the end of a later one.
 
         Parameters
         ----------
-        stamps : (n,) int array, ns
-        received : (n,) int array, ns
+        later : ClockSpan
 
         Returns
         -------
         ClockSpan
         """
-        return ClockSpan(self.first_ns, int(stamps[-1]), self.first_received_ns, int(received[-1]))
+        return ClockSpan(self.first_ns, later.last_ns, self.first_received_ns,
+                         later.last_received_ns)
 
     @classmethod
     def of(cls, stamps: IntArray, received: IntArray) -> 'ClockSpan':

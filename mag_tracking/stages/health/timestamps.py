@@ -73,18 +73,16 @@ class TimestampFault:
         is_serious = self.error_s > MAX_ERROR_S
         text = self.text
         if is_serious and np.isfinite(self.error_s):
-            text += f'; the timestamps are wrong by up to {1e3 * self.error_s:.0f} ms'
+            text += (f'; the timestamps are wrong by up to {1e3 * self.error_s:.0f} ms, which makes '
+                     'tracks ambiguous')
         return Finding(is_serious, sensor, text, _ADVICE[self.cause], self.cause)
 
 
 _ADVICE = {
     Cause.ZERO_STAMPS: 'set the timestamps in the driver',
-    Cause.COARSE_STAMPS: 'let the driver set timestamps of a finer resolution; until then, tracks '
-                         'are ambiguous if the error exceeds 20 ms',
-    Cause.PACKET_STAMPS: 'let the driver set the timestamp of each reading; until then, tracks are '
-                         'ambiguous if the error exceeds 20 ms',
-    Cause.BURST_STAMPS: 'let the driver set the time of measurement instead of the time of '
-                        'arrival; until then, tracks are ambiguous if the error exceeds 20 ms',
+    Cause.COARSE_STAMPS: 'let the driver set timestamps of a finer resolution',
+    Cause.PACKET_STAMPS: 'let the driver set the timestamp of each reading',
+    Cause.BURST_STAMPS: 'let the driver set the time of measurement instead of the time of arrival',
     Cause.MILLISECOND_STAMPS: 'correct the unit of the timestamps in the driver'}
 
 

@@ -141,12 +141,17 @@ class SampleRates:
         are_slow: BoolArray = (n_long >= MIN_INTERVALS) & (2 * n_long > n_known)
         return are_slow
 
-    @property
-    def warning(self) -> str:
-        """Sentence about the sensors that are or were too slow; empty if there are none."""
-        slow = np.flatnonzero(self._slow_s)
-        if not len(slow):
-            return ''
-        names = ', '.join(self._network.names[j] for j in slow)
-        fault = low_rate_fault(1.0 / float(self._slow_s.max()), self._network, self._settings)
-        return f'{names}: {fault}'
+    def slow_rate(self, sensor: str) -> float:
+        """Lowest rate at which a sensor is or was too slow.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        float, Hz
+            NaN if the sensor was never too slow.
+        """
+        interval_s = self._slow_s[self._network.index(sensor)]
+        return 1.0 / float(interval_s) if interval_s else float('nan')
