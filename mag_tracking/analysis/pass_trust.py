@@ -198,6 +198,8 @@ def trusted_quantities(fit: PassFit) -> tuple[str, ...]:
 
 def _invalid_pass_reason(fit: PassFit) -> str:
     """Reason why a fit does not show one target at constant velocity; empty if it does."""
+    if fit.data.doubt:
+        return fit.data.doubt
     if not fit.converged:
         return 'the fit did not converge'
     if not has_plausible_residual(fit):

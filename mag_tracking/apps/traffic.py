@@ -27,6 +27,7 @@ from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame, Track
+from mag_tracking.stages.calibrate.field_comparison import earth_field_findings
 from mag_tracking.units import NS
 
 RETENTION_S = 300.0
@@ -68,6 +69,8 @@ class TrafficResult:
     """Topics of the network that are not in the recording."""
     sensors_without_background: tuple[str, ...]
     """Sensors whose background was not learnt."""
+    sensor_faults: tuple[str, ...]
+    """Faults of sensors that make their tracks ambiguous, with their remedies."""
     no_detection_reason: str | None
     """Explanation, in one sentence, of why nothing was detected; None if a target was detected."""
     no_track_reason: str | None
@@ -153,7 +156,8 @@ def count_traffic(recording: Recording, network: SensorNetwork, settings: Settin
     return TrafficResult(settings.traffic.class_names, tuple(collector.vehicles),
                          tuple(collector.summaries), dict(pipeline.traffic.counts), rejections,
                          tuple(reader.missing_topics()), tuple(pipeline.calibrate.unready()),
-                         reason, no_track_reason(pipeline.counts()['track']))
+                         tuple(map(str, earth_field_findings(
+                             pipeline.calibrate.field_inconsistencies()))), reason, no_track_reason(pipeline.counts()['track']))
 
 
 class _TrafficCollector:

@@ -193,6 +193,8 @@ def _print(name: str, result: TrafficResult, recording: Recording,
     for sensor in result.sensors_without_background:
         print(f'  warning: no background was learnt for {sensor}: the intervals without '
               'a target are too short')
+    for fault in result.sensor_faults:
+        print(f'  warning: {fault}')
     if result.no_detection_reason:
         print(f'  nothing was detected: {result.no_detection_reason}')
     if result.no_track_reason:
