@@ -9,7 +9,13 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.apps.events import EventsResult, find_events
-from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
+from mag_tracking.cli.options import (
+    Commands,
+    add_command,
+    add_recorded_network,
+    print_diagnoses,
+    recorded_network,
+)
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import PassEvent
@@ -59,8 +65,6 @@ def _events(args: argparse.Namespace) -> int:
                  disable=None) as bar:
         result = find_events(recording, network, settings, bar.update, lambda: bool(signals))
     _print(result, network.names)
-    for cause, n in {**result.rejections, **recording.losses}.items():
-        print(f'  warning: {cause}: {n}')
     if args.out is not None:
         write_events(args.out, result.events)
         print(f'tables in {args.out}')
@@ -71,16 +75,12 @@ def _events(args: argparse.Namespace) -> int:
 
 
 def _print(result: EventsResult, names: tuple[str, ...]) -> None:
-    """Print one line per event, the number of events of each sensor, and warnings."""
+    """Print the diagnoses, one line per event, and the number of events of each sensor."""
+    print_diagnoses(result.diagnoses)
     for event in result.events:
         print(line_of(event))
     counts = result.counts()
     print(', '.join(f'{name}: {quantity(counts.get(name, 0), "event")}' for name in names))
-    for topic in result.missing_topics:
-        print(f'  warning: no messages on {topic}')
-    for name in result.sensors_without_background:
-        print(f'  warning: no background was learnt for {name}: the intervals without a target are '
-              'too short')
 
 
 def line_of(event: PassEvent) -> str:

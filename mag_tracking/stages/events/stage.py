@@ -17,7 +17,9 @@ from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
-from mag_tracking.stages.events.single_sensor_pass import closest_point
+from mag_tracking.stages.events.single_sensor_pass import ClosestPoint, closest_point
+from mag_tracking.stages.track.low_rate import SampleRates
+from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
 PAD_S = 1.0
@@ -41,19 +43,25 @@ class Events:
     network : SensorNetwork
     align : AlignSettings
     detect : DetectSettings
+    track : TrackSettings
+        They determine the rate below which a pass is not resolved.
 
     Attributes
     ----------
     counts : Counter of str
         Number of events.
+    rates : SampleRates
+        Rates of the sensors.
     """
 
-    def __init__(self, network: SensorNetwork, align: AlignSettings,
-                 detect: DetectSettings) -> None:
+    def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
+                 track: TrackSettings) -> None:
         self.counts: Counter[str] = Counter()
+        self.rates = SampleRates(network, track)
         self._index = {name: j for j, name in enumerate(network.names)}
         parts = [network.part(np.array([j])) for j in range(len(network))]
-        self._sensors = [_SensorEvents(part, align, detect, self.counts) for part in parts]
+        self._sensors = [_SensorEvents(j, part, align, detect, self.rates, self.counts)
+                         for j, part in enumerate(parts)]
 
     def feed(self, readings: Readings) -> list[PassEvent]:
         """Add calibrated readings.
@@ -89,8 +97,9 @@ class Events:
 class _SensorEvents:
     """Detects the passes of targets at one sensor, and creates an event for each pass."""
 
-    def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
-                 counts: 'Counter[str]') -> None:
+    def __init__(self, j: int, network: SensorNetwork, align: AlignSettings,
+                 detect: DetectSettings, rates: SampleRates, counts: 'Counter[str]') -> None:
+        self._j, self._rates = j, rates
         self._name, self._R_ws = network.names[0], network.R_ws[0]
         self._network, self._settings = network, (align, detect)
         self._hold_ns, self._counts = int(detect.hold_s * NS), counts
@@ -123,6 +132,7 @@ class _SensorEvents:
         self._buffer.append(readings)
         out: list[PassEvent] = []
         for frame in self._align.feed(readings):
+            self._rates.add(frame, self._j)
             for record in self._detect.feed(frame):
                 if isinstance(record, Detection):
                     out += self._on_detection(record)
@@ -176,12 +186,16 @@ class _SensorEvents:
         peak = int(np.argmax(squared_field))
         is_detected = (onset_ns <= stamp) & (stamp <= release_ns)
         present = ~np.all(np.isnan(field), axis=0)
-        closest = closest_point(t, field, noise)
-        horizontal = horizontal_field(field, self._R_ws)
-        is_complete = ~np.isnan(horizontal).any(axis=1)
-        left_to_right = _left_to_right(
-            horizontal[is_complete], float(np.nanmean(noise)) if is_complete.any() else 0.0,
-            int(np.count_nonzero(stamp < onset_ns)))
+        closest, left_to_right = ClosestPoint((int(stamp[peak]) - onset_ns) / NS, np.inf, np.nan), \
+            0.5
+        # A slow sensor, or the end of a long stay, does not show a pass.
+        if not self._rates.are_slow()[self._j] and release_ns - onset_ns <= MAX_DURATION_S * NS:
+            closest = closest_point(t, field, noise)
+            horizontal = horizontal_field(field, self._R_ws)
+            is_complete = ~np.isnan(horizontal).any(axis=1)
+            left_to_right = _left_to_right(
+                horizontal[is_complete], float(np.nanmean(noise)) if is_complete.any() else 0.0,
+                int(np.count_nonzero(stamp < onset_ns)))
         return PassEvent(
             self._name, self._n, ended, onset_ns, release_ns, int(stamp[peak]), field[peak],
             float(np.sum(squared_field[is_detected]) * _median_interval(stamp)),

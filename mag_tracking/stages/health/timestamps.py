@@ -1,6 +1,5 @@
 """Timestamps that are not the times of the readings: coarse clocks, packets, bursts and zeros."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,8 +72,8 @@ class TimestampFault:
         is_serious = self.error_s > MAX_ERROR_S
         text = self.text
         if is_serious and np.isfinite(self.error_s):
-            text += (f'; the timestamps are wrong by up to {1e3 * self.error_s:.0f} ms, which makes '
-                     'tracks ambiguous')
+            text += (f'; the timestamps are wrong by up to {1e3 * self.error_s:.0f} ms, which '
+                     'makes tracks ambiguous')
         return Finding(is_serious, sensor, text, _ADVICE[self.cause], self.cause)
 
 

@@ -46,8 +46,8 @@ MEANINGS = {
     DOUBTFUL_BACKGROUND: 'the background of a sensor is doubtful',
     CONTRADICTS_EARTH_FIELD: 'the background of a sensor contradicts the Earth\'s field: its axes, '
                              'its gain or its orientation in the network file are wrong',
-    WRONG_TIMESTAMPS: 'the timestamps of a sensor are wrong by more than 20 ms: they are coarse, or '
-                      'those of packets or bursts',
+    WRONG_TIMESTAMPS: 'the timestamps of a sensor are wrong by more than 20 ms: they are coarse, '
+                      'or those of packets or bursts',
     SENSORS_CONTRADICT: 'the sensors contradict each other, and no majority agrees',
     MISFIT: 'the field does not fit the best hypothesis',
     CONTRADICTION: 'the probability of the field given the best hypothesis is below 1e-5',

@@ -7,7 +7,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.plausibility import MAX_RELATIVE_MOVE
 from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.units import NS
+from mag_tracking.units import NEVER, NS
 
 N_INTERVALS = 8
 """Number of latest intervals of a sensor that determine its rate. A sensor is slow if most of them
@@ -86,8 +86,8 @@ def low_rate_fault(rate: float, network: SensorNetwork, settings: TrackSettings)
     if not rate < required:
         return None
     speed = typical_speed(settings)
-    return (f'{rate:.3g} Hz is too slow: a car at {speed:g} m/s moves {speed / rate:.3g} m between '
-            f'readings; at least {np.ceil(10.0 * required) / 10.0:g} Hz are needed for tracks')
+    return (f'{rate:.3g} Hz is too slow: a car moves {speed / rate:.3g} m between readings (at '
+            f'{speed:g} m/s); at least {np.ceil(10.0 * required) / 10.0:g} Hz are needed for tracks')
 
 
 class SampleRates:
@@ -104,22 +104,25 @@ class SampleRates:
         required = required_rate(network, settings)
         self._max_interval_s = 1.0 / required if required else np.inf
         n = len(network)
-        self._last_ns: IntArray = np.full(n, -1, dtype=np.int64)
+        self._last_ns: IntArray = np.full(n, NEVER, dtype=np.int64)
         self._intervals_s: FloatArray = np.zeros((n, N_INTERVALS))
         self._next = np.zeros(n, dtype=np.int64)
         # Longest median interval at which each sensor was slow.
         self._slow_s: FloatArray = np.zeros(n)
 
-    def add(self, frame: FieldFrame) -> None:
+    def add(self, frame: FieldFrame, first: int = 0) -> None:
         """Update the rates with a frame.
 
         Parameters
         ----------
         frame : FieldFrame
+        first : int, optional
+            Index of the first sensor of the frame in the network.
         """
-        rows = np.flatnonzero(frame.n_samples)
-        interval_s = (frame.stamp_ns - self._last_ns[rows]) / NS / frame.n_samples[rows]
-        is_known = (self._last_ns[rows] >= 0) & (interval_s > 0.0)
+        measuring = np.flatnonzero(frame.n_samples)
+        rows = measuring + first
+        interval_s = (frame.stamp_ns - self._last_ns[rows]) / NS / frame.n_samples[measuring]
+        is_known = (self._last_ns[rows] != NEVER) & (interval_s > 0.0)
         self._last_ns[rows] = frame.stamp_ns
         rows, interval_s = rows[is_known], interval_s[is_known]
         self._intervals_s[rows, self._next[rows] % N_INTERVALS] = interval_s
@@ -141,8 +144,8 @@ class SampleRates:
         are_slow: BoolArray = (n_long >= MIN_INTERVALS) & (2 * n_long > n_known)
         return are_slow
 
-    def slow_rate(self, sensor: str) -> float:
-        """Lowest rate at which a sensor is or was too slow.
+    def fault(self, sensor: str) -> str | None:
+        """Describe the lowest rate at which a sensor is or was too slow.
 
         Parameters
         ----------
@@ -150,8 +153,9 @@ class SampleRates:
 
         Returns
         -------
-        float, Hz
-            NaN if the sensor was never too slow.
+        str or None
+            None if the sensor was never too slow.
         """
-        interval_s = self._slow_s[self._network.index(sensor)]
-        return 1.0 / float(interval_s) if interval_s else float('nan')
+        interval_s = float(self._slow_s[self._network.index(sensor)])
+        return low_rate_fault(1.0 / interval_s, self._network, self._settings) \
+            if interval_s else None
