@@ -111,6 +111,7 @@ def find_events(recording: Recording, network: SensorNetwork, settings: Settings
     try:
         for readings in until_stopped(reader.readings, progress, stopped):
             for calibrated in calibrate.feed(readings):
+                stage.set_relearnt(calibrate.relearnt())
                 pass_events += stage.feed(calibrated)
     except ReadingStopped:
         pass

@@ -9,7 +9,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, IntArray, Record
 from mag_tracking.calibration import core
 from mag_tracking.calibration.agreement import FieldInconsistency
-from mag_tracking.calibration.background import RunningBackground
+from mag_tracking.calibration.background import RelearntBackground, RunningBackground
 from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.doubtful_times import (
     CONTRADICTS_EARTH_FIELD,
@@ -214,6 +214,15 @@ class Calibrate:
             self._timestamps.doubtful_times[self._index[sensor]])
             for interval in by_sensor[-1:]]
         return max(times, key=lambda t: (t[1] is None, t[0]), default=None)
+
+    def relearnt(self) -> dict[str, tuple[RelearntBackground, ...]]:
+        """Latest changes of the background of each sensor that had any.
+
+        Returns
+        -------
+        dict of str to tuple of RelearntBackground
+        """
+        return {name: b.relearnt for name, b in self._background.items() if b.relearnt}
 
     def timestamp_fault(self, sensor: str) -> TimestampFault | None:
         """Return the worst regular error of the timestamps of a sensor so far.

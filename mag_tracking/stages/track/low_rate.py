@@ -87,7 +87,8 @@ def low_rate_fault(rate: float, network: SensorNetwork, settings: TrackSettings)
         return None
     speed = typical_speed(settings)
     return (f'{rate:.3g} Hz is too slow: a car moves {speed / rate:.3g} m between readings (at '
-            f'{speed:g} m/s); at least {np.ceil(10.0 * required) / 10.0:g} Hz are needed for tracks')
+            f'{speed:g} m/s); at least {np.ceil(10.0 * required) / 10.0:g} Hz are needed for '
+            'tracks')
 
 
 class SampleRates:
