@@ -41,6 +41,10 @@ class RelearntBackground(NamedTuple):
     has_departed: bool
     """Whether the background contained the field of a target, which has departed. Otherwise,
     another level lasted, or a former level returned."""
+    before: FloatArray
+    """Previous background, (3,) T, sensor frame. NaN for a missing axis."""
+    after: FloatArray
+    """New background, (3,) T, sensor frame. NaN for a missing axis."""
 
 
 class RunningBackground:
@@ -110,6 +114,9 @@ class RunningBackground:
         self._level = BackgroundLevel(sensors, freeze_std)
         self.n_relearnt = 0
         self.relearnt: tuple[RelearntBackground, ...] = ()
+        # Background and level (3,) [T] of the latest departure.
+        self._previous_level: FloatArray = np.full(3, np.nan)
+        self._departure_level: FloatArray = np.full(3, np.nan)
         self.doubtful_times: DoubtfulTimes = ()
         self._provisional = ProvisionalLevel(learn)
         self._departure = LevelDeparture(
@@ -314,6 +321,7 @@ class RunningBackground:
     def _change_if_steady(self, block: Block) -> None:
         """While frozen, adopt another level that persists or that was the background earlier."""
         self._observed_until = np.nan
+        self._previous_level, self._departure_level = self._level.at(block.time), block.mean
         departure = self._departure
         duration = block.time - departure.blocks[0].time
         relearn_time = departure.relearn_time(
@@ -348,7 +356,8 @@ class RunningBackground:
     def _count_relearnt(self, has_departed: bool) -> None:
         """Count another background, which applies from the latest reading on."""
         self.n_relearnt += 1
-        change = RelearntBackground(int(self._state['last_ns']), has_departed)
+        change = RelearntBackground(int(self._state['last_ns']), has_departed,
+                                    self._previous_level, self._departure_level)
         self.relearnt = (*self.relearnt, change)[-MAX_CHANGES:]
 
     def _adopt_if_background(self, new_blocks: deque[Block]) -> bool:

@@ -24,7 +24,7 @@ from mag_tracking.stages.events.single_sensor_pass import ClosestPoint, closest_
 from mag_tracking.stages.events.stays import Stays
 from mag_tracking.stages.track.low_rate import SampleRates
 from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.units import NS
+from mag_tracking.units import NEVER, NS
 
 PAD_S = 1.0
 """[s] Length of the margins without a target, before the onset and after the release."""
@@ -119,7 +119,9 @@ class _SensorEvents:
         self._name, self._R_ws = network.names[0], network.R_ws[0]
         self._network, self._settings = network, (align, detect)
         self._hold_ns, self._counts = int(detect.hold_s * NS), counts
-        self._n, self._stays = 0, Stays()
+        earth_field = network.earth_field
+        self._n, self._stays = 0, Stays(
+            np.full(3, np.nan) if earth_field is None else network.R_sw[0] @ earth_field)
         self.relearnt: Sequence[RelearntBackground] = ()
         self._reset()
 
@@ -148,6 +150,8 @@ class _SensorEvents:
         if not len(readings):
             return []
         self._buffer.append(readings)
+        if self._stays.first_ns == NEVER:
+            self._stays.first_ns = int(readings.stamp_ns[0])
         out: list[PassEvent] = []
         for frame in self._align.feed(readings):
             self._rates.add(frame, self._j)

@@ -16,7 +16,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.background import RelearntBackground
 from mag_tracking.event_records import PassEvent
 from mag_tracking.records import Readings
-from mag_tracking.units import NS
+from mag_tracking.units import NEVER, NS
 
 N_READINGS = 5
 """Number of readings from which the field before a change of the background is determined."""
@@ -24,6 +24,9 @@ MIN_FIELD_STDS = 3.0
 """Minimum magnitude of this field, in standard deviations of the noise."""
 MAX_DIFFERENCE = 0.15
 """Maximum relative difference between the field of a departure and that of the arrival."""
+MIN_APPROACH = 0.3
+"""Minimum decrease of the distance to the field without a vehicle, relative to the change of the
+background, for a vehicle to have left."""
 MAX_OPEN = 8
 """Maximum number of vehicles that stand beside a sensor; the oldest is reported as not ended."""
 
@@ -36,9 +39,23 @@ class _Stay(NamedTuple):
 
 
 class Stays:
-    """Joins the arrivals and the departures of vehicles that park beside one sensor."""
+    """Joins the arrivals and the departures of vehicles that park beside one sensor.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    free_field : (3,) array, T, sensor frame
+        Field without a vehicle; NaN if unknown. If a change of the background leads towards this
+        field, a vehicle that was present from the start has left.
+
+    Attributes
+    ----------
+    first_ns : int
+        Time of the first reading [ns].
+    """
+
+    def __init__(self, free_field: FloatArray) -> None:
+        self._free_field = free_field
+        self.first_ns = NEVER
         self._open: list[_Stay] = []
 
     def add(self, event: PassEvent, readings: Readings,
@@ -57,7 +74,8 @@ class Stays:
         -------
         list of PassEvent
             `event`, unless it is the arrival or the departure of a parked vehicle; a departure
-            completes the event of the arrival.
+            completes the event of the arrival. The event of a vehicle that was present from the
+            start begins with the first reading.
         """
         end_ns = int(readings.stamp_ns[-1])
         change = next((c for c in reversed(relearnt)
@@ -73,10 +91,19 @@ class Stays:
                 return [_until(self._open.pop(k), event.onset_ns, True)]
         if change.has_departed or np.linalg.norm(level) < MIN_FIELD_STDS * noise:
             return [event]
+        if self._has_departed(change):
+            return [replace(event, onset_ns=self.first_ns, release_ns=event.onset_ns)]
         self._open.append(_Stay(event, level))
         if len(self._open) > MAX_OPEN:
             return [_until(self._open.pop(0), event.release_ns, False)]
         return []
+
+    def _has_departed(self, change: RelearntBackground) -> bool:
+        """Whether the previous background was further from the field without a vehicle."""
+        before, after = (float(np.linalg.norm(np.nan_to_num(level - self._free_field)))
+                         for level in (change.before, change.after))
+        size = float(np.linalg.norm(np.nan_to_num(change.after - change.before)))
+        return before - after > MIN_APPROACH * size
 
     def flush(self, last_ns: int) -> list[PassEvent]:
         """Return the events of the vehicles that have not left, as not ended.
