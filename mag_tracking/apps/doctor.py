@@ -21,16 +21,15 @@ from mag_tracking.stages.calibrate.field_comparison import (
     earth_field_findings,
 )
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.health.clocks import clock_findings
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.stages.health.sensor_health import SensorHealth
 from mag_tracking.stages.survey.settings import SurveySettings
+from mag_tracking.stages.track.low_rate import low_rate_fault
 from mag_tracking.units import NS
 
 MAX_FROZEN_S = 30.0
 """Time for which a background may be frozen before it is reported [s]."""
-
-MAX_CLOCK_DIFFERENCE_S = 60.0
-"""Difference from the clocks of other sensors above which a clock is reported [s]."""
 
 MIN_MISSED_TARGETS = 3
 """Number of consecutive missed targets at which a sensor is reported."""
@@ -76,7 +75,8 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
     -------
     list of Finding
     """
-    findings = list(_clock_findings(network, sensors))
+    clocks = {name: health.clock for name, health in sensors.items()}
+    findings = list(clock_findings({name: c for name, c in clocks.items() if c is not None}))
     levels = np.array([level_of(calibrate, name, sensors[name]) for name in network.names])
     # Rounded levels stay equal during small changes, so that no new comparison is needed.
     levels = LEVEL_STEP * np.round(levels / LEVEL_STEP)
@@ -86,24 +86,6 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
         return [*findings, Finding(False, 'network', f'sensors were not compared: {error}',
                                    'add earth_field or site to the network file',
                                    Cause.NOT_COMPARED)]
-
-
-def _clock_findings(network: SensorNetwork,
-                    sensors: Mapping[str, SensorHealth]) -> Iterator[Finding]:
-    """Report sensors whose clock differs from the clocks of other sensors."""
-    delays = {name: sensors[name].delay_s[0] for name in network.names}
-    delays = {name: d for name, d in delays.items() if not np.isnan(d)}
-    if not delays:
-        return
-    # The clock nearest to the host clock is the reference. In a replay, all clocks differ from the
-    # host clock by about the same time.
-    reference = min(delays.values(), key=abs)
-    for name, delay in delays.items():
-        if abs(delay - reference) > MAX_CLOCK_DIFFERENCE_S:
-            yield Finding(True, name, f'its timestamps differ by {reference - delay:+.4g} s from '
-                          'the timestamps of other sensors', 'synchronise its clock (chrony, PTP); '
-                          'knocks correct only offsets below survey.max_clock_offset_s',
-                          Cause.CLOCK_DIFFERS)
 
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
@@ -148,6 +130,25 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
                       f'{(last - frozen_since_ns) / NS:.0f} s', 'remove any target near it; if the '
                       'field has changed permanently, call the service calibrate',
                       Cause.FROZEN_BACKGROUND)
+
+
+def rate_findings(name: str, fault: str | None) -> Iterator[Finding]:
+    """Report a sensor that is too slow for tracks.
+
+    Parameters
+    ----------
+    name : str
+        Sensor.
+    fault : str or None
+        Result of `low_rate_fault`.
+
+    Yields
+    ------
+    Finding
+    """
+    if fault is not None:
+        yield Finding(True, name, fault, 'raise the rate of the sensor; for parked vehicles, use '
+                      'mag-tracking events', Cause.RATE_TOO_LOW)
 
 
 class MissedTargets:
@@ -256,6 +257,8 @@ class Doctor:
             found += background_findings(name, self.calibrate, self._frozen_since_ns.get(name))
             found += covariance_findings(name, self.network.absolute_topics[j], self.calibrate)
             found += rejection_findings(name, self.calibrate)
+            found += rate_findings(name, low_rate_fault(
+                health.rate, self.network, self._settings.track))
         found += self._missed.findings()
         found += network_findings(self.network, self._settings.survey, self.calibrate,
                                   self.sensors)

@@ -3,16 +3,13 @@
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from mag_tracking.apps.doctor import background_findings, recording_findings
-from mag_tracking.apps.doctor_covariances import covariance_findings
-from mag_tracking.apps.doctor_rejections import rejection_findings
+from mag_tracking.apps.input_findings import input_findings
 from mag_tracking.physics import bounds
 from mag_tracking.pipeline import Pipeline
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.report.page import NOTE, WARNING, Note
-from mag_tracking.stages.calibrate.field_comparison import earth_field_findings
 from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.evidence import LOST
@@ -39,16 +36,8 @@ def replay_findings(recording: Recording, reader: SampleReader, pipeline: Pipeli
     -------
     list of Finding
     """
-    network, calibrate, missing = pipeline.network, pipeline.calibrate, reader.missing_topics()
-    found = recording_findings(recording, reader)
-    for name, topic in zip(network.names, network.absolute_topics, strict=True):
-        if topic in missing:
-            found.append(Finding(True, name, f'no messages on {topic}', 'check the topic in the '
-                                 'network file', Cause.NO_MESSAGES))
-        found += rejection_findings(name, calibrate)
-        found += background_findings(name, calibrate, None)
-        found += covariance_findings(name, topic, calibrate)
-    found += earth_field_findings(calibrate.field_inconsistencies())
+    found = input_findings(recording, reader, pipeline.network, pipeline.calibrate,
+                           pipeline.track.rates)
     for stage, counts in pipeline.counts().items():
         if stage != 'calibrate' and (causes := rejected(counts)):
             found.append(Finding(False, stage, ', '.join(

@@ -15,6 +15,7 @@ InputDoubts: TypeAlias = Mapping[str, Mapping[str, DoubtfulTimes]]
 
 DOUBTFUL_BACKGROUND = 'doubtful_background'
 CONTRADICTS_EARTH_FIELD = 'contradicts_earth_field'
+WRONG_TIMESTAMPS = 'wrong_timestamps'
 """Reasons why the input of a sensor is doubtful."""
 
 MAX_INTERVALS = 16

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.message_arrays import magnetic_fields
 from mag_tracking.messages.schema import acceleration_of, reading_of, readings_of
@@ -24,6 +25,7 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
 from mag_tracking.report.metrics import Truth
+from mag_tracking.stages.health.clocks import ClockSpan
 
 TRUTH_PREFIX = 'ground_truth/'
 """Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
@@ -47,6 +49,8 @@ class SampleReader:
     ----------
     rejected : Counter
         Number of messages and readings that cannot be used, by cause.
+    clocks : dict of str to ClockSpan
+        First and last timestamp of each sensor so far, with their log times.
     namespace : str
         Namespace of the network's relative topics in the recording.
 
@@ -77,6 +81,7 @@ class SampleReader:
                                  f'{recording.types.get(truth, "not in the recording")}; '
                                  f'topics with poses: {", ".join(pose_topics) or "none found"}')
         self.rejected: Counter[str] = Counter()
+        self.clocks: dict[str, ClockSpan] = {}
         self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
         if recording.types and not self._is_batched \
                 and not any(t in recording.types for t in self._sensors):
@@ -135,6 +140,7 @@ class SampleReader:
         batch = Readings(
             sensors, sensor_index[block.channel[rows]], fields.stamp_ns[fields.is_decoded],
             fields.field[fields.is_decoded], None if C is None else C[fields.is_decoded])
+        self._note_clocks(batch, block.log_time_ns[rows])
         other_messages = np.setdiff1d(np.arange(len(block)),
                                       np.append(rows, self._truth.add_block(block)))
         parts, n_added = [], 0
@@ -209,12 +215,27 @@ class SampleReader:
             if is_truth:
                 self._truth.add(message.topic, content)
             elif readings is not None:
-                yield self._network_readings(readings), message.log_time_ns
+                readings = self._network_readings(readings)
+                self._note_clocks(readings, np.full(len(readings), message.log_time_ns))
+                yield readings, message.log_time_ns
             elif imu_sensors is not None:
                 for name in imu_sensors:
                     yield acceleration_of(content, name), message.log_time_ns
             elif sensor is not None:
-                yield reading_of(content, sensor), message.log_time_ns
+                reading = reading_of(content, sensor)
+                self._note_clocks(reading, np.array([message.log_time_ns]))
+                yield reading, message.log_time_ns
+
+    def _note_clocks(self, readings: Readings, log_time_ns: IntArray) -> None:
+        """Extend the clock of each sensor by readings, which were logged at `log_time_ns` (n,)."""
+        for j in np.unique(readings.sensor).tolist():
+            stamps, received = readings.stamp_ns, log_time_ns
+            if len(readings.names) > 1:
+                is_own = readings.sensor == j
+                stamps, received = stamps[is_own], received[is_own]
+            span = ClockSpan.of(stamps, received)
+            earlier = self.clocks.get(readings.names[j], span)
+            self.clocks[readings.names[j]] = earlier.until(span)
 
     def _network_readings(self, readings: Readings) -> Readings:
         """Select the readings of the network's sensors, and count readings of other sensors."""

@@ -9,11 +9,12 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, IntArray, Record
 from mag_tracking.calibration import core
 from mag_tracking.calibration.agreement import FieldInconsistency
-from mag_tracking.calibration.background import RunningBackground
+from mag_tracking.calibration.background import RelearntBackground, RunningBackground
 from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.doubtful_times import (
     CONTRADICTS_EARTH_FIELD,
     DOUBTFUL_BACKGROUND,
+    WRONG_TIMESTAMPS,
     DoubtfulTimes,
     shifted,
 )
@@ -34,6 +35,7 @@ from mag_tracking.stages.calibrate.restoration import (
 )
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.health.diagnosis import Cause
+from mag_tracking.stages.health.timestamps import TimestampFault, TimestampMonitor
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NEVER, NS
 
@@ -103,6 +105,7 @@ class Calibrate:
         self._background: dict[str, RunningBackground] = {}
         self._changes = SharedChanges()
         self._restoration = BackgroundRestoration(settings.max_resume_gap_s)
+        self._timestamps = TimestampMonitor(len(network))
         self._comparison = FieldComparison(network, survey or SurveySettings())
         self.update_network(network)
 
@@ -177,7 +180,7 @@ class Calibrate:
         return [name for name, b in self._background.items() if not b.ready]
 
     def input_doubts(self) -> dict[str, dict[str, DoubtfulTimes]]:
-        """Intervals in which the background of a sensor was doubtful.
+        """Intervals in which the background or the timestamps of a sensor were doubtful.
 
         A background is doubtful while it is provisional or may contain the field of a target, and
         while it contradicts the Earth's field.
@@ -189,11 +192,13 @@ class Calibrate:
         """
         out = {DOUBTFUL_BACKGROUND: {n: b.doubtful_times for n, b in self._background.items()
                                      if b.doubtful_times},
-               CONTRADICTS_EARTH_FIELD: self._comparison.doubtful_times()}
+               CONTRADICTS_EARTH_FIELD: self._comparison.doubtful_times(),
+               WRONG_TIMESTAMPS: {n: times for n, i in self._index.items()
+                                  if (times := self._timestamps.doubtful_times[i])}}
         return {reason: by_sensor for reason, by_sensor in out.items() if by_sensor}
 
     def latest_doubt(self, sensor: str) -> tuple[int, int | None] | None:
-        """Latest interval in which the background of a sensor was doubtful.
+        """Latest interval in which the background or the timestamps of a sensor were doubtful.
 
         Parameters
         ----------
@@ -205,9 +210,33 @@ class Calibrate:
             Open intervals (end None) come first. None if there is no interval.
         """
         times = [interval for by_sensor in (
-            self._background[sensor].doubtful_times, self._comparison.times_of(sensor))
+            self._background[sensor].doubtful_times, self._comparison.times_of(sensor),
+            self._timestamps.doubtful_times[self._index[sensor]])
             for interval in by_sensor[-1:]]
         return max(times, key=lambda t: (t[1] is None, t[0]), default=None)
+
+    def relearnt(self) -> dict[str, tuple[RelearntBackground, ...]]:
+        """Latest changes of the background of each sensor that had any.
+
+        Returns
+        -------
+        dict of str to tuple of RelearntBackground
+        """
+        return {name: b.relearnt for name, b in self._background.items() if b.relearnt}
+
+    def timestamp_fault(self, sensor: str) -> TimestampFault | None:
+        """Return the worst regular error of the timestamps of a sensor so far.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        TimestampFault or None
+            None if the timestamps are regular.
+        """
+        return self._timestamps.worst_fault(self._index[sensor])
 
     def field_inconsistencies(self) -> list[FieldInconsistency]:
         """Sensors whose background contradicts the Earth's field so much that tracks are wrong.
@@ -255,6 +284,7 @@ class Calibrate:
         rows = readings.rows(self._index)
         validity, covariances = _own_covariances(readings)
         stamps, fields = plain(readings.stamp_ns, np.int64), plain(readings.field)
+        self._timestamps.add(rows, stamps - self._network.clock_offset_ns[rows], fields)
         out, batch = self._new_output(len(readings)), self._batches[0]
         batch['next'] = 0
         while reason := core.calibrate_readings(

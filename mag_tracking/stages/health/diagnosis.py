@@ -19,7 +19,7 @@ class Cause(enum.Enum):
     MILLISECOND_STAMPS = 'timestamps in milliseconds'
     ZERO_STAMPS = 'timestamps of zero'
     BOOT_STAMPS = 'timestamps since the start of the device'
-    WHOLE_SECOND_STAMPS = 'timestamps in whole seconds'
+    COARSE_STAMPS = 'coarse timestamps'
     BURST_STAMPS = 'readings in bursts'
     PACKET_STAMPS = 'one timestamp per packet'
     CLOCK_DIFFERS = 'clock differs'
@@ -126,7 +126,7 @@ _EXPLAINED = {
     Cause.MILLISECOND_STAMPS: _WRONG_STAMPS,
     Cause.ZERO_STAMPS: _WRONG_STAMPS,
     Cause.BOOT_STAMPS: _WRONG_STAMPS,
-    Cause.WHOLE_SECOND_STAMPS: _WRONG_STAMPS,
+    Cause.COARSE_STAMPS: _WRONG_STAMPS,
     Cause.BURST_STAMPS: _WRONG_STAMPS,
     Cause.PACKET_STAMPS: _WRONG_STAMPS,
     Cause.CLOCK_STEPPED: _explained('BACKWARD_STAMPS DUPLICATE_STAMPS TOO_FAR_AHEAD REJECTED',

@@ -13,7 +13,10 @@ from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
 from mag_tracking.quantities import occurrences
+from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.stages.health.diagnosis import Cause, Finding
+from mag_tracking.stages.health.timestamps import WINDOW as TIMESTAMP_WINDOW
+from mag_tracking.stages.health.timestamps import TimestampFault, timestamp_fault
 from mag_tracking.stages.health.window import median_field, quantiles, sample_noise_std
 from mag_tracking.units import NEVER, NS
 
@@ -62,6 +65,7 @@ class SensorHealth:
         self._received: IntArray = np.zeros(0, dtype=np.int64)
         self._fields: FloatArray = np.zeros((0, 3))
         self._interval_ns, self._jitter = float('nan'), float('inf')
+        self._timestamp_fault: TimestampFault | None = None
         self._noise: FloatArray = np.full(3, np.nan)
         # Results for the current window; cleared when readings are added.
         self._cache: dict[str, FloatArray] = {}
@@ -138,6 +142,14 @@ class SensorHealth:
         """Count the faults in the timestamps of the `n` latest readings."""
         # The first interval starts at the preceding reading, if there is one.
         intervals = np.diff(self._stamps[-n - 1:])
+        self._counts['duplicates'] += int((intervals == 0).sum())
+        self._counts['backward timestamps'] += int((intervals < 0).sum())
+        fault = timestamp_fault(self._stamps[-TIMESTAMP_WINDOW:], self._fields[-TIMESTAMP_WINDOW:])
+        if fault is not None:
+            # The intervals of such timestamps show neither lost readings nor clock steps.
+            self._timestamp_fault = fault.after(self._timestamp_fault)
+            self._interval_ns, self._jitter = fault.interval_s * NS, float('inf')
+            return
         is_received = self._received[-n - 1:] != NEVER
         receipts = np.diff(np.where(is_received, self._received[-n - 1:], 0)) / NS
         steps = receipts - intervals / NS
@@ -150,8 +162,6 @@ class SensorHealth:
         if is_step.any():
             self._counts['clock steps'] += int(is_step.sum())
             self._largest_step_s = max(self._largest_step_s, *steps[is_step].tolist(), key=abs)
-        self._counts['duplicates'] += int((intervals == 0).sum())
-        self._counts['backward timestamps'] += int((intervals < 0).sum())
         if self._jitter < MAX_JITTER:
             gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) & ~is_step
             self._counts['lost'] += int(np.sum(np.round(intervals[gaps] / self._interval_ns) - 1))
@@ -278,6 +288,14 @@ class SensorHealth:
         return ''.join(np.array(list('xyz'))[unchanged]) if unchanged.sum() < present.sum() else ''
 
     @property
+    def clock(self) -> ClockSpan | None:
+        """Timestamps and times of receipt of the window; None if no time of receipt is known."""
+        self.update()
+        is_received = self._received != NEVER
+        return ClockSpan.of(self._stamps[is_received], self._received[is_received]) \
+            if is_received.any() else None
+
+    @property
     def delay_s(self) -> list[float]:
         """Delay [s] from timestamp to receipt: median, 5 % and 95 % quantiles; NaN if unknown."""
         self.update()
@@ -338,6 +356,8 @@ class SensorHealth:
         """Yield findings about duplicate timestamps, lost readings and delays."""
         c = self.counts
         median, low, high = self.delay_s
+        if self._timestamp_fault is not None:
+            yield self._timestamp_fault.finding(name)
         if c['duplicates'] > 0.001 * n:
             yield Finding(False, name, f'{c["duplicates"]} of {n} readings repeat the previous '
                           'timestamp', 'check whether the driver publishes readings twice, or '

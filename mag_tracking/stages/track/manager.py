@@ -8,6 +8,7 @@ from collections import Counter, deque
 
 import numpy as np
 
+from mag_tracking.arrays import BoolArray
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, InputDoubts, are_doubtful
 from mag_tracking.errors import NetworkError
 from mag_tracking.inference.axes import whitened_energy
@@ -18,6 +19,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.bank_size import sensors_at_start
 from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.disturbances import Disturbances
+from mag_tracking.stages.track.low_rate import SampleRates
 from mag_tracking.stages.track.observation import MAX_ROTATION
 from mag_tracking.stages.track.running_track import RunningTrack, TrackRecord
 from mag_tracking.stages.track.sensor_selection import SensorSubset
@@ -27,6 +29,8 @@ from mag_tracking.units import NS
 
 NO_SCALE = 'detections not tracked (scale not observable with one sensor)'
 NO_SCALE_FRAMES = 'frames in which no track could start (scale not observable with one sensor)'
+
+TOO_SLOW = 'detections not tracked (the rate of the sensors is too low)'
 
 UNCERTAIN_ORIENTATIONS = ('sensors with an orientation uncertainty above '
                           f'{np.degrees(MAX_ROTATION):g} degrees')
@@ -59,6 +63,8 @@ class TrackManager:
     ----------
     counts : Counter
         Number of events, by description.
+    rates : SampleRates
+        Rates of the sensors.
 
     Raises
     ------
@@ -83,6 +89,7 @@ class TrackManager:
         self._restart_energy: float | None = None
         self._next_network: SensorNetwork | None = None
         self._disturbances = Disturbances(network.names)
+        self.rates = SampleRates(network, settings)
         self._input_doubts: InputDoubts = {}
         self._doubtful_rows: dict[str, dict[int, DoubtfulTimes]] = {}
         n_uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
@@ -170,6 +177,7 @@ class TrackManager:
         out, previous = self._end_at_gap(frame), self._last_ns
         self._last_ns = frame.stamp_ns
         self.counts['frames'] += 1
+        self.rates.add(frame)
         if not self._tracks:
             self._disturbances.feed(frame)
         if not frame.target_present:
@@ -277,8 +285,13 @@ class TrackManager:
             return []
         s = self._settings
         recent = [f for f in self._recent if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
-        if not (s.single_sensor_prior or self._target.starts_anywhere) \
-                and _n_sensors(frame, *recent) < 2:
+        n_required = 1 if s.single_sensor_prior or self._target.starts_anywhere else 2
+        is_slow = self.rates.are_slow()
+        if is_slow.any() and _n_sensors(frame, *recent, without=is_slow) < n_required:
+            self.counts[TOO_SLOW] += 1
+            self._restart_energy = np.inf
+            return []
+        if _n_sensors(frame, *recent) < n_required:
             self.counts[NO_SCALE_FRAMES] += 1
             self._store_frame(frame)
             return []
@@ -325,6 +338,7 @@ def _energy(frame: FieldFrame) -> float:
     return float(np.nansum(np.square(frame.field)))
 
 
-def _n_sensors(*frames: FieldFrame) -> int:
-    """Number of sensors that measured in at least one frame."""
-    return int(np.count_nonzero(np.any([~np.isnan(f.field) for f in frames], axis=(0, 2))))
+def _n_sensors(*frames: FieldFrame, without: BoolArray | bool = False) -> int:
+    """Number of sensors, `without` some (n_sensors,), that measured in at least one frame."""
+    have_measured = np.any([~np.isnan(f.field) for f in frames], axis=(0, 2))
+    return int(np.count_nonzero(have_measured & ~np.asarray(without)))
