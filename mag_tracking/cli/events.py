@@ -57,7 +57,8 @@ def add(commands: Commands) -> None:
 
 def _events(args: argparse.Namespace) -> int:
     """Run `mag-tracking events`."""
-    network, settings = recorded_network(args), settings_of(args)
+    network = recorded_network(args)
+    settings = settings_of(args, network)
     recording = Recording(args.recording)
     if args.out is not None and recording.lies_in(args.out):
         raise OutputError(f'--out: {args.out} is the folder of the recording; choose another one')

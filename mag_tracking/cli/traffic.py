@@ -84,7 +84,8 @@ def add(commands: Commands) -> None:
 
 def _traffic(args: argparse.Namespace) -> int:
     """Run `mag-tracking traffic`."""
-    network, settings = recorded_network(args), settings_of(args)
+    network = recorded_network(args)
+    settings = settings_of(args, network)
     names = distinct_names(args.recordings)
     recordings = _recordings(args, network)
     tables: dict[str, list[dict[str, Any]]] = {'passages': [], 'intervals': []}

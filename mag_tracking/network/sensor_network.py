@@ -13,6 +13,8 @@ from mag_tracking.units import NS
 
 MAX_COMPACT_EXTENT = 2.0
 """Maximum horizontal extent of a compact network [m], half of the length of a car."""
+MIN_BOARD_SENSORS, MAX_BOARD_EXTENT = 3, 1.0
+"""Minimum number of sensors of a board, and its maximum extent [m]. A board tracks a magnet."""
 MIN_DELAY_BASELINE = 0.1
 """Minimum horizontal distance between two sensors for the estimation of a delay [m]."""
 
@@ -136,6 +138,12 @@ class SensorNetwork:
         network determines range and moment hardly better than a single sensor.
         """
         return bool(np.hypot(*np.ptp(self.positions[:, :2], axis=0)) < MAX_COMPACT_EXTENT)
+
+    @property
+    def is_board(self) -> bool:
+        """Whether the sensors are so close together that they track a magnet, not a vehicle."""
+        extent = np.linalg.norm(np.ptp(self.positions, axis=0))
+        return len(self) >= MIN_BOARD_SENSORS and bool(extent < MAX_BOARD_EXTENT)
 
     def part(self, rows: IntArray) -> 'SensorNetwork':
         """Create a network of selected sensors.

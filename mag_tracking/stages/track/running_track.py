@@ -195,8 +195,9 @@ class RunningTrack:
             return []
         for member in () if self._target.starts_anywhere else self.members:
             member.evidence.check_approach(self._final_sensors.part_of(frame))
-        frame_update = self._bank.advance(self._bank.sensors.part_of(frame), dt)
-        if not self._update_evidence(frame_update):
+        used = self._bank.sensors.part_of(frame)
+        frame_update = self._bank.advance(used, 0.0 if self._restart_after_gap(used, dt) else dt)
+        if not self._update_evidence(frame_update, dt):
             return self.end('no hypothesis explains the field')
         self._bank.store_and_prune(frame_update, publish)
         best = self.bank.best()
@@ -223,9 +224,19 @@ class RunningTrack:
         row = best if bank is self.bank else bank.best()
         return MemberView(bank, row, self._bank.single_target, self._bank.gain(row))
 
-    def _update_evidence(self, frame_update: FrameUpdate) -> bool:
+    def _restart_after_gap(self, frame: FieldFrame, dt: float) -> bool:
+        """Start the hypotheses again if the target was lost in a gap; return whether they were."""
+        states = self._bank.smoothed(self.bank.best(), False) \
+            if self._target.is_lost_after(self._settings, self._bank.sensors.network, dt) else []
+        if not self._bank.restart_after_gap(frame, dt):
+            return False
+        # The path before the gap was smoothed on its own.
+        self.members[0].early += states
+        return True
+
+    def _update_evidence(self, frame_update: FrameUpdate, dt: float) -> bool:
         """Update the evidence of the members; return False if no hypothesis explains the frame."""
-        frame, dt = frame_update.frame, frame_update.dt
+        frame = frame_update.frame
         if frame_update.n_rejected and np.count_nonzero(frame.n_samples) <= frame_update.n_rejected:
             # Without a majority of sensors, the track itself may be wrong.
             for member in self.members:
