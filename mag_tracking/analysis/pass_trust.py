@@ -15,6 +15,7 @@ from mag_tracking.analysis.pass_covariance import reach
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.arrays import FloatArray
+from mag_tracking.physics.bounds import ADVICE, impossible_reason
 
 NOISE_ENERGY = 16.3
 """Whitened energy of three axes that noise exceeds with a probability of 0.001."""
@@ -167,8 +168,12 @@ def trusted_quantities(fit: PassFit) -> tuple[str, ...]:
 
 def _invalid_pass_reason(fit: PassFit) -> str:
     """Reason why a fit does not show one target at constant velocity; empty if it does."""
+    if fit.data.doubt:
+        return fit.data.doubt
     if not fit.converged:
         return 'the fit did not converge'
+    if reason := impossible_reason(fit.velocity, fit.moment[0]):
+        return f'{reason}; {ADVICE}'
     if not has_plausible_residual(fit):
         return (f'not one target at constant velocity: {1.0 - fit.explained:.1%} of the field is '
                 f'unexplained, {fit.residual_elsewhere:.1%} where a vehicle at that distance '

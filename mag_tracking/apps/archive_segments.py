@@ -10,7 +10,7 @@ frames.
 import dataclasses
 import json
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from zipfile import BadZipFile
@@ -19,7 +19,7 @@ import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes
+from mag_tracking.calibration.doubtful_times import InputDoubts
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
@@ -32,8 +32,8 @@ CHUNK_FRAMES = 2000
 MIN_QUIET_S = 1.0
 """Minimum duration without a target that ends a segment [s]."""
 
-Doubts = Mapping[str, DoubtfulTimes]
-"""{sensor: times at which its background is doubtful}."""
+Doubts = InputDoubts
+"""{reason: {sensor: times at which its readings are doubtful}}."""
 NumberedPass = tuple[int, PassData, tuple[str, ...]]
 """Index of a pass in its recording (from 1), measurements of the pass, and notes for the user."""
 
@@ -139,13 +139,14 @@ def _read_chunk(path: Path, network: SensorNetwork) -> FrameChunk:
     with np.load(path) as arrays:
         text = json.loads(str(arrays['text']))
         doubts: dict[int, Doubts] = {
-            int(k): {sensor: tuple((begin, end) for begin, end in times)
-                     for sensor, times in by_sensor.items()}
-            for k, by_sensor in text['doubts'].items()}
+            int(k): {reason: {sensor: tuple((begin, end) for begin, end in times)
+                              for sensor, times in by_sensor.items()}
+                     for reason, by_sensor in by_reason.items()}
+            for k, by_reason in text['doubts'].items()}
         passes = tuple(
-            (number, PassData(network, stamp_ns, *(
-                arrays[f'pass_{number}_{name}'] for name in _PASS_ARRAYS)), tuple(notes))
-            for number, stamp_ns, notes in text['passes'])
+            (number, dataclasses.replace(PassData(network, stamp_ns, *(
+                arrays[f'pass_{number}_{name}'] for name in _PASS_ARRAYS)), doubt=doubt),
+             tuple(notes)) for number, stamp_ns, doubt, notes in text['passes'])
         return FrameChunk(**{name: arrays[name] for name in _FRAME_ARRAYS}, doubts=doubts,
                           passes=passes)
 
@@ -156,7 +157,7 @@ def _write_chunk(path: Path, chunk: FrameChunk) -> None:
     for number, data, _ in chunk.passes:
         arrays |= {f'pass_{number}_{name}': getattr(data, name) for name in _PASS_ARRAYS}
     text = json.dumps({'doubts': chunk.doubts, 'passes': [
-        (number, data.stamp_ns, notes) for number, data, notes in chunk.passes]})
+        (number, data.stamp_ns, data.doubt, notes) for number, data, notes in chunk.passes]})
     with open(path, 'xb') as stream:
         np.savez(stream, text=np.array(text), **arrays)
 

@@ -185,7 +185,7 @@ class _Segmenter:
         """Write a frame with its detection result, and the health rows that are due."""
         self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
         self._last_ns = frame.stamp_ns
-        self._writer.add_frame(frame, self._passes.calibrate.doubtful_intervals())
+        self._writer.add_frame(frame, self._passes.calibrate.input_doubts())
         self._add_health(self._health.due_rows(frame.stamp_ns, self._passes.calibrate))
 
     def _add_passes(self, passes: Iterable[tuple[PassData, tuple[str, ...]]]) -> None:

@@ -282,7 +282,7 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
     source : Readings, RecordedReadings, or path of a recording
         A recording is read in batches and need not fit into memory.
     network : SensorNetwork or path of a network file
-    target : 'vehicle' or 'magnet'
+    target : 'vehicle', 'magnet' (in a hand) or 'bench' (a magnet on a bench)
     settings : {name: value}, optional
         Settings that differ from the defaults of the target, such as {'track.iterations': 5};
         config/default.yaml lists all settings.

@@ -100,7 +100,8 @@ def add(commands: Commands) -> None:
 
 def _replay(args: argparse.Namespace) -> int:
     """Run `mag-tracking replay`."""
-    network, settings = recorded_network(args), settings_of(args)
+    network = recorded_network(args)
+    settings = settings_of(args, network)
     names = distinct_names(args.recordings)
     if args.rerun:
         check_rerun()

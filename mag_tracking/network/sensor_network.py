@@ -20,6 +20,8 @@ MAX_SENSORS = 1000
 MAX_EXTENT = 1e5
 """Maximum distance between two sensors of a network [m]. Over larger distances, the surface of the
 Earth is no plane; positions that are farther apart have another unit than metres."""
+MIN_BOARD_SENSORS, MAX_BOARD_EXTENT = 3, 1.0
+"""Minimum number of sensors of a board, and its maximum extent [m]. A board tracks a magnet."""
 MIN_DELAY_BASELINE = 0.1
 """Minimum horizontal distance between two sensors for the estimation of a delay [m]."""
 
@@ -162,6 +164,12 @@ class SensorNetwork:
         network determines range and moment hardly better than a single sensor.
         """
         return bool(np.hypot(*np.ptp(self.positions[:, :2], axis=0)) < MAX_COMPACT_EXTENT)
+
+    @property
+    def is_board(self) -> bool:
+        """Whether the sensors are so close together that they track a magnet, not a vehicle."""
+        extent = np.linalg.norm(np.ptp(self.positions, axis=0))
+        return len(self) >= MIN_BOARD_SENSORS and bool(extent < MAX_BOARD_EXTENT)
 
     def part(self, rows: IntArray) -> 'SensorNetwork':
         """Create a network of selected sensors.

@@ -28,6 +28,7 @@ from mag_tracking.recording.sensor_topics import FrameCheck, examine_topics, fau
 from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
 from mag_tracking.report.metrics import Truth
+from mag_tracking.stages.health.clocks import ClockSpan
 
 TRUTH_PREFIX = 'ground_truth/'
 """Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
@@ -55,6 +56,8 @@ class SampleReader:
     ----------
     rejected : Counter
         Number of messages and readings that cannot be used, or not as they are, by cause.
+    clocks : dict of str to ClockSpan
+        First and last timestamp of each sensor so far, with their log times.
     namespace : str
         Namespace of the network's relative topics in the recording.
 
@@ -86,6 +89,7 @@ class SampleReader:
                                  f'topics with poses: {", ".join(pose_topics) or "none found"}')
         self.rejected: Counter[str] = Counter()
         self._unknown_sensors: set[str] = set()
+        self.clocks: dict[str, ClockSpan] = {}
         self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
         self._frames = FrameCheck(recording.path)
         self._unstamped, self._shared = self._examine_topics(network)
@@ -161,6 +165,7 @@ class SampleReader:
             sensors, sensor_index[block.channel[rows]],
             self._stamps(block, rows, fields.stamp_ns[fields.is_decoded]),
             fields.field[fields.is_decoded], None if C is None else C[fields.is_decoded])
+        self._note_clocks(batch, block.log_time_ns[rows])
         other_messages = np.setdiff1d(np.arange(len(block)),
                                       np.append(rows, self._truth.add_block(block)))
         parts, n_added = [], 0
@@ -261,7 +266,9 @@ class SampleReader:
             if is_truth:
                 self._truth.add(message.topic, content)
             elif readings is not None:
-                yield self._network_readings(readings), message.log_time_ns
+                readings = self._network_readings(readings)
+                self._note_clocks(readings, np.full(len(readings), message.log_time_ns))
+                yield readings, message.log_time_ns
             elif imu_sensors is not None:
                 for name in imu_sensors:
                     yield acceleration_of(content, name), message.log_time_ns
@@ -279,9 +286,21 @@ class SampleReader:
         if message.topic in self._unstamped and reading.stamp_ns[0] == 0:
             reading = replace(reading, stamp_ns=np.array([message.log_time_ns]))
             self._count_unstamped(message.topic, 1)
+        self._note_clocks(reading, np.array([message.log_time_ns]))
         reading = self._network_readings(reading)
         if len(reading):
             yield reading, message.log_time_ns
+
+    def _note_clocks(self, readings: Readings, log_time_ns: IntArray) -> None:
+        """Extend the clock of each sensor by readings, which were logged at `log_time_ns` (n,)."""
+        for j in np.unique(readings.sensor).tolist():
+            stamps, received = readings.stamp_ns, log_time_ns
+            if len(readings.names) > 1:
+                is_own = readings.sensor == j
+                stamps, received = stamps[is_own], received[is_own]
+            span = ClockSpan.of(stamps, received)
+            earlier = self.clocks.get(readings.names[j], span)
+            self.clocks[readings.names[j]] = earlier.until(span)
 
     def _network_readings(self, readings: Readings) -> Readings:
         """Select the readings of the network's sensors, and count readings of other sensors."""

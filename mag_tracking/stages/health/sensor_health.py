@@ -5,7 +5,6 @@ Readings are monitored without being changed or delayed. Memory is bounded by a 
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,6 +13,10 @@ from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
 from mag_tracking.quantities import occurrences
+from mag_tracking.stages.health.clocks import ClockSpan
+from mag_tracking.stages.health.diagnosis import Cause, Finding
+from mag_tracking.stages.health.timestamps import WINDOW as TIMESTAMP_WINDOW
+from mag_tracking.stages.health.timestamps import TimestampFault, timestamp_fault
 from mag_tracking.stages.health.window import median_field, quantiles, sample_noise_std
 from mag_tracking.units import NEVER, NS
 
@@ -41,21 +44,6 @@ SPIKE_STD = 30.0
 deviations of the noise."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A fault, and advice on how to fix it."""
-
-    serious: bool
-    """True if the fault makes results wrong, false if it only makes them less accurate."""
-    subject: str
-    """Name of the sensor or stage."""
-    fault: str
-    advice: str
-
-    def __str__(self) -> str:
-        return f'{self.subject}: {self.fault}; {self.advice}'
-
-
 class SensorHealth:
     """Monitors the readings of one sensor.
 
@@ -77,6 +65,7 @@ class SensorHealth:
         self._received: IntArray = np.zeros(0, dtype=np.int64)
         self._fields: FloatArray = np.zeros((0, 3))
         self._interval_ns, self._jitter = float('nan'), float('inf')
+        self._timestamp_fault: TimestampFault | None = None
         self._noise: FloatArray = np.full(3, np.nan)
         # Results for the current window; cleared when readings are added.
         self._cache: dict[str, FloatArray] = {}
@@ -153,6 +142,14 @@ class SensorHealth:
         """Count the faults in the timestamps of the `n` latest readings."""
         # The first interval starts at the preceding reading, if there is one.
         intervals = np.diff(self._stamps[-n - 1:])
+        self._counts['duplicates'] += int((intervals == 0).sum())
+        self._counts['backward timestamps'] += int((intervals < 0).sum())
+        fault = timestamp_fault(self._stamps[-TIMESTAMP_WINDOW:], self._fields[-TIMESTAMP_WINDOW:])
+        if fault is not None:
+            # The intervals of such timestamps show neither lost readings nor clock steps.
+            self._timestamp_fault = fault.after(self._timestamp_fault)
+            self._interval_ns, self._jitter = fault.interval_s * NS, float('inf')
+            return
         is_received = self._received[-n - 1:] != NEVER
         receipts = np.diff(np.where(is_received, self._received[-n - 1:], 0)) / NS
         steps = receipts - intervals / NS
@@ -165,8 +162,6 @@ class SensorHealth:
         if is_step.any():
             self._counts['clock steps'] += int(is_step.sum())
             self._largest_step_s = max(self._largest_step_s, *steps[is_step].tolist(), key=abs)
-        self._counts['duplicates'] += int((intervals == 0).sum())
-        self._counts['backward timestamps'] += int((intervals < 0).sum())
         if self._jitter < MAX_JITTER:
             gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) & ~is_step
             self._counts['lost'] += int(np.sum(np.round(intervals[gaps] / self._interval_ns) - 1))
@@ -293,6 +288,14 @@ class SensorHealth:
         return ''.join(np.array(list('xyz'))[unchanged]) if unchanged.sum() < present.sum() else ''
 
     @property
+    def clock(self) -> ClockSpan | None:
+        """Timestamps and times of receipt of the window; None if no time of receipt is known."""
+        self.update()
+        is_received = self._received != NEVER
+        return ClockSpan.of(self._stamps[is_received], self._received[is_received]) \
+            if is_received.any() else None
+
+    @property
     def delay_s(self) -> list[float]:
         """Delay [s] from timestamp to receipt: median, 5 % and 95 % quantiles; NaN if unknown."""
         self.update()
@@ -304,7 +307,7 @@ class SensorHealth:
 
     def findings(self, name: str, noise_std: FloatArray | None = None,
                  max_field: float = 1e-3, is_live: bool = True) -> list[Finding]:
-        """Faults of the sensor; serious faults come first.
+        """Faults of the sensor, without ranking.
 
         Parameters
         ----------
@@ -324,7 +327,7 @@ class SensorHealth:
         n = self.counts['readings']
         if not n:
             return [Finding(True, name, 'no reading', 'check its cable, its driver and the topic '
-                            'in the network file')]
+                            'in the network file', Cause.NO_MESSAGES)]
         found = [*(self._clock_findings(name) if is_live else ()),
                  *self._time_findings(name, n), *self._value_findings(name, n, max_field)]
         if noise_std is not None and not np.nanmax(np.abs(self.field), initial=0.0) > max_field:
@@ -333,38 +336,45 @@ class SensorHealth:
                 axis = int(np.nanargmax(noise_ratio))
                 found.append(Finding(False, name, f'{"xyz"[axis]} is {noise_ratio[axis]:.0f} times '
                                      'as noisy as at its calibration', 'look for a new source of '
-                                     'interference nearby (a motor, a cable), or calibrate again'))
-        return sorted(found, key=lambda f: not f.serious)
+                                     'interference nearby (a motor, a cable), or calibrate again',
+                                     Cause.NOISY))
+        return found
 
     def _clock_findings(self, name: str) -> Iterator[Finding]:
         """Yield findings about clock steps and backward timestamps."""
         if n := self.counts['clock steps']:
             yield Finding(True, name, f'its clock stepped {occurrences(n)} relative to the '
                           f'host, by up to {self._largest_step_s:+.2f} s', 'synchronise the '
-                          'clocks (chrony, PTP), and take timestamps from a monotonic clock')
+                          'clocks (chrony, PTP), and take timestamps from a monotonic clock',
+                          Cause.CLOCK_STEPPED)
         if n := self.counts['backward timestamps']:
             yield Finding(True, name, f'timestamps went back {occurrences(n)}', 'check for two '
-                          'publishers on one topic, a clock that was set, or a looped replay')
+                          'publishers on one topic, a clock that was set, or a looped replay',
+                          Cause.BACKWARD_STAMPS)
 
     def _time_findings(self, name: str, n: int) -> Iterator[Finding]:
         """Yield findings about duplicate timestamps, lost readings and delays."""
         c = self.counts
         median, low, high = self.delay_s
+        if self._timestamp_fault is not None:
+            yield self._timestamp_fault.finding(name)
         if c['duplicates'] > 0.001 * n:
             yield Finding(False, name, f'{c["duplicates"]} of {n} readings repeat the previous '
                           'timestamp', 'check whether the driver publishes readings twice, or '
-                          'whether its timestamps are too coarse')
+                          'whether its timestamps are too coarse', Cause.DUPLICATE_STAMPS)
         if c['lost'] > 0.01 * n:
             yield Finding(c['lost'] > 0.2 * n, name, f'{c["lost"]} readings were lost, {n} were '
-                          'received', 'check the link, and the queue size of the recorder')
+                          'received', 'check the link, and the queue size of the recorder',
+                          Cause.LOST)
         if c['clock steps'] or abs(median) > MAX_LIVE_DELAY_S:
             return
         if high - low > 0.05:
             yield Finding(False, name, f'readings take {1e3 * low:.0f} to {1e3 * high:.0f} ms to '
-                          'arrive', 'use timestamps of the sensor instead of the time of receipt')
+                          'arrive', 'use timestamps of the sensor instead of the time of receipt',
+                          Cause.DELAY_VARIES)
         elif abs(median) > 1.0:
             yield Finding(False, name, f'the delay from timestamp to receipt is {median:.1f} s',
-                          'synchronise the clocks of sensor and host (chrony, PTP)')
+                          'synchronise the clocks of sensor and host (chrony, PTP)', Cause.DELAYED)
 
     def _value_findings(self, name: str, n: int, max_field: float) -> Iterator[Finding]:
         """Yield findings about the values and the axes of the readings."""
@@ -373,25 +383,27 @@ class SensorHealth:
         if largest > max_field:
             yield Finding(True, name, f'a field component of {largest:.3g} T exceeds the limit of '
                           f'{max_field:g} T', 'check the unit (gauss or microtesla published as '
-                          'tesla?), or near a magnet raise calibrate.max_field')
+                          'tesla?), or near a magnet raise calibrate.max_field', Cause.WRONG_UNIT)
         if c['without any axis'] > 0.01 * n:
             yield Finding(True, name, f'{c["without any axis"]} of {n} readings have no valid '
-                          'axis', 'check the sensor and its driver')
-        for axis in self.dead_axes:
-            yield Finding(True, name, f'{axis} does not change', 'the axis is dead: check the '
-                          'sensor and its driver')
-        for axis in 'xyz':
-            if 0.01 * n < c[axis] - c['without any axis'] and c[axis] < 0.99 * n:
-                yield Finding(False, name, f'{axis} is missing in {c[axis]} of {n} readings',
-                              'check the sensor and its driver')
+                          'axis', 'check the sensor and its driver', Cause.NO_AXIS)
+        if dead := self.dead_axes:
+            yield Finding(True, name, ' and '.join(dead) + (
+                ' does not change' if len(dead) == 1 else ' do not change'),
+                'the axis is dead: check the sensor and its driver', Cause.DEAD_AXIS)
+        if missing := ', '.join(f'{axis} is missing in {c[axis]}' for axis in 'xyz'
+                                if 0.01 * n < c[axis] - c['without any axis']
+                                and c[axis] < 0.99 * n):
+            yield Finding(False, name, f'{missing} of {n} readings',
+                          'check the sensor and its driver', Cause.MISSING_AXIS)
         if c['stuck readings']:
             yield Finding(True, name, f'{c["stuck readings"]} readings are identical to all '
                           f'readings of the previous {STUCK_S:g} s',
-                          'the sensor or its driver is stuck: restart it')
+                          'the sensor or its driver is stuck: restart it', Cause.STUCK)
         if c['saturated'] > 0.001 * n:
             yield Finding(True, name, f'{c["saturated"]} of {n} readings are at the end of the '
                           'range of the sensor', 'select a larger measuring range, or move the '
-                          'sensor further away from the targets')
+                          'sensor further away from the targets', Cause.SATURATED)
         if c['spikes'] > 0.001 * n:
             yield Finding(False, name, f'{c["spikes"]} of {n} readings are spikes', 'check '
-                          'connectors, power supply and checksums')
+                          'connectors, power supply and checksums', Cause.SPIKES)
