@@ -110,6 +110,11 @@ def timestamp_fault(stamps: IntArray, fields: FloatArray) -> TimestampFault | No
     n_equal = np.count_nonzero(intervals == 0)
     if n_shared >= max(MIN_SHARED * len(intervals), 0.2 * n_equal, 2):
         return _shared_fault(stamps, intervals)
+    if n_equal:
+        stamps = stamps[np.append(True, intervals != 0)]
+        intervals = np.diff(stamps)
+    if len(stamps) < MIN_READINGS:
+        return None
     return _burst_fault(stamps, intervals) or _coarse_fault(stamps, intervals)
 
 
