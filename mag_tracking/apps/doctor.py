@@ -26,6 +26,7 @@ from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.stages.health.sensor_health import SensorHealth
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.stages.track.low_rate import low_rate_fault
+from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
 MAX_FROZEN_S = 30.0
@@ -132,20 +133,24 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
                       Cause.FROZEN_BACKGROUND)
 
 
-def rate_findings(name: str, fault: str | None) -> Iterator[Finding]:
+def rate_findings(name: str, rate: float, network: SensorNetwork,
+                  settings: TrackSettings) -> Iterator[Finding]:
     """Report a sensor that is too slow for tracks.
 
     Parameters
     ----------
     name : str
         Sensor.
-    fault : str or None
-        Result of `low_rate_fault`.
+    rate : float, Hz
+        NaN or inf if unknown.
+    network : SensorNetwork
+    settings : TrackSettings
 
     Yields
     ------
     Finding
     """
+    fault = low_rate_fault(rate, network, settings)
     if fault is not None:
         yield Finding(True, name, fault, 'raise the rate of the sensor; for parked vehicles, use '
                       'mag-tracking events', Cause.RATE_TOO_LOW)
@@ -257,8 +262,8 @@ class Doctor:
             found += background_findings(name, self.calibrate, self._frozen_since_ns.get(name))
             found += covariance_findings(name, self.network.absolute_topics[j], self.calibrate)
             found += rejection_findings(name, self.calibrate)
-            found += rate_findings(name, low_rate_fault(
-                health.rate, self.network, self._settings.track))
+            found += rate_findings(name, self.calibrate.lowest_rate(name), self.network,
+                                   self._settings.track)
         found += self._missed.findings()
         found += network_findings(self.network, self._settings.survey, self.calibrate,
                                   self.sensors)

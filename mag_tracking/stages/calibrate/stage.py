@@ -238,6 +238,20 @@ class Calibrate:
         """
         return self._timestamps.worst_fault(self._index[sensor])
 
+    def lowest_rate(self, sensor: str) -> float:
+        """Return the lowest rate of a sensor so far, from its raw timestamps.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        float, Hz
+            inf if unknown.
+        """
+        return self._timestamps.lowest_rate(self._index[sensor])
+
     def field_inconsistencies(self) -> list[FieldInconsistency]:
         """Sensors whose background contradicts the Earth's field so much that tracks are wrong.
 

@@ -16,7 +16,11 @@ from mag_tracking.quantities import occurrences
 from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.stages.health.timestamps import WINDOW as TIMESTAMP_WINDOW
-from mag_tracking.stages.health.timestamps import TimestampFault, timestamp_fault
+from mag_tracking.stages.health.timestamps import (
+    TimestampFault,
+    latest_interval_s,
+    timestamp_fault,
+)
 from mag_tracking.stages.health.window import median_field, quantiles, sample_noise_std
 from mag_tracking.units import NEVER, NS
 
@@ -36,6 +40,8 @@ MAX_JITTER = 0.3
 readings are not counted."""
 STUCK_S = 1.0
 """[s] A sensor is stuck if its readings are identical for longer than this."""
+MIN_STUCK_READINGS = 8
+"""A slow sensor is stuck if more than this number of readings are identical."""
 MIN_MOVED_STEPS = 10.0
 """A target that changes one axis by more than this number of quantisation steps is assumed to
 change every other axis by at least one step."""
@@ -163,7 +169,12 @@ class SensorHealth:
             self._counts['clock steps'] += int(is_step.sum())
             self._largest_step_s = max(self._largest_step_s, *steps[is_step].tolist(), key=abs)
         if self._jitter < MAX_JITTER:
-            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) & ~is_step
+            # Intervals like the latest ones are those of another rate.
+            latest_ns = latest_interval_s(self._stamps) * NS
+            is_other_rate = (latest_ns > GAP_RATIO * self._interval_ns) \
+                & (np.abs(intervals - latest_ns) < 0.2 * latest_ns)
+            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) \
+                & ~is_step & ~is_other_rate
             self._counts['lost'] += int(np.sum(np.round(intervals[gaps] / self._interval_ns) - 1))
         forward = np.diff(self._stamps)
         forward = forward[forward > 0]
@@ -204,7 +215,8 @@ class SensorHealth:
         # Index of the first reading of each run of identical readings; -1 = in an earlier batch.
         run_start = np.maximum.accumulate(np.where(is_repeated, -1, np.arange(n)))
         unchanged_since = np.where(run_start < 0, self._unchanged_since_ns or 0, stamps[run_start])
-        stuck = np.flatnonzero(stamps - unchanged_since > STUCK_S * NS)
+        min_duration = np.nanmax([STUCK_S * NS, MIN_STUCK_READINGS * self._interval_ns])
+        stuck = np.flatnonzero(stamps - unchanged_since > min_duration)
         self._unchanged_since_ns = int(unchanged_since[-1])
         self._count_runs(is_repeated, unchanged_since, stamps)
         if not self.is_coarse:
