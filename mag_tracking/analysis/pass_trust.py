@@ -14,6 +14,7 @@ import numpy as np
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.arrays import FloatArray
+from mag_tracking.physics.bounds import ADVICE, impossible_reason
 
 POINT_REACH = 2.1
 """[m] Reach of the iron of a car from a single dipole. At distance r, the model error relative to
@@ -202,6 +203,8 @@ def _invalid_pass_reason(fit: PassFit) -> str:
         return fit.data.doubt
     if not fit.converged:
         return 'the fit did not converge'
+    if reason := impossible_reason(fit.velocity, fit.moment[0]):
+        return f'{reason}; {ADVICE}'
     if not has_plausible_residual(fit):
         return (f'not one target at constant velocity: {1.0 - fit.explained:.1%} of the field is '
                 f'unexplained, {fit.residual_elsewhere:.1%} where a vehicle at that distance '

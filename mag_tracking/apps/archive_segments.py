@@ -138,8 +138,8 @@ def _read_chunk(path: Path, network: SensorNetwork) -> FrameChunk:
                      for reason, by_sensor in by_reason.items()}
             for k, by_reason in text['doubts'].items()}
         passes = tuple(
-            (number, PassData(network, stamp_ns, *(
-                arrays[f'pass_{number}_{name}'] for name in _PASS_ARRAYS), None, doubt),
+            (number, dataclasses.replace(PassData(network, stamp_ns, *(
+                arrays[f'pass_{number}_{name}'] for name in _PASS_ARRAYS)), doubt=doubt),
              tuple(notes)) for number, stamp_ns, doubt, notes in text['passes'])
         return FrameChunk(**{name: arrays[name] for name in _FRAME_ARRAYS}, doubts=doubts,
                           passes=passes)

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from mag_tracking.apps.input_findings import input_findings
+from mag_tracking.physics import bounds
 from mag_tracking.pipeline import Pipeline
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
@@ -134,6 +135,9 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(WARNING, quantity(n_lost, 'track lost its target', 'tracks lost their target')
                    + ': check the orientations in the network file; other possible causes are '
                    'simultaneous targets, or a kind of target that the settings do not include')
+    for reason in bounds.REASONS:
+        if n := counts.get(f'tracks ended: {reason}', 0):
+            yield Note(WARNING, f'{quantity(n, "track")} ended: {reason}; {bounds.ADVICE}')
     n_uncertain = counts.get(UNCERTAIN_ORIENTATIONS, 0)
     if n_uncertain:
         yield Note(WARNING, quantity(n_uncertain, 'sensor has', 'sensors have')

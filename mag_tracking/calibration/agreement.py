@@ -152,9 +152,10 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
         is_offset = offset_std > 0.0 \
             and s.probability(s.field, offset_std) > OFFSET_PROBABILITY \
             and not any(p > EXPLAINED_PROBABILITY for _, p in exact)
+        gains = _gain_explanations(s)
         explanations = tuple(text for text, _ in exact) or (
-            ('a constant offset of the sensor or of iron nearby', *_gain_explanations(s))
-            if is_offset else _gain_explanations(s) or _partial_explanation(s.field, s.R_ws, s.std, B0)
+            ('a constant offset of the sensor or of iron nearby', *gains) if is_offset else
+            gains or _partial_explanation(s.field, s.R_ws, s.std, B0)
             or _orientation_explanation(s))
         magnitude = float(np.sqrt(np.nansum((s.field - s.R_ws.T @ B0)**2)))
         inconsistencies.append(FieldInconsistency(

@@ -233,7 +233,7 @@ def test_a_backward_time_jump_between_segments_loses_no_frames(tmp_path):
 def test_doubts_are_stored_with_the_frames_of_a_segment(tmp_path):
     """Doubts are stored at the start of each segment and whenever they change."""
     writer = SegmentWriter(tmp_path, 3.0)
-    first, second = {'mag_1': ((1, None),)}, {'mag_1': ((1, 5),)}
+    first, second = ({'doubtful_background': {'mag_1': ((1, end),)}} for end in (None, 5))
     for k, frame in enumerate(frames((5.0, False), (2.0, True), (9.0, False))):
         writer.add_frame(frame, first if k < 60 else second)
     writer.close()

@@ -44,8 +44,8 @@ MEANINGS = {
     FELT_BY_ONE_SENSOR: 'only one sensor senses the target: range and moment are not observable '
                         'and follow from the settings',
     DOUBTFUL_BACKGROUND: 'the background of a sensor is doubtful',
-    CONTRADICTS_EARTH_FIELD: 'the background of a sensor contradicts the Earth\'s field: its axes, '
-                             'its gain or its orientation in the network file are wrong',
+    CONTRADICTS_EARTH_FIELD: 'a sensor contradicts the Earth\'s field: its axes, its gain or its '
+                             'orientation in the network file are wrong',
     WRONG_TIMESTAMPS: 'the timestamps of a sensor are wrong by more than 20 ms: they are coarse, '
                       'or those of packets or bursts',
     SENSORS_CONTRADICT: 'the sensors contradict each other, and no majority agrees',

@@ -211,8 +211,9 @@ class RunningTrack:
             return []
         update = BankUpdate(frame_update.frame, dt, self.bank, self._bank.filter,
                             self._bank.sensors, self._settings)
-        out: list[TrackRecord] = [member.publish(update, view)
-                                  for member, view in zip(self.members, views, strict=True)]
+        out: list[TrackRecord] = [
+            record for member, view in zip(self.members, views, strict=True)
+            for record in member.publish(update, view)]
         self._handover_due = best if self._bank.sensors.is_part else None
         return [*out, *lagged_poses, *self._end_lost_members(frame_update.frame)]
 
