@@ -5,7 +5,7 @@ from typing import Any
 
 from mag_tracking.apps.doctor import background_findings, recording_findings
 from mag_tracking.apps.doctor_covariances import covariance_findings
-from mag_tracking.apps.doctor_rejections import rejection_findings
+from mag_tracking.apps.doctor_rejections import driver_findings, rejection_findings
 from mag_tracking.pipeline import Pipeline
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
@@ -43,6 +43,7 @@ def replay_findings(recording: Recording, reader: SampleReader, pipeline: Pipeli
         if topic in missing:
             found.append(Finding(True, name, f'no messages on {topic}', 'check the topic in the '
                                  'network file', Cause.NO_MESSAGES))
+        found += driver_findings(name, calibrate)
         found += rejection_findings(name, calibrate)
         found += background_findings(name, calibrate, None)
         found += covariance_findings(name, topic, calibrate)

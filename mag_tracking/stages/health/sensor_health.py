@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration.reading_faults import NO_FAULTS, ReadingFaults
 from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
@@ -51,16 +52,26 @@ class SensorHealth:
     ----------
     update_interval : int, optional
         Number of readings between two updates.
+    faults : ReadingFaults, optional
+        Marks and repetitions, which are not evaluated as readings.
+
+    Attributes
+    ----------
+    faults : ReadingFaults
     """
 
-    def __init__(self, update_interval: int = UPDATE_INTERVAL) -> None:
-        self._update_interval = update_interval
+    def __init__(self, update_interval: int = UPDATE_INTERVAL,
+                 faults: ReadingFaults = NO_FAULTS) -> None:
+        self.faults, self._update_interval = faults, update_interval
         self._counts: Counter[str] = Counter()
         self._largest_step_s = 0.0
         self._buffered: list[tuple[int, FloatArray, int]] = []
         self._stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._received: IntArray = np.zeros(0, dtype=np.int64)
+        # Latest reading; window of the readings without marks and repetitions, and its timestamps.
+        self._latest: FloatArray = np.zeros((0, 3))
         self._fields: FloatArray = np.zeros((0, 3))
+        self._field_stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._interval_ns, self._jitter = float('nan'), float('inf')
         self._noise: FloatArray = np.full(3, np.nan)
         # Results for the current window; cleared when readings are added.
@@ -129,10 +140,20 @@ class SensorHealth:
             return
         self._stamps = np.append(self._stamps, stamps)[-WINDOW:]
         self._received = np.append(self._received, received)[-WINDOW:]
-        self._fields = np.append(self._fields, fields, axis=0)[-WINDOW:]
         self._counts['readings'] += n
         self._check_timestamps(n)
-        self._check_fields(n)
+        missing = np.isnan(fields)
+        for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
+            self._counts[axis] += count
+        self._counts['without any axis'] += int(missing.all(axis=1).sum())
+        with_latest = np.append(self._latest, fields, axis=0)
+        self._latest = with_latest[-1:].copy()
+        kept = self.faults.without(with_latest)[-n:]
+        is_kept = ~np.isnan(kept).all(axis=1) | missing.all(axis=1)
+        if is_kept.any():
+            self._field_stamps = np.append(self._field_stamps, stamps[is_kept])[-WINDOW:]
+            self._fields = np.append(self._fields, kept[is_kept], axis=0)[-WINDOW:]
+            self._check_fields(int(is_kept.sum()))
 
     def _check_timestamps(self, n: int) -> None:
         """Count the faults in the timestamps of the `n` latest readings."""
@@ -164,10 +185,6 @@ class SensorHealth:
 
     def _check_fields(self, n: int) -> None:
         """Count the faults in the fields of the `n` latest readings."""
-        missing = np.isnan(self._fields[-n:])
-        for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
-            self._counts[axis] += count
-        self._counts['without any axis'] += int(missing.all(axis=1).sum())
         self._check_stuck(n)
         # The two preceding readings are included, because the last one had no successor before.
         fields = self._fields[-n - 2:]
@@ -185,7 +202,7 @@ class SensorHealth:
 
     def _check_stuck(self, n: int) -> None:
         """Count the stuck readings among the `n` latest readings."""
-        stamps, fields = self._stamps[-n:], self._fields[-n - 1:]
+        stamps, fields = self._field_stamps[-n:], self._fields[-n - 1:]
         equal = (fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])
         self._has_changed |= (~equal & ~np.isnan(fields[1:]) & ~np.isnan(fields[:-1])).any(axis=0)
         is_repeated = equal.all(axis=1)
