@@ -34,6 +34,8 @@ MAX_JITTER = 0.3
 readings are not counted."""
 STUCK_S = 1.0
 """[s] A sensor is stuck if its readings are identical for longer than this."""
+MAX_PLATEAU_S = 0.5
+"""[s] Maximum time for which a target that passes saturates a sensor."""
 MIN_MOVED_STEPS = 10.0
 """A target that changes one axis by more than this number of quantisation steps is assumed to
 change every other axis by at least one step."""
@@ -72,6 +74,7 @@ class SensorHealth:
         self._latest: FloatArray = np.zeros((0, 3))
         self._fields: FloatArray = np.zeros((0, 3))
         self._field_stamps: IntArray = np.zeros(0, dtype=np.int64)
+        self._is_saturated: BoolArray = np.zeros(0, dtype=bool)
         self._interval_ns, self._jitter = float('nan'), float('inf')
         self._noise: FloatArray = np.full(3, np.nan)
         # Results for the current window; cleared when readings are added.
@@ -193,12 +196,15 @@ class SensorHealth:
         # A comparison with NaN is false: while the noise is unknown, no spikes are counted.
         noise = np.maximum(self._noise, self._steps / np.sqrt(12.0))
         is_spike = (np.minimum(np.abs(before), np.abs(after)) > SPIKE_STD * noise) \
-            & (before * after > 0.0)
+            & ((before > 0.0) == (after > 0.0))
         self._counts['spikes'] += int(is_spike.any(axis=1).sum())
         if self._n_since_stuck >= WINDOW:
             self._noise = self._cache['noise'] = sample_noise_std(self._fields)
-        is_saturated = np.array([saturated_readings(axis) for axis in self._fields.T])[:, -n:]
-        self._counts['saturated'] += int(np.count_nonzero(is_saturated.any(axis=0)))
+        # A limit is recognised only after the excursion.
+        known = np.append(self._is_saturated, np.zeros(n, dtype=bool))[-len(self._fields):]
+        self._is_saturated = known | saturated_readings(
+            self._fields, MAX_PLATEAU_S * NS / self._interval_ns).any(axis=1)
+        self._counts['saturated'] += int(np.count_nonzero(self._is_saturated & ~known))
 
     def _check_stuck(self, n: int) -> None:
         """Count the stuck readings among the `n` latest readings."""
