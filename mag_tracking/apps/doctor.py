@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 
 from mag_tracking.apps.doctor_covariances import covariance_findings
-from mag_tracking.apps.doctor_rejections import rejection_findings
+from mag_tracking.apps.doctor_rejections import driver_findings, rejection_findings
 from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
@@ -20,7 +20,7 @@ from mag_tracking.stages.calibrate.field_comparison import (
     compared_with_earth,
     earth_field_findings,
 )
-from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.calibrate.stage import FAULTS_FOUND, Calibrate
 from mag_tracking.stages.health.clocks import clock_findings
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.stages.health.sensor_health import SensorHealth
@@ -226,6 +226,7 @@ class Doctor:
         self._clock_ns = dict(zip(network.names, network.clock_offset_ns.tolist(), strict=True))
         self._frozen_since_ns: dict[str, int] = {}
         self._missed = MissedTargets(network.names)
+        self._n_faults_found = 0
 
     def feed(self, readings: Readings, received_ns: int | None = None) -> None:
         """Add raw readings.
@@ -237,9 +238,14 @@ class Doctor:
             Time of reception of the message; None if unknown.
         """
         names, stamps = readings.sensor_names(), readings.stamp_ns.tolist()
+        self.calibrate.feed(readings)
+        if self.calibrate.counts[FAULTS_FOUND] != self._n_faults_found:
+            self._n_faults_found = self.calibrate.counts[FAULTS_FOUND]
+            for name, health in self.sensors.items():
+                if health.faults != self.calibrate.faults_of(name):
+                    self.sensors[name] = SensorHealth(faults=self.calibrate.faults_of(name))
         for name, stamp, field in zip(names, stamps, readings.field, strict=True):
             self.sensors[name].add(stamp - self._clock_ns[name], field, received_ns)
-        self.calibrate.feed(readings)
         backgrounds = self.calibrate.backgrounds()
         for name, stamp in zip(names, stamps, strict=True):
             if backgrounds[name].frozen:
@@ -261,6 +267,7 @@ class Doctor:
                                      self._settings.calibrate.max_field)
             found += background_findings(name, self.calibrate, self._frozen_since_ns.get(name))
             found += covariance_findings(name, self.network.absolute_topics[j], self.calibrate)
+            found += driver_findings(name, self.calibrate)
             found += rejection_findings(name, self.calibrate)
             found += rate_findings(name, self.calibrate.lowest_rate(name), self.network,
                                    self._settings.track)

@@ -2,7 +2,7 @@
 
 from mag_tracking.apps.doctor import background_findings, rate_findings, recording_findings
 from mag_tracking.apps.doctor_covariances import covariance_findings
-from mag_tracking.apps.doctor_rejections import rejection_findings
+from mag_tracking.apps.doctor_rejections import driver_findings, rejection_findings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
@@ -40,6 +40,7 @@ def input_findings(recording: Recording, reader: SampleReader, network: SensorNe
         if (timestamps := calibrate.timestamp_fault(name)) is not None:
             found.append(timestamps.finding(name))
         found += rate_findings(name, calibrate.lowest_rate(name), network, settings)
+        found += driver_findings(name, calibrate)
         found += rejection_findings(name, calibrate)
         found += background_findings(name, calibrate, None)
         found += covariance_findings(name, topic, calibrate)

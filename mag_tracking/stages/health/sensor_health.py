@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration.reading_faults import NO_FAULTS, ReadingFaults
 from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
@@ -42,6 +43,8 @@ STUCK_S = 1.0
 """[s] A sensor is stuck if its readings are identical for longer than this."""
 MIN_STUCK_READINGS = 8
 """A slow sensor is stuck if more than this number of readings are identical."""
+MAX_PLATEAU_S = 0.5
+"""[s] Maximum time for which a target that passes saturates a sensor."""
 MIN_MOVED_STEPS = 10.0
 """A target that changes one axis by more than this number of quantisation steps is assumed to
 change every other axis by at least one step."""
@@ -60,16 +63,28 @@ class SensorHealth:
     ----------
     update_interval : int, optional
         Number of readings between two updates.
+    faults : ReadingFaults, optional
+        Marks and repetitions, which are not evaluated as readings.
+
+    Attributes
+    ----------
+    faults : ReadingFaults
     """
 
-    def __init__(self, update_interval: int = UPDATE_INTERVAL) -> None:
-        self._update_interval = update_interval
+    def __init__(self, update_interval: int = UPDATE_INTERVAL,
+                 faults: ReadingFaults = NO_FAULTS) -> None:
+        self.faults, self._update_interval = faults, update_interval
         self._counts: Counter[str] = Counter()
         self._largest_step_s = 0.0
         self._buffered: list[tuple[int, FloatArray, int]] = []
         self._stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._received: IntArray = np.zeros(0, dtype=np.int64)
+        self._raw_fields: FloatArray = np.zeros((0, 3))
+        # Latest reading; window of the readings without marks and repetitions, and its timestamps.
+        self._latest: FloatArray = np.zeros((0, 3))
         self._fields: FloatArray = np.zeros((0, 3))
+        self._field_stamps: IntArray = np.zeros(0, dtype=np.int64)
+        self._is_saturated: BoolArray = np.zeros(0, dtype=bool)
         self._interval_ns, self._jitter = float('nan'), float('inf')
         self._timestamp_fault: TimestampFault | None = None
         self._noise: FloatArray = np.full(3, np.nan)
@@ -139,10 +154,21 @@ class SensorHealth:
             return
         self._stamps = np.append(self._stamps, stamps)[-WINDOW:]
         self._received = np.append(self._received, received)[-WINDOW:]
-        self._fields = np.append(self._fields, fields, axis=0)[-WINDOW:]
+        self._raw_fields = np.append(self._raw_fields, fields, axis=0)[-TIMESTAMP_WINDOW:]
         self._counts['readings'] += n
         self._check_timestamps(n)
-        self._check_fields(n)
+        missing = np.isnan(fields)
+        for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
+            self._counts[axis] += count
+        self._counts['without any axis'] += int(missing.all(axis=1).sum())
+        with_latest = np.append(self._latest, fields, axis=0)
+        self._latest = with_latest[-1:].copy()
+        kept = self.faults.without(with_latest)[-n:]
+        is_kept = ~np.isnan(kept).all(axis=1) | missing.all(axis=1)
+        if is_kept.any():
+            self._field_stamps = np.append(self._field_stamps, stamps[is_kept])[-WINDOW:]
+            self._fields = np.append(self._fields, kept[is_kept], axis=0)[-WINDOW:]
+            self._check_fields(int(is_kept.sum()))
 
     def _check_timestamps(self, n: int) -> None:
         """Count the faults in the timestamps of the `n` latest readings."""
@@ -150,7 +176,7 @@ class SensorHealth:
         intervals = np.diff(self._stamps[-n - 1:])
         self._counts['duplicates'] += int((intervals == 0).sum())
         self._counts['backward timestamps'] += int((intervals < 0).sum())
-        fault = timestamp_fault(self._stamps[-TIMESTAMP_WINDOW:], self._fields[-TIMESTAMP_WINDOW:])
+        fault = timestamp_fault(self._stamps[-TIMESTAMP_WINDOW:], self._raw_fields)
         if fault is not None:
             # The intervals of such timestamps show neither lost readings nor clock steps.
             self._timestamp_fault = fault.after(self._timestamp_fault)
@@ -185,10 +211,6 @@ class SensorHealth:
 
     def _check_fields(self, n: int) -> None:
         """Count the faults in the fields of the `n` latest readings."""
-        missing = np.isnan(self._fields[-n:])
-        for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
-            self._counts[axis] += count
-        self._counts['without any axis'] += int(missing.all(axis=1).sum())
         self._check_stuck(n)
         # The two preceding readings are included, because the last one had no successor before.
         fields = self._fields[-n - 2:]
@@ -197,16 +219,19 @@ class SensorHealth:
         # A comparison with NaN is false: while the noise is unknown, no spikes are counted.
         noise = np.maximum(self._noise, self._steps / np.sqrt(12.0))
         is_spike = (np.minimum(np.abs(before), np.abs(after)) > SPIKE_STD * noise) \
-            & (before * after > 0.0)
+            & ((before > 0.0) == (after > 0.0))
         self._counts['spikes'] += int(is_spike.any(axis=1).sum())
         if self._n_since_stuck >= WINDOW:
             self._noise = self._cache['noise'] = sample_noise_std(self._fields)
-        is_saturated = np.array([saturated_readings(axis) for axis in self._fields.T])[:, -n:]
-        self._counts['saturated'] += int(np.count_nonzero(is_saturated.any(axis=0)))
+        # A limit is recognised only after the excursion.
+        known = np.append(self._is_saturated, np.zeros(n, dtype=bool))[-len(self._fields):]
+        self._is_saturated = known | saturated_readings(
+            self._fields, MAX_PLATEAU_S * NS / self._interval_ns).any(axis=1)
+        self._counts['saturated'] += int(np.count_nonzero(self._is_saturated & ~known))
 
     def _check_stuck(self, n: int) -> None:
         """Count the stuck readings among the `n` latest readings."""
-        stamps, fields = self._stamps[-n:], self._fields[-n - 1:]
+        stamps, fields = self._field_stamps[-n:], self._fields[-n - 1:]
         equal = (fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])
         self._has_changed |= (~equal & ~np.isnan(fields[1:]) & ~np.isnan(fields[:-1])).any(axis=0)
         is_repeated = equal.all(axis=1)
