@@ -37,7 +37,7 @@ def replay_findings(recording: Recording, reader: SampleReader, pipeline: Pipeli
     list of Finding
     """
     found = input_findings(recording, reader, pipeline.network, pipeline.calibrate,
-                           pipeline.track.rates)
+                           pipeline.settings.track)
     for stage, counts in pipeline.counts().items():
         if stage != 'calibrate' and (causes := rejected(counts)):
             found.append(Finding(False, stage, ', '.join(
