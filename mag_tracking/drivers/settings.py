@@ -1,13 +1,11 @@
 """Settings common to all drivers, and the units of field and acceleration."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
-from mag_tracking.units import FIELD_UNITS, field_scale
 
 ACCELERATION_UNITS = {'m/s2': 1.0, 'g': 9.80665, 'mg': 9.80665e-3}
 """Factor from each unit to m/s²."""
@@ -43,37 +41,30 @@ class DriverSettings:
         'timeout.', 's', (0.0, 86400.0))
 
 
-def scale_of(unit: str, units: Mapping[str, float], name: str) -> float:
-    """Factor that converts a unit to SI.
+def acceleration_scale(unit: str) -> float:
+    """Convert the unit of an acceleration to m/s².
 
     Parameters
     ----------
     unit : str
-        Key of `units`, or a number.
-    units : dict of str to float
-        `FIELD_UNITS` or `ACCELERATION_UNITS`.
-    name : str
-        Name of the setting, for the error message.
+        Key of `ACCELERATION_UNITS`, or a number (m/s² per count).
 
     Returns
     -------
-    float
+    float, m/s²
 
     Raises
     ------
     SettingsError
-        If `unit` is neither a known unit nor a finite number other than 0, or a field of more than
-        1 T per count.
+        If `unit` is neither a known unit nor a finite number other than 0.
     """
-    if units is FIELD_UNITS:
-        return field_scale(unit, name)
-    if unit in units:
-        return units[unit]
+    if unit in ACCELERATION_UNITS:
+        return ACCELERATION_UNITS[unit]
     try:
         scale = float(unit)
     except ValueError:
         scale = float('nan')
     if not np.isfinite(scale) or scale == 0.0:
-        raise SettingsError(f'{name}: {unit!r} is neither a number other than 0 nor one of '
-                            f'{", ".join(units)}')
+        raise SettingsError(f'acceleration_unit: {unit!r} is neither a number other than 0 nor '
+                            f'one of {", ".join(ACCELERATION_UNITS)}')
     return scale
