@@ -22,6 +22,8 @@ FIELD_UNITS = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e
 TIME_UNITS = {'s': NS, 'ms': 10**6, 'us': 10**3, 'ns': 1, 'min': 60 * NS, 'h': 3600 * NS,
               'd': 86400 * NS}
 """Nanoseconds per unit."""
+MAX_SCALE = 100.0
+"""[T per count] A larger number is meant as counts per unit."""
 _FIELD_NAMES = {
     'T': 't tesla teslas', 'mT': 'mt millitesla', 'uT': 'ut mut microtesla', 'nT': 'nt nanotesla',
     'G': 'g ga gs gauss', 'mG': 'mg mga mgs mgauss milligauss'}
@@ -114,7 +116,7 @@ def field_scale(text: str, name: str = 'unit') -> float:
     Raises
     ------
     SettingsError
-        If the text is neither a unit nor a number other than 0, or is more than 1 T per count.
+        If the text is neither a unit nor a number other than 0, or exceeds `MAX_SCALE`.
     """
     text = text.strip()
     if unit := field_unit(text):
@@ -133,7 +135,7 @@ def field_scale(text: str, name: str = 'unit') -> float:
         raise SettingsError(f'{name}: {text!r} is neither one of {", ".join(FIELD_UNITS)}, nor a '
                             'number of counts per unit such as 1090/G, nor a number other than 0 '
                             '(tesla per count)')
-    if abs(scale) > 1.0:
+    if abs(scale) > MAX_SCALE:
         raise SettingsError(f'{name}: {text} means {scale:g} tesla per count; for {text} counts '
                             f'per gauss, write {text}/G')
     return scale
