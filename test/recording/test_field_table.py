@@ -82,8 +82,8 @@ LAYOUTS = {
     'line of units': (text([['ms', '', 'nT', 'nT', 'nT'], *cells(
         lambda t: f'{1000 * t:.1f}', lambda b: f'{1000 * b:.0f}')]), {'unit': ''}),
     'grouped digits': (text(cells(number=lambda b: f'"{1000 * b:,.1f}"')), {'unit': 'nT'}),
-    'names': (text(cells(sensors=('left side', '00:1A'))),
-              {'sensors': {'left side': 'mag_1', '00:1A': 'mag_2'}}),
+    'names': (text(cells(sensors=('vänster', '00:1A'))),
+              {'sensors': {'vänster': 'mag_1', '00:1A': 'mag_2'}}),
     'gauss': (text(cells(number=lambda b: f'{b / 100:.5f}')), {'unit': 'Gauss'}),
     'counts per gauss': (text(cells(number=lambda b: f'{b * 1e3:.0f}')), {'unit': '100000/G'}),
     'tesla per count': (text(cells(number=lambda b: f'{b * 1e3:.0f}')), {'unit': '1e-9'}),
