@@ -23,7 +23,7 @@ from mag_tracking.drivers.settings import STAMPED_BY, DriverSettings, accelerati
 from mag_tracking.drivers.single_source import SingleSource, contest
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample, Readings
-from mag_tracking.units import NS, field_scale
+from mag_tracking.units import NS, TIME_UNITS, field_scale, unit_since_1970
 
 POLL_S = 0.2
 """[s] Interval at which `serve` checks whether to stop."""
@@ -388,9 +388,8 @@ class Driver:
             if len(self._clocks) > len(self._claims):
                 self._drop_clocks()
             uses_arrivals = stamp_by == 'arrival' or stamp_by == 'auto' and ticks is None
-            settings = self._clock_settings if not isinstance(ticks, DeviceDate) else replace(
-                self._clock_settings, tick_s=1e-6, wrap=0)
-            clock = (ArrivalClock if uses_arrivals else DeviceClock)(settings)
+            clock = (ArrivalClock if uses_arrivals else DeviceClock)(
+                _clock_settings_for(ticks, self._clock_settings))
             self._clocks[arrival.source] = clock
         if ticks is None and isinstance(clock, DeviceClock):
             self.driver_counts['readings without a device time'] += 1
@@ -409,6 +408,15 @@ class Driver:
             clock = self._clocks.pop(source)
             self.driver_counts.update(clock.counts)
             self.driver_counts.update(clock.restarts)
+
+
+def _clock_settings_for(ticks: float | None, settings: ClockSettings) -> ClockSettings:
+    """Adapt the settings of a clock to a date, or to a number that only a time since 1970 can be.
+    """
+    unit = 'us' if isinstance(ticks, DeviceDate) else None
+    if unit is None and ticks is not None and 0 < settings.wrap <= ticks:
+        unit = unit_since_1970(ticks)
+    return settings if unit is None else replace(settings, tick_s=TIME_UNITS[unit] / NS, wrap=0)
 
 
 def _bytes_of(axes: Axes | None) -> bytes:

@@ -195,11 +195,13 @@ def test_stamp_by_selects_the_source_of_timestamps():
     assert driver.counts()['readings without a device time'] == 1
 
 
-def test_a_date_as_device_time_needs_no_clock_settings():
+@pytest.mark.parametrize('ticks, clock', [
+    (lambda k: DeviceDate(1.79e15 + 20_000 * k), ClockSettings(tick_s=1.0)),
+    (lambda k: 1.79e12 + 20 * k, ClockSettings()), (lambda k: 1.79e18 + 2e7 * k, ClockSettings())])
+def test_a_time_since_1970_needs_no_clock_settings(ticks, clock):
     """Messages are delayed by 0 to 50 ms; the timestamps follow the device."""
-    readings = [Reading('', (1.0, 2.0, 3.0), ticks=DeviceDate(1.79e15 + 20_000 * k))
-                for k in range(100)]
-    driver, _, machine = driver_of([[r] for r in readings], clock=ClockSettings(tick_s=1.0))
+    readings = [Reading('', (1.0, 2.0, 3.0), ticks=ticks(k)) for k in range(100)]
+    driver, _, machine = driver_of([[r] for r in readings], clock=clock)
     stamps = []
     for k in range(100):
         machine.now_ns = 10**10 + 20_000_000 * k + (k % 6) * 10_000_000
