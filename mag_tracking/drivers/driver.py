@@ -414,7 +414,9 @@ def _clock_settings_for(ticks: float | None, settings: ClockSettings) -> ClockSe
     """Adapt the settings of a clock to a date, or to a number that only a time since 1970 can be.
     """
     unit = 'us' if isinstance(ticks, DeviceDate) else None
-    if unit is None and ticks is not None and 0 < settings.wrap <= ticks:
+    # A counter of microseconds has no decimals.
+    if unit is None and ticks is not None and (
+            0 < settings.wrap <= ticks or settings.tick_s == 1e-6 and ticks % 1.0):
         unit = unit_since_1970(ticks)
     return settings if unit is None else replace(settings, tick_s=TIME_UNITS[unit] / NS, wrap=0)
 

@@ -197,7 +197,8 @@ def test_stamp_by_selects_the_source_of_timestamps():
 
 @pytest.mark.parametrize('ticks, clock', [
     (lambda k: DeviceDate(1.79e15 + 20_000 * k), ClockSettings(tick_s=1.0)),
-    (lambda k: 1.79e12 + 20 * k, ClockSettings()), (lambda k: 1.79e18 + 2e7 * k, ClockSettings())])
+    (lambda k: 1.79e12 + 20 * k, ClockSettings()), (lambda k: 1.79e18 + 2e7 * k, ClockSettings()),
+    (lambda k: 1.79e9 + 0.005 + 0.02 * k, ClockSettings())])
 def test_a_time_since_1970_needs_no_clock_settings(ticks, clock):
     """Messages are delayed by 0 to 50 ms; the timestamps follow the device."""
     readings = [Reading('', (1.0, 2.0, 3.0), ticks=ticks(k)) for k in range(100)]
