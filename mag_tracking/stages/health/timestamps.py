@@ -29,6 +29,8 @@ MAX_BURST_INTERVAL_NS = 2_000_000
 of a magnetometer that is read in blocks with pauses are further apart."""
 SHORT_RATIO = 0.3
 """Maximum ratio of a short interval to the mean interval."""
+MAX_INTERVAL_STEPS = 3
+"""Maximum interval between readings, in steps of the clock, that the clock makes irregular."""
 ROUND_STEPS_NS = np.array([m * 10**k for k in range(5, 10) for m in (1, 2, 4, 5)] + [16_666_667])
 """[ns] Steps of coarse clocks; other steps are those of packets."""
 
@@ -165,7 +167,8 @@ def _coarse_fault(stamps: IntArray, intervals: IntArray) -> TimestampFault | Non
     they move all later timestamps away from a line.
     """
     step_ns = int(np.gcd.reduce(intervals))
-    if step_ns < 2.0 * MAX_ERROR_S * NS or not _is_coarse_step(stamps, step_ns):
+    if step_ns < 2.0 * MAX_ERROR_S * NS or not _is_coarse_step(stamps, step_ns) \
+            or np.median(intervals) > MAX_INTERVAL_STEPS * step_ns:
         return None
     counts = np.unique(intervals, return_counts=True)[1]
     k = np.arange(len(stamps))
