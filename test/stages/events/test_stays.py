@@ -36,7 +36,7 @@ def events_of(rate, duration_s, *stays, ramp_s=0.0, batch=64):
     events, out = Events(NETWORK, settings.align, settings.detect, settings.track), []
     for k in range(0, len(t), batch):
         for calibrated in calibrate.feed(readings.part(slice(k, k + batch))):
-            events.set_relearnt(calibrate.relearnt())
+            events.set_relearnt(calibrate.backgrounds())
             out += events.feed(calibrated)
     return sorted(out + events.flush(), key=lambda event: event.onset_ns)
 
