@@ -10,7 +10,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, IntArray, Record
 from mag_tracking.calibration import core
 from mag_tracking.calibration.agreement import FieldInconsistency
-from mag_tracking.calibration.background import RelearntBackground, RunningBackground
+from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.doubtful_times import (
     CONTRADICTS_EARTH_FIELD,
@@ -37,7 +37,7 @@ from mag_tracking.stages.calibrate.restoration import (
 )
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.health.diagnosis import Cause
-from mag_tracking.stages.health.timestamps import TimestampFault, TimestampMonitor
+from mag_tracking.stages.health.timestamps import TimestampMonitor
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NEVER, NS
 
@@ -90,6 +90,8 @@ class Calibrate:
     ----------
     counts : Counter of str
         Number of readings by outcome, and of events such as time jumps.
+    timestamps : TimestampMonitor
+        Faults of the timestamps, and rates.
     """
 
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
@@ -114,7 +116,7 @@ class Calibrate:
         self._background: dict[str, RunningBackground] = {}
         self._changes = SharedChanges()
         self._restoration = BackgroundRestoration(settings.max_resume_gap_s)
-        self._timestamps = TimestampMonitor(len(network))
+        self.timestamps = TimestampMonitor(network.names)
         self._comparison = FieldComparison(network, survey or SurveySettings())
         self.update_network(network)
 
@@ -202,8 +204,7 @@ class Calibrate:
         out = {DOUBTFUL_BACKGROUND: {n: b.doubtful_times for n, b in self._background.items()
                                      if b.doubtful_times},
                CONTRADICTS_EARTH_FIELD: self._comparison.doubtful_times(),
-               WRONG_TIMESTAMPS: {n: times for n, i in self._index.items()
-                                  if (times := self._timestamps.doubtful_times[i])}}
+               WRONG_TIMESTAMPS: self.timestamps.doubtful_times()}
         return {reason: by_sensor for reason, by_sensor in out.items() if by_sensor}
 
     def latest_doubt(self, sensor: str) -> tuple[int, int | None] | None:
@@ -220,46 +221,9 @@ class Calibrate:
         """
         times = [interval for by_sensor in (
             self._background[sensor].doubtful_times, self._comparison.times_of(sensor),
-            self._timestamps.doubtful_times[self._index[sensor]])
+            self.timestamps.doubtful_times().get(sensor, ()))
             for interval in by_sensor[-1:]]
         return max(times, key=lambda t: (t[1] is None, t[0]), default=None)
-
-    def relearnt(self) -> dict[str, tuple[RelearntBackground, ...]]:
-        """Latest changes of the background of each sensor that had any.
-
-        Returns
-        -------
-        dict of str to tuple of RelearntBackground
-        """
-        return {name: b.relearnt for name, b in self._background.items() if b.relearnt}
-
-    def timestamp_fault(self, sensor: str) -> TimestampFault | None:
-        """Return the worst regular error of the timestamps of a sensor so far.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        TimestampFault or None
-            None if the timestamps are regular.
-        """
-        return self._timestamps.worst_fault(self._index[sensor])
-
-    def lowest_rate(self, sensor: str) -> float:
-        """Return the lowest rate of a sensor so far, from its raw timestamps.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        float, Hz
-            inf if unknown.
-        """
-        return self._timestamps.lowest_rate(self._index[sensor])
 
     def field_inconsistencies(self) -> list[FieldInconsistency]:
         """Sensors whose background contradicts the Earth's field so much that tracks are wrong.
@@ -307,7 +271,7 @@ class Calibrate:
         rows = readings.rows(self._index)
         validity, covariances = _own_covariances(readings)
         stamps, fields = plain(readings.stamp_ns, np.int64), plain(readings.field)
-        self._timestamps.add(rows, stamps - self._network.clock_offset_ns[rows], fields)
+        self.timestamps.add(rows, stamps - self._network.clock_offset_ns[rows], fields)
         out, batch = self._new_output(len(readings)), self._batches[0]
         batch['next'] = 0
         while reason := core.calibrate_readings(
