@@ -138,8 +138,8 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
                    'simultaneous targets, or a kind of target that the settings do not include')
     if n := counts.get(BELOW_SENSORS, 0):
         yield Note(WARNING, f'{quantity(n, "vehicle appears", "vehicles appear")} to pass below '
-                   'the sensors: two sensors are exchanged, or the sensors are mounted upside down; '
-                   'check topics, positions and orientations in the network file')
+                   'the sensors: two sensors are exchanged, or the sensors are mounted upside '
+                   'down; check topics, positions and orientations in the network file')
     for reason in bounds.REASONS:
         if n := counts.get(f'tracks ended: {reason}', 0):
             yield Note(WARNING, f'{quantity(n, "track")} ended: {reason}; {bounds.ADVICE}')

@@ -287,21 +287,9 @@ class TrackManager:
 
     def _initiate(self, frame: FieldFrame) -> list[TrackRecord]:
         """Start a track, if possible, with the frames before the detection; return its records."""
-        if len(self._network) == 1 and not self._settings.single_sensor_prior:
-            self.counts[NO_SCALE] += 1
-            self._restart_energy = np.inf
-            return []
         s = self._settings
         recent = [f for f in self._recent if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
-        n_required = 1 if s.single_sensor_prior or self._target.starts_anywhere else 2
-        is_slow = self.rates.are_slow()
-        if is_slow.any() and _n_sensors(frame, *recent, without=is_slow) < n_required:
-            self.counts[TOO_SLOW] += 1
-            self._restart_energy = np.inf
-            return []
-        if _n_sensors(frame, *recent) < n_required:
-            self.counts[NO_SCALE_FRAMES] += 1
-            self._store_frame(frame)
+        if not self._may_start(frame, recent):
             return []
         later_sensors = self._sensors_at(frame, s.max_sensors)
         n_at_start = sensors_at_start(s, self._network, self._target.model)
@@ -330,6 +318,25 @@ class TrackManager:
             frame, recent,
             approach_unobserved=is_in_tail or bool(recent) and _n_sensors(*recent) < 2)
         return out + self._delete_ended(frame.stamp_ns)
+
+    def _may_start(self, frame: FieldFrame, recent: list[FieldFrame]) -> bool:
+        """Whether enough sensors measure fast enough for a track; otherwise count the frame."""
+        s = self._settings
+        if len(self._network) == 1 and not s.single_sensor_prior:
+            self.counts[NO_SCALE] += 1
+            self._restart_energy = np.inf
+            return False
+        n_required = 1 if s.single_sensor_prior or self._target.starts_anywhere else 2
+        is_slow = self.rates.are_slow()
+        if is_slow.any() and _n_sensors(frame, *recent, without=is_slow) < n_required:
+            self.counts[TOO_SLOW] += 1
+            self._restart_energy = np.inf
+            return False
+        if _n_sensors(frame, *recent) < n_required:
+            self.counts[NO_SCALE_FRAMES] += 1
+            self._store_frame(frame)
+            return False
+        return True
 
     def _sensors_at(self, frame: FieldFrame, n: int) -> SensorSubset:
         """Up to `n` sensors for a new track, nearest to the sensor with the strongest field."""
