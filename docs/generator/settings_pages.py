@@ -36,8 +36,8 @@ in `summary.json`. {doc}`/concepts/uncertainty` explains what the flag promises.
 ARCHIVE = """# Tables of an archive
 
 Columns of the Parquet tables that `mag-tracking archive` writes ({doc}`/guides/archive`). Unknown
-values are null. The unit and the meaning of each column are also stored in the metadata of the
-files.
+values are null, and NaN in a covariance. The unit and the meaning of each column are also stored in
+the metadata of the files.
 """
 TRAFFIC = """# Tables of traffic
 

@@ -93,10 +93,16 @@ def work_file_errors(path: Path) -> Iterator[None]:
     ----------
     path : Path
         The file.
+
+    Raises
+    ------
+    RecordingError
+        If reading fails.
     """
     try:
         yield
-    except (OSError, ValueError, TypeError, LookupError, EOFError, BadZipFile) as error:
+    except (OSError, ValueError, TypeError, LookupError, EOFError, RecursionError,
+            BadZipFile) as error:
         raise RecordingError(f'{path} is damaged ({error}); delete the folder "unfinished" of the '
                              'archive and run the same command again') from error
 

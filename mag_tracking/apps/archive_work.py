@@ -34,7 +34,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.archive_folder import common_columns, join_tables, recording_key
 from mag_tracking.recording.archive_tables import TABLES
-from mag_tracking.recording.parquet_table import TableWriter
+from mag_tracking.recording.parquet_table import TableWriter, check_row
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame
@@ -45,6 +45,8 @@ N_DIPOLES = 3
 
 CUT_FILE = 'columns.json'
 """Name of the file in which `cut` stores its result for later tasks."""
+
+_COLUMNS_OF_JOIN = ('tracks', 'passes', 'error')
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,8 @@ def cut(job: Job) -> dict[str, Any]:
             replace_text(folder / CUT_FILE, json.dumps(columns))
     with work_file_errors(job.cut_folder / CUT_FILE):
         stored: dict[str, Any] = json.loads((job.cut_folder / CUT_FILE).read_text())
-        return stored | {'segments': int(stored['segments'])}
+        check_row(stored, [c for c in TABLES['recordings'] if c.name not in _COLUMNS_OF_JOIN])
+    return stored
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 
 from mag_tracking.apps.doctor_covariances import covariance_findings
-from mag_tracking.apps.doctor_rejections import rejection_findings
+from mag_tracking.apps.doctor_rejections import driver_findings, rejection_findings
 from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
@@ -20,12 +20,13 @@ from mag_tracking.stages.calibrate.field_comparison import (
     compared_with_earth,
     earth_field_findings,
 )
-from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.calibrate.stage import FAULTS_FOUND, Calibrate
 from mag_tracking.stages.health.clocks import clock_findings
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.stages.health.sensor_health import SensorHealth
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.stages.track.low_rate import low_rate_fault
+from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
 MAX_FROZEN_S = 30.0
@@ -132,20 +133,24 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
                       Cause.FROZEN_BACKGROUND)
 
 
-def rate_findings(name: str, fault: str | None) -> Iterator[Finding]:
+def rate_findings(name: str, rate: float, network: SensorNetwork,
+                  settings: TrackSettings) -> Iterator[Finding]:
     """Report a sensor that is too slow for tracks.
 
     Parameters
     ----------
     name : str
         Sensor.
-    fault : str or None
-        Result of `low_rate_fault`.
+    rate : float, Hz
+        NaN or inf if unknown.
+    network : SensorNetwork
+    settings : TrackSettings
 
     Yields
     ------
     Finding
     """
+    fault = low_rate_fault(rate, network, settings)
     if fault is not None:
         yield Finding(True, name, fault, 'raise the rate of the sensor; for parked vehicles, use '
                       'mag-tracking events', Cause.RATE_TOO_LOW)
@@ -221,6 +226,7 @@ class Doctor:
         self._clock_ns = dict(zip(network.names, network.clock_offset_ns.tolist(), strict=True))
         self._frozen_since_ns: dict[str, int] = {}
         self._missed = MissedTargets(network.names)
+        self._n_faults_found = 0
 
     def feed(self, readings: Readings, received_ns: int | None = None) -> None:
         """Add raw readings.
@@ -232,9 +238,14 @@ class Doctor:
             Time of reception of the message; None if unknown.
         """
         names, stamps = readings.sensor_names(), readings.stamp_ns.tolist()
+        self.calibrate.feed(readings)
+        if self.calibrate.counts[FAULTS_FOUND] != self._n_faults_found:
+            self._n_faults_found = self.calibrate.counts[FAULTS_FOUND]
+            for name, health in self.sensors.items():
+                if health.faults != self.calibrate.faults_of(name):
+                    self.sensors[name] = SensorHealth(faults=self.calibrate.faults_of(name))
         for name, stamp, field in zip(names, stamps, readings.field, strict=True):
             self.sensors[name].add(stamp - self._clock_ns[name], field, received_ns)
-        self.calibrate.feed(readings)
         backgrounds = self.calibrate.backgrounds()
         for name, stamp in zip(names, stamps, strict=True):
             if backgrounds[name].frozen:
@@ -256,9 +267,10 @@ class Doctor:
                                      self._settings.calibrate.max_field)
             found += background_findings(name, self.calibrate, self._frozen_since_ns.get(name))
             found += covariance_findings(name, self.network.absolute_topics[j], self.calibrate)
+            found += driver_findings(name, self.calibrate)
             found += rejection_findings(name, self.calibrate)
-            found += rate_findings(name, low_rate_fault(
-                health.rate, self.network, self._settings.track))
+            found += rate_findings(name, self.calibrate.lowest_rate(name), self.network,
+                                   self._settings.track)
         found += self._missed.findings()
         found += network_findings(self.network, self._settings.survey, self.calibrate,
                                   self.sensors)

@@ -2,9 +2,11 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
+
+import numpy as np
 
 from mag_tracking.apps.input_findings import input_findings
 from mag_tracking.apps.prescan import prescan_of
@@ -118,8 +120,16 @@ def find_events(recording: Recording, network: SensorNetwork, settings: Settings
     for calibrated in calibrate.flush():
         pass_events += stage.feed(calibrated)
     pass_events += stage.flush()
+    pass_events = [_with_timestamp_error(event, calibrate) for event in pass_events]
     return EventsResult(tuple(pass_events),
                         dict(reader.rejected + Counter(rejected(calibrate.counts))),
                         tuple(calibrate.unready()), tuple(reader.missing_topics()),
                         tuple(ranked(input_findings(recording, reader, network, calibrate,
-                                                    stage.rates))))
+                                                    settings.track))))
+
+
+def _with_timestamp_error(event: PassEvent, calibrate: Calibrate) -> PassEvent:
+    """Event whose `closest_std` includes the error of the timestamps of its sensor."""
+    fault = calibrate.timestamp_fault(event.sensor)
+    return event if fault is None else replace(
+        event, closest_std=float(np.hypot(event.closest_std, fault.error_s)))

@@ -2,7 +2,7 @@
 
 from mag_tracking.apps.doctor import background_findings, rate_findings, recording_findings
 from mag_tracking.apps.doctor_covariances import covariance_findings
-from mag_tracking.apps.doctor_rejections import rejection_findings
+from mag_tracking.apps.doctor_rejections import driver_findings, rejection_findings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
@@ -10,11 +10,11 @@ from mag_tracking.stages.calibrate.field_comparison import earth_field_findings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.clocks import clock_findings
 from mag_tracking.stages.health.diagnosis import Cause, Finding
-from mag_tracking.stages.track.low_rate import SampleRates
+from mag_tracking.stages.track.settings import TrackSettings
 
 
 def input_findings(recording: Recording, reader: SampleReader, network: SensorNetwork,
-                   calibrate: Calibrate, rates: SampleRates) -> list[Finding]:
+                   calibrate: Calibrate, settings: TrackSettings) -> list[Finding]:
     """Findings about a recording and the sensors, without ranking.
 
     Parameters
@@ -25,8 +25,7 @@ def input_findings(recording: Recording, reader: SampleReader, network: SensorNe
     network : SensorNetwork
     calibrate : Calibrate
         Calibration stage after the whole recording.
-    rates : SampleRates
-        Rates of the sensors in the whole recording.
+    settings : TrackSettings
 
     Returns
     -------
@@ -40,7 +39,8 @@ def input_findings(recording: Recording, reader: SampleReader, network: SensorNe
                                  'network file', Cause.NO_MESSAGES))
         if (timestamps := calibrate.timestamp_fault(name)) is not None:
             found.append(timestamps.finding(name))
-        found += rate_findings(name, rates.fault(name))
+        found += rate_findings(name, calibrate.lowest_rate(name), network, settings)
+        found += driver_findings(name, calibrate)
         found += rejection_findings(name, calibrate)
         found += background_findings(name, calibrate, None)
         found += covariance_findings(name, topic, calibrate)

@@ -9,7 +9,7 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.doubtful_times import DOUBTFUL_BACKGROUND, are_doubtful
-from mag_tracking.calibration.saturation import saturated_readings
+from mag_tracking.calibration.saturation import saturated_readings, with_margin
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import Detection, FieldFrame, Readings
@@ -22,6 +22,8 @@ from mag_tracking.units import NS
 
 PAD_S = 1.0
 """Duration of the background included before the onset of a detection [s]."""
+MAX_PLATEAU_S = 0.5
+"""Maximum time for which a target that passes saturates a sensor [s]."""
 MAX_PASS_S = 60.0
 """Maximum duration of a pass; a longer detection is truncated [s]."""
 
@@ -174,13 +176,17 @@ class PassCollector:
             rows = np.flatnonzero(sensor == j)
             if readings.covariance is not None:
                 covariance[rows] = _common_covariance(readings.covariance[rows])
-            for a, axis in enumerate('xyz'):
-                saturated = rows[saturated_readings(raw[rows, a])]
-                if len(saturated):
-                    field[saturated, a] = np.nan
-                    notes.append(f'{self._network.names[j]}: {axis} was saturated in '
-                                 f'{len(saturated)} of {len(rows)} samples at '
-                                 f'{raw[saturated[0], a]:.3g} T; these values are not used')
+            interval_s = float(np.median(np.diff(readings.stamp_ns[rows]))) / NS \
+                if len(rows) > 1 else np.inf
+            raw[rows] = np.where(np.isnan(field[rows]), np.nan, raw[rows])
+            is_saturated = saturated_readings(raw[rows], MAX_PLATEAU_S / interval_s)
+            field[rows] = np.where(with_margin(is_saturated), np.nan, field[rows])
+            for a, saturated in enumerate(is_saturated.T):
+                if saturated.any():
+                    notes.append(f'{self._network.names[j]}: {"xyz"[a]} was saturated in '
+                                 f'{saturated.sum()} of {len(rows)} samples at '
+                                 f'{raw[rows[saturated][0], a]:.3g} T; these values and the '
+                                 'adjacent ones are not used')
         self._onset_ns = None
         t = (readings.stamp_ns - begin) / NS
         return PassData(self._network, begin, t, sensor, field, covariance,

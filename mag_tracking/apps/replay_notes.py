@@ -38,7 +38,7 @@ def replay_findings(recording: Recording, reader: SampleReader, pipeline: Pipeli
     list of Finding
     """
     found = input_findings(recording, reader, pipeline.network, pipeline.calibrate,
-                           pipeline.track.rates)
+                           pipeline.settings.track)
     for stage, counts in pipeline.counts().items():
         if stage != 'calibrate' and (causes := rejected(counts)):
             found.append(Finding(False, stage, ', '.join(
@@ -127,6 +127,8 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(NOTE, 'all sensors are within two metres: range and moment are poorly '
                    'observable, and all tracks are ambiguous; use the speed and direction from the '
                    'delays between the sensors')
+    if summary['lanes'] and summary['target'] == 'vehicle' and counts.get('tracks', 0):
+        yield Note(NOTE, summary['lanes'])
     if summary['frames_too_long']:
         yield Note(WARNING, summary['frames_too_long'])
     if summary['clocks_apart']:

@@ -35,7 +35,8 @@ examples:
       --scheduler tcp://10.0.0.5:8786
 
 The workers of a Dask scheduler need this package, and access to the recordings and DIR under the
-same paths.
+same paths. A scheduler executes the code of whoever reaches it; the guide "Track an archive" shows
+how to use one with certificates (tls://...).
 '''
 
 

@@ -20,7 +20,6 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding, ranked
 from mag_tracking.stages.health.reading_buffer import ReadingBuffer
 from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S, WINDOW, SensorHealth
-from mag_tracking.stages.track.low_rate import low_rate_fault
 
 WINDOW_S = 60.0
 """[s] Length of an evaluation window. A fault is reported for one to two windows after
@@ -198,8 +197,8 @@ class HealthDiagnostics:
                                          self._settings.calibrate.max_field,
                                          not self._is_replayed):
                     in_windows.setdefault(f.cause, f)
-        findings += rate_findings(name, low_rate_fault(
-            self._reported_window(name).rate, self._network, self._settings.track))
+        findings += rate_findings(name, self._reported_window(name).rate, self._network,
+                                  self._settings.track)
         return ranked([*findings, *in_windows.values()])
 
     def _silence_findings(self, name: str, silent_s: float) -> list[Finding]:

@@ -69,6 +69,7 @@ from mag_tracking.nodes.traffic_topics import TrafficTopics
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.track.manager import TrackManager
+from mag_tracking.stages.track.plausibility import lane_note
 from mag_tracking.stages.track.running_track import TrackRecord
 from mag_tracking.stages.track.settings import BEST
 from mag_tracking.stages.traffic.stage import TrackedFrame
@@ -135,7 +136,14 @@ class TrackerNode(StageNode):
         steady_timer(self, 0.25, self.end_tracks_on_timeout)
         self.subscription(CalibrationState, CALIBRATION_STATE, self._receive_calibration,
                           LATCHED_QOS)
+        self._report_start()
+
+    def _report_start(self) -> None:
+        """Report the state; log which lanes are covered if the sensors stand beside a road."""
         self.report_state()
+        note = lane_note(self.settings.track.vehicle, self.network)
+        if note and self.settings.track.target == 'vehicle':
+            self.get_logger().info(note)
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """Stages whose counts are published in diagnostics, by name.

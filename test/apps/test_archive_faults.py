@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import threading
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -64,7 +65,7 @@ def test_an_incompatible_folder_is_refused(tmp_path, recordings, complete_archiv
     shutil.copytree(complete_archive, old_archive)
     metadata = json.loads((old_archive / 'archive.json').read_text())
     (old_archive / 'archive.json').write_text(json.dumps({**metadata, 'schema': 0}))
-    with pytest.raises(OutputError, match='tables of version 0; this program writes version 2'):
+    with pytest.raises(OutputError, match='tables of version 0; this program writes version 3'):
         archive(paths, NETWORK_FILE, settings, old_archive)
     (old_archive / 'archive.json').write_text('{"schema"')
     with pytest.raises(OutputError, match='cannot read'):
@@ -312,7 +313,7 @@ def test_an_empty_recording_has_null_values(tmp_path):
         vehicle_path('straight_car_right').read_bytes()[:500])
     archive([tmp_path], NETWORK_FILE, settings_for('vehicle', QUICK), tmp_path / 'out')
     (row,) = rows(tmp_path / 'out', 'recordings')
-    assert row[2] is None and row[3] == ''
+    assert row[2:4] == (None, None) and row[4] == ''
 
 
 @pytest.fixture
@@ -347,6 +348,43 @@ def test_damaged_intermediate_results_are_reported(job):
     (job.cut_folder / 'columns.json').write_text('{"frames": 1}')
     with pytest.raises(RecordingError, match='columns.json is damaged'):
         archive_work.cut(job)
+
+
+def test_a_recording_with_a_damaged_summary_is_tracked_again(
+        tmp_path, complete_archive, recordings):
+    """If it is not tracked in this run, its row is missing, which is reported."""
+    out, settings, lines = tmp_path / 'out', settings_for('vehicle', QUICK), []
+    shutil.copytree(complete_archive, out)
+    other, path = sorted(out.glob('done/straight_*.json'))
+    for summary in (other, path):
+        summary.write_text(summary.read_text().replace('"size"', '"sice"'))
+    run = archive([recordings / 'straight_small_left.mcap'], NETWORK_FILE, settings, out,
+                  report=lines.append)
+    assert len(run.done) == 1 and not run.failed and len(rows(out, 'recordings')) == 2
+    assert len(lines) == 2 and str(path) in lines[0] and str(other) in lines[1]
+    archive([recordings], NETWORK_FILE, settings, out, report=lines.append)
+    assert same_tables(out, complete_archive)
+
+
+@pytest.mark.parametrize('damage', [
+    lambda text: '', lambda text: '[' * 100_000, lambda text: text[:len(text) // 2],
+    lambda text: '{}', lambda text: '[]',
+    lambda text: text.replace('"size": ', '"size": null, "_": '),
+    lambda text: text.replace('"tracks": ', '"tracks": 9e99, "_": '),
+    lambda text: text.replace('"frames": ', '"frames": 9223372036854775808, "_": '),
+    lambda text: text.replace('"error": ""', '"error": null')])
+def test_damaged_summaries_are_named(tmp_path, complete_archive, damage):
+    shutil.copytree(complete_archive / 'done', tmp_path / 'done')
+    path, *others = sorted(tmp_path.glob('done/*.json'))
+    recording = Path(json.loads(path.read_text())['source'])
+    path.write_text(damage(path.read_text()))
+    (tmp_path / 'archive.json').write_text('{"schema": 3}')
+    lines = []
+    with ArchiveFolder(tmp_path, {}) as dataset:
+        with pytest.raises(OutputError, match=path.name):
+            dataset.done(recording)
+        assert len(list(dataset.summaries(lines.append))) == len(others) == 2
+    assert len(lines) == 1 and path.name in lines[0]
 
 
 def test_a_full_disk_is_reported_even_if_the_file_has_been_created(job, monkeypatch):

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -20,8 +21,9 @@ from mag_tracking.calibration.doubtful_times import (
 )
 from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.level_change import SharedChanges
+from mag_tracking.calibration.reading_faults import ReadingFaults, reading_faults
 from mag_tracking.calibration.screening import clear_spikes
-from mag_tracking.calibration.sensor_state import new_sensors
+from mag_tracking.calibration.sensor_state import N_WINDOW, new_sensors
 from mag_tracking.errors import NetworkError
 from mag_tracking.inference.axes import are_valid_covariances
 from mag_tracking.network import SensorNetwork
@@ -46,6 +48,9 @@ are staggered, because evaluating all blocks at once would delay the readings.""
 OVERRULED = 'message covariances overruled by the measured noise'
 """Key in the counts for message covariances that were replaced by the measured noise."""
 
+FAULTS_FOUND = 'faults of drivers found'
+"""Key in the counts for the events after which `faults_of` returns other faults."""
+
 REJECTIONS = {
     core.NO_AXIS: (Cause.NO_AXIS, 'no axis reported (all NaN)'),
     core.INFINITE: (Cause.INFINITE, 'infinite value'),
@@ -55,6 +60,8 @@ REJECTIONS = {
     core.DUPLICATE: (Cause.DUPLICATE_STAMPS, 'duplicate timestamp'),
     core.OUT_OF_ORDER: (Cause.BACKWARD_STAMPS, 'out of order'),
     core.STUCK: (Cause.STUCK, 'stuck sensor (repeated reading)'),
+    core.MARKED: (Cause.NO_READING_MARK, 'mark for a missing reading'),
+    core.REPEATED: (Cause.REPEATED, 'repetition of the previous reading'),
 }
 """Cause and description of the rejection for each reason code; `TOO_LARGE` depends on a setting."""
 
@@ -89,6 +96,8 @@ class Calibrate:
                  background_type: type[RunningBackground] = RunningBackground,
                  survey: SurveySettings | None = None) -> None:
         self.counts: Counter[str] = Counter()
+        # Rate of the readings of each sensor [Hz] when a fault of its driver was found.
+        self._rates = dict.fromkeys(network.names, float('nan'))
         self._rejections: dict[str, Counter[tuple[Cause, str]]] = {
             name: Counter() for name in network.names}
         self._settings, self._sensors = settings, new_sensors(len(network))
@@ -238,6 +247,20 @@ class Calibrate:
         """
         return self._timestamps.worst_fault(self._index[sensor])
 
+    def lowest_rate(self, sensor: str) -> float:
+        """Return the lowest rate of a sensor so far, from its raw timestamps.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        float, Hz
+            inf if unknown.
+        """
+        return self._timestamps.lowest_rate(self._index[sensor])
+
     def field_inconsistencies(self) -> list[FieldInconsistency]:
         """Sensors whose background contradicts the Earth's field so much that tracks are wrong.
 
@@ -314,6 +337,8 @@ class Calibrate:
             batch['n_spikes'] = 0
         if reason == core.BLOCK_COMPLETE:
             self._evaluate_block(i)
+        elif reason == core.WINDOW_COMPLETE:
+            self._examine_window(i)
         elif reason == core.JUMPED_BACK:
             self._background[name].forget()
             self._reject_held(i, 'time jumped back')
@@ -327,6 +352,64 @@ class Calibrate:
             self._calibrate_released(i, out)
         elif reason != core.SPIKES:
             self._reject(name, self._causes[reason])
+
+    def _examine_window(self, i: int) -> None:
+        """Search the latest raw readings of sensor `i` for faults of its driver."""
+        s, name = self._sensors[i], self._network.names[i]
+        known, found = self.faults_of(name), reading_faults(s['window'][:s['n_window']])
+        # The current reading is the first one after the window.
+        duration_s = (int(self._batches[0]['stamp_ns']) - int(s['window_begin_ns'])) / NS
+        if known.merged(found) != known:
+            self._set_faults(i, replace(known.merged(found), rate=(
+                int(s['n_window']) / duration_s if duration_s > 0.0 else float('nan'))))
+            if not s['is_examined']:
+                # The background has been learnt from faulty readings.
+                self._background[name].forget()
+        if s['n_window'] < N_WINDOW:
+            s['window_due'] = 2 * s['window_due']
+        else:
+            s['n_window'], s['is_examined'] = 0, True
+
+    def _set_faults(self, i: int, faults: ReadingFaults) -> None:
+        """Leave out the marks and repetitions of sensor `i` from now on."""
+        s, self._rates[self._network.names[i]] = self._sensors[i], faults.rate
+        self.counts[FAULTS_FOUND] += 1
+        s['n_marks'], s['marks'][:len(faults.marks)] = len(faults.marks), faults.marks
+        s['repetition'] = faults.repetition
+        # The steps, repetitions and differences so far are those of the faults.
+        s['step'] = np.inf
+        s['n_same'] = s['n_changed'] = s['n_rest'] = 0
+        s['repeats'] = s['changes'] = s['run'] = 0
+        self._reject_held(i, 'a fault of the driver was found')
+
+    def faults_of(self, sensor: str) -> ReadingFaults:
+        """Faults of the driver of a sensor that have been found so far.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        ReadingFaults
+        """
+        s = self._state_of(sensor)
+        return ReadingFaults(s['marks'][:s['n_marks']].copy(), float(s['repetition']),
+                             self._rates[sensor])
+
+    def n_marked(self, sensor: str) -> int:
+        """Number of readings of a sensor with a mark for a missing reading on any axis.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        int
+        """
+        return int(self._state_of(sensor)['n_partly_marked']) \
+            + self._rejections[sensor][REJECTIONS[core.MARKED]]
 
     def _calibrate_released(self, i: int, out: OutputBuffer) -> None:
         """Calibrate the readings of sensor `i` that the spike filter has released."""
@@ -385,7 +468,7 @@ class Calibrate:
         clear_spikes(self._sensors[i])
 
     def start_from(self, levels: Mapping[str, MostFrequentLevel],
-                   steps: Mapping[str, FloatArray]) -> None:
+                   steps: Mapping[str, FloatArray], faults: Mapping[str, ReadingFaults]) -> None:
         """Initialise the stage with the results of a first pass over the readings.
 
         Parameters
@@ -394,7 +477,12 @@ class Calibrate:
             Background of each sensor that is not quiet at the start.
         steps : mapping of str to (3,) array, T
             Resolution of the axes of each sensor.
+        faults : mapping of str to ReadingFaults
+            Faults of the drivers.
         """
+        for name, found in faults.items():
+            if found:
+                self._set_faults(self._index[name], found)
         for name, step in steps.items():
             self._state_of(name)['step'] = step
         for name, quiet in levels.items():

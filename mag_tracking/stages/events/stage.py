@@ -54,17 +54,15 @@ class Events:
     ----------
     counts : Counter of str
         Number of events.
-    rates : SampleRates
-        Rates of the sensors.
     """
 
     def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
                  track: TrackSettings) -> None:
         self.counts: Counter[str] = Counter()
-        self.rates = SampleRates(network, track)
+        rates = SampleRates(network, track)
         self._index = {name: j for j, name in enumerate(network.names)}
         parts = [network.part(np.array([j])) for j in range(len(network))]
-        self._sensors = [_SensorEvents(j, part, align, detect, self.rates, self.counts)
+        self._sensors = [_SensorEvents(j, part, align, detect, rates, self.counts)
                          for j, part in enumerate(parts)]
 
     def set_relearnt(self, relearnt: Mapping[str, Sequence[RelearntBackground]]) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration.reading_faults import NO_FAULTS, ReadingFaults
 from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
@@ -16,7 +17,11 @@ from mag_tracking.quantities import occurrences
 from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.stages.health.timestamps import WINDOW as TIMESTAMP_WINDOW
-from mag_tracking.stages.health.timestamps import TimestampFault, timestamp_fault
+from mag_tracking.stages.health.timestamps import (
+    TimestampFault,
+    latest_interval_s,
+    timestamp_fault,
+)
 from mag_tracking.stages.health.window import median_field, quantiles, sample_noise_std
 from mag_tracking.units import NEVER, NS
 
@@ -36,6 +41,10 @@ MAX_JITTER = 0.3
 readings are not counted."""
 STUCK_S = 1.0
 """[s] A sensor is stuck if its readings are identical for longer than this."""
+MIN_STUCK_READINGS = 8
+"""A slow sensor is stuck if more than this number of readings are identical."""
+MAX_PLATEAU_S = 0.5
+"""[s] Maximum time for which a target that passes saturates a sensor."""
 MIN_MOVED_STEPS = 10.0
 """A target that changes one axis by more than this number of quantisation steps is assumed to
 change every other axis by at least one step."""
@@ -54,16 +63,28 @@ class SensorHealth:
     ----------
     update_interval : int, optional
         Number of readings between two updates.
+    faults : ReadingFaults, optional
+        Marks and repetitions, which are not evaluated as readings.
+
+    Attributes
+    ----------
+    faults : ReadingFaults
     """
 
-    def __init__(self, update_interval: int = UPDATE_INTERVAL) -> None:
-        self._update_interval = update_interval
+    def __init__(self, update_interval: int = UPDATE_INTERVAL,
+                 faults: ReadingFaults = NO_FAULTS) -> None:
+        self.faults, self._update_interval = faults, update_interval
         self._counts: Counter[str] = Counter()
         self._largest_step_s = 0.0
         self._buffered: list[tuple[int, FloatArray, int]] = []
         self._stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._received: IntArray = np.zeros(0, dtype=np.int64)
+        self._raw_fields: FloatArray = np.zeros((0, 3))
+        # Latest reading; window of the readings without marks and repetitions, and its timestamps.
+        self._latest: FloatArray = np.zeros((0, 3))
         self._fields: FloatArray = np.zeros((0, 3))
+        self._field_stamps: IntArray = np.zeros(0, dtype=np.int64)
+        self._is_saturated: BoolArray = np.zeros(0, dtype=bool)
         self._interval_ns, self._jitter = float('nan'), float('inf')
         self._timestamp_fault: TimestampFault | None = None
         self._noise: FloatArray = np.full(3, np.nan)
@@ -133,10 +154,21 @@ class SensorHealth:
             return
         self._stamps = np.append(self._stamps, stamps)[-WINDOW:]
         self._received = np.append(self._received, received)[-WINDOW:]
-        self._fields = np.append(self._fields, fields, axis=0)[-WINDOW:]
+        self._raw_fields = np.append(self._raw_fields, fields, axis=0)[-TIMESTAMP_WINDOW:]
         self._counts['readings'] += n
         self._check_timestamps(n)
-        self._check_fields(n)
+        missing = np.isnan(fields)
+        for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
+            self._counts[axis] += count
+        self._counts['without any axis'] += int(missing.all(axis=1).sum())
+        with_latest = np.append(self._latest, fields, axis=0)
+        self._latest = with_latest[-1:].copy()
+        kept = self.faults.without(with_latest)[-n:]
+        is_kept = ~np.isnan(kept).all(axis=1) | missing.all(axis=1)
+        if is_kept.any():
+            self._field_stamps = np.append(self._field_stamps, stamps[is_kept])[-WINDOW:]
+            self._fields = np.append(self._fields, kept[is_kept], axis=0)[-WINDOW:]
+            self._check_fields(int(is_kept.sum()))
 
     def _check_timestamps(self, n: int) -> None:
         """Count the faults in the timestamps of the `n` latest readings."""
@@ -144,7 +176,7 @@ class SensorHealth:
         intervals = np.diff(self._stamps[-n - 1:])
         self._counts['duplicates'] += int((intervals == 0).sum())
         self._counts['backward timestamps'] += int((intervals < 0).sum())
-        fault = timestamp_fault(self._stamps[-TIMESTAMP_WINDOW:], self._fields[-TIMESTAMP_WINDOW:])
+        fault = timestamp_fault(self._stamps[-TIMESTAMP_WINDOW:], self._raw_fields)
         if fault is not None:
             # The intervals of such timestamps show neither lost readings nor clock steps.
             self._timestamp_fault = fault.after(self._timestamp_fault)
@@ -163,7 +195,12 @@ class SensorHealth:
             self._counts['clock steps'] += int(is_step.sum())
             self._largest_step_s = max(self._largest_step_s, *steps[is_step].tolist(), key=abs)
         if self._jitter < MAX_JITTER:
-            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) & ~is_step
+            # Intervals like the latest ones are those of another rate.
+            latest_ns = latest_interval_s(self._stamps) * NS
+            is_other_rate = (latest_ns > GAP_RATIO * self._interval_ns) \
+                & (np.abs(intervals - latest_ns) < 0.2 * latest_ns)
+            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) \
+                & ~is_step & ~is_other_rate
             self._counts['lost'] += int(np.sum(np.round(intervals[gaps] / self._interval_ns) - 1))
         forward = np.diff(self._stamps)
         forward = forward[forward > 0]
@@ -174,10 +211,6 @@ class SensorHealth:
 
     def _check_fields(self, n: int) -> None:
         """Count the faults in the fields of the `n` latest readings."""
-        missing = np.isnan(self._fields[-n:])
-        for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
-            self._counts[axis] += count
-        self._counts['without any axis'] += int(missing.all(axis=1).sum())
         self._check_stuck(n)
         # The two preceding readings are included, because the last one had no successor before.
         fields = self._fields[-n - 2:]
@@ -186,16 +219,19 @@ class SensorHealth:
         # A comparison with NaN is false: while the noise is unknown, no spikes are counted.
         noise = np.maximum(self._noise, self._steps / np.sqrt(12.0))
         is_spike = (np.minimum(np.abs(before), np.abs(after)) > SPIKE_STD * noise) \
-            & (before * after > 0.0)
+            & ((before > 0.0) == (after > 0.0))
         self._counts['spikes'] += int(is_spike.any(axis=1).sum())
         if self._n_since_stuck >= WINDOW:
             self._noise = self._cache['noise'] = sample_noise_std(self._fields)
-        is_saturated = np.array([saturated_readings(axis) for axis in self._fields.T])[:, -n:]
-        self._counts['saturated'] += int(np.count_nonzero(is_saturated.any(axis=0)))
+        # A limit is recognised only after the excursion.
+        known = np.append(self._is_saturated, np.zeros(n, dtype=bool))[-len(self._fields):]
+        self._is_saturated = known | saturated_readings(
+            self._fields, MAX_PLATEAU_S * NS / self._interval_ns).any(axis=1)
+        self._counts['saturated'] += int(np.count_nonzero(self._is_saturated & ~known))
 
     def _check_stuck(self, n: int) -> None:
         """Count the stuck readings among the `n` latest readings."""
-        stamps, fields = self._stamps[-n:], self._fields[-n - 1:]
+        stamps, fields = self._field_stamps[-n:], self._fields[-n - 1:]
         equal = (fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])
         self._has_changed |= (~equal & ~np.isnan(fields[1:]) & ~np.isnan(fields[:-1])).any(axis=0)
         is_repeated = equal.all(axis=1)
@@ -204,7 +240,8 @@ class SensorHealth:
         # Index of the first reading of each run of identical readings; -1 = in an earlier batch.
         run_start = np.maximum.accumulate(np.where(is_repeated, -1, np.arange(n)))
         unchanged_since = np.where(run_start < 0, self._unchanged_since_ns or 0, stamps[run_start])
-        stuck = np.flatnonzero(stamps - unchanged_since > STUCK_S * NS)
+        min_duration = np.nanmax([STUCK_S * NS, MIN_STUCK_READINGS * self._interval_ns])
+        stuck = np.flatnonzero(stamps - unchanged_since > min_duration)
         self._unchanged_since_ns = int(unchanged_since[-1])
         self._count_runs(is_repeated, unchanged_since, stamps)
         if not self.is_coarse:

@@ -16,6 +16,8 @@ UPDATE_INTERVAL = 64
 """Number of new readings of a sensor after which its timestamps are examined again."""
 MIN_READINGS = 16
 """Minimum number of readings that are examined."""
+N_INTERVALS = 8
+"""Number of latest intervals that determine the rate."""
 MAX_ERROR_S = 0.02
 """[s] Error of the timestamps above which tracks are ambiguous. A car at 20 m/s moves 0.4 m."""
 MIN_SHARED = 0.1
@@ -110,6 +112,11 @@ def timestamp_fault(stamps: IntArray, fields: FloatArray) -> TimestampFault | No
     n_equal = np.count_nonzero(intervals == 0)
     if n_shared >= max(MIN_SHARED * len(intervals), 0.2 * n_equal, 2):
         return _shared_fault(stamps, intervals)
+    if n_equal:
+        stamps = stamps[np.append(True, intervals != 0)]
+        intervals = np.diff(stamps)
+    if len(stamps) < MIN_READINGS:
+        return None
     return _burst_fault(stamps, intervals) or _coarse_fault(stamps, intervals)
 
 
@@ -194,6 +201,22 @@ def _groups(is_joined: BoolArray, stamps: IntArray) -> tuple[int, float, float]:
         float(np.ptp(stamps[complete])) / NS / int(complete[-1] - complete[0])
 
 
+def latest_interval_s(stamps: IntArray) -> float:
+    """Median of the latest intervals, which a few lost readings do not change.
+
+    Parameters
+    ----------
+    stamps : (n,) int array, ns
+
+    Returns
+    -------
+    float, s
+        0 if there are too few readings.
+    """
+    intervals = np.diff(stamps[-N_INTERVALS - 1:])
+    return max(float(np.median(intervals)) / NS, 0.0) if len(intervals) == N_INTERVALS else 0.0
+
+
 class TimestampMonitor:
     """Examines the timestamps of several sensors while their readings arrive.
 
@@ -215,6 +238,7 @@ class TimestampMonitor:
         self._stamps: list[IntArray] = [np.zeros(0, dtype=np.int64)] * n
         self._fields: list[FloatArray] = [np.zeros((0, 3))] * n
         self._worst: dict[int, TimestampFault] = {}
+        self._longest_s: FloatArray = np.zeros(n)
         self.doubtful_times: list[DoubtfulTimes] = [()] * n
 
     def add(self, rows: IntArray, stamps: IntArray, fields: FloatArray) -> None:
@@ -239,6 +263,8 @@ class TimestampMonitor:
         self._fields[j] = np.append(self._fields[j], fields, axis=0)[-WINDOW:]
         if fault is not None:
             self._worst[j] = fault.after(self._worst.get(j))
+        else:
+            self._longest_s[j] = max(self._longest_s[j], latest_interval_s(self._stamps[j]))
         times = self.doubtful_times[j]
         self.doubtful_times[j] = doubtful_since(times, first_ns) \
             if fault is not None and fault.error_s > MAX_ERROR_S \
@@ -264,3 +290,21 @@ class TimestampMonitor:
         """
         latest, worst = self._latest_fault(j), self._worst.get(j)
         return worst if latest is None else latest.after(worst)
+
+    def lowest_rate(self, j: int) -> float:
+        """Return the lowest rate of a sensor so far.
+
+        Parameters
+        ----------
+        j : int
+            Index of the sensor.
+
+        Returns
+        -------
+        float, Hz
+            From intervals without a fault of the timestamps; inf without such intervals.
+        """
+        stamps = np.append(self._stamps[j], self._buffer.peek(j)[0])
+        latest_s = latest_interval_s(stamps) if self.worst_fault(j) is None else 0.0
+        longest_s = max(float(self._longest_s[j]), latest_s)
+        return 1.0 / longest_s if longest_s else float('inf')

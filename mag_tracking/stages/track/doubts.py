@@ -61,7 +61,8 @@ MEANINGS = {
     HEIGHT: 'the height of the source is implausible for its kind of vehicle',
     BELOW_SENSORS: 'this vehicle or the previous one appears to pass below the sensors: two '
                    'sensors are exchanged, or the sensors are mounted upside down',
-    OFF_THE_ROAD: 'the target passes all sensors on one side, outside the configured lanes',
+    OFF_THE_ROAD: 'the target passes all sensors on one side, outside the lanes of '
+                  'track.vehicle.lateral_offsets',
     FRAMES_TOO_LONG: 'the target moves too far within one frame',
     CLOCKS_APART: 'the clocks of the sensors appear to differ in this or an earlier pass',
     ANOTHER_VEHICLE: 'the number of vehicles, or the position of one of them, is still uncertain',

@@ -101,15 +101,12 @@ class SampleRates:
     """
 
     def __init__(self, network: SensorNetwork, settings: TrackSettings) -> None:
-        self._network, self._settings = network, settings
         required = required_rate(network, settings)
         self._max_interval_s = 1.0 / required if required else np.inf
         n = len(network)
         self._last_ns: IntArray = np.full(n, NEVER, dtype=np.int64)
         self._intervals_s: FloatArray = np.zeros((n, N_INTERVALS))
         self._next = np.zeros(n, dtype=np.int64)
-        # Longest median interval at which each sensor was slow.
-        self._slow_s: FloatArray = np.zeros(n)
 
     def add(self, frame: FieldFrame, first: int = 0) -> None:
         """Update the rates with a frame.
@@ -128,10 +125,6 @@ class SampleRates:
         rows, interval_s = rows[is_known], interval_s[is_known]
         self._intervals_s[rows, self._next[rows] % N_INTERVALS] = interval_s
         self._next[rows] += 1
-        if (interval_s > self._max_interval_s).any():
-            slow = np.flatnonzero(self.are_slow())
-            self._slow_s[slow] = np.maximum(self._slow_s[slow], [
-                np.median(known[known > 0.0]) for known in self._intervals_s[slow]])
 
     def are_slow(self) -> BoolArray:
         """Whether most of the latest intervals of each sensor are too long.
@@ -144,19 +137,3 @@ class SampleRates:
         n_known = np.minimum(self._next, N_INTERVALS)
         are_slow: BoolArray = (n_long >= MIN_INTERVALS) & (2 * n_long > n_known)
         return are_slow
-
-    def fault(self, sensor: str) -> str | None:
-        """Describe the lowest rate at which a sensor is or was too slow.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        str or None
-            None if the sensor was never too slow.
-        """
-        interval_s = float(self._slow_s[self._network.index(sensor)])
-        return low_rate_fault(1.0 / interval_s, self._network, self._settings) \
-            if interval_s else None

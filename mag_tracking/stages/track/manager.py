@@ -64,8 +64,6 @@ class TrackManager:
     ----------
     counts : Counter
         Number of events, by description.
-    rates : SampleRates
-        Rates of the sensors.
 
     Raises
     ------
@@ -92,7 +90,7 @@ class TrackManager:
         # Whether the latest vehicle of known height passed below the sensors.
         self._passed_below = False
         self._disturbances = Disturbances(network.names)
-        self.rates = SampleRates(network, settings)
+        self._rates = SampleRates(network, settings)
         self._input_doubts: InputDoubts = {}
         self._doubtful_rows: dict[str, dict[int, DoubtfulTimes]] = {}
         n_uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
@@ -180,7 +178,7 @@ class TrackManager:
         out, previous = self._end_at_gap(frame), self._last_ns
         self._last_ns = frame.stamp_ns
         self.counts['frames'] += 1
-        self.rates.add(frame)
+        self._rates.add(frame)
         if not self._tracks:
             self._disturbances.feed(frame)
         if not frame.target_present:
@@ -327,7 +325,7 @@ class TrackManager:
             self._restart_energy = np.inf
             return False
         n_required = 1 if s.single_sensor_prior or self._target.starts_anywhere else 2
-        is_slow = self.rates.are_slow()
+        is_slow = self._rates.are_slow()
         if is_slow.any() and _n_sensors(frame, *recent, without=is_slow) < n_required:
             self.counts[TOO_SLOW] += 1
             self._restart_energy = np.inf

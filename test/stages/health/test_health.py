@@ -168,8 +168,7 @@ def test_a_steep_slope_is_not_a_spike():
 def test_saturated_readings_are_counted_once():
     stamps, fields, _ = faulty('saturated')
     clipped = np.isin(fields[:, 1], [1.5e-5, 1.6e-5]).sum()
-    # Neighbouring readings are suspect and also counted.
-    assert clipped <= examined(stamps, fields).counts['saturated'] <= 200 + 12
+    assert examined(stamps, fields).counts['saturated'] == clipped
 
 
 def test_a_stuck_two_axis_sensor_is_found():
@@ -291,20 +290,15 @@ def test_the_doctor_reports_frozen_relearnt_and_missing_backgrounds():
 def test_the_doctor_finds_no_faults_in_the_bundled_recordings(name, road_network):
     doctor, lost = examine(Recording(vehicle_path(name)), road_network, settings_for('vehicle'))
     findings = [str(d) for d in ranked(doctor.findings())]
-    if name == 'straight_truck_right':
-        # The truck passes so close that a sensor reaches its limit of 100 uT.
-        assert findings.pop().startswith('mag_2: 9 of 1400 readings are at the end of the range')
     assert not lost and not findings
 
 
-def test_the_doctor_reports_saturated_sensors_of_the_corridor(capsys):
-    """The car passes so close that two sensors reach their limit of 100 uT."""
+def test_the_doctor_finds_no_faults_in_the_corridor(capsys):
+    """The largest readings of two sensors are equal by chance, far below the end of the range."""
     folder = DATA / 'corridor'
     assert main(['doctor', str(folder / 'corridor_8_sensors.mcap'), '--network',
-                 str(folder / 'network.yaml')]) == 2
-    output = capsys.readouterr().out
-    assert [line.split()[1] for line in output.splitlines() if 'end of the range' in line] == [
-        'mag_2:', 'mag_4:']
+                 str(folder / 'network.yaml')]) == 0
+    assert 'end of the range' not in capsys.readouterr().out
 
 
 def test_the_doctor_command_checks_a_recording_and_its_arguments(tmp_path, capsys):
