@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, IntArray, Record
+from mag_tracking.arrays import FloatArray, Record, are_equal
 from mag_tracking.calibration import core
 from mag_tracking.calibration.agreement import FieldInconsistency
 from mag_tracking.calibration.background import RunningBackground
@@ -21,15 +21,16 @@ from mag_tracking.calibration.doubtful_times import (
 )
 from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.level_change import SharedChanges
-from mag_tracking.calibration.reading_faults import ReadingFaults, reading_faults
+from mag_tracking.calibration.reading_faults import ReadingFaults, leave_out, reading_faults
 from mag_tracking.calibration.screening import clear_spikes
 from mag_tracking.calibration.sensor_state import N_WINDOW, new_sensors
 from mag_tracking.errors import NetworkError
-from mag_tracking.inference.axes import are_valid_covariances
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.field_comparison import FieldComparison
+from mag_tracking.stages.calibrate.output_buffer import OVERRULED as OVERRULED
 from mag_tracking.stages.calibrate.output_buffer import OutputBuffer
+from mag_tracking.stages.calibrate.rejections import REJECTIONS, own_covariances
 from mag_tracking.stages.calibrate.restoration import (
     BackgroundRestoration,
     StoredBackground,
@@ -45,25 +46,8 @@ MAX_SYNCHRONOUS = 16
 """Maximum number of sensors whose blocks may end at the same time. In larger networks, the blocks
 are staggered, because evaluating all blocks at once would delay the readings."""
 
-OVERRULED = 'message covariances overruled by the measured noise'
-"""Key in the counts for message covariances that were replaced by the measured noise."""
-
 FAULTS_FOUND = 'faults of drivers found'
 """Key in the counts for the events after which `faults_of` returns other faults."""
-
-REJECTIONS = {
-    core.NO_AXIS: (Cause.NO_AXIS, 'no axis reported (all NaN)'),
-    core.INFINITE: (Cause.INFINITE, 'infinite value'),
-    core.BAD_COVARIANCE: (Cause.WRONG_COVARIANCE, 'covariance is not positive definite'),
-    core.AXIS_MISSING: (Cause.MISSING_AXIS, 'an axis that the correction needs is missing'),
-    core.TOO_FAR_AHEAD: (Cause.TOO_FAR_AHEAD, 'timestamp too far ahead'),
-    core.DUPLICATE: (Cause.DUPLICATE_STAMPS, 'duplicate timestamp'),
-    core.OUT_OF_ORDER: (Cause.BACKWARD_STAMPS, 'out of order'),
-    core.STUCK: (Cause.STUCK, 'stuck sensor (repeated reading)'),
-    core.MARKED: (Cause.NO_READING_MARK, 'mark for a missing reading'),
-    core.REPEATED: (Cause.REPEATED, 'repetition of the previous reading'),
-}
-"""Cause and description of the rejection for each reason code; `TOO_LARGE` depends on a setting."""
 
 
 class Calibrate:
@@ -144,8 +128,8 @@ class Calibrate:
                             for name in network.names}
         for i, name in enumerate(network.names):
             is_unchanged = previous is not None \
-                and _are_equal(previous.offset[i], network.offset[i]) \
-                and _are_equal(previous.correction[i], network.correction[i])
+                and are_equal(previous.offset[i], network.offset[i]) \
+                and are_equal(previous.correction[i], network.correction[i])
             shift = int(self._sensors[i]['clock_offset_ns'] - network.clock_offset_ns[i])
             if previous is not None and (not is_unchanged or shift):
                 self._restoration.forget(name)
@@ -269,7 +253,7 @@ class Calibrate:
             are none.
         """
         rows = readings.rows(self._index)
-        validity, covariances = _own_covariances(readings)
+        validity, covariances = own_covariances(readings)
         stamps, fields = plain(readings.stamp_ns, np.int64), plain(readings.field)
         self.timestamps.add(rows, stamps - self._network.clock_offset_ns[rows], fields)
         out, batch = self._new_output(len(readings)), self._batches[0]
@@ -282,16 +266,14 @@ class Calibrate:
                 self.counts[f'rejected: unknown sensor {name}'] += 1
             else:
                 self._handle(reason, int(batch['row']), out)
-        return self._finish(out)
+        return out.finish(self.counts)
 
     def _new_output(self, n: int) -> OutputBuffer:
         """Reset the batch counters, and create a buffer for the output of `n` raw readings."""
         capacity = n + int(self._sensors['n_held'].sum())
         if self._settings.decimate_to_hz:
             capacity += sum(d.n_waiting for d in self._decimators.values())
-        for name in ('n_out', 'n_learning', 'n_partly_learning', 'n_overruled'):
-            self._batches[0][name] = 0
-        return OutputBuffer(self._network.names, capacity)
+        return OutputBuffer(self._network.names, capacity, self._batches[0])
 
     def _handle(self, reason: int, i: int, out: OutputBuffer) -> None:
         """Handle an event of sensor `i` that the compiled code has reported."""
@@ -338,12 +320,7 @@ class Calibrate:
         """Leave out the marks and repetitions of sensor `i` from now on."""
         s, self._rates[self._network.names[i]] = self._sensors[i], faults.rate
         self.counts[FAULTS_FOUND] += 1
-        s['n_marks'], s['marks'][:len(faults.marks)] = len(faults.marks), faults.marks
-        s['repetition'] = faults.repetition
-        # The steps, repetitions and differences so far are those of the faults.
-        s['step'] = np.inf
-        s['n_same'] = s['n_changed'] = s['n_rest'] = 0
-        s['repeats'] = s['changes'] = s['run'] = 0
+        leave_out(s, faults)
         self._reject_held(i, 'a fault of the driver was found')
 
     def faults_of(self, sensor: str) -> ReadingFaults:
@@ -409,16 +386,6 @@ class Calibrate:
             if self._background[name].ready:
                 self._comparison.update(i, self.background(name), int(s['first_ns']),
                                         int(s['last_ns']))
-
-    def _finish(self, out: OutputBuffer) -> list[Readings]:
-        """Count the calibrated readings of a batch and return them."""
-        batch = self._batches[0]
-        for key, name in (('calibrated', 'n_out'), ('held back while learning', 'n_learning'),
-                          ('axes held back while learning', 'n_partly_learning'),
-                          (OVERRULED, 'n_overruled')):
-            if batch[name]:
-                self.counts[key] += int(batch[name])
-        return out.readings(int(batch['n_out']))
 
     @property
     def n_held(self) -> int:
@@ -508,7 +475,7 @@ class Calibrate:
             self._calibrate_released(int(i), out)
         for s in self._sensors:
             clear_spikes(s)
-        return self._finish(out)
+        return out.finish(self.counts)
 
     def _reject(self, sensor: str, cause: tuple[Cause, str], n: int = 1) -> None:
         """Count `n` rejected readings of a sensor by cause and description."""
@@ -609,20 +576,3 @@ class Calibrate:
         dict of str to RunningBackground
         """
         return dict(self._background)
-
-
-def _own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
-    """Validity codes (NONE, VALID, INVALID) and covariances (n, 3, 3) [T²] of the readings.
-
-    If the readings have no covariances, all codes are NONE and the second array is empty.
-    """
-    if readings.covariance is None:
-        return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
-    C = plain(readings.covariance)
-    valid = np.where(are_valid_covariances(plain(readings.field), C), core.VALID, core.INVALID)
-    return np.where(readings.has_unknown_covariance(), core.NONE, valid), C
-
-
-def _are_equal(a: FloatArray | None, b: FloatArray | None) -> bool:
-    """Whether two arrays are equal; None equals only None."""
-    return a is b if a is None or b is None else np.array_equal(a, b)
