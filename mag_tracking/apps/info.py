@@ -44,7 +44,7 @@ class Timing:
         self.n_messages = self.n_backward = self.n_unstamped = 0
         self._log: list[int] = []
         self._times: list[int] = []
-        self._longest = self._longest_begin = 0
+        self._longest = self._longest_begin = self._n_steps = 0
         self._counts = np.zeros(_N_BINS, dtype=np.int64)
         self._sums = np.zeros(_N_BINS)
 
@@ -54,18 +54,22 @@ class Timing:
         Parameters
         ----------
         times_ns : (n,) int array, ns
-            Timestamps; log times of messages that have none. If all are 0, log times are used.
+            Timestamps. Zeros are omitted; if all are 0, log times are used.
         log_times_ns : (n,) int array, ns
         """
         if not len(times_ns):
             return
         self.n_messages += len(times_ns)
-        if not times_ns.any() and log_times_ns.any():
-            self.n_unstamped += len(times_ns)
+        is_missing = (times_ns == 0) & (log_times_ns != 0)
+        self.n_unstamped += int(is_missing.sum())
+        if is_missing.all():
             times_ns = log_times_ns
+        else:
+            times_ns, log_times_ns = times_ns[~is_missing], log_times_ns[~is_missing]
         steps = np.diff(np.concatenate((self._times[1:], times_ns)).astype(np.int64))
         for span, values in ((self._log, log_times_ns), (self._times, times_ns)):
             span[:] = [span[0] if span else int(values[0]), int(values[-1])]
+        self._n_steps += len(steps)
         self.n_backward += int(np.sum(steps < 0))
         if len(steps) and steps.max() > self._longest:
             self._longest = int(steps.max())
@@ -114,7 +118,7 @@ class Timing:
         n_bins = self._n_regular_bins()
         n, total = int(self._counts[:n_bins].sum()), float(self._sums[:n_bins].sum())
         # Messages with equal times belong to the same intervals.
-        n += self.n_messages - 1 - int(self._counts.sum()) - self.n_backward
+        n += self._n_steps - int(self._counts.sum()) - self.n_backward
         parts = [f'{n * NS / total:.4g} Hz'] if total else []
         n_gaps = int(self._counts[n_bins:].sum())
         if n_gaps:
@@ -123,8 +127,7 @@ class Timing:
         if self.n_backward:
             parts.append(f'time steps backward {occurrences(self.n_backward)}')
         if self.n_unstamped:
-            parts.append(f'by log times, because header.stamp is 0 in '
-                         f'{quantity(self.n_unstamped, "message")}')
+            parts.append(f'header.stamp is 0 in {quantity(self.n_unstamped, "message")}')
         return ', '.join(parts)
 
 
