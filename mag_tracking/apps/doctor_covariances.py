@@ -6,7 +6,7 @@ import numpy as np
 
 from mag_tracking.quantities import quantity
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.health.sensor_health import Finding
+from mag_tracking.stages.health.diagnosis import Cause, Finding
 
 MAX_MISMATCH = 3.0
 """Factor within which a likely cause must explain the ratio of declared to measured noise."""
@@ -65,7 +65,7 @@ def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator
             or np.abs(np.log(declared[is_valid] / measured[is_valid])).max() < np.log(2.0):
         yield Finding(False, name, f'the covariances on {topic} contradict the quiet readings '
                       '(not positive definite, not finite, or with errors correlated between axes)',
-                      advice)
+                      advice, Cause.WRONG_COVARIANCE)
         return
     log_ratio = np.full(3, -1.0)
     log_ratio[is_valid] = np.abs(np.log(declared[is_valid] / measured[is_valid]))
@@ -74,4 +74,4 @@ def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator
         False, name, f'the messages on {topic} state a noise of {1e9 * declared[axis]:.3g} nT, but '
         f'quiet readings have {1e9 * measured[axis]:.3g} nT '
         f'(likely cause: {likely_cause(float(declared[axis]), float(measured[axis]))})',
-        advice)
+        advice, Cause.WRONG_COVARIANCE)

@@ -1,86 +1,85 @@
-"""Causes of rejected readings, with the advice of `mag-tracking doctor` for each cause."""
+"""Findings about rejected readings."""
 
-import enum
+from collections.abc import Iterator
 
-from mag_tracking.calibration import core
-from mag_tracking.stages.calibrate.stage import CAUSES
+from mag_tracking.arrays import FloatArray
+from mag_tracking.quantities import quantity
+from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.health.diagnosis import Cause, Finding
 
-
-class RejectionCause(enum.IntEnum):
-    """Reason why the `Calibrate` stage rejects a reading."""
-
-    UNKNOWN_SENSOR = core.UNKNOWN_SENSOR
-    NO_AXIS = core.NO_AXIS
-    INFINITE = core.INFINITE
-    TOO_LARGE = core.TOO_LARGE
-    BAD_COVARIANCE = core.BAD_COVARIANCE
-    AXIS_MISSING = core.AXIS_MISSING
-    TOO_FAR_AHEAD = core.TOO_FAR_AHEAD
-    DUPLICATE = core.DUPLICATE
-    OUT_OF_ORDER = core.OUT_OF_ORDER
-    STUCK = core.STUCK
-    SPIKES = core.SPIKES
-
+MIN_SERIOUS = 100
+"""Number of readings rejected for one cause above which results are assumed to be wrong."""
 
 ADVICE = {
-    RejectionCause.UNKNOWN_SENSOR: 'add the sensor to the network file',
-    RejectionCause.NO_AXIS: 'check the sensor and its driver',
-    RejectionCause.INFINITE: 'check the driver',
-    RejectionCause.TOO_LARGE: 'check for gauss or microtesla published as tesla; near a magnet, '
-                              'raise calibrate.max_field',
-    RejectionCause.BAD_COVARIANCE: 'publish a covariance of zeros if the noise is unknown',
-    RejectionCause.AXIS_MISSING: 'check the sensor and its driver, or remove the correction from '
-                                 'the network file',
-    RejectionCause.TOO_FAR_AHEAD: 'check for a clock step or corrupt messages',
-    RejectionCause.DUPLICATE: 'check whether the driver publishes readings twice, or with '
-                              'timestamps that are too coarse',
-    RejectionCause.OUT_OF_ORDER: 'check for two publishers on one topic, and for a clock step',
-    RejectionCause.STUCK: 'the sensor or its driver is stuck: restart it; for simulated sensors '
-                          'without noise, set calibrate.reject_stuck to false',
-    RejectionCause.SPIKES: 'check connectors, power supply and checksums; if the targets are fast, '
-                           'raise calibrate.spike_std'}
-"""Advice for each cause."""
-
-_CAUSE_OF_DESCRIPTION = {text: RejectionCause(reason) for reason, text in CAUSES.items()}
-
-_CAUSE_OF_PREFIX = {
-    'unknown sensor ': RejectionCause.UNKNOWN_SENSOR,
-    'above ': RejectionCause.TOO_LARGE,
-    'spike': RejectionCause.SPIKES,
-    'possible spike when ': RejectionCause.SPIKES}
-"""Causes whose description contains a variable part: {start of the description: cause}."""
+    Cause.NO_AXIS: 'check the sensor and its driver',
+    Cause.INFINITE: 'check the driver',
+    Cause.TOO_LARGE: 'check for gauss or microtesla published as tesla; near a magnet, raise '
+                     'calibrate.max_field',
+    Cause.WRONG_COVARIANCE: 'publish a covariance of zeros if the noise is unknown',
+    Cause.MISSING_AXIS: 'check the sensor and its driver, or remove the correction from the '
+                        'network file',
+    Cause.TOO_FAR_AHEAD: 'check for a clock step or corrupt messages',
+    Cause.DUPLICATE_STAMPS: 'check whether the driver publishes readings twice, or with timestamps '
+                            'that are too coarse',
+    Cause.BACKWARD_STAMPS: 'check for two publishers on one topic, and for a clock step',
+    Cause.STUCK: 'the sensor or its driver is stuck: restart it; for simulated sensors without '
+                 'noise, set calibrate.reject_stuck to false',
+    Cause.SPIKES: 'check connectors, power supply and checksums; if the targets are fast, raise '
+                  'calibrate.spike_std'}
+"""Advice for each cause of rejection by the stage Calibrate, except those of `driver_findings`."""
 
 
-def rejection_cause(description: str) -> RejectionCause | None:
-    """Identify a cause by its description in the counts of the stage Calibrate.
+def rejection_findings(name: str, calibrate: Calibrate) -> Iterator[Finding]:
+    """Report the rejected readings of one sensor.
 
     Parameters
     ----------
-    description : str
-        Key of the result of `stages.stage.rejected`.
+    name : str
+        Sensor.
+    calibrate : Calibrate
 
-    Returns
-    -------
-    RejectionCause or None
-        None if the description is unknown.
+    Yields
+    ------
+    Finding
     """
-    if description in _CAUSE_OF_DESCRIPTION:
-        return _CAUSE_OF_DESCRIPTION[description]
-    return next((cause for prefix, cause in _CAUSE_OF_PREFIX.items()
-                 if description.startswith(prefix)), None)
+    for (cause, description), n in calibrate.rejections_of(name).items():
+        if cause in ADVICE:
+            yield Finding(n > MIN_SERIOUS, name,
+                          f'{quantity(n, "reading")} rejected: {description}', ADVICE[cause], cause)
 
 
-def rejection_advice(description: str) -> str:
-    """Return the advice for a cause of rejection, given its description.
+def driver_findings(name: str, calibrate: Calibrate) -> Iterator[Finding]:
+    """Report the marks and the repeated readings of one sensor that were left out.
 
     Parameters
     ----------
-    description : str
-        Key of the result of `stages.stage.rejected`.
+    name : str
+        Sensor.
+    calibrate : Calibrate
 
-    Returns
-    -------
-    str
+    Yields
+    ------
+    Finding
     """
-    cause = rejection_cause(description)
-    return 'check the driver' if cause is None else ADVICE[cause]
+    faults = calibrate.faults_of(name)
+    if len(faults.marks):
+        n = calibrate.n_marked(name)
+        yield Finding(False, name, f'{quantity(n, "reading has", "readings have")} the value '
+                      f'{" or ".join(map(_describe_mark, faults.marks))}: a mark for a missing '
+                      'reading', 'these values are left out; let the driver publish NaN, or no '
+                      'message, if it has no reading', Cause.NO_READING_MARK)
+    if faults.repetition > 1.0:
+        yield Finding(False, name, f'each reading is repeated {faults.repetition:.3g} times: the '
+                      f'sensor measures at {faults.rate / faults.repetition:.3g} Hz, but is '
+                      f'published at {faults.rate:.3g} Hz', 'the repetitions are left out; let the '
+                      'driver publish each measurement once', Cause.REPEATED)
+
+
+def _describe_mark(mark: FloatArray) -> str:
+    """Format a mark, with the names of the axes unless it concerns all of them."""
+    axes = [f'{axis} = ' for axis in 'xyz']
+    values = [(axis, v) for axis, v in zip(axes, mark.tolist(), strict=True) if v == v]
+    if len(values) == 3 and len({v for _, v in values}) == 1:
+        values = [('', values[0][1])]
+    return ', '.join(axis + (f'{1e9 * v:.6g} nT' if abs(v) < 1.0 else f'{v:.6g} T')
+                     for axis, v in values)

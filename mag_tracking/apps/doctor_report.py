@@ -11,16 +11,17 @@ from mag_tracking.quantities import quantity
 from mag_tracking.report.page import ERROR, NOTE, Chart, Note, Page, Table, report_html
 from mag_tracking.report.page_charts import axes, escape_markup
 from mag_tracking.report.palette import AXIS_COLOURS
-from mag_tracking.stages.health.sensor_health import Finding
+from mag_tracking.stages.health.diagnosis import Diagnosis
 
 
-def write_report(doctor: Doctor, findings: Sequence[Finding], subject: str, path: Path) -> None:
-    """Write the report of the findings.
+def write_report(doctor: Doctor, diagnoses: Sequence[Diagnosis], subject: str,
+                 path: Path) -> None:
+    """Write the report of the diagnoses.
 
     Parameters
     ----------
     doctor : Doctor
-    findings : sequence of Finding
+    diagnoses : sequence of Diagnosis
     subject : str
         Name of the examined recording or network.
     path : Path
@@ -31,16 +32,16 @@ def write_report(doctor: Doctor, findings: Sequence[Finding], subject: str, path
     OutputError
         If the file cannot be written.
     """
-    replace_text(path, report_html(doctor_page(doctor, findings, subject)))
+    replace_text(path, report_html(doctor_page(doctor, diagnoses, subject)))
 
 
-def doctor_page(doctor: Doctor, findings: Sequence[Finding], subject: str) -> Page:
-    """Create the page with findings, noise and sample rates.
+def doctor_page(doctor: Doctor, diagnoses: Sequence[Diagnosis], subject: str) -> Page:
+    """Create the page with diagnoses, noise and sample rates.
 
     Parameters
     ----------
     doctor : Doctor
-    findings : sequence of Finding
+    diagnoses : sequence of Diagnosis
     subject : str
         Name of the examined recording or network.
 
@@ -48,11 +49,11 @@ def doctor_page(doctor: Doctor, findings: Sequence[Finding], subject: str) -> Pa
     -------
     Page
     """
-    notes = [Note(ERROR if f.serious else NOTE, str(f))
-             for f in findings] or [Note(NOTE, 'no faults found')]
-    n_serious = sum(f.serious for f in findings)
+    notes = [Note(ERROR if d.serious else NOTE, str(d))
+             for d in diagnoses] or [Note(NOTE, 'no faults found')]
+    n_serious = sum(d.serious for d in diagnoses)
     numbers = (f'{quantity(n_serious, "serious finding")}, '
-               f'{quantity(len(findings) - n_serious, "note")}')
+               f'{quantity(len(diagnoses) - n_serious, "note")}')
     return Page(f'Health of {subject}', numbers, notes, None, [_noise(doctor), _rates(doctor)],
                 [_table(doctor)])
 

@@ -8,7 +8,8 @@ import numpy as np
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.saturation import saturated_readings
+from mag_tracking.calibration.doubtful_times import DOUBTFUL_BACKGROUND, are_doubtful
+from mag_tracking.calibration.saturation import saturated_readings, with_margin
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import Detection, FieldFrame, Readings
@@ -16,10 +17,13 @@ from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.stage import rejected
+from mag_tracking.stages.track.doubts import MEANINGS
 from mag_tracking.units import NS
 
 PAD_S = 1.0
 """Duration of the background included before the onset of a detection [s]."""
+MAX_PLATEAU_S = 0.5
+"""Maximum time for which a target that passes saturates a sensor [s]."""
 MAX_PASS_S = 60.0
 """Maximum duration of a pass; a longer detection is truncated [s]."""
 
@@ -41,8 +45,8 @@ class PassCollector:
                  on_frame: Callable[[FieldFrame], object] | None = None) -> None:
         self._network, self._settings, self._on_frame = network, settings, on_frame
         self._max_field = settings.calibrate.max_field
-        self._stages = (Calibrate(network, settings.calibrate), Align(network, settings.align),
-                        Detect(network, settings.detect))
+        self._stages = (Calibrate(network, settings.calibrate, survey=settings.survey),
+                        Align(network, settings.align), Detect(network, settings.detect))
         # Raw and calibrated readings, in network time, from `PAD_S` before the onset or, without a
         # detection, before the latest frame.
         self._raw: deque[Readings] = deque()
@@ -172,16 +176,32 @@ class PassCollector:
             rows = np.flatnonzero(sensor == j)
             if readings.covariance is not None:
                 covariance[rows] = _common_covariance(readings.covariance[rows])
-            for a, axis in enumerate('xyz'):
-                saturated = rows[saturated_readings(raw[rows, a])]
-                if len(saturated):
-                    field[saturated, a] = np.nan
-                    notes.append(f'{self._network.names[j]}: {axis} was saturated in '
-                                 f'{len(saturated)} of {len(rows)} samples at '
-                                 f'{raw[saturated[0], a]:.3g} T; these values are not used')
+            interval_s = float(np.median(np.diff(readings.stamp_ns[rows]))) / NS \
+                if len(rows) > 1 else np.inf
+            raw[rows] = np.where(np.isnan(field[rows]), np.nan, raw[rows])
+            is_saturated = saturated_readings(raw[rows], MAX_PLATEAU_S / interval_s)
+            field[rows] = np.where(with_margin(is_saturated), np.nan, field[rows])
+            for a, saturated in enumerate(is_saturated.T):
+                if saturated.any():
+                    notes.append(f'{self._network.names[j]}: {"xyz"[a]} was saturated in '
+                                 f'{saturated.sum()} of {len(rows)} samples at '
+                                 f'{raw[rows[saturated][0], a]:.3g} T; these values and the '
+                                 'adjacent ones are not used')
         self._onset_ns = None
         t = (readings.stamp_ns - begin) / NS
-        return PassData(self._network, begin, t, sensor, field, covariance), tuple(notes)
+        return PassData(self._network, begin, t, sensor, field, covariance,
+                        doubt=self._doubt_at(onset_ns)), tuple(notes)
+
+    def _doubt_at(self, stamp_ns: int) -> str:
+        """Reason why the readings of a sensor are wrong at a time; empty if none is known.
+
+        A doubtful background is no reason, because the background of a fit is free.
+        """
+        for reason, by_sensor in self.calibrate.input_doubts().items():
+            names = [name for name, times in by_sensor.items() if are_doubtful(times, stamp_ns)]
+            if names and reason != DOUBTFUL_BACKGROUND:
+                return f'{", ".join(names)}: {MEANINGS[reason]}'
+        return ''
 
     def _raw_fields(self, calibrated: Readings) -> FloatArray:
         """Raw fields (n, 3) [T] of calibrated readings; NaN if the raw reading is unavailable."""

@@ -2,10 +2,13 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.quiet_level import BlockRecorder
+from mag_tracking.calibration.reading_faults import ReadingFaults
+from mag_tracking.calibration.sensor_state import N_WINDOW
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
@@ -28,15 +31,22 @@ N_READINGS_AT_ONCE = 8
 """Number of readings per batch while the initial background is learnt."""
 
 
+N_BEGINNING = N_WINDOW + 1
+"""Number of readings per sensor in which faults of the drivers are searched before the
+backgrounds."""
+
+
 @dataclass(frozen=True)
 class Prescan:
-    """Backgrounds and resolutions found by a first pass over a recording."""
+    """Backgrounds, resolutions and faults of drivers found by a first pass over a recording."""
 
     levels: dict[str, MostFrequentLevel]
     """{sensor: most frequent level}; empty if no target is present at the start of the
     recording."""
     steps: dict[str, FloatArray]
     """{sensor: (3,) smallest change of each axis, T}."""
+    faults: dict[str, ReadingFaults]
+    """{sensor: faults of the driver}."""
 
     def segment_of(self, sensor: str) -> list[float] | None:
         """Return the interval in which the background level of a sensor was observed.
@@ -54,13 +64,13 @@ class Prescan:
         return None if level is None else [level.begin, level.end]
 
     def apply(self, calibrate: Calibrate) -> None:
-        """Initialise the calibration stage with the backgrounds and resolutions.
+        """Initialise the calibration stage with the results.
 
         Parameters
         ----------
         calibrate : Calibrate
         """
-        calibrate.start_from(self.levels, self.steps)
+        calibrate.start_from(self.levels, self.steps, self.faults)
 
 
 def prescan(batches: Iterable[Readings], network: SensorNetwork,
@@ -77,16 +87,22 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
     Returns
     -------
     Prescan
-        Empty if the network file contains all backgrounds, or `look_ahead_s` is 0.
+        Only the faults if the network file contains all backgrounds; empty if `look_ahead_s` is 0.
     """
     without_background = [name for name, level in zip(network.names, network.background,
                                                       strict=True) if level is None]
-    if not without_background or not settings.look_ahead_s:
-        return Prescan({}, {})
+    if not settings.look_ahead_s:
+        return Prescan({}, {}, {})
+    batches = iter(batches)
+    beginning, faults = _beginning(batches, network, settings)
+    if not without_background:
+        return Prescan({}, {}, faults)
     recorder, learner = Calibrate(network, settings, BlockRecorder), Calibrate(network, settings)
+    for stage in (recorder, learner):
+        stage.start_from({}, {}, faults)
     first_ns: dict[str, int] = {}
     learnt: dict[str, tuple[float, FloatArray]] = {}
-    for readings in batches:
+    for readings in chain(beginning, batches):
         recorder.feed(readings)
         _learn(learner, readings, first_ns, learnt)
         start_ns = min(first_ns.values(), default=0)
@@ -106,7 +122,19 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
                 and _begins_quietly(learnt.get(name), level, background, settings)
     # The field of a target that one sensor detects at the start may be part of the backgrounds of
     # all sensors.
-    return Prescan({} if is_quiet else levels, steps)
+    return Prescan({} if is_quiet else levels, steps,
+                   {name: recorder.faults_of(name) for name in network.names})
+
+
+def _beginning(batches: Iterator[Readings], network: SensorNetwork, settings: CalibrateSettings
+               ) -> tuple[list[Readings], dict[str, ReadingFaults]]:
+    """First batches, and the faults of the drivers that are visible in them."""
+    stage, beginning, n = Calibrate(network, settings), [], 0
+    while n < N_BEGINNING * len(network) and (readings := next(batches, None)) is not None:
+        stage.feed(readings)
+        beginning.append(readings)
+        n += len(readings)
+    return beginning, {name: stage.faults_of(name) for name in network.names}
 
 
 def _level_of(recorder: BlockRecorder, departed_at: float | None,

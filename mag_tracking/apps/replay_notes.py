@@ -1,14 +1,69 @@
-"""Notes on a replay: warnings, limitations and disturbances."""
+"""Notes on a replay: diagnoses, limitations and disturbances."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from mag_tracking.apps.input_findings import input_findings
+from mag_tracking.physics import bounds
+from mag_tracking.pipeline import Pipeline
 from mag_tracking.quantities import quantity
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.report.page import NOTE, WARNING, Note
+from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding
+from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.evidence import LOST
 from mag_tracking.stages.track.manager import NO_SCALE, NO_SCALE_FRAMES, UNCERTAIN_ORIENTATIONS
 from mag_tracking.stages.track.smoothing import NOT_SMOOTHED
 from mag_tracking.units import NS
+
+
+def replay_findings(recording: Recording, reader: SampleReader, pipeline: Pipeline,
+                    no_detection_reason: str | None) -> list[Finding]:
+    """Findings about the input of a replay and the stages, without ranking.
+
+    Parameters
+    ----------
+    recording : Recording
+    reader : SampleReader
+        Reader at the end of the recording.
+    pipeline : Pipeline
+        Pipeline after the whole recording has been processed.
+    no_detection_reason : str or None
+        Reason why nothing was detected.
+
+    Returns
+    -------
+    list of Finding
+    """
+    found = input_findings(recording, reader, pipeline.network, pipeline.calibrate,
+                           pipeline.settings.track)
+    for stage, counts in pipeline.counts().items():
+        if stage != 'calibrate' and (causes := rejected(counts)):
+            found.append(Finding(False, stage, ', '.join(
+                f'{cause}: {n}' for cause, n in causes.items()), 'run mag-tracking doctor',
+                Cause.REJECTED))
+    if no_detection_reason:
+        found.append(Finding(False, 'detect', 'nothing was detected with the settings for a '
+                             f'{pipeline.settings.track.target}: {no_detection_reason}',
+                             'run mag-tracking doctor', Cause.NO_DETECTION))
+    return found
+
+
+def diagnosis_entries(diagnoses: Iterable[Diagnosis]) -> list[dict[str, Any]]:
+    """Entries of diagnoses in `summary.json`.
+
+    Parameters
+    ----------
+    diagnoses : iterable of Diagnosis
+
+    Returns
+    -------
+    list of dict
+        Cause, whether it is serious, and the text.
+    """
+    return [{'cause': d.finding.cause.value, 'serious': d.serious, 'text': str(d)}
+            for d in diagnoses]
 
 
 def notes_of(summary: Mapping[str, Any]) -> list[Note]:
@@ -28,25 +83,10 @@ def notes_of(summary: Mapping[str, Any]) -> list[Note]:
 
 
 def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
-    """Notes on missing topics and detections, rejected readings, and missing backgrounds."""
-    sensors = summary['sensors']
-    for topic in summary['missing_topics']:
-        yield Note(WARNING, f'no messages on {topic}')
-    if summary['no_detection_reason']:
-        yield Note(NOTE, f'nothing was detected with the settings for a {summary["target"]}: '
-                   f'{summary["no_detection_reason"]}')
-    for cause, n in {**summary['rejected'], **summary['lost']}.items():
-        yield Note(WARNING, f'{cause}: {n}')
-    stuck = [name for name, s in sensors.items() if s['stuck']]
-    if stuck:
-        yield Note(WARNING, f'{", ".join(stuck)}: the readings of an axis are constant '
-                   '(run mag-tracking doctor)')
-    unready_sensors = [name for name, s in sensors.items() if not s['ready'] and not s['stuck']]
-    if unready_sensors:
-        yield Note(WARNING, f'no background was learnt for {", ".join(unready_sensors)}: the '
-                   'quiet intervals are too short; set background and noise_std in the network '
-                   'file')
-    for name, s in sensors.items():
+    """Notes on the diagnoses and the initial backgrounds."""
+    for diagnosis in summary['diagnoses']:
+        yield Note(WARNING if diagnosis['serious'] else NOTE, diagnosis['text'])
+    for name, s in summary['sensors'].items():
         if s['quiet_stretch_s'] is not None:
             begin, end = s['quiet_stretch_s']
             yield Note(NOTE, f'a target is present at the start: the most frequent level of '
@@ -86,6 +126,8 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(NOTE, 'all sensors are within two metres: range and moment are poorly '
                    'observable, and all tracks are ambiguous; use the speed and direction from the '
                    'delays between the sensors')
+    if summary['lanes'] and summary['target'] == 'vehicle' and counts.get('tracks', 0):
+        yield Note(NOTE, summary['lanes'])
     if summary['frames_too_long']:
         yield Note(WARNING, summary['frames_too_long'])
     if summary['clocks_apart']:
@@ -95,6 +137,9 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(WARNING, quantity(n_lost, 'track lost its target', 'tracks lost their target')
                    + ': check the orientations in the network file; other possible causes are '
                    'simultaneous targets, or a kind of target that the settings do not include')
+    for reason in bounds.REASONS:
+        if n := counts.get(f'tracks ended: {reason}', 0):
+            yield Note(WARNING, f'{quantity(n, "track")} ended: {reason}; {bounds.ADVICE}')
     n_uncertain = counts.get(UNCERTAIN_ORIENTATIONS, 0)
     if n_uncertain:
         yield Note(WARNING, quantity(n_uncertain, 'sensor has', 'sensors have')

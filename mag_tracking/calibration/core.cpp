@@ -11,8 +11,9 @@ using Structured = py::array;
 
 // Python may have changed the values that are used as indices.
 Sensor& checked(Sensor& s) {
-    if (s.now < 0 || s.now > 1 || s.n_held < 0 || s.n_held > MAX_HELD + 1 || s.n_steps < 0)
-        throw py::value_error("now, n_held or n_steps of a sensor is out of range");
+    if (s.now < 0 || s.now > 1 || s.n_held < 0 || s.n_held > MAX_HELD + 1 || s.n_steps < 0
+        || s.n_window < 0 || s.n_marks < 0 || s.n_marks > MAX_MARKS)
+        throw py::value_error("now, n_held, n_steps, n_window or n_marks of a sensor is out of range");
     return s;
 }
 
@@ -103,6 +104,8 @@ py::object pooled_covariance(Array scatter, Array n) {
 void add_constants(py::module_& m) {
     m.attr("N_RECENT") = N_RECENT;
     m.attr("MAX_HELD") = MAX_HELD;
+    m.attr("N_WINDOW") = N_WINDOW;
+    m.attr("MAX_MARKS") = MAX_MARKS;
     m.attr("COARSE_FRACTION") = COARSE_FRACTION;
     m.attr("MIN_CHANGES") = MIN_CHANGES;
     m.attr("MAX_ROUNDING") = MAX_ROUNDING;
@@ -113,7 +116,8 @@ void add_constants(py::module_& m) {
 #define CODE(name) m.attr(#name) = int(name)
     CODE(DONE), CODE(UNKNOWN_SENSOR), CODE(NO_AXIS), CODE(INFINITE), CODE(TOO_LARGE);
     CODE(BAD_COVARIANCE), CODE(AXIS_MISSING), CODE(TOO_FAR_AHEAD), CODE(DUPLICATE);
-    CODE(OUT_OF_ORDER), CODE(STUCK), CODE(BLOCK_COMPLETE), CODE(JUMPED_BACK), CODE(RESTORABLE);
+    CODE(OUT_OF_ORDER), CODE(STUCK), CODE(MARKED), CODE(REPEATED), CODE(BLOCK_COMPLETE);
+    CODE(WINDOW_COMPLETE), CODE(JUMPED_BACK), CODE(RESTORABLE);
     CODE(SPIKES), CODE(PASSED), CODE(NONE), CODE(VALID), CODE(INVALID);
     CODE(PASSES), CODE(HELD), CODE(SPIKE), CODE(RELEASED);
 #undef CODE
@@ -124,7 +128,9 @@ void add_types(py::module_& m) {
     PYBIND11_NUMPY_DTYPE(
         Sensor, clock_offset_ns, offset, has_correction, correction, is_ready, centre, mean, slope,
         horizon, noise, noise_std, level_variance, first_ns, last_ns, unconfirmed_ns, is_restorable,
-        accepted, last, run, repeats, changes, raw, rest_since_ns, n_rest, n_same, n_changed, step,
+        accepted, window, n_window, window_begin_ns, window_due,
+        is_examined, n_marks, marks, n_partly_marked, repetition, latest,
+        last, run, repeats, changes, raw, rest_since_ns, n_rest, n_same, n_changed, step,
         step_variance, n_averaged, stated_std, n_overruled, before_ns, before, n_steps, steps,
         n_held, n_released, held_ns, held_field, held_steps, held_own, held_covariance, length,
         phase, end, now, is_full, n, time, origin, count, sum, product);

@@ -16,6 +16,8 @@ BATCH: np.dtype[Any]
 
 N_RECENT: int
 MAX_HELD: int
+N_WINDOW: int
+MAX_MARKS: int
 COARSE_FRACTION: float
 MIN_CHANGES: float
 MAX_ROUNDING: float
@@ -35,9 +37,12 @@ TOO_FAR_AHEAD: int
 DUPLICATE: int
 OUT_OF_ORDER: int
 STUCK: int
+MARKED: int
+REPEATED: int
 BLOCK_COMPLETE: int
 JUMPED_BACK: int
 RESTORABLE: int
+WINDOW_COMPLETE: int
 SPIKES: int
 PASSED: int
 

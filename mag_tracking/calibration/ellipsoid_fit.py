@@ -13,7 +13,7 @@ import numpy as np
 from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.calibration.ellipsoid_refinement import BASIS, Quality, refine_ellipsoid
 from mag_tracking.calibration.quadric import POSSIBLE_CAUSES, fit_quadric
-from mag_tracking.calibration.saturation import saturated_readings
+from mag_tracking.calibration.saturation import saturated_readings, with_margin
 
 MIN_READINGS = 50
 """Minimum number of readings."""
@@ -185,8 +185,7 @@ def fit_ellipsoid(readings: FloatArray, field_magnitude: float | None = None) ->
     """
     readings = _validated(readings, field_magnitude)
     present: BoolArray = ~np.any(np.isnan(readings), axis=1)
-    is_saturated = np.stack([saturated_readings(axis) for axis in readings.T], axis=1) \
-        & present[:, None]
+    is_saturated = with_margin(saturated_readings(readings)) & present[:, None]
     valid = readings[present & ~is_saturated.any(axis=1)]
     glitches = _glitches(valid)
     valid = valid[~glitches]

@@ -19,9 +19,9 @@ namespace mag_tracking {
 enum Reason {
     // The batch is finished, or the reading is rejected.
     DONE, UNKNOWN_SENSOR, NO_AXIS, INFINITE, TOO_LARGE, BAD_COVARIANCE, AXIS_MISSING, TOO_FAR_AHEAD,
-    DUPLICATE, OUT_OF_ORDER, STUCK,
+    DUPLICATE, OUT_OF_ORDER, STUCK, MARKED, REPEATED,
     // To be handled before the same reading is processed again.
-    BLOCK_COMPLETE = 20, JUMPED_BACK, RESTORABLE,
+    BLOCK_COMPLETE = 20, JUMPED_BACK, RESTORABLE, WINDOW_COMPLETE,
     // The previous `n_spikes` readings are rejected, or the `n_released` held readings are to be
     // used.
     SPIKES = 30, PASSED
@@ -67,6 +67,40 @@ struct Calibrated {
     int64_t *rows, *stamps;
     double *fields, *covariances;
 };
+
+// Copies a raw reading `in` (3) to `raw`, with NaN for the axes that have a mark for a missing
+// reading. Returns the number of these axes.
+inline int remove_marks(const Sensor& s, const double* in, double* raw) {
+    int n = 0;
+    for (int a = 0; a < 3; ++a) raw[a] = in[a];
+    for (int64_t k = 0; k < s.n_marks; ++k) {
+        const auto& mark = s.marks[k];
+        bool is_marked = true;
+        for (int a = 0; a < 3; ++a) is_marked &= std::isnan(mark[a]) || in[a] == mark[a];
+        for (int a = 0; is_marked && a < 3; ++a)
+            if (!std::isnan(mark[a]) && !std::isnan(raw[a])) raw[a] = NAN, ++n;
+    }
+    return n;
+}
+
+// Adds a raw reading to the window. Readings with a repeated timestamp are published twice and do not
+// show how often the sensor measures.
+inline void note_raw(Sensor& s, int64_t stamp, const double* raw, bool is_duplicate) {
+    if (is_duplicate || s.n_window >= N_WINDOW) return;
+    if (s.n_window == 0) s.window_begin_ns = stamp;
+    for (int a = 0; a < 3; ++a) s.window[s.n_window][a] = raw[a];
+    ++s.n_window;
+}
+
+// Whether a raw reading equals the latest one of a sensor that is read faster than it measures.
+inline bool is_repeated(Sensor& s, const double* raw) {
+    bool is_same = s.repetition > 1.0;
+    for (int a = 0; a < 3; ++a) {
+        is_same &= raw[a] == s.latest[a] || (std::isnan(raw[a]) && std::isnan(s.latest[a]));
+        s.latest[a] = raw[a];
+    }
+    return is_same;
+}
 
 // Reason for the rejection of a raw reading, or DONE.
 inline Reason field_fault(const Limits& limits, const double* raw, int64_t own) {
@@ -125,16 +159,21 @@ inline Reason timestamp_fault(Sensor& s, const Limits& limits, int64_t stamp) {
     return DONE;
 }
 
-// Reason for the rejection or delay of a reading, or DONE. Writes the reading, corrected for iron,
-// to `field`.
-inline Reason check(Sensor& s, const Limits& limits, int64_t stamp, const double* raw, int64_t own,
-                    double* field) {
+// Reason for the rejection or delay of a reading `in` (3), or DONE. Writes the raw reading without
+// marks to `raw`, and the reading, corrected for iron, to `field`.
+inline Reason check(Sensor& s, const Limits& limits, int64_t stamp, const double* in, int64_t own,
+                    double* raw, double* field) {
     if (s.is_full) return BLOCK_COMPLETE;
+    if (s.n_window >= s.window_due) return WINDOW_COMPLETE;
+    const int n_marked = remove_marks(s, in, raw);
     Reason reason = field_fault(limits, raw, own);
+    if (reason == NO_AXIS && n_marked) return MARKED;
     if (reason != DONE) return reason;
     if (!remove_iron(s, raw, field)) return AXIS_MISSING;
     reason = timestamp_fault(s, limits, stamp);
     if (reason != DONE) return reason;
+    s.n_partly_marked += n_marked > 0;
+    if (is_repeated(s, raw)) return REPEATED;
     return limits.reject_stuck && is_stuck(s, field) ? STUCK : DONE;
 }
 
@@ -238,20 +277,22 @@ inline void correct_covariance(const Sensor& s, const double* C, double* out) {
 // Calibrate readings from `next` on, until the batch is finished or Python is required.
 inline Reason calibrate(Sensor* sensors, const Limits& limits, const RawReadings& in, Batch& batch,
                         const Calibrated& out) {
-    double field[3], C[9];
+    double raw[3], field[3], C[9];
     while (batch.next < in.n) {
         const int64_t i = batch.next++, row = batch.row = in.rows[i];
         if (row < 0) return UNKNOWN_SENSOR;
         Sensor& s = sensors[row];
         const int64_t stamp = batch.stamp_ns = in.stamps[i] - s.clock_offset_ns;
-        const Reason reason = check(s, limits, stamp, in.fields + 3 * i, in.own[i], field);
+        const bool is_duplicate = stamp == s.last_ns;
+        const Reason reason = check(s, limits, stamp, in.fields + 3 * i, in.own[i], raw, field);
         if (reason >= BLOCK_COMPLETE) batch.next = i;
+        else note_raw(s, stamp, in.fields + 3 * i, is_duplicate);
         if (reason != DONE) return reason;
         if (in.own[i]) correct_covariance(s, in.covariances + 9 * i, C);
         const Reading reading{stamp, field, in.own[i], C};
         const Verdict verdict = screen(s, limits, batch, reading);
         // Spikes do not update the steps of the sensor.
-        if (verdict == PASSES || verdict == RELEASED) note_step(s, stamp, in.fields + 3 * i);
+        if (verdict == PASSES || verdict == RELEASED) note_step(s, stamp, raw);
         if (verdict == PASSES) {
             ++s.accepted;
             if (!limits.is_decimated && use(s, limits, batch, row, reading, out)) {

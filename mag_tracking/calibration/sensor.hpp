@@ -12,6 +12,10 @@ namespace mag_tracking {
 constexpr int N_RECENT = 8;
 // Maximum number of readings of a spike; a longer change is a step.
 constexpr int MAX_HELD = 3;
+// Number of raw readings in which faults of the driver are searched.
+constexpr int N_WINDOW = 512;
+// Maximum number of values that mark a missing reading.
+constexpr int MAX_MARKS = 4;
 
 struct Sensor {
     // From the network file: clock offset, hard iron, soft iron.
@@ -27,6 +31,15 @@ struct Sensor {
     // First and latest timestamp; a timestamp that is too far ahead and not yet confirmed; whether
     // a stored background may be restored at the next reading.
     int64_t first_ns, last_ns, unconfirmed_ns, is_restorable, accepted;
+    // Faults of the driver, found in the latest raw readings when their number is `window_due` (`is_examined`
+    // if this has happened with a whole window): marks
+    // for missing readings (NaN: any value of the axis), the number of readings of which some axes
+    // had a mark, and the number of readings per measurement.
+    double window[N_WINDOW][3];
+    int64_t n_window, window_begin_ns, window_due, is_examined, n_marks;
+    double marks[MAX_MARKS][3];
+    int64_t n_partly_marked;
+    double repetition, latest[3];
     // Repetition: the latest reading, the length of the current run of equal readings, and the
     // numbers of readings that were equal to the previous reading, or differed.
     double last[3];

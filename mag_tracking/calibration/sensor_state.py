@@ -14,6 +14,11 @@ N_RECENT = core.N_RECENT
 MAX_HELD = core.MAX_HELD
 """Maximum number of readings of a spike; a longer change is a step."""
 
+N_WINDOW = core.N_WINDOW
+"""Number of raw readings in which faults of the driver are searched."""
+FIRST_WINDOW = 128
+"""Number of raw readings after which the first search takes place; it doubles up to `N_WINDOW`."""
+
 SENSOR = core.SENSOR
 """Data type of the state of one sensor, defined in `sensor.hpp`. Values are in [T] and [s], or in
 [ns] if the name ends with `_ns`."""
@@ -34,7 +39,8 @@ def new_sensors(n: int) -> StructArray:
     sensors = np.zeros(n, SENSOR)
     for name in ('first_ns', 'last_ns', 'unconfirmed_ns', 'before_ns'):
         sensors[name] = NEVER
-    for name in ('last', 'before', 'end', 'noise_std', 'noise', 'raw', 'stated_std'):
+    for name in ('last', 'before', 'end', 'noise_std', 'noise', 'raw', 'stated_std', 'latest'):
         sensors[name] = np.nan
     sensors['step'], sensors['n_averaged'] = np.inf, 1.0
+    sensors['window_due'], sensors['repetition'] = FIRST_WINDOW, 1.0
     return sensors

@@ -21,7 +21,8 @@ from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.recording.reader import Recording
-from mag_tracking.stages.health.sensor_health import Finding, SensorHealth
+from mag_tracking.stages.health.diagnosis import Finding, ranked
+from mag_tracking.stages.health.sensor_health import SensorHealth
 
 _DOCTOR_HELP = '''
 Examines a recording or live topics, and reports the faults of each sensor with a remedy: missing,
@@ -56,7 +57,8 @@ def _doctor(args: argparse.Namespace) -> int:
     """Run `mag-tracking doctor`."""
     if (args.recording is None) == (args.live is None):
         raise SettingsError('doctor: give either RECORDING or --live SECONDS')
-    network, settings = recorded_network(args), settings_of(args)
+    network = recorded_network(args)
+    settings = settings_of(args, network)
     check_report(args, args.recording, args.network)
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
         if args.live is not None:
@@ -82,19 +84,22 @@ def _report(args: argparse.Namespace, doctor: Doctor, further_findings: list[Fin
     """Print all sensors and findings, write the report, and return the exit status."""
     for name, health in doctor.sensors.items():
         print(f'{name:11s} {_row(health)}')
-    findings = sorted(further_findings + doctor.findings(), key=lambda f: not f.serious)
-    for finding in findings:
-        print(f'{"ERROR" if finding.serious else "note "} {finding.subject}: {finding.fault}\n'
-              f'      {finding.advice}')
-    if not findings:
+    diagnoses = ranked(further_findings + doctor.findings())
+    for d in diagnoses:
+        print(f'{"ERROR" if d.serious else "note "} {d.finding.subject}: {d.finding.fault}\n'
+              f'      {d.finding.advice}')
+        for consequence in d.consequences:
+            subject = '' if consequence.subject == d.finding.subject else f'{consequence.subject}: '
+            print(f'      therefore {subject}{consequence.fault}')
+    if not diagnoses:
         print('no faults found')
     if args.report is not None:
-        write_report(doctor, findings, 'the running sensors' if args.recording is None
+        write_report(doctor, diagnoses, 'the running sensors' if args.recording is None
                      else args.recording.name, args.report)
     if is_interrupted:
         print('interrupted: the results cover only the part read so far')
         return 130
-    return 2 if any(f.serious for f in findings) else 0
+    return 2 if any(d.serious for d in diagnoses) else 0
 
 
 def _row(health: SensorHealth) -> str:

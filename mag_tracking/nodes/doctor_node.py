@@ -23,7 +23,7 @@ from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import SENSOR_QOS, STREAM_QOS, make_executor, spin
 from mag_tracking.pipeline import Settings
 from mag_tracking.quantities import quantity
-from mag_tracking.stages.health.sensor_health import Finding
+from mag_tracking.stages.health.diagnosis import Cause, Finding
 
 
 class DoctorNode(Node):
@@ -76,7 +76,7 @@ class DoctorNode(Node):
         """
         topic = self.resolve_topic_name(RAW_READINGS)
         found = [Finding(True, topic, f'{quantity(n, "invalid message")}: {error}',
-                         'check the driver that publishes this topic')
+                         'check the driver that publishes this topic', Cause.UNDECODABLE)
                  for error, n in self._invalid_messages.items()]
         for sensor, topic in self._topics.items():
             found += topic_findings(self, sensor, topic)

@@ -7,7 +7,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.topics import absolute
-from mag_tracking.stages.health.sensor_health import Finding
+from mag_tracking.stages.health.diagnosis import Cause, Finding
 
 MAX_NAMED = 4
 """Maximum number of names in a message; the remaining names are only counted."""
@@ -30,12 +30,12 @@ def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
     """
     publishers = node.get_publishers_info_by_topic(topic)
     found = [Finding(True, sensor, f'{p.node_name} publishes {p.topic_type} on {topic}',
-                     f'the type must be {MAGNETIC_FIELD}')
+                     f'the type must be {MAGNETIC_FIELD}', Cause.WRONG_TYPE)
              for p in publishers if p.topic_type != MAGNETIC_FIELD]
     if len(publishers) > 1:
         names = ', '.join(sorted(name for name in map(node_of, publishers) if name)) or 'unknown'
         found.append(Finding(True, sensor, f'{len(publishers)} publishers of {topic}: {names}',
-                             'stop all but one'))
+                             'stop all but one', Cause.SEVERAL_PUBLISHERS))
     return found
 
 
@@ -79,7 +79,7 @@ def no_message_finding(node: Node, sensor: str, topic: str, known: Mapping[str, 
     """
     if node.count_publishers(topic):
         return Finding(True, sensor, f'no message received on {topic}, although it has a '
-                       'publisher', 'check the sensor and its driver')
+                       'publisher', 'check the sensor and its driver', Cause.NO_MESSAGES)
     namespace = node.get_namespace().rstrip('/')
     other_topics = sorted((name for name, kinds in node.get_topic_names_and_types()
                            if MAGNETIC_FIELD in kinds and name not in known.values()
@@ -88,7 +88,8 @@ def no_message_finding(node: Node, sensor: str, topic: str, known: Mapping[str, 
     advice = 'start its driver, or remap its topic'
     if other_topics:
         advice += f'; magnetic fields are published on {shortened(other_topics)}'
-    return Finding(True, sensor, f'no message received: {topic} has no publisher', advice)
+    return Finding(True, sensor, f'no message received: {topic} has no publisher', advice,
+                   Cause.NO_MESSAGES)
 
 
 def shortened(names: list[str]) -> str:

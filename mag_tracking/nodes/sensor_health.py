@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from numpy.typing import ArrayLike
 from rclpy.node import Node
 
-from mag_tracking.apps.doctor import background_findings, network_findings
+from mag_tracking.apps.doctor import background_findings, network_findings, rate_findings
 from mag_tracking.apps.doctor_covariances import covariance_findings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute
@@ -17,13 +17,9 @@ from mag_tracking.nodes.sensor_graph import no_message_finding, topic_findings
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding, ranked
 from mag_tracking.stages.health.reading_buffer import ReadingBuffer
-from mag_tracking.stages.health.sensor_health import (
-    MAX_LIVE_DELAY_S,
-    WINDOW,
-    Finding,
-    SensorHealth,
-)
+from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S, WINDOW, SensorHealth
 
 WINDOW_S = 60.0
 """[s] Length of an evaluation window. A fault is reported for one to two windows after
@@ -177,45 +173,46 @@ class HealthDiagnostics:
         return previous if previous is not None and current.counts['readings'] < MIN_READINGS \
             else current
 
-    def _findings(self, j: int, name: str, calibrate: Calibrate) -> list[Finding]:
-        """Faults of a sensor, most serious first."""
+    def _diagnoses(self, j: int, name: str, calibrate: Calibrate) -> list[Diagnosis]:
+        """Diagnoses of a sensor, most serious first."""
         silent_s = time.monotonic() - self._last_received[j]
         graph_findings = [] if self._node is None else topic_findings(
             self._node, name, self._topics[name])
         if not silent_s <= SILENCE_TIMEOUT_S:
-            return [*graph_findings, *self._silence_findings(name, silent_s)]
-        findings = {f.fault: f for f in (*graph_findings, *self._network_findings[name],
-                                         *self._clock_findings(name))}
+            return ranked([*graph_findings, *self._silence_findings(name, silent_s)])
+        findings = [*graph_findings, *self._network_findings[name], *self._clock_findings(name)]
         # A background that is being learnt is not a fault until the timeout.
         timeout_s = 5.0 + LEARNING_TIMEOUT_FACTOR * self._settings.calibrate.learn_s
         if calibrate.backgrounds()[name].ready:
             self._unready_since.pop(name, None)
         unready_since = self._unready_since.setdefault(name, time.monotonic())
         if calibrate.backgrounds()[name].ready or time.monotonic() - unready_since > timeout_s:
-            findings.update({f.fault: f for f in background_findings(
-                name, calibrate, self._frozen_since_ns.get(name), self._relearnt_counts[0][name])})
-        findings.update({f.fault: f for f in covariance_findings(
-            name, self._topics[name], calibrate)})
+            findings += background_findings(name, calibrate, self._frozen_since_ns.get(name),
+                                            self._relearnt_counts[0][name])
+        findings += covariance_findings(name, self._topics[name], calibrate)
+        in_windows: dict[Cause, Finding] = {}
         for health in (self._previous_window[name], self._current_window[name]):
             if health is not None and health.counts['readings']:
                 for f in health.findings(name, self._network.noise_std[j],
                                          self._settings.calibrate.max_field,
                                          not self._is_replayed):
-                    findings.setdefault(f.fault, f)
-        return sorted(findings.values(), key=lambda f: not f.serious)
+                    in_windows.setdefault(f.cause, f)
+        findings += rate_findings(name, self._reported_window(name).rate, self._network,
+                                  self._settings.track)
+        return ranked([*findings, *in_windows.values()])
 
     def _silence_findings(self, name: str, silent_s: float) -> list[Finding]:
         """Return the fault of a silent sensor, if any; without readings, `silent_s` is NaN."""
         topic = self._topics[name]
         if not math.isnan(silent_s):
             return [Finding(True, name, f'silent for {silent_s:.0f} s', 'check its cable, its '
-                            f'driver and the topic {topic}')]
+                            f'driver and the topic {topic}', Cause.NO_MESSAGES)]
         # Nodes that are launched together do not start at the same time.
         if time.monotonic() - self._start_time < STARTUP_S:
             return []
         if self._node is None:
             return [Finding(True, name, 'no message received', 'check its cable, its driver and '
-                            f'the topic {topic}')]
+                            f'the topic {topic}', Cause.NO_MESSAGES)]
         return [no_message_finding(self._node, name, topic, self._topics)]
 
     def _clock_findings(self, name: str) -> list[Finding]:
@@ -229,7 +226,8 @@ class HealthDiagnostics:
         return [Finding(False, name, f'its timestamps are {difference} '
                         f'{"behind" if delay_s > 0.0 else "ahead of"} the clock of this computer',
                         'for a recording, set use_sim_time (--use-sim-time); otherwise set the '
-                        'clock of the device, or let its driver use the time of arrival')]
+                        'clock of the device, or let its driver use the time of arrival',
+                        Cause.CLOCK_DIFFERS)]
 
     def is_awaited(self, name: str) -> bool:
         """Whether no reading of a sensor has been received yet.
@@ -262,10 +260,10 @@ class HealthDiagnostics:
         DiagnosticStatus
         """
         name = self._network.names[j]
-        findings = self._findings(j, name, calibrate)
+        diagnoses = self._diagnoses(j, name, calibrate)
         level = DiagnosticStatus.OK
-        if findings:
-            level = DiagnosticStatus.ERROR if findings[0].serious else DiagnosticStatus.WARN
+        if diagnoses:
+            level = DiagnosticStatus.ERROR if diagnoses[0].serious else DiagnosticStatus.WARN
         health = self._reported_window(name)
         background = calibrate.backgrounds()[name]
         c, n = health.counts, max(1, health.counts['readings'])
@@ -283,11 +281,12 @@ class HealthDiagnostics:
             'backgrounds relearnt': background.n_relearnt}
         return DiagnosticStatus(
             level=level, name=f'{node}: {name}', hardware_id=name,
-            message=f'{findings[0].fault}; {findings[0].advice}' if findings else
+            message=f'{diagnoses[0].finding.fault}; {diagnoses[0].finding.advice}' if diagnoses else
             f'waiting for {self._topics[name]}' if self.is_awaited(name) else 'running',
             values=[KeyValue(key=k, value=v if isinstance(v, str) else _number(v))
                     for k, v in values.items()]
-            + [KeyValue(key='also', value=f.fault) for f in findings[1:]])
+            + [KeyValue(key='also', value=d.finding.fault) for d in diagnoses[1:]]
+            + [KeyValue(key='therefore', value=f.fault) for d in diagnoses for f in d.consequences])
 
 
 def _number(value: float) -> str:

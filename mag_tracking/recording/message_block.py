@@ -1,7 +1,7 @@
 """Blocks of messages: their bytes, and arrays of their channels, log times and byte positions."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -155,6 +155,15 @@ class MessageBlock:
         """
         return MessageBlock(self.data, self.kinds, self.channel[selection],
                             self.log_time_ns[selection], self.begin[selection], self.end[selection])
+
+    def with_used_kinds(self) -> 'MessageBlock':
+        """Copy the block without the channels that have no messages in it.
+
+        Returns
+        -------
+        MessageBlock
+        """
+        return replace(self, kinds={n: self.kinds[n] for n in np.unique(self.channel).tolist()})
 
     def merged(self, other: 'MessageBlock') -> 'MessageBlock':
         """Merge this block with another block of the same file, in order of log time.

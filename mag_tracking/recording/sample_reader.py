@@ -28,6 +28,7 @@ from mag_tracking.recording.sensor_topics import FrameCheck, examine_topics, fau
 from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
 from mag_tracking.report.metrics import Truth
+from mag_tracking.stages.health.clocks import ClockSpan
 
 TRUTH_PREFIX = 'ground_truth/'
 """Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
@@ -35,6 +36,8 @@ never for tracking."""
 BATCH_SIZE = 256
 """Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
 few readings. The caller can stop only between batches."""
+MAX_UNKNOWN_SENSORS = 20
+"""Number of sensors outside the network whose readings are counted by sensor."""
 MAX_TOPICS = 10
 """Number of topics that an error lists."""
 
@@ -53,6 +56,8 @@ class SampleReader:
     ----------
     rejected : Counter
         Number of messages and readings that cannot be used, or not as they are, by cause.
+    clocks : dict of str to ClockSpan
+        First and last timestamp of each sensor so far, with their log times.
     namespace : str
         Namespace of the network's relative topics in the recording.
 
@@ -83,6 +88,8 @@ class SampleReader:
                                  f'{recording.types.get(truth, "not in the recording")}; '
                                  f'topics with poses: {", ".join(pose_topics) or "none found"}')
         self.rejected: Counter[str] = Counter()
+        self._unknown_sensors: set[str] = set()
+        self.clocks: dict[str, ClockSpan] = {}
         self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
         self._frames = FrameCheck(recording.path)
         self._unstamped, self._dated, self._shared = self._examine_topics(network)
@@ -132,7 +139,9 @@ class SampleReader:
         """
         for block in self._recording.blocks(progress=progress):
             for first in range(0, len(block), BATCH_SIZE):
-                readings = self._block_readings(block.part(slice(first, first + BATCH_SIZE)))
+                # A recording may have thousands of other topics.
+                part = block.part(slice(first, first + BATCH_SIZE)).with_used_kinds()
+                readings = self._block_readings(part)
                 if len(readings):
                     yield readings
             # The bytes of this chunk are freed before the next chunk is read.
@@ -157,6 +166,7 @@ class SampleReader:
         batch = Readings(
             sensors, sensor_index[block.channel[rows]], fields.stamp_ns[is_fast],
             fields.field[is_fast], None if C is None else C[is_fast])
+        self._note_clocks(batch, block.log_time_ns[rows])
         other_messages = np.setdiff1d(np.arange(len(block)),
                                       np.append(rows, self._truth.add_block(block)))
         parts, n_added = [], 0
@@ -243,7 +253,9 @@ class SampleReader:
             if is_truth:
                 self._truth.add(message.topic, content)
             elif readings is not None:
-                yield self._network_readings(readings), message.log_time_ns
+                readings = self._network_readings(readings)
+                self._note_clocks(readings, np.full(len(readings), message.log_time_ns))
+                yield readings, message.log_time_ns
             elif imu_sensors is not None:
                 for name in imu_sensors:
                     yield acceleration_of(content, name), message.log_time_ns
@@ -268,7 +280,19 @@ class SampleReader:
                 self.rejected[cause] += 1
                 return
         if len(reading):
+            self._note_clocks(reading, np.array([message.log_time_ns]))
             yield reading, message.log_time_ns
+
+    def _note_clocks(self, readings: Readings, log_time_ns: IntArray) -> None:
+        """Extend the clock of each sensor by readings, which were logged at `log_time_ns` (n,)."""
+        for j in np.unique(readings.sensor).tolist():
+            stamps, received = readings.stamp_ns, log_time_ns
+            if len(readings.names) > 1:
+                is_own = readings.sensor == j
+                stamps, received = stamps[is_own], received[is_own]
+            span = ClockSpan.of(stamps, received)
+            earlier = self.clocks.get(readings.names[j], span)
+            self.clocks[readings.names[j]] = earlier.until(span)
 
     def _network_readings(self, readings: Readings) -> Readings:
         """Select the readings of the network's sensors, and count readings of other sensors."""
@@ -277,8 +301,11 @@ class SampleReader:
                             dtype=bool)[readings.sensor]
         if is_known.all():
             return readings
-        self.rejected.update(f'reading of {name}, which is not in the network'
-                             for name in readings.part(~is_known).sensor_names())
+        for name in readings.part(~is_known).sensor_names():
+            if len(self._unknown_sensors) < MAX_UNKNOWN_SENSORS:
+                self._unknown_sensors.add(name)
+            label = name if name in self._unknown_sensors else 'another sensor'
+            self.rejected[f'reading of {label}, which is not in the network'] += 1
         return readings.part(is_known)
 
     def truth_arrays(self) -> dict[str, Truth]:

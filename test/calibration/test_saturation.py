@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from mag_tracking.apps.pass_collector import PassCollector
-from mag_tracking.calibration.saturation import N_MARGIN, saturated_readings
+from mag_tracking.calibration.saturation import N_MARGIN, saturated_readings, with_margin
 from mag_tracking.pipeline import settings_for
 from support.passes import ROAD, measured, random_path, unknowns_at
 from support.samples import MagSample, one
@@ -15,34 +15,77 @@ def curve(n=200):
     return 500.0 * np.exp(-((np.arange(n) - 90.0) / 15.0)**2)
 
 
+def noise(seed=1, n=200):
+    return np.random.default_rng(seed).standard_normal((n, 3))
+
+
+def on_x(values):
+    """Readings with `values` on x, and noise on the other axes."""
+    fields = noise(2, len(values))
+    fields[:, 0] = values
+    return fields
+
+
 def test_saturation_is_detected_in_noise():
-    noisy = curve() + np.random.default_rng(1).standard_normal(200)
+    noisy = curve() + noise()[:, 0]
     clipped = np.minimum(noisy, 300.0)
-    expected = np.convolve(noisy >= 300.0, np.ones(2 * N_MARGIN + 1), 'same') > 0.0
-    assert expected.sum() < 60
-    assert np.array_equal(saturated_readings(clipped), expected)
-    assert np.array_equal(saturated_readings(-clipped), expected)
-    assert not saturated_readings(noisy).any()
+    assert np.array_equal(saturated_readings(on_x(clipped))[:, 0], noisy >= 300.0)
+    assert np.array_equal(saturated_readings(-on_x(clipped))[:, 0], noisy >= 300.0)
+    assert not saturated_readings(on_x(clipped))[:, 1:].any()
+    assert not saturated_readings(on_x(noisy)).any()
 
 
-@pytest.mark.parametrize('step', [1.0, 5.0, 20.0])
-def test_coarse_steps_are_not_saturation(step):
-    assert not saturated_readings(np.round(curve() / step) * step).any()
+def test_the_readings_next_to_a_saturated_reading_are_excluded():
+    is_saturated = saturated_readings(on_x(np.minimum(curve() + noise()[:, 0], 300.0)))
+    expected = np.convolve(is_saturated[:, 0], np.ones(2 * N_MARGIN + 1), 'same') > 0.0
+    excluded = with_margin(is_saturated)
+    assert np.array_equal(excluded[:, 0], expected) and not excluded[:, 1:].any()
 
 
-def test_saturation_requires_three_equal_readings():
-    assert saturated_readings([0.0, 1.0, 5.0, 5.0, 5.0, 1.0, 0.0]).all()
-    assert not saturated_readings([0.0, 1.0, 5.0, 5.0, 1.0]).any() \
-        and not saturated_readings([]).any()
+@pytest.mark.parametrize('step', [0.3, 0.85, 1.0, 1.5, 2.0, 3.0, 5.0, 20.0])
+@pytest.mark.parametrize('seed', range(5))
+def test_steps_in_noise_are_not_saturation(seed, step):
+    """At rest, an axis repeats its extremes; the peak of a pass may be a few equal readings."""
+    fields = curve()[:, None] * [1.0, 0.1, 0.0] + noise(seed)
+    assert not saturated_readings(np.round(fields / step) * step).any()
+    assert not saturated_readings(np.round(noise(seed, 2000) / step) * step).any()
+
+
+@pytest.mark.parametrize('step', [0.3, 1.0, 2.0])
+def test_a_limit_is_found_in_coarse_steps(step):
+    clipped = np.minimum(np.round((curve() + noise()[:, 0]) / step) * step, 120.0 * step)
+    found = saturated_readings(on_x(clipped))
+    assert np.array_equal(found[:, 0], clipped == 120.0 * step)
+
+
+def test_a_target_that_stands_is_not_saturation():
+    """Its field is constant as well, and may begin and end as suddenly."""
+    standing = np.concatenate([curve()[:90], np.full(100, 500.0), curve()[90:]])
+    fields = np.round((standing + noise(3, 300)[:, 0]) / 3.0) * 3.0
+    assert not saturated_readings(on_x(fields)).any()
+
+
+def test_held_readings_are_not_saturation():
+    fields = curve()[:, None] * [1.0, 0.7, -0.4] + noise()
+    fields[88:96] = fields[88]
+    assert not saturated_readings(fields).any()
+
+
+def test_a_jump_to_a_value_is_not_saturation():
+    """The end of the range is also a mark for a missing reading."""
+    fields = noise()
+    fields[50:60, 0] = 500.0
+    assert not saturated_readings(fields).any()
 
 
 def test_missing_or_stuck_readings_are_not_saturation():
-    clipped = np.minimum(curve() + np.random.default_rng(1).standard_normal(200), 300.0)
+    clipped = np.minimum(curve() + noise()[:, 0], 300.0)
     clipped[::7] = np.nan
-    found = saturated_readings(clipped)
+    found = saturated_readings(on_x(clipped))
     assert found.any() and not found[::7].any()
-    assert not saturated_readings(np.full(50, 3.0)).any() \
-        and not saturated_readings(np.full(5, np.nan)).any()
+    assert not saturated_readings(np.full((50, 3), 3.0)).any() \
+        and not saturated_readings(np.full((5, 3), np.nan)).any() \
+        and not saturated_readings(np.zeros((0, 3))).any()
 
 
 def test_a_saturated_segment_is_excluded_from_a_pass_and_reported():

@@ -2,23 +2,33 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray, Record
 from mag_tracking.calibration import core
-from mag_tracking.calibration.background import RunningBackground
+from mag_tracking.calibration.agreement import FieldInconsistency
+from mag_tracking.calibration.background import RelearntBackground, RunningBackground
 from mag_tracking.calibration.decimation import Decimator
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted
+from mag_tracking.calibration.doubtful_times import (
+    CONTRADICTS_EARTH_FIELD,
+    DOUBTFUL_BACKGROUND,
+    WRONG_TIMESTAMPS,
+    DoubtfulTimes,
+    shifted,
+)
 from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.level_change import SharedChanges
+from mag_tracking.calibration.reading_faults import ReadingFaults, reading_faults
 from mag_tracking.calibration.screening import clear_spikes
-from mag_tracking.calibration.sensor_state import new_sensors
+from mag_tracking.calibration.sensor_state import N_WINDOW, new_sensors
 from mag_tracking.errors import NetworkError
 from mag_tracking.inference.axes import are_valid_covariances
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
+from mag_tracking.stages.calibrate.field_comparison import FieldComparison
 from mag_tracking.stages.calibrate.output_buffer import OutputBuffer
 from mag_tracking.stages.calibrate.restoration import (
     BackgroundRestoration,
@@ -26,6 +36,9 @@ from mag_tracking.stages.calibrate.restoration import (
     stored_background,
 )
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.stages.health.diagnosis import Cause
+from mag_tracking.stages.health.timestamps import TimestampFault, TimestampMonitor
+from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NEVER, NS
 
 MAX_SYNCHRONOUS = 16
@@ -35,17 +48,22 @@ are staggered, because evaluating all blocks at once would delay the readings.""
 OVERRULED = 'message covariances overruled by the measured noise'
 """Key in the counts for message covariances that were replaced by the measured noise."""
 
-CAUSES = {
-    core.NO_AXIS: 'no axis reported (all NaN)',
-    core.INFINITE: 'infinite value',
-    core.BAD_COVARIANCE: 'covariance is not positive definite',
-    core.AXIS_MISSING: 'an axis that the correction needs is missing',
-    core.TOO_FAR_AHEAD: 'timestamp too far ahead',
-    core.DUPLICATE: 'duplicate timestamp',
-    core.OUT_OF_ORDER: 'out of order',
-    core.STUCK: 'stuck sensor (repeated reading)',
+FAULTS_FOUND = 'faults of drivers found'
+"""Key in the counts for the events after which `faults_of` returns other faults."""
+
+REJECTIONS = {
+    core.NO_AXIS: (Cause.NO_AXIS, 'no axis reported (all NaN)'),
+    core.INFINITE: (Cause.INFINITE, 'infinite value'),
+    core.BAD_COVARIANCE: (Cause.WRONG_COVARIANCE, 'covariance is not positive definite'),
+    core.AXIS_MISSING: (Cause.MISSING_AXIS, 'an axis that the correction needs is missing'),
+    core.TOO_FAR_AHEAD: (Cause.TOO_FAR_AHEAD, 'timestamp too far ahead'),
+    core.DUPLICATE: (Cause.DUPLICATE_STAMPS, 'duplicate timestamp'),
+    core.OUT_OF_ORDER: (Cause.BACKWARD_STAMPS, 'out of order'),
+    core.STUCK: (Cause.STUCK, 'stuck sensor (repeated reading)'),
+    core.MARKED: (Cause.NO_READING_MARK, 'mark for a missing reading'),
+    core.REPEATED: (Cause.REPEATED, 'repetition of the previous reading'),
 }
-"""Cause of rejection for each reason code, except causes that name a value."""
+"""Cause and description of the rejection for each reason code; `TOO_LARGE` depends on a setting."""
 
 
 class Calibrate:
@@ -65,6 +83,8 @@ class Calibrate:
     settings : CalibrateSettings
     background_type : type, optional
         Class that estimates the background of each sensor.
+    survey : SurveySettings, optional
+        Settings of the comparison of the backgrounds with the Earth's field.
 
     Attributes
     ----------
@@ -73,22 +93,29 @@ class Calibrate:
     """
 
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
-                 background_type: type[RunningBackground] = RunningBackground) -> None:
+                 background_type: type[RunningBackground] = RunningBackground,
+                 survey: SurveySettings | None = None) -> None:
         self.counts: Counter[str] = Counter()
-        self._per_sensor: dict[str, Counter[str]] = {name: Counter() for name in network.names}
+        # Rate of the readings of each sensor [Hz] when a fault of its driver was found.
+        self._rates = dict.fromkeys(network.names, float('nan'))
+        self._rejections: dict[str, Counter[tuple[Cause, str]]] = {
+            name: Counter() for name in network.names}
         self._settings, self._sensors = settings, new_sensors(len(network))
         self._batches = np.zeros(1, core.BATCH)
         self._limits = np.array([(
             settings.max_field, settings.max_forward_jump_s * NS, settings.max_backward_jump_s * NS,
             settings.reject_stuck, settings.spike_std, settings.decimate_to_hz > 0.0,
             settings.trust_covariances)], core.LIMITS)
-        self._causes = {**CAUSES, core.TOO_LARGE: f'above {settings.max_field:g} T (gauss or '
-                        'microtesla published as tesla?)'}
+        self._causes = {**REJECTIONS, core.TOO_LARGE: (
+            Cause.TOO_LARGE, f'above {settings.max_field:g} T (gauss or microtesla published as '
+            'tesla?)')}
         self._network, self._background_type = network, background_type
         self._index = {name: i for i, name in enumerate(network.names)}
         self._background: dict[str, RunningBackground] = {}
         self._changes = SharedChanges()
         self._restoration = BackgroundRestoration(settings.max_resume_gap_s)
+        self._timestamps = TimestampMonitor(len(network))
+        self._comparison = FieldComparison(network, survey or SurveySettings())
         self.update_network(network)
 
     def update_network(self, network: SensorNetwork) -> None:
@@ -110,6 +137,7 @@ class Calibrate:
             raise NetworkError(f'the new network has the sensors {", ".join(network.names)}; '
                                f'expected {", ".join(self._index)}')
         previous, self._network = self._network if self._background else None, network
+        self._comparison.use(network)
         self._decimators = {name: Decimator(self._settings.decimate_to_hz)
                             for name in network.names}
         for i, name in enumerate(network.names):
@@ -134,6 +162,7 @@ class Calibrate:
                 s[name] += shift
         background = self._background[network.names[i]]
         background.doubtful_times = shifted(background.doubtful_times, shift)
+        self._comparison.shift(network.names[i], shift)
         offset, correction = network.offset[i], network.correction[i]
         s['clock_offset_ns'] = network.clock_offset_ns[i]
         s['offset'] = 0.0 if offset is None else offset
@@ -159,15 +188,88 @@ class Calibrate:
         """
         return [name for name, b in self._background.items() if not b.ready]
 
-    def doubtful_intervals(self) -> dict[str, DoubtfulTimes]:
-        """Intervals in which a background was provisional or may have contained a target's field.
+    def input_doubts(self) -> dict[str, dict[str, DoubtfulTimes]]:
+        """Intervals in which the background or the timestamps of a sensor were doubtful.
+
+        A background is doubtful while it is provisional or may contain the field of a target, and
+        while it contradicts the Earth's field.
 
         Returns
         -------
-        dict of str to DoubtfulTimes
-            Intervals ((begin, end) [ns], ...) of each sensor that has any.
+        dict of str to dict of str to DoubtfulTimes
+            {reason: {sensor: intervals}}, for each sensor that has any.
         """
-        return {n: b.doubtful_times for n, b in self._background.items() if b.doubtful_times}
+        out = {DOUBTFUL_BACKGROUND: {n: b.doubtful_times for n, b in self._background.items()
+                                     if b.doubtful_times},
+               CONTRADICTS_EARTH_FIELD: self._comparison.doubtful_times(),
+               WRONG_TIMESTAMPS: {n: times for n, i in self._index.items()
+                                  if (times := self._timestamps.doubtful_times[i])}}
+        return {reason: by_sensor for reason, by_sensor in out.items() if by_sensor}
+
+    def latest_doubt(self, sensor: str) -> tuple[int, int | None] | None:
+        """Latest interval in which the background or the timestamps of a sensor were doubtful.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        (begin, end), int, ns, or None
+            Open intervals (end None) come first. None if there is no interval.
+        """
+        times = [interval for by_sensor in (
+            self._background[sensor].doubtful_times, self._comparison.times_of(sensor),
+            self._timestamps.doubtful_times[self._index[sensor]])
+            for interval in by_sensor[-1:]]
+        return max(times, key=lambda t: (t[1] is None, t[0]), default=None)
+
+    def relearnt(self) -> dict[str, tuple[RelearntBackground, ...]]:
+        """Latest changes of the background of each sensor that had any.
+
+        Returns
+        -------
+        dict of str to tuple of RelearntBackground
+        """
+        return {name: b.relearnt for name, b in self._background.items() if b.relearnt}
+
+    def timestamp_fault(self, sensor: str) -> TimestampFault | None:
+        """Return the worst regular error of the timestamps of a sensor so far.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        TimestampFault or None
+            None if the timestamps are regular.
+        """
+        return self._timestamps.worst_fault(self._index[sensor])
+
+    def lowest_rate(self, sensor: str) -> float:
+        """Return the lowest rate of a sensor so far, from its raw timestamps.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        float, Hz
+            inf if unknown.
+        """
+        return self._timestamps.lowest_rate(self._index[sensor])
+
+    def field_inconsistencies(self) -> list[FieldInconsistency]:
+        """Sensors whose background contradicts the Earth's field so much that tracks are wrong.
+
+        Returns
+        -------
+        list of FieldInconsistency
+            The latest inconsistency of each sensor that had any, in the order of the network.
+        """
+        return self._comparison.inconsistencies()
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
         """Number of accepted and rejected readings of a sensor, in total and by cause of rejection.
@@ -180,7 +282,10 @@ class Calibrate:
         -------
         Counter of str
         """
-        return self._per_sensor[sensor] + Counter(accepted=int(self._state_of(sensor)['accepted']))
+        rejections = self._rejections[sensor]
+        counts = {f'rejected: {description}': n for (_, description), n in rejections.items()}
+        return Counter(counts) + Counter(accepted=int(self._state_of(sensor)['accepted']),
+                                         rejected=rejections.total())
 
     def _state_of(self, sensor: str) -> Record:
         """State of a sensor: its element of the array that compiled code updates."""
@@ -202,6 +307,7 @@ class Calibrate:
         rows = readings.rows(self._index)
         validity, covariances = _own_covariances(readings)
         stamps, fields = plain(readings.stamp_ns, np.int64), plain(readings.field)
+        self._timestamps.add(rows, stamps - self._network.clock_offset_ns[rows], fields)
         out, batch = self._new_output(len(readings)), self._batches[0]
         batch['next'] = 0
         while reason := core.calibrate_readings(
@@ -227,10 +333,12 @@ class Calibrate:
         """Handle an event of sensor `i` that the compiled code has reported."""
         batch, name = self._batches[0], self._network.names[i]
         if batch['n_spikes']:
-            self._reject(name, 'spike', int(batch['n_spikes']))
+            self._reject(name, (Cause.SPIKES, 'spike'), int(batch['n_spikes']))
             batch['n_spikes'] = 0
         if reason == core.BLOCK_COMPLETE:
-            self._background[name].evaluate_block()
+            self._evaluate_block(i)
+        elif reason == core.WINDOW_COMPLETE:
+            self._examine_window(i)
         elif reason == core.JUMPED_BACK:
             self._background[name].forget()
             self._reject_held(i, 'time jumped back')
@@ -244,6 +352,64 @@ class Calibrate:
             self._calibrate_released(i, out)
         elif reason != core.SPIKES:
             self._reject(name, self._causes[reason])
+
+    def _examine_window(self, i: int) -> None:
+        """Search the latest raw readings of sensor `i` for faults of its driver."""
+        s, name = self._sensors[i], self._network.names[i]
+        known, found = self.faults_of(name), reading_faults(s['window'][:s['n_window']])
+        # The current reading is the first one after the window.
+        duration_s = (int(self._batches[0]['stamp_ns']) - int(s['window_begin_ns'])) / NS
+        if known.merged(found) != known:
+            self._set_faults(i, replace(known.merged(found), rate=(
+                int(s['n_window']) / duration_s if duration_s > 0.0 else float('nan'))))
+            if not s['is_examined']:
+                # The background has been learnt from faulty readings.
+                self._background[name].forget()
+        if s['n_window'] < N_WINDOW:
+            s['window_due'] = 2 * s['window_due']
+        else:
+            s['n_window'], s['is_examined'] = 0, True
+
+    def _set_faults(self, i: int, faults: ReadingFaults) -> None:
+        """Leave out the marks and repetitions of sensor `i` from now on."""
+        s, self._rates[self._network.names[i]] = self._sensors[i], faults.rate
+        self.counts[FAULTS_FOUND] += 1
+        s['n_marks'], s['marks'][:len(faults.marks)] = len(faults.marks), faults.marks
+        s['repetition'] = faults.repetition
+        # The steps, repetitions and differences so far are those of the faults.
+        s['step'] = np.inf
+        s['n_same'] = s['n_changed'] = s['n_rest'] = 0
+        s['repeats'] = s['changes'] = s['run'] = 0
+        self._reject_held(i, 'a fault of the driver was found')
+
+    def faults_of(self, sensor: str) -> ReadingFaults:
+        """Faults of the driver of a sensor that have been found so far.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        ReadingFaults
+        """
+        s = self._state_of(sensor)
+        return ReadingFaults(s['marks'][:s['n_marks']].copy(), float(s['repetition']),
+                             self._rates[sensor])
+
+    def n_marked(self, sensor: str) -> int:
+        """Number of readings of a sensor with a mark for a missing reading on any axis.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        int
+        """
+        return int(self._state_of(sensor)['n_partly_marked']) \
+            + self._rejections[sensor][REJECTIONS[core.MARKED]]
 
     def _calibrate_released(self, i: int, out: OutputBuffer) -> None:
         """Calibrate the readings of sensor `i` that the spike filter has released."""
@@ -266,11 +432,19 @@ class Calibrate:
     def _calibrate_reading(self, i: int, stamp: int, field: FloatArray, validity: int,
                            covariance: FloatArray, out: OutputBuffer) -> None:
         """Calibrate one reading of sensor `i`, and append the result to `out`."""
-        background = self._background[self._network.names[i]]
-        background.evaluate_block()
+        self._evaluate_block(i)
         while not core.use_reading(self._sensors, self._limits, self._batches, i, stamp,
                                    plain(field), validity, plain(covariance), *out.arrays):
-            background.evaluate_block()
+            self._evaluate_block(i)
+
+    def _evaluate_block(self, i: int) -> None:
+        """Evaluate the latest complete block of sensor `i`, unless it has been evaluated."""
+        name, s = self._network.names[i], self._sensors[i]
+        if s['is_full']:
+            self._background[name].evaluate_block()
+            if self._background[name].ready:
+                self._comparison.update(i, self.background(name), int(s['first_ns']),
+                                        int(s['last_ns']))
 
     def _finish(self, out: OutputBuffer) -> list[Readings]:
         """Count the calibrated readings of a batch and return them."""
@@ -289,12 +463,12 @@ class Calibrate:
 
     def _reject_held(self, i: int, event: str) -> None:
         """Reject the held readings of sensor `i`, which no reading after `event` can confirm."""
-        self._reject(self._network.names[i], f'possible spike when {event}',
+        self._reject(self._network.names[i], (Cause.SPIKES, f'possible spike when {event}'),
                      int(self._sensors[i]['n_held']))
         clear_spikes(self._sensors[i])
 
     def start_from(self, levels: Mapping[str, MostFrequentLevel],
-                   steps: Mapping[str, FloatArray]) -> None:
+                   steps: Mapping[str, FloatArray], faults: Mapping[str, ReadingFaults]) -> None:
         """Initialise the stage with the results of a first pass over the readings.
 
         Parameters
@@ -303,7 +477,12 @@ class Calibrate:
             Background of each sensor that is not quiet at the start.
         steps : mapping of str to (3,) array, T
             Resolution of the axes of each sensor.
+        faults : mapping of str to ReadingFaults
+            Faults of the drivers.
         """
+        for name, found in faults.items():
+            if found:
+                self._set_faults(self._index[name], found)
         for name, step in steps.items():
             self._state_of(name)['step'] = step
         for name, quiet in levels.items():
@@ -348,7 +527,7 @@ class Calibrate:
         there the reading that completes a block is calibrated with the previous background.
         """
         for i in np.flatnonzero(self._sensors['is_full']):
-            self._background[self._network.names[i]].evaluate_block()
+            self._evaluate_block(int(i))
 
     def flush(self) -> list[Readings]:
         """Calibrate and return the readings that are still held.
@@ -367,11 +546,24 @@ class Calibrate:
             clear_spikes(s)
         return self._finish(out)
 
-    def _reject(self, sensor: str, cause: str, n: int = 1) -> None:
-        """Count `n` rejected readings of a sensor by cause."""
+    def _reject(self, sensor: str, cause: tuple[Cause, str], n: int = 1) -> None:
+        """Count `n` rejected readings of a sensor by cause and description."""
         if n:
-            self.counts[f'rejected: {cause}'] += n
-            self._per_sensor[sensor].update({'rejected': n, f'rejected: {cause}': n})
+            self.counts[f'rejected: {cause[1]}'] += n
+            self._rejections[sensor][cause] += n
+
+    def rejections_of(self, sensor: str) -> 'Counter[tuple[Cause, str]]':
+        """Number of rejected readings of a sensor, by cause and description.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        Counter of (Cause, str)
+        """
+        return self._rejections[sensor].copy()
 
     def forget(self, sensors: Collection[str] = ()) -> None:
         """Discard the backgrounds of sensors and learn them again.

@@ -5,15 +5,23 @@ Readings are monitored without being changed or delayed. Memory is bounded by a 
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration.reading_faults import NO_FAULTS, ReadingFaults
 from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
 from mag_tracking.quantities import occurrences
+from mag_tracking.stages.health.clocks import ClockSpan
+from mag_tracking.stages.health.diagnosis import Cause, Finding
+from mag_tracking.stages.health.timestamps import WINDOW as TIMESTAMP_WINDOW
+from mag_tracking.stages.health.timestamps import (
+    TimestampFault,
+    latest_interval_s,
+    timestamp_fault,
+)
 from mag_tracking.stages.health.window import median_field, quantiles, sample_noise_std
 from mag_tracking.units import NEVER, NS
 
@@ -33,27 +41,16 @@ MAX_JITTER = 0.3
 readings are not counted."""
 STUCK_S = 1.0
 """[s] A sensor is stuck if its readings are identical for longer than this."""
+MIN_STUCK_READINGS = 8
+"""A slow sensor is stuck if more than this number of readings are identical."""
+MAX_PLATEAU_S = 0.5
+"""[s] Maximum time for which a target that passes saturates a sensor."""
 MIN_MOVED_STEPS = 10.0
 """A target that changes one axis by more than this number of quantisation steps is assumed to
 change every other axis by at least one step."""
 SPIKE_STD = 30.0
 """Minimum difference of a spike from both neighbouring readings, in the same direction, in standard
 deviations of the noise."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A fault, and advice on how to fix it."""
-
-    serious: bool
-    """True if the fault makes results wrong, false if it only makes them less accurate."""
-    subject: str
-    """Name of the sensor or stage."""
-    fault: str
-    advice: str
-
-    def __str__(self) -> str:
-        return f'{self.subject}: {self.fault}; {self.advice}'
 
 
 class SensorHealth:
@@ -66,17 +63,30 @@ class SensorHealth:
     ----------
     update_interval : int, optional
         Number of readings between two updates.
+    faults : ReadingFaults, optional
+        Marks and repetitions, which are not evaluated as readings.
+
+    Attributes
+    ----------
+    faults : ReadingFaults
     """
 
-    def __init__(self, update_interval: int = UPDATE_INTERVAL) -> None:
-        self._update_interval = update_interval
+    def __init__(self, update_interval: int = UPDATE_INTERVAL,
+                 faults: ReadingFaults = NO_FAULTS) -> None:
+        self.faults, self._update_interval = faults, update_interval
         self._counts: Counter[str] = Counter()
         self._largest_step_s = 0.0
         self._buffered: list[tuple[int, FloatArray, int]] = []
         self._stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._received: IntArray = np.zeros(0, dtype=np.int64)
+        self._raw_fields: FloatArray = np.zeros((0, 3))
+        # Latest reading; window of the readings without marks and repetitions, and its timestamps.
+        self._latest: FloatArray = np.zeros((0, 3))
         self._fields: FloatArray = np.zeros((0, 3))
+        self._field_stamps: IntArray = np.zeros(0, dtype=np.int64)
+        self._is_saturated: BoolArray = np.zeros(0, dtype=bool)
         self._interval_ns, self._jitter = float('nan'), float('inf')
+        self._timestamp_fault: TimestampFault | None = None
         self._noise: FloatArray = np.full(3, np.nan)
         # Results for the current window; cleared when readings are added.
         self._cache: dict[str, FloatArray] = {}
@@ -144,15 +154,34 @@ class SensorHealth:
             return
         self._stamps = np.append(self._stamps, stamps)[-WINDOW:]
         self._received = np.append(self._received, received)[-WINDOW:]
-        self._fields = np.append(self._fields, fields, axis=0)[-WINDOW:]
+        self._raw_fields = np.append(self._raw_fields, fields, axis=0)[-TIMESTAMP_WINDOW:]
         self._counts['readings'] += n
         self._check_timestamps(n)
-        self._check_fields(n)
+        missing = np.isnan(fields)
+        for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
+            self._counts[axis] += count
+        self._counts['without any axis'] += int(missing.all(axis=1).sum())
+        with_latest = np.append(self._latest, fields, axis=0)
+        self._latest = with_latest[-1:].copy()
+        kept = self.faults.without(with_latest)[-n:]
+        is_kept = ~np.isnan(kept).all(axis=1) | missing.all(axis=1)
+        if is_kept.any():
+            self._field_stamps = np.append(self._field_stamps, stamps[is_kept])[-WINDOW:]
+            self._fields = np.append(self._fields, kept[is_kept], axis=0)[-WINDOW:]
+            self._check_fields(int(is_kept.sum()))
 
     def _check_timestamps(self, n: int) -> None:
         """Count the faults in the timestamps of the `n` latest readings."""
         # The first interval starts at the preceding reading, if there is one.
         intervals = np.diff(self._stamps[-n - 1:])
+        self._counts['duplicates'] += int((intervals == 0).sum())
+        self._counts['backward timestamps'] += int((intervals < 0).sum())
+        fault = timestamp_fault(self._stamps[-TIMESTAMP_WINDOW:], self._raw_fields)
+        if fault is not None:
+            # The intervals of such timestamps show neither lost readings nor clock steps.
+            self._timestamp_fault = fault.after(self._timestamp_fault)
+            self._interval_ns, self._jitter = fault.interval_s * NS, float('inf')
+            return
         is_received = self._received[-n - 1:] != NEVER
         receipts = np.diff(np.where(is_received, self._received[-n - 1:], 0)) / NS
         steps = receipts - intervals / NS
@@ -165,10 +194,13 @@ class SensorHealth:
         if is_step.any():
             self._counts['clock steps'] += int(is_step.sum())
             self._largest_step_s = max(self._largest_step_s, *steps[is_step].tolist(), key=abs)
-        self._counts['duplicates'] += int((intervals == 0).sum())
-        self._counts['backward timestamps'] += int((intervals < 0).sum())
         if self._jitter < MAX_JITTER:
-            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) & ~is_step
+            # Intervals like the latest ones are those of another rate.
+            latest_ns = latest_interval_s(self._stamps) * NS
+            is_other_rate = (latest_ns > GAP_RATIO * self._interval_ns) \
+                & (np.abs(intervals - latest_ns) < 0.2 * latest_ns)
+            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) \
+                & ~is_step & ~is_other_rate
             self._counts['lost'] += int(np.sum(np.round(intervals[gaps] / self._interval_ns) - 1))
         forward = np.diff(self._stamps)
         forward = forward[forward > 0]
@@ -179,10 +211,6 @@ class SensorHealth:
 
     def _check_fields(self, n: int) -> None:
         """Count the faults in the fields of the `n` latest readings."""
-        missing = np.isnan(self._fields[-n:])
-        for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
-            self._counts[axis] += count
-        self._counts['without any axis'] += int(missing.all(axis=1).sum())
         self._check_stuck(n)
         # The two preceding readings are included, because the last one had no successor before.
         fields = self._fields[-n - 2:]
@@ -191,16 +219,19 @@ class SensorHealth:
         # A comparison with NaN is false: while the noise is unknown, no spikes are counted.
         noise = np.maximum(self._noise, self._steps / np.sqrt(12.0))
         is_spike = (np.minimum(np.abs(before), np.abs(after)) > SPIKE_STD * noise) \
-            & (before * after > 0.0)
+            & ((before > 0.0) == (after > 0.0))
         self._counts['spikes'] += int(is_spike.any(axis=1).sum())
         if self._n_since_stuck >= WINDOW:
             self._noise = self._cache['noise'] = sample_noise_std(self._fields)
-        is_saturated = np.array([saturated_readings(axis) for axis in self._fields.T])[:, -n:]
-        self._counts['saturated'] += int(np.count_nonzero(is_saturated.any(axis=0)))
+        # A limit is recognised only after the excursion.
+        known = np.append(self._is_saturated, np.zeros(n, dtype=bool))[-len(self._fields):]
+        self._is_saturated = known | saturated_readings(
+            self._fields, MAX_PLATEAU_S * NS / self._interval_ns).any(axis=1)
+        self._counts['saturated'] += int(np.count_nonzero(self._is_saturated & ~known))
 
     def _check_stuck(self, n: int) -> None:
         """Count the stuck readings among the `n` latest readings."""
-        stamps, fields = self._stamps[-n:], self._fields[-n - 1:]
+        stamps, fields = self._field_stamps[-n:], self._fields[-n - 1:]
         equal = (fields[1:] == fields[:-1]) | np.isnan(fields[1:]) & np.isnan(fields[:-1])
         self._has_changed |= (~equal & ~np.isnan(fields[1:]) & ~np.isnan(fields[:-1])).any(axis=0)
         is_repeated = equal.all(axis=1)
@@ -209,7 +240,8 @@ class SensorHealth:
         # Index of the first reading of each run of identical readings; -1 = in an earlier batch.
         run_start = np.maximum.accumulate(np.where(is_repeated, -1, np.arange(n)))
         unchanged_since = np.where(run_start < 0, self._unchanged_since_ns or 0, stamps[run_start])
-        stuck = np.flatnonzero(stamps - unchanged_since > STUCK_S * NS)
+        min_duration = np.nanmax([STUCK_S * NS, MIN_STUCK_READINGS * self._interval_ns])
+        stuck = np.flatnonzero(stamps - unchanged_since > min_duration)
         self._unchanged_since_ns = int(unchanged_since[-1])
         self._count_runs(is_repeated, unchanged_since, stamps)
         if not self.is_coarse:
@@ -293,6 +325,14 @@ class SensorHealth:
         return ''.join(np.array(list('xyz'))[unchanged]) if unchanged.sum() < present.sum() else ''
 
     @property
+    def clock(self) -> ClockSpan | None:
+        """Timestamps and times of receipt of the window; None if no time of receipt is known."""
+        self.update()
+        is_received = self._received != NEVER
+        return ClockSpan.of(self._stamps[is_received], self._received[is_received]) \
+            if is_received.any() else None
+
+    @property
     def delay_s(self) -> list[float]:
         """Delay [s] from timestamp to receipt: median, 5 % and 95 % quantiles; NaN if unknown."""
         self.update()
@@ -304,7 +344,7 @@ class SensorHealth:
 
     def findings(self, name: str, noise_std: FloatArray | None = None,
                  max_field: float = 1e-3, is_live: bool = True) -> list[Finding]:
-        """Faults of the sensor; serious faults come first.
+        """Faults of the sensor, without ranking.
 
         Parameters
         ----------
@@ -324,7 +364,7 @@ class SensorHealth:
         n = self.counts['readings']
         if not n:
             return [Finding(True, name, 'no reading', 'check its cable, its driver and the topic '
-                            'in the network file')]
+                            'in the network file', Cause.NO_MESSAGES)]
         found = [*(self._clock_findings(name) if is_live else ()),
                  *self._time_findings(name, n), *self._value_findings(name, n, max_field)]
         if noise_std is not None and not np.nanmax(np.abs(self.field), initial=0.0) > max_field:
@@ -333,38 +373,45 @@ class SensorHealth:
                 axis = int(np.nanargmax(noise_ratio))
                 found.append(Finding(False, name, f'{"xyz"[axis]} is {noise_ratio[axis]:.0f} times '
                                      'as noisy as at its calibration', 'look for a new source of '
-                                     'interference nearby (a motor, a cable), or calibrate again'))
-        return sorted(found, key=lambda f: not f.serious)
+                                     'interference nearby (a motor, a cable), or calibrate again',
+                                     Cause.NOISY))
+        return found
 
     def _clock_findings(self, name: str) -> Iterator[Finding]:
         """Yield findings about clock steps and backward timestamps."""
         if n := self.counts['clock steps']:
             yield Finding(True, name, f'its clock stepped {occurrences(n)} relative to the '
                           f'host, by up to {self._largest_step_s:+.2f} s', 'synchronise the '
-                          'clocks (chrony, PTP), and take timestamps from a monotonic clock')
+                          'clocks (chrony, PTP), and take timestamps from a monotonic clock',
+                          Cause.CLOCK_STEPPED)
         if n := self.counts['backward timestamps']:
             yield Finding(True, name, f'timestamps went back {occurrences(n)}', 'check for two '
-                          'publishers on one topic, a clock that was set, or a looped replay')
+                          'publishers on one topic, a clock that was set, or a looped replay',
+                          Cause.BACKWARD_STAMPS)
 
     def _time_findings(self, name: str, n: int) -> Iterator[Finding]:
         """Yield findings about duplicate timestamps, lost readings and delays."""
         c = self.counts
         median, low, high = self.delay_s
+        if self._timestamp_fault is not None:
+            yield self._timestamp_fault.finding(name)
         if c['duplicates'] > 0.001 * n:
             yield Finding(False, name, f'{c["duplicates"]} of {n} readings repeat the previous '
                           'timestamp', 'check whether the driver publishes readings twice, or '
-                          'whether its timestamps are too coarse')
+                          'whether its timestamps are too coarse', Cause.DUPLICATE_STAMPS)
         if c['lost'] > 0.01 * n:
             yield Finding(c['lost'] > 0.2 * n, name, f'{c["lost"]} readings were lost, {n} were '
-                          'received', 'check the link, and the queue size of the recorder')
+                          'received', 'check the link, and the queue size of the recorder',
+                          Cause.LOST)
         if c['clock steps'] or abs(median) > MAX_LIVE_DELAY_S:
             return
         if high - low > 0.05:
             yield Finding(False, name, f'readings take {1e3 * low:.0f} to {1e3 * high:.0f} ms to '
-                          'arrive', 'use timestamps of the sensor instead of the time of receipt')
+                          'arrive', 'use timestamps of the sensor instead of the time of receipt',
+                          Cause.DELAY_VARIES)
         elif abs(median) > 1.0:
             yield Finding(False, name, f'the delay from timestamp to receipt is {median:.1f} s',
-                          'synchronise the clocks of sensor and host (chrony, PTP)')
+                          'synchronise the clocks of sensor and host (chrony, PTP)', Cause.DELAYED)
 
     def _value_findings(self, name: str, n: int, max_field: float) -> Iterator[Finding]:
         """Yield findings about the values and the axes of the readings."""
@@ -373,25 +420,27 @@ class SensorHealth:
         if largest > max_field:
             yield Finding(True, name, f'a field component of {largest:.3g} T exceeds the limit of '
                           f'{max_field:g} T', 'check the unit (gauss or microtesla published as '
-                          'tesla?), or near a magnet raise calibrate.max_field')
+                          'tesla?), or near a magnet raise calibrate.max_field', Cause.WRONG_UNIT)
         if c['without any axis'] > 0.01 * n:
             yield Finding(True, name, f'{c["without any axis"]} of {n} readings have no valid '
-                          'axis', 'check the sensor and its driver')
-        for axis in self.dead_axes:
-            yield Finding(True, name, f'{axis} does not change', 'the axis is dead: check the '
-                          'sensor and its driver')
-        for axis in 'xyz':
-            if 0.01 * n < c[axis] - c['without any axis'] and c[axis] < 0.99 * n:
-                yield Finding(False, name, f'{axis} is missing in {c[axis]} of {n} readings',
-                              'check the sensor and its driver')
+                          'axis', 'check the sensor and its driver', Cause.NO_AXIS)
+        if dead := self.dead_axes:
+            yield Finding(True, name, ' and '.join(dead) + (
+                ' does not change' if len(dead) == 1 else ' do not change'),
+                'the axis is dead: check the sensor and its driver', Cause.DEAD_AXIS)
+        if missing := ', '.join(f'{axis} is missing in {c[axis]}' for axis in 'xyz'
+                                if 0.01 * n < c[axis] - c['without any axis']
+                                and c[axis] < 0.99 * n):
+            yield Finding(False, name, f'{missing} of {n} readings',
+                          'check the sensor and its driver', Cause.MISSING_AXIS)
         if c['stuck readings']:
             yield Finding(True, name, f'{c["stuck readings"]} readings are identical to all '
                           f'readings of the previous {STUCK_S:g} s',
-                          'the sensor or its driver is stuck: restart it')
+                          'the sensor or its driver is stuck: restart it', Cause.STUCK)
         if c['saturated'] > 0.001 * n:
             yield Finding(True, name, f'{c["saturated"]} of {n} readings are at the end of the '
                           'range of the sensor', 'select a larger measuring range, or move the '
-                          'sensor further away from the targets')
+                          'sensor further away from the targets', Cause.SATURATED)
         if c['spikes'] > 0.001 * n:
             yield Finding(False, name, f'{c["spikes"]} of {n} readings are spikes', 'check '
-                          'connectors, power supply and checksums')
+                          'connectors, power supply and checksums', Cause.SPIKES)

@@ -12,6 +12,7 @@ from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.stages.health.diagnosis import ranked
 from mag_tracking.stages.health.reading_buffer import ReadingBuffer
 from mag_tracking.stages.health.sensor_health import WINDOW, SensorHealth
 from mag_tracking.stages.health.window import quantiles
@@ -167,8 +168,7 @@ def test_a_steep_slope_is_not_a_spike():
 def test_saturated_readings_are_counted_once():
     stamps, fields, _ = faulty('saturated')
     clipped = np.isin(fields[:, 1], [1.5e-5, 1.6e-5]).sum()
-    # Neighbouring readings are suspect and also counted.
-    assert clipped <= examined(stamps, fields).counts['saturated'] <= 200 + 12
+    assert examined(stamps, fields).counts['saturated'] == clipped
 
 
 def test_a_stuck_two_axis_sensor_is_found():
@@ -194,7 +194,7 @@ def test_a_sensor_without_readings_is_reported():
 
 
 def doctor_findings(change=lambda k, field: field, seconds=10.0, **settings):
-    """Findings of `Doctor` for three sensors; `change` modifies the fields of the second sensor."""
+    """Diagnoses of `Doctor` for three sensors; `change` modifies the fields of the second one."""
     network = line_network(3)
     doctor = Doctor(network, settings_for('vehicle', settings))
     rng = np.random.default_rng(5)
@@ -204,10 +204,7 @@ def doctor_findings(change=lambda k, field: field, seconds=10.0, **settings):
             if j == 1:
                 field = change(k, field)
             doctor.feed(one(MagSample(10**18 + k * 20_000_000, name, field)))
-    findings = doctor.findings()
-    # Serious findings come first.
-    assert findings == sorted(findings, key=lambda f: not f.serious)
-    return [str(f) for f in findings]
+    return [str(d) for d in ranked(doctor.findings())]
 
 
 def test_a_target_that_stays_causes_no_findings():
@@ -222,13 +219,12 @@ def test_the_doctor_compares_sensors_with_the_earth_field():
     assert 'y is flipped' in findings[0]
     findings = doctor_findings(lambda k, field: field * 1e6)
     assert any('its unit is microtesla' in text for text in findings), findings
-    assert any(text.startswith('calibrate: 500 readings rejected: above') for text in findings)
+    assert any(text.startswith('mag_2:') and '500 readings rejected: above' in text
+               for text in findings), findings
     # The first spike is not counted, because the noise is not known yet.
     few = doctor_findings(lambda k, field: field * (1e6 if k % 100 == 1 else 1.0), seconds=20.0)
-    assert 'mag_2: 9 of 1000 readings are spikes' in few[0] and '10 readings rejected' in few[1]
-    # A large proportion of rejections is serious and comes first.
-    many = doctor_findings(lambda k, field: field * (1e6 if k % 8 == 1 else 1.0), seconds=20.0)
-    assert '125 readings rejected' in many[0] and 'are spikes' in many[1]
+    assert few[0].startswith('mag_2: 9 of 1000 readings are spikes')
+    assert '10 readings rejected' in few[0]
 
 
 def test_a_background_in_the_file_does_not_hide_a_flipped_axis():
@@ -241,7 +237,7 @@ def test_a_background_in_the_file_does_not_hide_a_flipped_axis():
             field = backgrounds[j] * ([1.0, 1.0, -1.0] if j == 2 else np.ones(3))
             doctor.feed(one(MagSample(k * 20_000_000, name,
                                       field + SIGMA * rng.standard_normal(3))))
-    findings = [str(f) for f in doctor.findings()]
+    findings = [str(d) for d in ranked(doctor.findings())]
     assert "mag_3: differs from the Earth's field by" in findings[0]
     assert 'z is flipped' in findings[0]
 
@@ -257,7 +253,7 @@ def test_without_an_earth_field_sensors_are_compared_with_each_other():
                 field = network.R_sw[j] @ EARTH * ([1.0, -1.0, 1.0] if j == 1 else np.ones(3))
                 doctor.feed(one(MagSample(k * 20_000_000, name,
                                           field + SIGMA * rng.standard_normal(3))))
-        findings = [str(f) for f in doctor.findings()]
+        findings = [str(d) for d in ranked(doctor.findings())]
         assert len(findings) == 1 and findings[0].startswith(message), findings
 
 
@@ -273,7 +269,7 @@ def test_clocks_far_apart_are_reported_and_the_age_of_a_replay_is_not():
                 # All timestamps are years old, as in a replay.
                 stamp = received - 10**17 - (offset_ns if j else 0)
                 doctor.feed(one(MagSample(stamp, name, field)), received)
-        findings = [str(f) for f in doctor.findings()]
+        findings = [str(d) for d in ranked(doctor.findings())]
         assert len(findings) == n, findings
         assert not n or findings[0].startswith(
             'mag_2: its timestamps differ by -120 s from the timestamps of other sensors')
@@ -293,21 +289,16 @@ def test_the_doctor_reports_frozen_relearnt_and_missing_backgrounds():
 @pytest.mark.parametrize('name', VEHICLES)
 def test_the_doctor_finds_no_faults_in_the_bundled_recordings(name, road_network):
     doctor, lost = examine(Recording(vehicle_path(name)), road_network, settings_for('vehicle'))
-    findings = [str(f) for f in doctor.findings()]
-    if name == 'straight_truck_right':
-        # The truck passes so close that a sensor reaches its limit of 100 uT.
-        assert findings.pop().startswith('mag_2: 9 of 1400 readings are at the end of the range')
+    findings = [str(d) for d in ranked(doctor.findings())]
     assert not lost and not findings
 
 
-def test_the_doctor_reports_saturated_sensors_of_the_corridor(capsys):
-    """The car passes so close that two sensors reach their limit of 100 uT."""
+def test_the_doctor_finds_no_faults_in_the_corridor(capsys):
+    """The largest readings of two sensors are equal by chance, far below the end of the range."""
     folder = DATA / 'corridor'
     assert main(['doctor', str(folder / 'corridor_8_sensors.mcap'), '--network',
-                 str(folder / 'network.yaml')]) == 2
-    output = capsys.readouterr().out
-    assert [line.split()[1] for line in output.splitlines() if 'end of the range' in line] == [
-        'mag_2:', 'mag_4:']
+                 str(folder / 'network.yaml')]) == 0
+    assert 'end of the range' not in capsys.readouterr().out
 
 
 def test_the_doctor_command_checks_a_recording_and_its_arguments(tmp_path, capsys):

@@ -1,0 +1,80 @@
+"""Repetition: detect a driver that publishes readings faster than its sensor measures.
+
+Each reading is then repeated a regular number of times. A sensor with coarse steps also repeats
+readings at rest, but at random: the number of repetitions has a geometric distribution.
+"""
+
+import numpy as np
+
+from mag_tracking.arrays import BoolArray, FloatArray
+
+MIN_REPETITION = 1.2
+"""Minimum number of readings per measurement; timing jitter causes fewer repetitions."""
+MAX_REPETITION = 40.0
+"""Maximum number of readings per measurement."""
+MIN_LOG_ODDS = 24.0
+"""Minimum significance of the regularity: random repetitions reach the power of a frequency with a
+probability of exp(-24), at each of some thousand frequencies."""
+MIN_RESULTANT = 0.85
+"""Minimum regularity of the changes, relative to a perfectly regular source."""
+OVERSAMPLING = 4
+"""Oversampling of the frequencies at which the regularity is evaluated."""
+
+
+def changes_of(fields: FloatArray) -> BoolArray:
+    """Find the readings that differ from the previous reading.
+
+    Parameters
+    ----------
+    fields : (n, 3) array
+        Readings in chronological order; NaN for a missing axis.
+
+    Returns
+    -------
+    (n,) bool array
+        True for the first reading.
+    """
+    before, after = fields[:-1], fields[1:]
+    equal = (after == before) | np.isnan(after) & np.isnan(before)
+    return np.append(np.ones(min(1, len(fields)), dtype=bool), ~equal.all(axis=1))
+
+
+def repetition_of(fields: FloatArray) -> float:
+    """Number of readings per measurement, from the regularity of the changes.
+
+    A source that is read every r readings changes at the readings ceil(k r). The phases of the
+    changes modulo r then cover 1/r of the circle, so their resultant is sin(π/r) / (π/r). Changes
+    that are missing because two measurements are equal do not matter.
+
+    Parameters
+    ----------
+    fields : (n, 3) array
+        Readings in chronological order; NaN for a missing axis.
+
+    Returns
+    -------
+    float
+        1 if readings are not repeated regularly. An integer unless the rates are incommensurate.
+    """
+    n = len(fields)
+    changed = changes_of(fields)[1:].astype(float)
+    n_changes = changed.sum()
+    if n_changes < MIN_LOG_ODDS or n_changes > len(changed) / MIN_REPETITION:
+        return 1.0
+    size = OVERSAMPLING * 2 ** int(np.ceil(np.log2(n)))
+    resultant = np.abs(np.fft.rfft(changed, size)) / n_changes
+    frequency = np.arange(len(resultant)) / size
+    # A rate above half the rate of publishing is aliased. Equal measurements only lower the number
+    # of changes, so a source is at least as fast as the changes.
+    frequency = np.where(frequency < 0.95 * n_changes / len(changed), 1.0 - frequency, frequency)
+    period = 1.0 / np.maximum(frequency, 1e-9)
+    expected = np.sinc(1.0 / period)
+    is_regular = (period >= MIN_REPETITION) & (period <= MAX_REPETITION) \
+        & (resultant > MIN_RESULTANT * expected) & (n_changes * resultant**2 > MIN_LOG_ODDS)
+    if not is_regular.any():
+        return 1.0
+    # Multiples of the rate are regular as well: the slowest source decides.
+    slowest = np.flatnonzero(is_regular & (period > 0.9 * period[is_regular].max()))
+    best = float(period[slowest[np.argmax(resultant[slowest])]])
+    nearest = round(best)
+    return float(nearest) if abs(best - nearest) * n < 2.0 * best**2 / OVERSAMPLING else best
