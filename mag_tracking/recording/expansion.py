@@ -15,8 +15,9 @@ LARGEST_CHUNK_MB = 256.0
 """Largest size of a decompressed chunk, message or record that is read [MB]."""
 LARGEST_CHUNK_VARIABLE = 'MAG_TRACKING_LARGEST_CHUNK_MB'
 """Environment variable that replaces `LARGEST_CHUNK_MB`, in commands, nodes and workers."""
-_STEP = 4 << 20
-"""Number of bytes that are decompressed at once."""
+_STEP, _LARGE_STEP = 1 << 20, 4 << 20
+"""Numbers of bytes that are decompressed at once. The larger one is for decompressors that copy
+their remaining input at each step."""
 _MAGIC = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
 
 
@@ -130,7 +131,7 @@ def _pieces(decompressor: 'bz2.BZ2Decompressor | lz4.frame.LZ4FrameDecompressor'
             data: bytes) -> Iterator[bytes]:
     """Decompress piece by piece; raises EOFError if the end is missing."""
     while not decompressor.eof:
-        piece = decompressor.decompress(data, max_length=_STEP)
+        piece = decompressor.decompress(data, max_length=_LARGE_STEP)
         if piece:
             yield piece
         elif not decompressor.eof:
