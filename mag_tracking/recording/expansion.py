@@ -18,6 +18,8 @@ LARGEST_CHUNK_VARIABLE = 'MAG_TRACKING_LARGEST_CHUNK_MB'
 _STEP, _LARGE_STEP = 1 << 20, 4 << 20
 """Numbers of bytes that are decompressed at once. The larger one is for decompressors that copy
 their remaining input at each step."""
+_MAX_WINDOW = 64 << 20
+"""Largest memory of previous output that a zstd frame may require, bytes."""
 _MAGIC = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
 
 
@@ -112,7 +114,7 @@ def expanded(compression: str, data: bytes, limit: int, is_cut: bool = False) ->
 
 def _zstd_pieces(data: bytes) -> Iterator[bytes]:
     """Decompress one frame piece by piece."""
-    with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+    with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as reader:
         while piece := reader.read(_STEP):
             yield piece
 

@@ -150,3 +150,25 @@ def test_a_folder_without_a_recording_names_its_file(tmp_path):
     (tmp_path / 'field.csv').write_bytes(TABLE)
     with pytest.raises(RecordingError, match='no recording.*field.csv.*table'):
         Recording(tmp_path)
+
+
+def test_messages_in_a_write_ahead_log_are_not_lost_silently(tmp_path):
+    path = tmp_path / 'a.db3'
+    database = sqlite3.connect(path)
+    database.executescript('''
+        CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,
+                            serialization_format TEXT, offered_qos_profiles TEXT);
+        CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,
+                              data BLOB);
+        INSERT INTO topics VALUES(1, '/x', 'std_msgs/msg/String', 'cdr', '');
+        PRAGMA journal_mode = WAL;''')
+    with database:
+        database.execute("INSERT INTO messages VALUES(1, 1, 5, x'00010000')")
+    # As after a crash: the log exists, because the database is still open.
+    recording = Recording(path)
+    assert len(list(recording.messages())) == 0
+    (loss,) = recording.losses
+    assert 'a.db3-wal' in loss and 'wal_checkpoint' in loss
+    database.close()
+    recording = Recording(path)
+    assert len(list(recording.messages())) == 1 and not recording.losses
