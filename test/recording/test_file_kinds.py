@@ -55,7 +55,7 @@ KINDS = {
     'decimal_comma': (b't;x\n0,1;2,5\n', 'table', 'mag-tracking import'),
     'utf16': ('t,x\n0.1,2.5\n'.encode('utf-16'), 'table', 'mag-tracking import'),
     'no_header': (b'0.1 2.5 3.5 4.5\n0.2 2.5 3.5 4.5\n', 'table', 'mag-tracking import'),
-    'iaga': (IAGA, 'IAGA-2002', 'CSV'),
+    'iaga': (IAGA, 'IAGA-2002', 'mag-tracking import'),
     'ulog': (b'ULog\x01\x12\x35\x01' + bytes(50), 'ULog', 'ulog2csv'),
     'dataflash': (b'\xa3\x95\x80\x80\x59FMT\0BBnNZ' + bytes(60), 'DataFlash', 'mavlogdump.py'),
     'dataflash_text': (b'FMT, 128, 89, FMT, BBnNZ, Type,Length\n', 'ArduPilot', 'MAG'),
