@@ -23,7 +23,6 @@ GAP_INTERVALS, MIN_GAP_S = 10.0, 1.0
 """A gap is longer than this number of median intervals, and than this time [s]."""
 _BINS_PER_OCTAVE = 16
 """Resolution of the histogram of intervals."""
-_N_BINS = 64 * _BINS_PER_OCTAVE
 _MAX_CLOCK_DIFFERENCE = 0.1
 """Relative difference of the durations of two clocks above which one of them is wrong."""
 _MIN_CLOCK_DIFFERENCE_S = 10.0
@@ -45,8 +44,8 @@ class Timing:
         self._log: list[int] = []
         self._times: list[int] = []
         self._longest = self._longest_begin = self._n_steps = 0
-        self._counts = np.zeros(_N_BINS, dtype=np.int64)
-        self._sums = np.zeros(_N_BINS)
+        # Histogram of the intervals: number and sum [ns] by logarithm.
+        self._bins: dict[int, tuple[int, int]] = {}
 
     def add(self, times_ns: IntArray, log_times_ns: IntArray) -> None:
         """Add messages in the order of the recording.
@@ -75,10 +74,14 @@ class Timing:
             self._longest = int(steps.max())
             # The end of the step is in this batch.
             self._longest_begin = int(times_ns[int(steps.argmax()) - len(steps)]) - self._longest
-        forward = steps[steps > 0]
-        bins = np.minimum((np.log2(forward) * _BINS_PER_OCTAVE).astype(np.int64), _N_BINS - 1)
-        self._counts += np.bincount(bins, minlength=_N_BINS)
-        self._sums += np.bincount(bins, forward, minlength=_N_BINS)
+        forward = np.sort(steps[steps > 0])
+        bins = (np.log2(forward) * _BINS_PER_OCTAVE).astype(np.int64)
+        numbers, first = np.unique(bins, return_index=True)
+        sums = np.add.reduceat(forward, first) if len(first) else forward
+        for k, n, total in zip(numbers.tolist(), np.diff([*first, len(bins)]).tolist(),
+                               sums.tolist(), strict=True):
+            earlier_n, earlier_total = self._bins.get(k, (0, 0))
+            self._bins[k] = earlier_n + n, earlier_total + total
 
     @property
     def span_s(self) -> float:
@@ -98,12 +101,13 @@ class Timing:
             _MIN_CLOCK_DIFFERENCE_S, _MAX_CLOCK_DIFFERENCE * min(abs(self.span_s),
                                                                  abs(self.log_span_s)))
 
-    def _n_regular_bins(self) -> int:
-        """Number of bins of intervals that are not gaps."""
-        cumulated = np.cumsum(self._counts)
-        median_bin = int(np.searchsorted(cumulated, (cumulated[-1] + 1) // 2))
+    def _longest_regular_bin(self) -> int:
+        """Largest bin of intervals that are not gaps."""
+        bins = sorted(self._bins)
+        cumulated = np.cumsum([self._bins[k][0] for k in bins])
+        median_bin = bins[int(np.searchsorted(cumulated, (cumulated[-1] + 1) // 2))] if bins else 0
         longest = max(GAP_INTERVALS * 2.0 ** (median_bin / _BINS_PER_OCTAVE), MIN_GAP_S * NS)
-        return int(np.log2(longest) * _BINS_PER_OCTAVE) + 1
+        return int(np.log2(longest) * _BINS_PER_OCTAVE)
 
     def describe(self) -> str:
         """Format rate, gaps and steps backward.
@@ -115,12 +119,12 @@ class Timing:
         """
         if self.n_messages < 2:
             return ''
-        n_bins = self._n_regular_bins()
-        n, total = int(self._counts[:n_bins].sum()), float(self._sums[:n_bins].sum())
+        longest_bin = self._longest_regular_bin()
+        n_gaps = sum(n for k, (n, _) in self._bins.items() if k > longest_bin)
+        total = sum(total for k, (_, total) in self._bins.items() if k <= longest_bin)
         # Messages with equal times belong to the same intervals.
-        n += self._n_steps - int(self._counts.sum()) - self.n_backward
+        n = self._n_steps - n_gaps - self.n_backward
         parts = [f'{n * NS / total:.4g} Hz'] if total else []
-        n_gaps = int(self._counts[n_bins:].sum())
         if n_gaps:
             parts.append(f'{quantity(n_gaps, "gap")}, the longest {self._longest / NS:.4g} s, '
                          f'{(self._longest_begin - self._times[0]) / NS:.4g} s after the start')
@@ -210,7 +214,10 @@ def _batch_times(block: MessageBlock, topic: str, rows: IntArray, faults: 'Count
         except RecordingError:
             faults[fault_of(message)] += 1
             continue
-        for j in np.unique(readings.sensor).tolist():
-            stamps = readings.stamp_ns[readings.sensor == j]
+        order = np.argsort(readings.sensor, kind='stable')
+        numbers, first = np.unique(readings.sensor[order], return_index=True)
+        # Without readings, the split has one part and no number.
+        for j, stamps in zip(numbers.tolist(), np.split(readings.stamp_ns[order], first[1:]),
+                             strict=False):
             yield (Source(topic, readings.names[j]), stamps,
                    np.full(len(stamps), block.log_time_ns[k]))

@@ -287,19 +287,17 @@ class _Channels:
 
     def __init__(self) -> None:
         self._schemas: dict[int, Schema] = {0: Schema(id=0, data=b'', encoding='', name='')}
-        self._waiting: dict[int, Channel] = {}
+        self._waiting: dict[int, list[Channel]] = {}
         self.kinds: dict[int, ChannelKind] = {}
 
     def add(self, record: Schema | Channel) -> None:
         """Add a schema or a channel. A channel is defined when its schema is."""
         if isinstance(record, Schema):
             self._schemas[record.id] = record
-            channels = [c for c in self._waiting.values() if c.schema_id == record.id]
+            for channel in self._waiting.pop(record.id, ()):
+                self.add(channel)
+        elif record.schema_id in self._schemas:
+            self.kinds[record.id] = ChannelKind.of(
+                record.topic, record.message_encoding, self._schemas[record.schema_id])
         else:
-            self._waiting[record.id] = record
-            channels = [record]
-        for channel in channels:
-            if channel.schema_id in self._schemas:
-                self.kinds[channel.id] = ChannelKind.of(
-                    channel.topic, channel.message_encoding, self._schemas[channel.schema_id])
-                del self._waiting[channel.id]
+            self._waiting.setdefault(record.schema_id, []).append(record)
