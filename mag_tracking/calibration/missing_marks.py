@@ -78,6 +78,30 @@ def are_marked(fields: FloatArray, marks: FloatArray) -> BoolArray:
     return found
 
 
+def describe_marks(marks: FloatArray) -> str:
+    """Format marks, with the names of the axes unless a mark concerns all of them.
+
+    Parameters
+    ----------
+    marks : (k, 3) array, T
+
+    Returns
+    -------
+    str
+    """
+    return ' or '.join(map(_describe_mark, marks))
+
+
+def _describe_mark(mark: FloatArray) -> str:
+    """Format a mark (3,) [T]."""
+    values = [(f'{axis} = ', v) for axis, v in zip('xyz', mark.tolist(), strict=True)
+              if not np.isnan(v)]
+    if len(values) == 3 and len({v for _, v in values}) == 1:
+        values = [('', values[0][1])]
+    return ', '.join(axis + (f'{1e9 * v:.6g} nT' if abs(v) < 1.0 else f'{v:.6g} T')
+                     for axis, v in values)
+
+
 def _marks_of_axis(fields: FloatArray, axis: int) -> list[float]:
     """Marks of one axis."""
     fields = fields[~np.isnan(fields[:, axis])]

@@ -6,7 +6,7 @@ readings at rest, but at random: the number of repetitions has a geometric distr
 
 import numpy as np
 
-from mag_tracking.arrays import BoolArray, FloatArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 
 MIN_REPETITION = 1.2
 """Minimum number of readings per measurement; timing jitter causes fewer repetitions."""
@@ -75,6 +75,17 @@ def repetition_of(fields: FloatArray) -> float:
         return 1.0
     # Multiples of the rate are regular as well: the slowest source decides.
     slowest = np.flatnonzero(is_regular & (period > 0.9 * period[is_regular].max()))
-    best = float(period[slowest[np.argmax(resultant[slowest])]])
+    bin_of_best = slowest[np.argmax(resultant[slowest])]
+    best = _refined(np.flatnonzero(changed), float(frequency[bin_of_best]), 1.0 / size)
     nearest = round(best)
     return float(nearest) if abs(best - nearest) * n < 2.0 * best**2 / OVERSAMPLING else best
+
+
+def _refined(changes: IntArray, frequency: float, width: float) -> float:
+    """Period of the most regular frequency within `width` of a `frequency` [1/reading].
+
+    `changes` are the indices of the readings that changed.
+    """
+    frequencies = frequency + width * np.linspace(-1.0, 1.0, 65)
+    resultant = np.abs(np.exp(2j * np.pi * np.outer(frequencies, changes)).sum(axis=1))
+    return float(1.0 / frequencies[np.argmax(resultant)])

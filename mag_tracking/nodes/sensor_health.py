@@ -10,6 +10,7 @@ from rclpy.node import Node
 
 from mag_tracking.apps.doctor import background_findings, network_findings
 from mag_tracking.apps.doctor_covariances import covariance_findings
+from mag_tracking.apps.doctor_rejections import driver_findings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute
 from mag_tracking.nodes.flow import SILENCE_TIMEOUT_S
@@ -70,13 +71,9 @@ class HealthDiagnostics:
         # Earlier timestamps were corrected with the clock offsets of the previous network.
         self._buffer = ReadingBuffer(len(network), WINDOW // 2)
         self._previous_window: dict[str, SensorHealth | None] = dict.fromkeys(network.names)
-        self._current_window = self._new_window()
+        self._current_window = {name: SensorHealth() for name in network.names}
         self._start_time = time.monotonic()
         self._window_end = self._start_time + WINDOW_S
-
-    def _new_window(self) -> dict[str, SensorHealth]:
-        """Create an empty `SensorHealth` for each sensor."""
-        return {name: SensorHealth() for name in self._network.names}
 
     def use_network(self, network: SensorNetwork) -> None:
         """Replace the network by another calibration of the same sensors; restart the windows.
@@ -143,11 +140,17 @@ class HealthDiagnostics:
         calibrate : Calibrate
             Calibration stage.
         """
+        for name, health in self._current_window.items():
+            if health.faults != (faults := calibrate.faults_of(name)):
+                # Earlier statistics include the faulty readings.
+                self._previous_window[name] = None
+                self._current_window[name] = SensorHealth(faults=faults)
         self._compare(calibrate)
         if time.monotonic() > self._window_end:
             self._window_end = time.monotonic() + WINDOW_S
             self._previous_window, self._current_window = \
-                {**self._current_window}, self._new_window()
+                {**self._current_window}, {name: SensorHealth(faults=health.faults)
+                                           for name, health in self._current_window.items()}
             self._relearnt_counts = [self._relearnt_counts[1], {
                 name: b.n_relearnt for name, b in calibrate.backgrounds().items()}]
 
@@ -190,6 +193,7 @@ class HealthDiagnostics:
             findings += background_findings(name, calibrate, self._frozen_since_ns.get(name),
                                             self._relearnt_counts[0][name])
         findings += covariance_findings(name, self._topics[name], calibrate)
+        findings += driver_findings(name, calibrate)
         in_windows: dict[Cause, Finding] = {}
         for health in (self._previous_window[name], self._current_window[name]):
             if health is not None and health.counts['readings']:

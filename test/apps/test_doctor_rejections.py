@@ -19,8 +19,7 @@ STEP_NS = 10_000_000
 
 def test_every_cause_of_rejection_has_advice():
     causes = {cause for cause, _ in REJECTIONS.values()}
-    causes = causes - {Cause.NO_READING_MARK, Cause.REPEATED} | {Cause.TOO_LARGE, Cause.SPIKES}
-    assert causes == set(ADVICE) and all(ADVICE.values())
+    assert causes | {Cause.TOO_LARGE, Cause.SPIKES} == set(ADVICE) and all(ADVICE.values())
 
 
 def quiet(n, network):

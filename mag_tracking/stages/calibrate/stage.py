@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,13 +13,14 @@ from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted
 from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.level_change import SharedChanges
-from mag_tracking.calibration.reading_faults import ReadingFaults, reading_faults
+from mag_tracking.calibration.reading_faults import ReadingFaults
 from mag_tracking.calibration.screening import clear_spikes
-from mag_tracking.calibration.sensor_state import N_WINDOW, new_sensors
+from mag_tracking.calibration.sensor_state import new_sensors
 from mag_tracking.errors import NetworkError
 from mag_tracking.inference.axes import are_valid_covariances
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
+from mag_tracking.stages.calibrate.driver_faults import DriverFaults
 from mag_tracking.stages.calibrate.output_buffer import OutputBuffer
 from mag_tracking.stages.calibrate.restoration import (
     BackgroundRestoration,
@@ -50,10 +50,8 @@ REJECTIONS = {
     core.DUPLICATE: (Cause.DUPLICATE_STAMPS, 'duplicate timestamp'),
     core.OUT_OF_ORDER: (Cause.BACKWARD_STAMPS, 'out of order'),
     core.STUCK: (Cause.STUCK, 'stuck sensor (repeated reading)'),
-    core.MARKED: (Cause.NO_READING_MARK, 'mark for a missing reading'),
-    core.REPEATED: (Cause.REPEATED, 'repetition of the previous reading'),
 }
-"""Cause and description of the rejection for each reason code; `TOO_LARGE` depends on a setting."""
+"""Cause and description of the rejection for each reason code, except descriptions with a value."""
 
 
 class Calibrate:
@@ -83,12 +81,11 @@ class Calibrate:
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
                  background_type: type[RunningBackground] = RunningBackground) -> None:
         self.counts: Counter[str] = Counter()
-        # Rate of the readings of each sensor [Hz] when a fault of its driver was found.
-        self._rates = dict.fromkeys(network.names, float('nan'))
         self._rejections: dict[str, Counter[tuple[Cause, str]]] = {
             name: Counter() for name in network.names}
         self._settings, self._sensors = settings, new_sensors(len(network))
         self._batches = np.zeros(1, core.BATCH)
+        self._driver_faults = DriverFaults(self._sensors)
         self._limits = np.array([(
             settings.max_field, settings.max_forward_jump_s * NS, settings.max_backward_jump_s * NS,
             settings.reject_stuck, settings.spike_std, settings.decimate_to_hz > 0.0,
@@ -260,36 +257,18 @@ class Calibrate:
         elif reason == core.PASSED:
             self._calibrate_released(i, out)
         elif reason != core.SPIKES:
-            self._reject(name, self._causes[reason])
+            self._reject(name, self._causes[reason] if reason in self._causes
+                         else self._driver_faults.rejection(i, reason))
 
     def _examine_window(self, i: int) -> None:
         """Search the latest raw readings of sensor `i` for faults of its driver."""
-        s, name = self._sensors[i], self._network.names[i]
-        known, found = self.faults_of(name), reading_faults(s['window'][:s['n_window']])
-        # The current reading is the first one after the window.
-        duration_s = (int(self._batches[0]['stamp_ns']) - int(s['window_begin_ns'])) / NS
-        if known.merged(found) != known:
-            self._set_faults(i, replace(known.merged(found), rate=(
-                int(s['n_window']) / duration_s if duration_s > 0.0 else float('nan'))))
-            if not s['is_examined']:
+        is_beginning = not self._sensors[i]['is_examined']
+        if self._driver_faults.examine(i, int(self._batches[0]['stamp_ns'])):
+            self._reject_held(i, 'a fault of the driver was found')
+            self.counts[FAULTS_FOUND] += 1
+            if is_beginning:
                 # The background has been learnt from faulty readings.
-                self._background[name].forget()
-        if s['n_window'] < N_WINDOW:
-            s['window_due'] = 2 * s['window_due']
-        else:
-            s['n_window'], s['is_examined'] = 0, True
-
-    def _set_faults(self, i: int, faults: ReadingFaults) -> None:
-        """Leave out the marks and repetitions of sensor `i` from now on."""
-        s, self._rates[self._network.names[i]] = self._sensors[i], faults.rate
-        self.counts[FAULTS_FOUND] += 1
-        s['n_marks'], s['marks'][:len(faults.marks)] = len(faults.marks), faults.marks
-        s['repetition'] = faults.repetition
-        # The steps, repetitions and differences so far are those of the faults.
-        s['step'] = np.inf
-        s['n_same'] = s['n_changed'] = s['n_rest'] = 0
-        s['repeats'] = s['changes'] = s['run'] = 0
-        self._reject_held(i, 'a fault of the driver was found')
+                self._background[self._network.names[i]].forget()
 
     def faults_of(self, sensor: str) -> ReadingFaults:
         """Faults of the driver of a sensor that have been found so far.
@@ -302,9 +281,7 @@ class Calibrate:
         -------
         ReadingFaults
         """
-        s = self._state_of(sensor)
-        return ReadingFaults(s['marks'][:s['n_marks']].copy(), float(s['repetition']),
-                             self._rates[sensor])
+        return self._driver_faults.of(self._index[sensor])
 
     def n_marked(self, sensor: str) -> int:
         """Number of readings of a sensor with a mark for a missing reading on any axis.
@@ -317,8 +294,9 @@ class Calibrate:
         -------
         int
         """
-        return int(self._state_of(sensor)['n_partly_marked']) \
-            + self._rejections[sensor][REJECTIONS[core.MARKED]]
+        return int(self._state_of(sensor)['n_partly_marked']) + sum(
+            n for (cause, _), n in self._rejections[sensor].items()
+            if cause is Cause.NO_READING_MARK)
 
     def _calibrate_released(self, i: int, out: OutputBuffer) -> None:
         """Calibrate the readings of sensor `i` that the spike filter has released."""
@@ -383,7 +361,8 @@ class Calibrate:
         """
         for name, found in faults.items():
             if found:
-                self._set_faults(self._index[name], found)
+                self._driver_faults.store(self._index[name], found)
+                self.counts[FAULTS_FOUND] += 1
         for name, step in steps.items():
             self._state_of(name)['step'] = step
         for name, quiet in levels.items():
