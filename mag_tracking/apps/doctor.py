@@ -19,6 +19,7 @@ from mag_tracking.records import Readings
 from mag_tracking.stages.align.frame_period import frame_period_warning
 from mag_tracking.stages.calibrate.stage import FAULTS_FOUND, Calibrate
 from mag_tracking.stages.health.diagnosis import Cause, Finding
+from mag_tracking.stages.health.host_stalls import HostStalls
 from mag_tracking.stages.health.sensor_health import SensorHealth
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NS
@@ -226,7 +227,7 @@ class Doctor:
         self._clock_ns = dict(zip(network.names, network.clock_offset_ns.tolist(), strict=True))
         self._frozen_since_ns: dict[str, int] = {}
         self._missed = MissedTargets(network.names)
-        self._n_faults_found = 0
+        self._n_faults_found, self._stalls = 0, HostStalls()
 
     def feed(self, readings: Readings, received_ns: int | None = None) -> None:
         """Add raw readings.
@@ -238,6 +239,8 @@ class Doctor:
             Time of reception of the message; None if unknown.
         """
         names, stamps = readings.sensor_names(), readings.stamp_ns.tolist()
+        if received_ns is not None:
+            self._stalls.add(received_ns, names)
         self.calibrate.feed(readings)
         if self.calibrate.counts[FAULTS_FOUND] != self._n_faults_found:
             self._n_faults_found = self.calibrate.counts[FAULTS_FOUND]
@@ -261,7 +264,7 @@ class Doctor:
         list of Finding
             Without ranking; see `stages.health.diagnosis.ranked`.
         """
-        found: list[Finding] = []
+        found = list(self._stalls.findings())
         for j, (name, health) in enumerate(self.sensors.items()):
             found += health.findings(name, self.network.noise_std[j],
                                      self._settings.calibrate.max_field)

@@ -1,5 +1,6 @@
 """Live input of `mag-tracking doctor`, received for a limited time."""
 
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +25,7 @@ from mag_tracking.nodes.stage_node import SENSOR_QOS, STREAM_QOS, make_executor,
 from mag_tracking.pipeline import Settings
 from mag_tracking.quantities import quantity
 from mag_tracking.stages.health.diagnosis import Cause, Finding
+from mag_tracking.stages.health.host_stalls import load_findings
 
 
 class DoctorNode(Node):
@@ -82,7 +84,8 @@ class DoctorNode(Node):
             found += topic_findings(self, sensor, topic)
             if sensor not in self._batched_sensors and not self.count_publishers(topic):
                 found.append(no_message_finding(self, sensor, topic, self._topics))
-        return found
+        load, n_processors = os.getloadavg()[0], os.cpu_count() or 1
+        return [*load_findings(self.doctor.findings(), load, n_processors), *found]
 
 
 @dataclass

@@ -1,6 +1,7 @@
 """Diagnostics of the health of each sensor over the last one to two minutes."""
 
 import math
+import os
 import time
 
 import numpy as np
@@ -19,6 +20,7 @@ from mag_tracking.pipeline import Settings
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding, ranked
+from mag_tracking.stages.health.host_stalls import TIME_CAUSES, HostStalls, load_findings
 from mag_tracking.stages.health.reading_buffer import ReadingBuffer
 from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S, WINDOW, SensorHealth
 
@@ -72,6 +74,7 @@ class HealthDiagnostics:
         self._buffer = ReadingBuffer(len(network), WINDOW // 2)
         self._previous_window: dict[str, SensorHealth | None] = dict.fromkeys(network.names)
         self._current_window = {name: SensorHealth() for name in network.names}
+        self._stalls, self._previous_stalls = HostStalls(), HostStalls()
         self._start_time = time.monotonic()
         self._window_end = self._start_time + WINDOW_S
 
@@ -94,6 +97,7 @@ class HealthDiagnostics:
             Time of arrival.
         """
         indices = readings.rows(self._index)
+        self._stalls.add(now_ns, readings.names)
         self._last_received[indices[indices >= 0]] = time.monotonic()
         # Readings of unknown sensors (index -1) get a wrong offset, but are not used.
         stamps, field, i = readings.stamp_ns - self._clock_ns[indices], plain(readings.field), 0
@@ -151,6 +155,7 @@ class HealthDiagnostics:
             self._previous_window, self._current_window = \
                 {**self._current_window}, {name: SensorHealth(faults=health.faults)
                                            for name, health in self._current_window.items()}
+            self._stalls, self._previous_stalls = HostStalls(), self._stalls
             self._relearnt_counts = [self._relearnt_counts[1], {
                 name: b.n_relearnt for name, b in calibrate.backgrounds().items()}]
 
@@ -201,7 +206,11 @@ class HealthDiagnostics:
                                          self._settings.calibrate.max_field,
                                          not self._is_replayed):
                     in_windows.setdefault(f.cause, f)
-        return ranked([*findings, *in_windows.values()])
+        findings += in_windows.values()
+        if not self._is_replayed and any(f.cause in TIME_CAUSES for f in findings):
+            findings += [*load_findings(findings, os.getloadavg()[0], os.cpu_count() or 1),
+                         *self._stalls.findings(), *self._previous_stalls.findings()]
+        return ranked(findings)
 
     def _silence_findings(self, name: str, silent_s: float) -> list[Finding]:
         """Return the fault of a silent sensor, if any; without readings, `silent_s` is NaN."""
