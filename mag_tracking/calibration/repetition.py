@@ -56,8 +56,10 @@ def repetition_of(fields: FloatArray) -> float:
     float
         1 if readings are not repeated regularly. An integer unless the rates are incommensurate.
     """
-    n = len(fields)
-    changed = changes_of(fields)[1:].astype(float)
+    n, present = len(fields), np.flatnonzero(~np.isnan(fields).all(axis=1))
+    changed = np.zeros(n)
+    changed[present] = changes_of(fields[present])
+    changed = changed[1:]
     n_changes = changed.sum()
     if n_changes < MIN_LOG_ODDS or n_changes > len(changed) / MIN_REPETITION:
         return 1.0

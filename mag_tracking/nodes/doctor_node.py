@@ -85,7 +85,8 @@ class DoctorNode(Node):
             if sensor not in self._batched_sensors and not self.count_publishers(topic):
                 found.append(no_message_finding(self, sensor, topic, self._topics))
         load, n_processors = os.getloadavg()[0], os.cpu_count() or 1
-        return [*load_findings(self.doctor.findings(), load, n_processors), *found]
+        return [*load_findings(self.doctor.findings(), list(self._topics), load,
+                               n_processors), *found]
 
 
 @dataclass

@@ -75,6 +75,8 @@ class HealthDiagnostics:
         self._previous_window: dict[str, SensorHealth | None] = dict.fromkeys(network.names)
         self._current_window = {name: SensorHealth() for name in network.names}
         self._stalls, self._previous_stalls = HostStalls(), HostStalls()
+        # Findings of each sensor that an overloaded computer explains.
+        self._late_findings: dict[str, list[Finding]] = {}
         self._start_time = time.monotonic()
         self._window_end = self._start_time + WINDOW_S
 
@@ -207,8 +209,11 @@ class HealthDiagnostics:
                                          not self._is_replayed):
                     in_windows.setdefault(f.cause, f)
         findings += in_windows.values()
-        if not self._is_replayed and any(f.cause in TIME_CAUSES for f in findings):
-            findings += [*load_findings(findings, os.getloadavg()[0], os.cpu_count() or 1),
+        self._late_findings[name] = [f for f in findings if f.cause in TIME_CAUSES]
+        if not self._is_replayed and self._late_findings[name]:
+            late = [f for found in self._late_findings.values() for f in found]
+            findings += [*load_findings(late, self._network.names, os.getloadavg()[0],
+                                        os.cpu_count() or 1),
                          *self._stalls.findings(), *self._previous_stalls.findings()]
         return ranked(findings)
 

@@ -78,12 +78,16 @@ class HostStalls:
                           Cause.OVERLOADED)
 
 
-def load_findings(found: Collection[Finding], load: float, n_processors: int) -> Iterator[Finding]:
-    """Report a high load of the computer if it explains findings.
+def load_findings(found: Collection[Finding], sensors: Collection[str], load: float,
+                  n_processors: int) -> Iterator[Finding]:
+    """Report a high load of the computer if readings of all sensors are late or lost.
 
     Parameters
     ----------
     found : collection of Finding
+        Findings of all sensors.
+    sensors : collection of str
+        Names of the sensors.
     load : float
         Mean number of processes that run or wait for a processor.
     n_processors : int
@@ -92,7 +96,8 @@ def load_findings(found: Collection[Finding], load: float, n_processors: int) ->
     ------
     Finding
     """
-    if load > n_processors and any(f.cause in TIME_CAUSES for f in found):
+    late = {f.subject for f in found if f.cause in TIME_CAUSES}
+    if load > n_processors and sensors and late.issuperset(sensors):
         yield Finding(False, 'computer', f'{load:.1f} processes compete for '
                       f'{n_processors} processors: the computer is overloaded', 'reduce the load '
                       'of this computer', Cause.OVERLOADED)

@@ -69,8 +69,10 @@ def test_packets_and_pauses_are_not_an_overload(packet_s):
 
 
 def test_a_load_is_reported_only_if_it_explains_something():
-    lost = [Finding(True, 'mag_1', '50 readings were lost', '', Cause.LOST)]
-    (overload,) = load_findings(lost, 9.0, 2)
+    names = ('mag_1', 'mag_2')
+    lost = [Finding(True, name, '50 readings were lost', '', Cause.LOST) for name in names]
+    (overload,) = load_findings(lost, names, 9.0, 2)
     assert overload.cause is Cause.OVERLOADED and '9.0 processes' in overload.fault
-    assert not list(load_findings(lost, 1.5, 2))
-    assert not list(load_findings([], 9.0, 2))
+    assert not list(load_findings(lost, names, 1.5, 2))
+    assert not list(load_findings(lost[:1], names, 9.0, 2))
+    assert not list(load_findings([], (), 9.0, 2))
