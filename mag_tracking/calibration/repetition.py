@@ -57,18 +57,18 @@ def repetition_of(fields: FloatArray) -> float:
         1 if readings are not repeated regularly. An integer unless the rates are incommensurate.
     """
     n, present = len(fields), np.flatnonzero(~np.isnan(fields).all(axis=1))
-    changed = np.zeros(n)
-    changed[present] = changes_of(fields[present])
-    changed = changed[1:]
-    n_changes = changed.sum()
-    if n_changes < MIN_LOG_ODDS or n_changes > len(changed) / MIN_REPETITION:
+    is_change = np.zeros(n, dtype=bool)
+    is_change[present] = changes_of(fields[present])
+    changes = np.flatnonzero(is_change[1:])
+    n_changes = len(changes)
+    if n_changes < MIN_LOG_ODDS or n_changes > len(present) / MIN_REPETITION:
         return 1.0
     size = OVERSAMPLING * 2 ** int(np.ceil(np.log2(n)))
-    resultant = np.abs(np.fft.rfft(changed, size)) / n_changes
+    resultant = np.abs(np.fft.rfft(is_change[1:].astype(float), size)) / n_changes
     frequency = np.arange(len(resultant)) / size
     # A rate above half the rate of publishing is aliased. Equal measurements only lower the number
     # of changes, so a source is at least as fast as the changes.
-    frequency = np.where(frequency < 0.95 * n_changes / len(changed), 1.0 - frequency, frequency)
+    frequency = np.where(frequency < 0.95 * n_changes / n, 1.0 - frequency, frequency)
     period = 1.0 / np.maximum(frequency, 1e-9)
     expected = np.sinc(1.0 / period)
     is_regular = (period >= MIN_REPETITION) & (period <= MAX_REPETITION) \
@@ -78,7 +78,7 @@ def repetition_of(fields: FloatArray) -> float:
     # Multiples of the rate are regular as well: the slowest source decides.
     slowest = np.flatnonzero(is_regular & (period > 0.9 * period[is_regular].max()))
     bin_of_best = slowest[np.argmax(resultant[slowest])]
-    best = _refined(np.flatnonzero(changed), float(frequency[bin_of_best]), 1.0 / size)
+    best = _refined(changes, float(frequency[bin_of_best]), 1.0 / size)
     nearest = round(best)
     return float(nearest) if abs(best - nearest) * n < 2.0 * best**2 / OVERSAMPLING else best
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from mag_tracking.arrays import StructArray
 from mag_tracking.calibration import core
-from mag_tracking.calibration.missing_marks import describe_marks
+from mag_tracking.calibration.missing_marks import are_marked, describe_marks
 from mag_tracking.calibration.reading_faults import ReadingFaults, reading_faults
-from mag_tracking.calibration.sensor_state import N_WINDOW
+from mag_tracking.calibration.sensor_state import FIRST_WINDOW, N_WINDOW
 from mag_tracking.stages.health.diagnosis import Cause
 from mag_tracking.units import NS
 
@@ -58,7 +58,7 @@ class DriverFaults:
         s['n_same'] = s['n_changed'] = s['n_rest'] = 0
         s['repeats'] = s['changes'] = s['run'] = 0
 
-    def examine(self, i: int, stamp_ns: int) -> bool:
+    def examine(self, i: int, stamp_ns: int) -> float:
         """Search the latest raw readings of sensor `i`.
 
         Parameters
@@ -69,21 +69,22 @@ class DriverFaults:
 
         Returns
         -------
-        bool
-            Whether a fault was found and stored.
+        float
+            Fraction of the readings in the window with a mark if a fault was found and stored; NaN
+            otherwise.
         """
         s, n = self._sensors[i], int(self._sensors[i]['n_window'])
         known = self.of(i)
         faults = known.merged(reading_faults(s['window'][:n]))
         if n < N_WINDOW:
-            s['window_due'] = 2 * s['window_due']
+            s['window_due'] += FIRST_WINDOW
         else:
-            s['n_window'], s['is_examined'] = 0, True
+            s['n_window'] = 0
         if faults == known:
-            return False
+            return float('nan')
         duration_s = (stamp_ns - int(s['window_begin_ns'])) / NS
         self.store(i, replace(faults, rate=n / duration_s if duration_s > 0.0 else float('nan')))
-        return True
+        return float(are_marked(s['window'][:n], faults.marks).any(axis=1).mean())
 
     def rejection(self, i: int, reason: int) -> tuple[Cause, str]:
         """Cause and description of the rejection of a reading of sensor `i`.

@@ -38,6 +38,9 @@ are staggered, because evaluating all blocks at once would delay the readings.""
 OVERRULED = 'message covariances overruled by the measured noise'
 """Key in the counts for message covariances that were replaced by the measured noise."""
 
+MAX_MARKED = 0.2
+"""Fraction of readings with a mark above which a background is learnt again when they are found."""
+
 FAULTS_FOUND = 'faults of drivers found'
 """Key in the counts for the events after which `faults_of` returns other faults."""
 
@@ -262,12 +265,12 @@ class Calibrate:
 
     def _examine_window(self, i: int) -> None:
         """Search the latest raw readings of sensor `i` for faults of its driver."""
-        is_beginning = not self._sensors[i]['is_examined']
-        if self._driver_faults.examine(i, int(self._batches[0]['stamp_ns'])):
+        marked_fraction = self._driver_faults.examine(i, int(self._batches[0]['stamp_ns']))
+        if marked_fraction >= 0.0:
             self._reject_held(i, 'a fault of the driver was found')
             self.counts[FAULTS_FOUND] += 1
-            if is_beginning:
-                # The background has been learnt from faulty readings.
+            if marked_fraction > MAX_MARKED:
+                # The background has been learnt from the marks.
                 self._background[self._network.names[i]].forget()
 
     def faults_of(self, sensor: str) -> ReadingFaults:
