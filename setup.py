@@ -38,8 +38,8 @@ setup(
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     ext_modules=CORES,
     options={'build_ext': {'parallel': os.cpu_count()}},
-    package_data={NAME: ['py.typed', 'nodes/*.xml', 'report/page/*', '*/core.pyi',
-                         'stages/*/core.pyi']},
+    package_data={NAME: ['py.typed', 'nodes/*.xml', 'report/page/*', 'report/plotly/*',
+                         '*/core.pyi', 'stages/*/core.pyi']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -51,13 +51,13 @@ setup(
     # ROS and mag_tracking_msgs are not listed: they may be installed from apt, and pip would look
     # for mag-tracking-msgs on PyPI, where it does not exist.
     install_requires=[
+        'lz4',
         'matplotlib',
         'mcap',
         'mcap-protobuf-support',
         'mcap-ros2-support',
         'numpy',
         'paho-mqtt>=2',
-        'plotly',
         'pygeomag',
         'pyserial',
         'PyYAML',
@@ -93,8 +93,24 @@ setup(
         # `colcon test` runs pytest only if the extra "test" lists it.
         'test': [
             # CircuitPython drivers as users install them.
+            'adafruit-circuitpython-bno055',
+            'adafruit-circuitpython-bno08x',
+            'adafruit-circuitpython-fxos8700',
+            'adafruit-circuitpython-icm20x',
+            'adafruit-circuitpython-lis2mdl',
             'adafruit-circuitpython-lis3mdl',
+            'adafruit-circuitpython-lsm303agr-mag',
+            'adafruit-circuitpython-lsm303dlh-mag',
+            'adafruit-circuitpython-lsm9ds0',
+            'adafruit-circuitpython-lsm9ds1',
+            'adafruit-circuitpython-mlx90393',
+            'adafruit-circuitpython-mlx90395',
             'adafruit-circuitpython-mmc56x3',
+            'adafruit-circuitpython-qmc5883p',
+            'adafruit-circuitpython-tlv493d',
+            'adafruit-circuitpython-tmag5273',
+            'circuitpython-qmc5883l',
+            'circuitpython-rm3100',
             # Readers of archives.
             'duckdb',
             'filterpy',

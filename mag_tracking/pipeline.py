@@ -38,30 +38,43 @@ class Settings:
     survey: SurveySettings = field(default_factory=SurveySettings)
 
 
-TARGET_DEFAULTS: dict[str, dict[str, Any]] = {
-    'vehicle': {},
-    'magnet': {
-        'calibrate.max_field': 0.1,
-        'calibrate.relearn_s': 0.0,
-        'calibrate.spike_std': 0.0,
-        'align.burst': True,
-        'align.period_s': 0.5,
-        'align.max_wait_s': 2.0,
-        'detect.onset_frames': 1,
-        'detect.background_std': 5e-7,
-        'track.field_error': 0.01,
-        'track.mounting_std_deg': 0.0,
-        'track.model_error_time_s': 0.0,
-        'track.background_std': 5e-7,
-        'track.iterations': 5,
-        'track.relinearise_window_s': 0.0,
-        'track.lookback_s': 0.0,
-        'track.end_gap_s': 30.0,
-        'track.max_smoothing_s': 3600.0,
-        'track.end_std': 0.2,
-    },
+_MAGNET: dict[str, Any] = {
+    'track.target': 'magnet',
+    # Sensors beside a magnet have offsets of tens of microtesla, which are harmless.
+    'survey.offset_std': 0.0,
+    'calibrate.max_field': 0.1,
+    'calibrate.relearn_s': 0.0,
+    'calibrate.spike_std': 0.0,
+    'align.burst': True,
+    'align.period_s': 0.5,
+    'align.max_wait_s': 2.0,
+    'detect.onset_frames': 1,
+    'detect.background_std': 5e-7,
+    'track.field_error': 0.01,
+    'track.mounting_std_deg': 0.0,
+    'track.model_error_time_s': 0.0,
+    'track.background_std': 5e-7,
+    'track.iterations': 5,
+    'track.relinearise_window_s': 0.0,
+    'track.lookback_s': 0.0,
+    'track.end_gap_s': 30.0,
+    'track.max_smoothing_s': 3600.0,
+    'track.end_std': 0.2,
 }
-"""Overrides of the default settings by type of target."""
+
+TARGET_DEFAULTS: dict[str, dict[str, Any]] = {
+    'vehicle': {'track.target': 'vehicle'},
+    'magnet': {
+        **_MAGNET,
+        'track.magnet.speed_std': 0.5,
+        'track.magnet.spin_std': 3.0,
+        'track.magnet.acceleration': 0.5,
+        'track.magnet.angular_acceleration': 3.0,
+    },
+    'bench': _MAGNET,
+}
+"""Overrides of the default settings by type of target: vehicles, a magnet in a hand (up to 0.5 m/s
+and 3 rad/s), or a magnet that is moved step by step on a bench."""
 
 
 def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Settings:
@@ -73,7 +86,7 @@ def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Setti
         Key of `TARGET_DEFAULTS`.
     changes : mapping of str to setting, optional
         Values by dotted name that override the defaults of the target. A value of `track.target`
-        must equal `target`.
+        must not differ from that of the target.
 
     Returns
     -------
@@ -86,11 +99,11 @@ def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Setti
     """
     if target not in TARGET_DEFAULTS:
         raise SettingsError(f'target: expected {" or ".join(TARGET_DEFAULTS)}, got {target!r}')
-    changes = dict(changes or {})
-    if changes.setdefault('track.target', target) != target:
+    defaults, changes = TARGET_DEFAULTS[target], dict(changes or {})
+    if changes.get('track.target', defaults['track.target']) != defaults['track.target']:
         raise SettingsError(f'track.target: the parameters contain {changes["track.target"]!r}, '
                             f'but {target!r} was requested; remove one of them')
-    return replace(replace(Settings(), TARGET_DEFAULTS[target]), changes)
+    return replace(replace(Settings(), defaults), changes)
 
 
 Output: TypeAlias = (FieldFrame | Detection | Track | SmoothedPose | Disturbance | VehiclePassage
@@ -119,7 +132,7 @@ class Pipeline:
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self.network = network
         self.settings = settings
-        self.calibrate = Calibrate(network, settings.calibrate)
+        self.calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
         self.align = Align(network, settings.align)
         self.detect = Detect(network, settings.detect)
         self.track = TrackManager(network, settings.track)
@@ -145,7 +158,7 @@ class Pipeline:
             Resulting records, in order of processing.
         """
         calibrated = self._calibrate.feed(readings)
-        self.track.set_doubtful_times(self.calibrate.doubtful_intervals())
+        self.track.set_input_doubts(self.calibrate.input_doubts())
         return self._process_calibrated(calibrated)
 
     def flush(self) -> list[Output]:

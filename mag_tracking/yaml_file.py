@@ -12,6 +12,11 @@ from mag_tracking.files import checked_path
 
 MAX_NODES = 1_000_000
 """Maximum number of keys, values, lists and mappings in a file after expansion of aliases."""
+MAX_ENTRIES = 1000
+"""Maximum number of entries of a mapping, such as the sensors of a network. The parser needs half a
+minute for 10,000 sensors."""
+MAX_BYTES = 2_000_000
+"""Maximum size of a file [bytes]; a thousand sensors with all calibrations have 1.1 MB."""
 MAX_DEPTH = 64
 """Maximum depth of lists and mappings after expansion of aliases."""
 MAX_BITS = 14_000
@@ -28,6 +33,13 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         if node is not None:
             _check_size(node)
         return node
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Compose a node; raises YAMLError if its mapping exceeds `MAX_ENTRIES`."""
+        if isinstance(parent, yaml.MappingNode) and len(parent.value) >= MAX_ENTRIES:
+            raise yaml.YAMLError(f'more than {MAX_ENTRIES} entries in the mapping that begins in '
+                                 f'line {parent.start_mark.line + 1}')
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False
                           ) -> dict[Hashable, Any]:
@@ -112,6 +124,10 @@ def read_yaml(path: str | PathLike[str], error: type[MagTrackingError]) -> Any:
     """
     path = checked_path(path, error)
     try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise error(f'{path} has {size / 1e6:.1f} MB; the maximum of a YAML file is '
+                        f'{MAX_BYTES / 1e6:g} MB')
         with open(path, encoding='utf-8') as stream:
             return parse_yaml(stream, str(path), error)
     except OSError as problem:

@@ -150,6 +150,13 @@ def test_tests_use_no_private_names(path):
     assert sorted(private_uses(ast.parse(path.read_text()))) == []
 
 
+def test_no_file_is_read_as_code():
+    """Reading a file of Python objects executes the code of its author."""
+    pattern = r'pickle\b|joblib|marshal|shelve|\bdill\b'
+    assert {str(p.relative_to(ROOT)): found for p in FILES
+            if (found := re.findall(pattern, p.read_text()))} == {}
+
+
 def test_the_tests_mirror_the_package():
     """Every folder of tests, with the listed exceptions, is a subpackage."""
     exceptions = {'data', 'support', 'system', 'bench', '__pycache__'}

@@ -324,6 +324,7 @@ def test_a_track_has_a_map_a_weights_and_a_field_figure(result):
     assert len(titles) == 3 and all('Track 1' in title for title in titles)
     labels = [line.get_label() for line in result.map_figure(1).axes[0].lines]
     assert {'truth', 'smoothed', 'magnetometers'} <= set(labels)
+    assert isinstance(result.pass_figure(), Figure)
     with pytest.raises(mt.UnknownTrackError, match='track 7 is not in the result; tracks.*: 1'):
         result.map_figure(7)
 

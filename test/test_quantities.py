@@ -44,7 +44,8 @@ def test_the_nouns_track_and_detection_agree_with_the_number():
 
 SUMMARY = {
     'sensors': {}, 'diagnoses': [], 'tracks': [], 'close_network': False, 'target': 'vehicle',
-    'frames_too_long': None, 'clocks_apart': None, 'unflagged_poses': None, 'disturbances': []}
+    'frames_too_long': None, 'lanes': None, 'clocks_apart': None, 'unflagged_poses': None,
+    'disturbances': []}
 
 
 @pytest.mark.parametrize('n, beginnings', [

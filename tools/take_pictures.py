@@ -31,9 +31,10 @@ def figures():
     truck = mt.fit(vehicle_path('straight_truck_right'), NETWORK_FILE).passes[0].chosen
     plan = mt.plan(NETWORK_FILE, 'car', heading=[0.0, 180.0], offset=[-2.0, -2.0])
     corridor = mt.read_network(DATA / 'corridor' / 'network.yaml')
-    found = calibrate(Recording(DATA / 'corridor' / 'corridor_8_sensors.mcap'), corridor,
-                      settings_for('vehicle'), date='2026-05-01')
-    return {'junction_map': track.map_figure(), 'junction_weights': track.weights_figure(),
+    recording = DATA / 'corridor' / 'corridor_8_sensors.mcap'
+    found = calibrate(Recording(recording), corridor, settings_for('vehicle'), date='2026-05-01')
+    return {'pass': mt.track(recording, corridor).pass_figure(max_std=1.0),
+            'junction_map': track.map_figure(), 'junction_weights': track.weights_figure(),
             'junction_field': track.field_figure(), 'truck_fit': pass_figure(truck, 'truck'),
             'plan_position': position_figure(plan), 'plan_sensor': sensor_figure(plan),
             'calibration': calibration_figure(found, corridor)}

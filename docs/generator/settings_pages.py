@@ -15,10 +15,12 @@ start; those marked *live* may change while a node runs.
 """
 MAGNET = """## Defaults for a magnet
 
-`target: magnet` (`--target magnet`) changes these defaults.
+`target: magnet` (`--target magnet`) changes these defaults for a magnet in a hand that moves at up to
+0.5 m/s and turns
+at up to 3 rad/s. `target: bench` is for a magnet that is moved slowly or step by step.
 
-| parameter | vehicle | magnet |
-|---|---|---|"""
+| parameter | vehicle | magnet | bench |
+|---|---|---|---|"""
 DRIVERS = """# Drivers file
 
 Every setting of a drivers file. {doc}`/guides/connect_sensors` explains what they are for.
@@ -34,8 +36,8 @@ in `summary.json`. {doc}`/concepts/uncertainty` explains what the flag promises.
 ARCHIVE = """# Tables of an archive
 
 Columns of the Parquet tables that `mag-tracking archive` writes ({doc}`/guides/archive`). Unknown
-values are null. The unit and the meaning of each column are also stored in the metadata of the
-files.
+values are null, and NaN in a covariance. The unit and the meaning of each column are also stored in
+the metadata of the files.
 """
 TRAFFIC = """# Tables of traffic
 
@@ -59,8 +61,9 @@ def parameters():
         lines += [f'## {group}', '', *(line for p in members for line in entry(p))]
     default = {p.name: p.value for p in flatten(Settings())}
     lines.append(MAGNET)
-    lines += [f'| `{p.name}` | `{default[p.name]}` | `{p.value}` |'
-              for p in flatten(settings_for('magnet')) if p.value != default[p.name]]
+    lines += [f'| `{p.name}` | `{default[p.name]}` | `{p.value}` | `{bench.value}` |'
+              for p, bench in zip(*(flatten(settings_for(target)) for target in (
+                  'magnet', 'bench')), strict=True) if p.value != default[p.name]]
     return '\n'.join(lines) + '\n'
 
 

@@ -19,7 +19,11 @@ result = mt.track(DATA / 'vehicles' / 'junction_left_turns_to_rear.mcap', NETWOR
 print(result)
 
 # %%
-# Map of the track: the published poses with 90 % ellipses (circles mark ambiguous poses), the
+# The pass: the vehicle to scale at five published poses, their 90 % regions, and the smoothed path.
+figure = result.pass_figure()
+
+# %%
+# Map of the hypotheses: the published poses with 90 % ellipses (circles mark ambiguous poses), the
 # smoothed track, the ground truth, and the best hypothesis of each arrival direction.
 figure = result.map_figure()
 

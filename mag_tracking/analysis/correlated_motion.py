@@ -19,6 +19,7 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.least_squares import model_error_covariance
 from mag_tracking.network.sensor_network import MIN_DELAY_BASELINE
+from mag_tracking.physics.bounds import ADVICE, MAX_SPEED, TOO_FAST
 
 MIN_CORRELATION = 0.97
 """Minimum fraction of the energy of one field that is explained by the other, delayed field."""
@@ -200,6 +201,8 @@ def _fit_velocity(data: PassData, pairs: Sequence[PairDelay],
     # If the delays are inconsistent, their standard deviations are too small.
     covariance *= max(1.0, float(residuals @ residuals) / dof) if dof else 1.0
     norm = float(np.linalg.norm(slowness))
+    if norm * MAX_SPEED < 1.0:
+        return CorrelatedMotion(f'{TOO_FAST}; {ADVICE}', similarity=similarity, pairs=tuple(pairs))
     unit_slowness = slowness / norm
     norm_std = float(np.sqrt(unit_slowness @ covariance @ unit_slowness))
     direction = Vt[0] * unit_slowness[0] if is_collinear else unit_slowness

@@ -35,6 +35,8 @@ class PassData:
     of the averaged samples, not the covariance of their mean. Ignored for missing axes."""
     count: IntArray | None = None
     """(n,) number of averaged samples; None if no samples were averaged."""
+    doubt: str = ''
+    """Reason why the readings are wrong, so that no fit is accepted; empty if none is known."""
 
     @classmethod
     def from_frames(cls, network: SensorNetwork, stamps_ns: Sequence[int],

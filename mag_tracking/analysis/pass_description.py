@@ -10,6 +10,7 @@ from mag_tracking.analysis.bearing import bearing_of, scaled_to_range
 from mag_tracking.analysis.pass_covariance import (
     SensorErrors,
     robust_covariance,
+    shape_covariance,
     velocity_change,
 )
 from mag_tracking.analysis.pass_data import PassData, background_columns
@@ -190,6 +191,9 @@ def _partial_fits(linear: _LinearisedFit, minimum: Minimum, explained: float, er
     with np.errstate(invalid='ignore'):
         robust = robust_covariance(data, linear.whitened, linear.residuals, total_field, covariance,
                                    errors)
+        shapes = [shape_covariance(data, linear.whitened, covariance, int(indices[0]), n, path)
+                  for n, path, indices in zip(linear.orders, linear.theta, linear.target_indices,
+                                              strict=True)]
         predicted_std = np.sqrt(np.einsum('yi,ij,yj->y', H, robust, H)).reshape(-1, 3)
         covariance, robust = (T @ P @ T.T for P in (covariance, robust))
     unexplained = residual_elsewhere(data, [FittedRow(n, path, field) for n, path, field in zip(
@@ -206,7 +210,8 @@ def _partial_fits(linear: _LinearisedFit, minimum: Minimum, explained: float, er
             n_dipoles, target_data, '', minimum.converged, tuple(linear.names[i] for i in indices),
             linear.x[indices], covariance[block], robust[block], minimum.cost, explained,
             duration_s, *change, unexplained, predicted=linear.fields[k] + linear.background,
-            predicted_std=predicted_std, n_other_unknowns=len(linear.x) - len(indices)))
+            predicted_std=predicted_std, n_other_unknowns=len(linear.x) - len(indices),
+            shape_covariance=shapes[k]))
     return fits
 
 

@@ -80,7 +80,8 @@ class PassFit:
     means that the unknown is not observable."""
     robust_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """(n_x, n_x) covariance including sensor errors and model errors with correlated residuals.
-    All standard deviations are derived from this covariance."""
+    All standard deviations are derived from it, and those of positions from
+    `position_covariance`."""
     cost: float = np.nan
     """Sum of squared whitened residuals, TSP14 eq. (46b)."""
     explained: float = np.nan
@@ -109,6 +110,8 @@ class PassFit:
     n_other_unknowns: int = 0
     """Number of unknowns of other targets in the same joint fit; `data` does not contain their
     fields."""
+    shape_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    """(3, 3) [m²] covariance of the middle of a vehicle about the centre of the row."""
 
     @property
     def n_unknowns(self) -> int:
@@ -164,6 +167,16 @@ class PassFit:
     def position(self) -> FloatArray:
         """Position of the centre of the target at time zero, (3,) m, world frame."""
         return self.x[:3]
+
+    @property
+    def position_covariance(self) -> FloatArray:
+        """Covariance of the position of the middle of the vehicle, (3, 3) m², world frame.
+
+        For a single sensor without a known range, whose unit of length is the range, it is the
+        covariance of the centre of the row.
+        """
+        P = self.robust_covariance[:3, :3]
+        return P if self.bearing is not None else P + self.shape_covariance
 
     @property
     def velocity(self) -> FloatArray:
@@ -243,4 +256,5 @@ class PassFit:
         g_time = -np.concatenate([v, r + 2.0 * t_cpa * v]) / (v @ v)
         g_range = np.concatenate([u, t_cpa * u])
         return (t_cpa, np.float64(np.sqrt(g_time @ P @ g_time)), distance,
-                np.float64(np.sqrt(g_range @ P @ g_range)))
+                np.float64(np.sqrt(g_range @ P @ g_range
+                                   + u @ (self.position_covariance - P[:3, :3]) @ u)))

@@ -11,24 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mag_tracking.analysis.pass_covariance import reach
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.arrays import FloatArray
-
-POINT_REACH = 2.1
-"""[m] Reach of the iron of a car from a single dipole. At distance r, the model error relative to
-the field is the reach over r. Four real cars at 4.5 m had normalised costs of 10, 14, 17 and 51
-(T10 Table 6.1, TSP14 Table I). Their signal energy was 1200 times the noise energy at the CPA (T10
-eq. (6.1)), or 87 times per value on average over the pass. Three cars left 10 to 18 % of the energy
-unexplained; the fourth, with 57 %, cannot be modelled as a point."""
-
-ROW_REACH = 0.45
-"""Reach of the iron from a row, relative to the spacing of its dipoles. With three dipoles, T10
-Table 6.5 and TSP14 Table II report costs of 1.3 to 1.6 for cars, and of 77 to 303 for trucks with
-twenty times the energy. These costs correspond to 0.15 to 0.45."""
-
-MIN_ROW_REACH = 0.4
-"""[m] Minimum reach of the iron from a row, from the cars in T10 Table 6.5 and TSP14 Table II."""
+from mag_tracking.physics.bounds import ADVICE, impossible_reason
 
 NOISE_ENERGY = 16.3
 """Whitened energy of three axes that noise exceeds with a probability of 0.001."""
@@ -56,23 +43,6 @@ MAX_HEADING_STD = np.pi / 6.0
 MAX_TIME_STD = 0.25
 """Maximum standard deviation of a trusted CPA time, relative to the distance of the nearest sensor
 over the speed."""
-
-
-def reach(n_dipoles: int, length: float) -> float:
-    """Maximum distance between the iron of a vehicle and the dipoles that model it.
-
-    Parameters
-    ----------
-    n_dipoles : int
-    length : float, m
-
-    Returns
-    -------
-    float, m
-    """
-    if n_dipoles == 1:
-        return POINT_REACH
-    return max(MIN_ROW_REACH, ROW_REACH * abs(length) / (n_dipoles - 1))
 
 
 class FittedRow(NamedTuple):
@@ -198,8 +168,12 @@ def trusted_quantities(fit: PassFit) -> tuple[str, ...]:
 
 def _invalid_pass_reason(fit: PassFit) -> str:
     """Reason why a fit does not show one target at constant velocity; empty if it does."""
+    if fit.data.doubt:
+        return fit.data.doubt
     if not fit.converged:
         return 'the fit did not converge'
+    if reason := impossible_reason(fit.velocity, fit.moment[0]):
+        return f'{reason}; {ADVICE}'
     if not has_plausible_residual(fit):
         return (f'not one target at constant velocity: {1.0 - fit.explained:.1%} of the field is '
                 f'unexplained, {fit.residual_elsewhere:.1%} where a vehicle at that distance '

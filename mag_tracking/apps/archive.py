@@ -153,7 +153,8 @@ def archive(recordings: Iterable[str | PathLike[str]],
         Called several times per second; the run ends when it returns true. The next run into
         `out` continues with the remaining recordings.
     report : function, optional
-        Called with a message to the user for each recording that fails.
+        Called with a message to the user for each recording that fails, and for each damaged file
+        of the dataset.
 
     Returns
     -------
@@ -176,17 +177,10 @@ def archive(recordings: Iterable[str | PathLike[str]],
     import_pyarrow()
     network, paths, run = network_of(network), recordings_of(recordings), ArchiveRun()
     folder = checked_path(out, OutputError).resolve()
-    paths = [path for path in paths if folder not in path.parents]
+    progress, report = progress or (lambda _: None), report or (lambda _: None)
     with ArchiveFolder(folder, _configuration(network, settings)) as dataset:
-        remaining: list[Path] = []
-        for path in paths:
-            entry = dataset.done(path)
-            if entry is None:
-                remaining.append(path)
-            else:
-                run.tracked_earlier.append(path)
-                if progress is not None:
-                    progress(entry['size'])
+        remaining = _remaining([path for path in paths if folder not in path.parents], dataset, run,
+                               progress, report)
         try:
             if remaining:
                 with _Cluster(workers, scheduler) as cluster:
@@ -194,10 +188,28 @@ def archive(recordings: Iterable[str | PathLike[str]],
                         remaining, stopped or (lambda: False))
                     run.lost_workers = cluster.n_lost
         finally:
-            dataset.write_recordings([*dataset.summaries(), *(
+            dataset.write_recordings([*dataset.summaries(report), *(
                 common_columns(path, None) | {'error': reason}
                 for path, reason in run.failed.items())])
     return run
+
+
+def _remaining(paths: Iterable[Path], dataset: ArchiveFolder, run: ArchiveRun,
+               progress: Callable[[int], object], report: Callable[[str], object]) -> list[Path]:
+    """Return the recordings that are not yet tracked, and add the others to `run`."""
+    remaining = []
+    for path in paths:
+        try:
+            summary = dataset.done(path)
+        except OutputError as error:
+            report(f'{error}; {path.name} is tracked again')
+            summary = None
+        if summary is None:
+            remaining.append(path)
+        else:
+            run.tracked_earlier.append(path)
+            progress(summary['size'])
+    return remaining
 
 
 def _configuration(network: SensorNetwork, settings: Settings) -> dict[str, Any]:
@@ -213,11 +225,11 @@ class _Scheduler:
     """Submits the tasks of all recordings to a cluster, each task after its dependencies."""
 
     def __init__(self, dataset: ArchiveFolder, cluster: _Cluster, network: SensorNetwork,
-                 settings: Settings, run: ArchiveRun, progress: Callable[[int], object] | None,
-                 report: Callable[[str], object] | None) -> None:
+                 settings: Settings, run: ArchiveRun, progress: Callable[[int], object],
+                 report: Callable[[str], object]) -> None:
         self._dataset, self._cluster, self._run = dataset, cluster, run
         self._network, self._settings = network, settings
-        self._progress, self._report = progress or (lambda _: None), report or (lambda _: None)
+        self._progress, self._report = progress, report
         self._unfinished_segments: Counter[Path] = Counter()
         self._states: dict[Path, list[list[Any]]] = {}
 

@@ -8,17 +8,20 @@ frames.
 """
 
 import dataclasses
-import pickle
+import json
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes
-from mag_tracking.errors import OutputError
+from mag_tracking.calibration.doubtful_times import InputDoubts
+from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.units import NS
 
@@ -29,8 +32,8 @@ CHUNK_FRAMES = 2000
 MIN_QUIET_S = 1.0
 """Minimum duration without a target that ends a segment [s]."""
 
-Doubts = Mapping[str, DoubtfulTimes]
-"""{sensor: times at which its background is doubtful}."""
+Doubts = InputDoubts
+"""{reason: {sensor: times at which its readings are doubtful}}."""
 NumberedPass = tuple[int, PassData, tuple[str, ...]]
 """Index of a pass in its recording (from 1), measurements of the pass, and notes for the user."""
 
@@ -77,30 +80,95 @@ class FrameChunk:
                 int(self.degrees_of_freedom[k])), self.doubts.get(k)
 
 
-def read_segment(path: Path) -> Iterator[FrameChunk]:
-    """Read a segment written by `SegmentWriter`.
+_FRAME_ARRAYS = ('stamp_ns', 'field', 'covariance', 'n_samples', 'time_offset', 'target_present',
+                 'statistic', 'degrees_of_freedom')
+_PASS_ARRAYS = ('t', 'sensor', 'field', 'covariance')
+
+
+@contextmanager
+def work_file_errors(path: Path) -> Iterator[None]:
+    """Convert the errors of reading a file of intermediate results to a RecordingError.
 
     Parameters
     ----------
     path : Path
-        File of the segment.
+        The file.
 
-    Yields
+    Raises
     ------
-    FrameChunk
+    RecordingError
+        If reading fails.
     """
-    with open(path, 'rb') as stream:
-        while stream.peek(1):
-            yield pickle.load(stream)
+    try:
+        yield
+    except (OSError, ValueError, TypeError, LookupError, EOFError, RecursionError,
+            BadZipFile) as error:
+        raise RecordingError(f'{path} is damaged ({error}); delete the folder "unfinished" of the '
+                             'archive and run the same command again') from error
 
 
-class SegmentWriter:
-    """Writes each segment of a recording to a separate file, using bounded memory.
+def read_segment(folder: Path, network: SensorNetwork) -> Iterator[FrameChunk]:
+    """Read a segment written by `SegmentWriter`.
 
     Parameters
     ----------
     folder : Path
-        Folder for the files `segment-0.pickle`, ...
+        Folder of the segment.
+    network : SensorNetwork
+        Network of the recording.
+
+    Yields
+    ------
+    FrameChunk
+
+    Raises
+    ------
+    RecordingError
+        If a file of the segment is damaged.
+    """
+    with work_file_errors(folder):
+        paths = sorted(folder.iterdir(), key=lambda path: int(path.stem))
+    for path in paths:
+        with work_file_errors(path):
+            chunk = _read_chunk(path, network)
+        yield chunk
+
+
+def _read_chunk(path: Path, network: SensorNetwork) -> FrameChunk:
+    """Read a file written by `_write_chunk`."""
+    with np.load(path) as arrays:
+        text = json.loads(str(arrays['text']))
+        doubts: dict[int, Doubts] = {
+            int(k): {reason: {sensor: tuple((begin, end) for begin, end in times)
+                              for sensor, times in by_sensor.items()}
+                     for reason, by_sensor in by_reason.items()}
+            for k, by_reason in text['doubts'].items()}
+        passes = tuple(
+            (number, dataclasses.replace(PassData(network, stamp_ns, *(
+                arrays[f'pass_{number}_{name}'] for name in _PASS_ARRAYS)), doubt=doubt),
+             tuple(notes)) for number, stamp_ns, doubt, notes in text['passes'])
+        return FrameChunk(**{name: arrays[name] for name in _FRAME_ARRAYS}, doubts=doubts,
+                          passes=passes)
+
+
+def _write_chunk(path: Path, chunk: FrameChunk) -> None:
+    """Write a chunk as arrays and, for everything else, one JSON text; raises OSError."""
+    arrays = {name: getattr(chunk, name) for name in _FRAME_ARRAYS}
+    for number, data, _ in chunk.passes:
+        arrays |= {f'pass_{number}_{name}': getattr(data, name) for name in _PASS_ARRAYS}
+    text = json.dumps({'doubts': chunk.doubts, 'passes': [
+        (number, data.stamp_ns, data.doubt, notes) for number, data, notes in chunk.passes]})
+    with open(path, 'xb') as stream:
+        np.savez(stream, text=np.array(text), **arrays)
+
+
+class SegmentWriter:
+    """Writes each segment of a recording to a separate folder, using bounded memory.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder for the folders `segment-0`, ..., each with the chunks `0.npz`, ...
     lookback_s : float, s
         Time span of the earlier frames that a new track uses.
 
@@ -121,7 +189,7 @@ class SegmentWriter:
         self._lookback: deque[tuple[FieldFrame, Doubts]] = deque()
         self._unwritten: list[tuple[FieldFrame, Doubts]] = []
         self._passes: list[NumberedPass] = []
-        self._n_written, self._is_open = 0, False
+        self._n_written = self._n_chunks = 0
         self._quiet_since_ns = 0
         self._last_frame: FieldFrame | None = None
 
@@ -143,7 +211,7 @@ class SegmentWriter:
         Raises
         ------
         OutputError
-            If the segment file cannot be written.
+            If a file of the segment cannot be written.
         """
         last, self._last_frame = self._last_frame, frame
         self.n_frames += 1
@@ -191,15 +259,15 @@ class SegmentWriter:
         Raises
         ------
         OutputError
-            If the segment file cannot be written.
+            If a file of the segment cannot be written.
         """
         if self._unwritten or self._passes:
             self._write()
-        self.n_segments += self._is_open
-        self._n_written, self._is_open = 0, False
+        self.n_segments += self._n_chunks > 0
+        self._n_written = self._n_chunks = 0
 
     def _write(self) -> None:
-        """Append the buffered frames and passes to the segment file; raises OutputError."""
+        """Write the buffered frames and passes to the next file; raises OutputError."""
         frames = [frame for frame, _ in self._unwritten]
         doubts: dict[int, Doubts] = {}
         previous: Doubts | None = None
@@ -207,15 +275,15 @@ class SegmentWriter:
             if current != previous:
                 doubts[k] = previous = current
 
-        arrays = {name: np.array([getattr(frame, name) for frame in frames]) for name in (
-            'stamp_ns', 'field', 'covariance', 'n_samples', 'time_offset', 'target_present',
-            'statistic', 'degrees_of_freedom')}
+        arrays = {name: np.array([getattr(frame, name) for frame in frames])
+                  for name in _FRAME_ARRAYS}
         chunk = FrameChunk(**arrays, doubts=doubts, passes=tuple(self._passes))
-        path = self._folder / f'segment-{self.n_segments}.pickle'
+        path = self._folder / f'segment-{self.n_segments}' / f'{self._n_chunks}.npz'
         try:
-            with open(path, 'ab' if self._is_open else 'wb') as stream:
-                pickle.dump(chunk, stream)
+            path.parent.mkdir(exist_ok=True)
+            _write_chunk(path, chunk)
         except OSError as error:
             raise OutputError(f'cannot write {path}: {error.strerror}') from error
         self._n_written += len(frames)
-        self._is_open, self._unwritten, self._passes = True, [], []
+        self._n_chunks += 1
+        self._unwritten, self._passes = [], []

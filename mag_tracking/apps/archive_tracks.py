@@ -72,7 +72,7 @@ class SegmentTables:
         """
         for frame, doubts in chunk.frames():
             if doubts is not None:
-                tracker.set_doubtful_times(doubts)
+                tracker.set_input_doubts(doubts)
             records = tracker.feed(frame)
             self._tracks.add(records)
             self._collector.add([frame, *records])

@@ -6,43 +6,47 @@ task can therefore be repeated.
 
 import copy
 import json
-import pickle
 import secrets
 import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.archive_health import HealthRows
-from mag_tracking.apps.archive_segments import SegmentWriter, read_segment
+from mag_tracking.apps.archive_result import (
+    ClockComparisonHistory,
+    SegmentResult,
+    read_result,
+    write_result,
+)
+from mag_tracking.apps.archive_segments import SegmentWriter, read_segment, work_file_errors
 from mag_tracking.apps.archive_tracks import SEGMENT_TABLES, SegmentTables
 from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.prescan import prescan_of
-from mag_tracking.arrays import IntArray
 from mag_tracking.errors import OutputError
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.archive_folder import common_columns, join_tables, recording_key
 from mag_tracking.recording.archive_tables import TABLES
-from mag_tracking.recording.parquet_table import TableWriter
+from mag_tracking.recording.parquet_table import TableWriter, check_row
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.manager import TrackManager
-from mag_tracking.stages.track.rigid_pass import RigidPass
 
 N_DIPOLES = 3
 """Number of dipoles in the row that models a vehicle."""
 
-CUT_FILE, TRACKED_FILE = 'columns.json', 'tracked.pickle'
-"""Names of the files in which `cut` and `track_segment` store results for later tasks."""
+CUT_FILE = 'columns.json'
+"""Name of the file in which `cut` stores its result for later tasks."""
+
+_COLUMNS_OF_JOIN = ('tracks', 'passes', 'error')
 
 
 @dataclass(frozen=True)
@@ -80,49 +84,6 @@ class Job:
         return self.work_folder / f'segment-{k}'
 
 
-class ClockComparisonHistory(ClockComparison):
-    """Clock comparison with the history of the passes added to it.
-
-    Parameters
-    ----------
-    n_sensors : int
-
-    Attributes
-    ----------
-    passes : list of (RigidPass, (n,) int array)
-        Passes, each with the indices of its sensors in the network.
-    clocks_differed : bool
-        Whether a clock offset was ever significant. Tracks then depend on earlier passes.
-    """
-
-    def __init__(self, n_sensors: int) -> None:
-        super().__init__(n_sensors)
-        self.passes: list[tuple[RigidPass, IntArray]] = []
-        self.clocks_differed = False
-
-    def add(self, found: RigidPass, rows: IntArray) -> None:
-        """Add a pass to the comparison and to the history.
-
-        Parameters
-        ----------
-        found : RigidPass
-        rows : (n,) int array
-            Index, in the network, of each sensor of the pass.
-        """
-        super().add(found, rows)
-        self.passes.append((found, rows))
-        self.clocks_differed |= self.largest_offset is not None
-
-
-@dataclass
-class _SegmentResult:
-    """Numbers of tracks and passes in a tracked segment, and its clock comparison."""
-
-    n_tracks: int
-    n_passes: int
-    evidence: ClockComparisonHistory = field(repr=False)
-
-
 def cut(job: Job) -> dict[str, Any]:
     """Read a recording and write its segments and its table of sensor health.
 
@@ -145,8 +106,10 @@ def cut(job: Job) -> dict[str, Any]:
             with TableWriter(folder / 'health.parquet', TABLES['health']) as table:
                 columns = _Segmenter(job, folder, table).read()
             replace_text(folder / CUT_FILE, json.dumps(columns))
-    result: dict[str, Any] = json.loads((job.cut_folder / CUT_FILE).read_text())
-    return result
+    with work_file_errors(job.cut_folder / CUT_FILE):
+        stored: dict[str, Any] = json.loads((job.cut_folder / CUT_FILE).read_text())
+        check_row(stored, [c for c in TABLES['recordings'] if c.name not in _COLUMNS_OF_JOIN])
+    return stored
 
 
 @contextmanager
@@ -222,7 +185,7 @@ class _Segmenter:
         """Write a frame with its detection result, and the health rows that are due."""
         self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
         self._last_ns = frame.stamp_ns
-        self._writer.add_frame(frame, self._passes.calibrate.doubtful_intervals())
+        self._writer.add_frame(frame, self._passes.calibrate.input_doubts())
         self._add_health(self._health.due_rows(frame.stamp_ns, self._passes.calibrate))
 
     def _add_passes(self, passes: Iterable[tuple[PassData, tuple[str, ...]]]) -> None:
@@ -250,22 +213,26 @@ def track_segment(job: Job, k: int) -> None:
     ------
     OutputError
         If a file cannot be written.
+    RecordingError
+        If a file of the segment is damaged.
     """
     if not job.segment_folder(k).exists():
         with _atomic_folder(job.segment_folder(k)) as folder:
-            _track_into(folder, job, k, ClockComparisonHistory(len(job.network)))
+            result = _track_into(folder, job, k, ClockComparisonHistory(len(job.network)))
+            write_result(folder, result)
 
 
-def _track_into(folder: Path, job: Job, k: int, evidence: ClockComparisonHistory) -> None:
+def _track_into(folder: Path, job: Job, k: int, evidence: ClockComparisonHistory
+                ) -> SegmentResult:
     """Track a segment with the clock `evidence` of earlier segments, and write its tables."""
     tracker = TrackManager(job.network, job.settings.track, evidence)
     with SegmentTables(job.recording, {name: folder / f'{name}.parquet' for name in SEGMENT_TABLES},
                        N_DIPOLES, job.settings.track) as tables:
-        for chunk in read_segment(job.cut_folder / f'segment-{k}.pickle'):
+        for chunk in read_segment(job.cut_folder / f'segment-{k}', job.network):
             tables.track(chunk, tracker)
         tables.finish(tracker)
-    with _output_errors(folder / TRACKED_FILE), open(folder / TRACKED_FILE, 'wb') as stream:
-        pickle.dump(_SegmentResult(tables.n_tracks, tables.n_passes, evidence), stream)
+    return SegmentResult(tables.n_tracks, tables.n_passes, evidence.clocks_differed,
+                          evidence.passes)
 
 
 def join(job: Job) -> dict[str, Any]:
@@ -287,6 +254,8 @@ def join(job: Job) -> dict[str, Any]:
     ------
     OutputError
         If a file cannot be written.
+    RecordingError
+        If a file of intermediate results is damaged.
     """
     columns = cut(job)
     name, evidence = recording_key(job.recording), ClockComparisonHistory(len(job.network))
@@ -294,17 +263,16 @@ def join(job: Job) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(dir=job.work_folder, prefix='.again.') as repeat_folder:
         for k in range(columns['segments']):
             folder = job.segment_folder(k)
-            result = _read_result(folder)
+            result = read_result(folder)
             evidence.passes = []
             combined_evidence = copy.deepcopy(evidence)
-            for rigid_pass in result.evidence.passes:
+            for rigid_pass in result.clock_passes:
                 combined_evidence.add(*rigid_pass)
-            if k and (combined_evidence.clocks_differed or result.evidence.clocks_differed):
+            if k and (combined_evidence.clocks_differed or result.clocks_differed):
                 folder = Path(repeat_folder) / f'segment-{k}'
                 folder.mkdir()
-                _track_into(folder, job, k, evidence)
-                result = _read_result(folder)
-                combined_evidence = result.evidence
+                combined_evidence = evidence
+                result = _track_into(folder, job, k, combined_evidence)
             evidence = combined_evidence
             folders.append(folder)
             id_offsets.append(n_tracks)
@@ -316,13 +284,6 @@ def join(job: Job) -> dict[str, Any]:
                         job.archive_folder, name)
     join_tables([job.cut_folder / 'health.parquet'], [0], 'health', job.archive_folder, name)
     return {**columns, 'tracks': n_tracks, 'passes': n_passes, 'error': ''}
-
-
-def _read_result(folder: Path) -> _SegmentResult:
-    """Read the result that `track_segment` stored in a folder."""
-    with open(folder / TRACKED_FILE, 'rb') as stream:
-        result: _SegmentResult = pickle.load(stream)
-    return result
 
 
 def _format_counts(counts: Mapping[str, int]) -> str:

@@ -155,7 +155,7 @@ def _calibrated_readings(path: Path, network: SensorNetwork) -> Readings:
     """Read a recording and return its calibrated readings."""
     settings = settings_for('vehicle')
     recording = Recording(path)
-    calibrate = Calibrate(network, settings.calibrate)
+    calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
     prescan_of(recording, network, settings.calibrate).apply(calibrate)
     parts = [part for batch in SampleReader(recording, network).readings()
              for part in calibrate.feed(batch)]

@@ -27,6 +27,11 @@ THREAD_START_TIMEOUT_S = 60.0
 NO_WORKERS_TIMEOUT_S = 180.0
 """Maximum time without workers after all of them were lost [s]. A busy computer may need more than
 a minute to start a worker again."""
+LOCAL_ADDRESS = '127.0.0.1'
+"""Address on which the processes on this machine listen."""
+TLS_VARIABLES = ', '.join(f'DASK_DISTRIBUTED__COMM__TLS__{name}'
+                          for name in ('CA_FILE', 'CLIENT__CERT', 'CLIENT__KEY'))
+"""Environment variables of Dask with the files for a scheduler at tls://..."""
 POLL_S = 0.3
 """Maximum time to wait for a task before returning to the caller [s]."""
 
@@ -57,7 +62,8 @@ class Cluster(Generic[_Key]):
     workers : int
         Number of processes on this machine.
     scheduler : str or None
-        Address of a Dask scheduler, used instead of `workers`.
+        Address of a Dask scheduler, used instead of `workers`. Certificates for tls:// are those of
+        the configuration of Dask (`TLS_VARIABLES`).
 
     Attributes
     ----------
@@ -69,7 +75,7 @@ class Cluster(Generic[_Key]):
     MissingDependencyError
         If Dask is not installed.
     ClusterError
-        If the scheduler does not respond or has no workers.
+        If the workers do not start, or the scheduler does not respond or has no workers.
     """
 
     def __init__(self, workers: int, scheduler: str | None) -> None:
@@ -242,35 +248,53 @@ def _event_loop() -> 'IOLoop':
 
 def _local_client(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
     """Start worker processes on this machine and return a client that submits tasks to them."""
+    import dask
+
     # Starting Python's resource tracker unblocks SIGINT in the calling thread, which must not be
     # the thread of the event loop.
     resource_tracker.ensure_running()
-    cluster = stack.enter_context(distributed.LocalCluster(
-        loop=_event_loop(), n_workers=workers, threads_per_worker=1, processes=True,
-        dashboard_address=':0',
-        # The exception of a task is returned as its result and need not be logged.
-        silence_logs=logging.CRITICAL,
-        # Each worker uses one core.
-        env={'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1'}))
+    # Dask would never restart a worker that is still starting 15 s after an earlier loss.
+    stack.enter_context(dask.config.set(
+        {'distributed.deploy.lost-worker-timeout': '365 days'}))
+    try:
+        cluster = stack.enter_context(distributed.LocalCluster(
+            loop=_event_loop(), n_workers=workers, threads_per_worker=1, processes=True,
+            # Scheduler and workers execute the code of whoever connects to them. Without an
+            # address, the server of the dashboard has a fixed port.
+            host=LOCAL_ADDRESS, dashboard_address=f'{LOCAL_ADDRESS}:0',
+            # The exception of a task is returned as its result and need not be logged.
+            silence_logs=logging.CRITICAL,
+            # Each worker uses one core.
+            env={'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1'}))
+    except (OSError, RuntimeError, *_TIMEOUT_ERRORS) as error:
+        raise ClusterError('the worker processes did not start: one of them was killed or out of '
+                           f'memory, or cannot listen on {LOCAL_ADDRESS} '
+                           f'({error.__cause__ or error}); run the command again, if needed with '
+                           f'fewer --workers than {workers}') from error
     client: Client = distributed.Client(cluster)
     return client
 
 
-async def _check_response(address: str) -> None:
-    """Check that a scheduler responds; raises OSError or ValueError."""
+async def _check_response(address: str, connection: dict[str, Any]) -> None:
+    """Check that a scheduler responds; raises OSError, TypeError or ValueError."""
     from distributed.comm.core import connect
 
-    await (await connect(address, timeout=CONNECT_TIMEOUT_S)).close()
+    await (await connect(address, timeout=CONNECT_TIMEOUT_S, **connection)).close()
 
 
 def _remote_client(distributed: Any, address: str) -> 'Client':
     """Connect a client to a running scheduler; raises ClusterError."""
     loop = _event_loop()
     try:
+        security = distributed.Security()
+        connection = security.get_connection_args('client')
+        if address.startswith('tls:') and connection['ssl_context'] is None:
+            raise ClusterError(f'{address}: TLS requires certificates; set {TLS_VARIABLES}')
         # A client that cannot connect reports errors when it is garbage-collected.
-        distributed.utils.sync(loop, _check_response, address)
-        client: Client = distributed.Client(address, timeout=CONNECT_TIMEOUT_S, loop=loop)
-    except (OSError, ValueError) as error:
+        distributed.utils.sync(loop, _check_response, address, connection)
+        client: Client = distributed.Client(address, timeout=CONNECT_TIMEOUT_S, loop=loop,
+                                            security=security)
+    except (OSError, TypeError, ValueError) as error:
         raise ClusterError(f'{address}: no response from a Dask scheduler ({error})') from error
     try:
         client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)

@@ -7,9 +7,9 @@ import numpy as np
 
 from mag_tracking.apps.doctor_covariances import covariance_findings
 from mag_tracking.apps.doctor_rejections import driver_findings, rejection_findings
+from mag_tracking.apps.host_stalls import HostStalls
 from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.agreement import consensus, disagreements
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.quantities import occurrences
@@ -17,18 +17,21 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings
 from mag_tracking.stages.align.frame_period import frame_period_warning
+from mag_tracking.stages.calibrate.field_comparison import (
+    compared_with_earth,
+    earth_field_findings,
+)
 from mag_tracking.stages.calibrate.stage import FAULTS_FOUND, Calibrate
+from mag_tracking.stages.health.clocks import clock_findings
 from mag_tracking.stages.health.diagnosis import Cause, Finding
-from mag_tracking.stages.health.host_stalls import HostStalls
 from mag_tracking.stages.health.sensor_health import SensorHealth
 from mag_tracking.stages.survey.settings import SurveySettings
+from mag_tracking.stages.track.low_rate import low_rate_fault
+from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
 MAX_FROZEN_S = 30.0
 """Time for which a background may be frozen before it is reported [s]."""
-
-MAX_CLOCK_DIFFERENCE_S = 60.0
-"""Difference from the clocks of other sensors above which a clock is reported [s]."""
 
 MIN_MISSED_TARGETS = 3
 """Number of consecutive missed targets at which a sensor is reported."""
@@ -74,43 +77,17 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
     -------
     list of Finding
     """
-    findings = list(_clock_findings(network, sensors))
+    clocks = {name: health.clock for name, health in sensors.items()}
+    findings = list(clock_findings({name: c for name, c in clocks.items() if c is not None}))
     levels = np.array([level_of(calibrate, name, sensors[name]) for name in network.names])
     # Rounded levels stay equal during small changes, so that no new comparison is needed.
     levels = LEVEL_STEP * np.round(levels / LEVEL_STEP)
-    std = np.array([np.full(3, np.deg2rad(survey.nominal_std_deg)) if s is None else s
-                    for s in network.orientation_std])
-    earth_field = network.earth_field
-    if earth_field is None:
-        try:
-            earth_field = consensus(levels, network.R_ws)
-        except ValueError as error:
-            return [*findings, Finding(False, 'network', f'sensors were not compared: {error}',
-                                       'add earth_field or site to the network file',
-                                       Cause.NOT_COMPARED)]
-    return findings + [
-        Finding(True, d.sensor, str(d).removeprefix(f'{d.sensor} '),
-                'fix the sensor, or its orientation in the network file', Cause.CONTRADICTS_EARTH)
-        for d in disagreements(network.names, levels, network.R_ws, std, earth_field,
-                               survey.compass_bias_std)]
-
-
-def _clock_findings(network: SensorNetwork,
-                    sensors: Mapping[str, SensorHealth]) -> Iterator[Finding]:
-    """Report sensors whose clock differs from the clocks of other sensors."""
-    delays = {name: sensors[name].delay_s[0] for name in network.names}
-    delays = {name: d for name, d in delays.items() if not np.isnan(d)}
-    if not delays:
-        return
-    # The clock nearest to the host clock is the reference. In a replay, all clocks differ from the
-    # host clock by about the same time.
-    reference = min(delays.values(), key=abs)
-    for name, delay in delays.items():
-        if abs(delay - reference) > MAX_CLOCK_DIFFERENCE_S:
-            yield Finding(True, name, f'its timestamps differ by {reference - delay:+.4g} s from '
-                          'the timestamps of other sensors', 'synchronise its clock (chrony, PTP); '
-                          'knocks correct only offsets below survey.max_clock_offset_s',
-                          Cause.CLOCK_DIFFERS)
+    try:
+        return findings + earth_field_findings(compared_with_earth(network, survey, levels))
+    except ValueError as error:
+        return [*findings, Finding(False, 'network', f'sensors were not compared: {error}',
+                                   'add earth_field or site to the network file',
+                                   Cause.NOT_COMPARED)]
 
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
@@ -155,6 +132,29 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
                       f'{(last - frozen_since_ns) / NS:.0f} s', 'remove any target near it; if the '
                       'field has changed permanently, call the service calibrate',
                       Cause.FROZEN_BACKGROUND)
+
+
+def rate_findings(name: str, rate: float, network: SensorNetwork,
+                  settings: TrackSettings) -> Iterator[Finding]:
+    """Report a sensor that is too slow for tracks.
+
+    Parameters
+    ----------
+    name : str
+        Sensor.
+    rate : float, Hz
+        NaN or inf if unknown.
+    network : SensorNetwork
+    settings : TrackSettings
+
+    Yields
+    ------
+    Finding
+    """
+    fault = low_rate_fault(rate, network, settings)
+    if fault is not None:
+        yield Finding(True, name, fault, 'raise the rate of the sensor; for parked vehicles, use '
+                      'mag-tracking events', Cause.RATE_TOO_LOW)
 
 
 class MissedTargets:
@@ -223,7 +223,7 @@ class Doctor:
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self.network, self._settings = network, settings
         self.sensors = {name: SensorHealth() for name in network.names}
-        self.calibrate = Calibrate(network, settings.calibrate)
+        self.calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
         self._clock_ns = dict(zip(network.names, network.clock_offset_ns.tolist(), strict=True))
         self._frozen_since_ns: dict[str, int] = {}
         self._missed = MissedTargets(network.names)
@@ -245,8 +245,8 @@ class Doctor:
         if self.calibrate.counts[FAULTS_FOUND] != self._n_faults_found:
             self._n_faults_found = self.calibrate.counts[FAULTS_FOUND]
             for name, health in self.sensors.items():
-                if health.faults != self.calibrate.faults_of(name):
-                    self.sensors[name] = SensorHealth(faults=self.calibrate.faults_of(name))
+                if health.faults != self.calibrate.driver_faults.of(name):
+                    self.sensors[name] = SensorHealth(faults=self.calibrate.driver_faults.of(name))
         for name, stamp, field in zip(names, stamps, readings.field, strict=True):
             self.sensors[name].add(stamp - self._clock_ns[name], field, received_ns)
         backgrounds = self.calibrate.backgrounds()
@@ -272,6 +272,8 @@ class Doctor:
             found += covariance_findings(name, self.network.absolute_topics[j], self.calibrate)
             found += driver_findings(name, self.calibrate)
             found += rejection_findings(name, self.calibrate)
+            found += rate_findings(name, self.calibrate.lowest_rate(name), self.network,
+                                   self._settings.track)
         found += self._missed.findings()
         found += network_findings(self.network, self._settings.survey, self.calibrate,
                                   self.sensors)

@@ -42,7 +42,7 @@ def rejection_findings(name: str, calibrate: Calibrate) -> Iterator[Finding]:
     ------
     Finding
     """
-    for (cause, description), n in calibrate.rejections_of(name).items():
+    for (cause, description), n in calibrate.rejections.of(name).items():
         if cause in ADVICE:
             yield Finding(n > MIN_SERIOUS, name,
                           f'{quantity(n, "reading")} rejected: {description}', ADVICE[cause], cause)
@@ -61,9 +61,9 @@ def driver_findings(name: str, calibrate: Calibrate) -> Iterator[Finding]:
     ------
     Finding
     """
-    faults = calibrate.faults_of(name)
+    faults = calibrate.driver_faults.of(name)
     if len(faults.marks):
-        n = calibrate.n_marked(name)
+        n = calibrate.driver_faults.n_marked(name)
         yield Finding(False, name, f'{quantity(n, "reading has", "readings have")} the value '
                       f'{describe_marks(faults.marks)}: a mark for a missing reading', 'these '
                       'values are left out; let the driver publish NaN, or no message, if it has '

@@ -2,10 +2,13 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
 
+import numpy as np
+
+from mag_tracking.apps.input_findings import input_findings
 from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.apps.readings import network_of
 from mag_tracking.event_records import PassEvent
@@ -17,6 +20,7 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.events.stage import Events
+from mag_tracking.stages.health.diagnosis import Diagnosis, ranked
 from mag_tracking.stages.stage import rejected
 
 
@@ -32,6 +36,8 @@ class EventsResult:
     """Sensors whose background was not learnt."""
     missing_topics: tuple[str, ...]
     """Topics of the network that are not in the recording."""
+    diagnoses: tuple[Diagnosis, ...]
+    """Diagnoses of the recording and the sensors."""
 
     def counts(self) -> dict[str, int]:
         """Count the events of each sensor.
@@ -100,19 +106,30 @@ def find_events(recording: Recording, network: SensorNetwork, settings: Settings
         If the recording has none of the network's topics.
     """
     reader = SampleReader(recording, network)
-    calibrate = Calibrate(network, settings.calibrate)
-    stage = Events(network, settings.align, settings.detect)
+    calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
+    stage = Events(network, settings.align, settings.detect, settings.track)
     prescan_of(recording, network, settings.calibrate, stopped).apply(calibrate)
     pass_events: list[PassEvent] = []
     try:
         for readings in until_stopped(reader.readings, progress, stopped):
             for calibrated in calibrate.feed(readings):
+                stage.set_relearnt(calibrate.relearnt())
                 pass_events += stage.feed(calibrated)
     except ReadingStopped:
         pass
     for calibrated in calibrate.flush():
         pass_events += stage.feed(calibrated)
     pass_events += stage.flush()
+    pass_events = [_with_timestamp_error(event, calibrate) for event in pass_events]
     return EventsResult(tuple(pass_events),
                         dict(reader.rejected + Counter(rejected(calibrate.counts))),
-                        tuple(calibrate.unready()), tuple(reader.missing_topics()))
+                        tuple(calibrate.unready()), tuple(reader.missing_topics()),
+                        tuple(ranked(input_findings(recording, reader, network, calibrate,
+                                                    settings.track))))
+
+
+def _with_timestamp_error(event: PassEvent, calibrate: Calibrate) -> PassEvent:
+    """Event whose `closest_std` includes the error of the timestamps of its sensor."""
+    fault = calibrate.timestamp_fault(event.sensor)
+    return event if fault is None else replace(
+        event, closest_std=float(np.hypot(event.closest_std, fault.error_s)))

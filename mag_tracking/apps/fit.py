@@ -18,6 +18,7 @@ from mag_tracking.recording.fit_folder import FIT_COLUMNS, pass_rows
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.report.dataframes import STATE_UNITS, dataframe
+from mag_tracking.stages.calibrate.field_comparison import earth_field_findings
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -88,7 +89,7 @@ class RecordingFit:
         yield from self._fitter.flush(stopped)
 
     def warnings(self) -> list[str]:
-        """Describe missing topics, backgrounds and detections, and lost or rejected readings.
+        """Describe missing topics, backgrounds and detections, and faulty or rejected readings.
 
         Returns
         -------
@@ -100,6 +101,8 @@ class RecordingFit:
         lines += [f'no background was learnt for {name}: its quiet intervals are too short; '
                   'set background and noise_std in the network file'
                   for name in collector.sensors_without_background()]
+        lines += [str(f) for f in earth_field_findings(
+            collector.calibrate.field_inconsistencies())]
         reason = collector.no_detection_reason(self._reader.missing_topics())
         lines += [f'nothing was detected: {reason}'] if reason else []
         for counts in (self._reader.rejected, collector.rejected, self._recording.losses):

@@ -15,6 +15,7 @@ from mag_tracking.report.fit_figures import target_alone
 from mag_tracking.report.page import NOTE, REPORT, WARNING, Chart, Note, Page, Table, report_html
 from mag_tracking.report.page_charts import axes, curve
 from mag_tracking.report.page_scene import field_entry, fitted_entry, scene_of
+from mag_tracking.report.road import Road, road_of
 from mag_tracking.units import NS
 
 RECORDING_GAP_S = 5.0
@@ -81,7 +82,8 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
               for k, fitted in enumerate(passes) if fitted.chosen is not None]
     end_times = [peak_times[k] + float(fitted.fits[0].data.t.max())
                  for k, fitted in enumerate(passes)]
-    scene = scene_of(network, 0, int(max(end_times) * NS), tracks) if tracks else None
+    scene = scene_of(network, 0, int(max(end_times) * NS), tracks, _road(passes, network)) \
+        if tracks else None
     n_estimates = len(tracks)
     n_passes = len({(fitted.recording, fitted.number) for fitted in passes})
     vehicles_text = f', {quantity(len(passes), "vehicle")}' if len(passes) > n_passes else ''
@@ -124,18 +126,28 @@ def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, peak_time: float)
     F[:, :3, 3:] = t[:, None, None] * np.eye(3)
     state = F @ fit.x[:6]
     C = F @ fit.robust_covariance[:6, :6] @ F.transpose(0, 2, 1)
+    C[:, :3, :3] += fit.position_covariance - fit.robust_covariance[:3, :3]
     target_field = target_alone(fit)
     other_field = fit.predicted - target_field
     fields = [field_entry(int(j), (data.field - other_field)[data.sensor == j],
                           target_field[data.sensor == j], peak_time + data.t[data.sensor == j])
               for j in data.sensors]
-    entry = fitted_entry(number, peak_time + t, state, C, fit.ambiguous, fields)
+    entry = fitted_entry(number, peak_time + t, state, C, fit.ambiguous, float(fit.length[0]),
+                         fields)
     entry['facts'] = {
         'label': f'{fitted.recording}, {fitted.label}', 'kind': quantity(fit.n_dipoles, 'dipole'),
         'speed': float(fit.speed[0]), 'moment': float(np.linalg.norm(fit.moment[0])),
         'verdict': ('ambiguous' if fit.ambiguous else 'unique')
         + f', cost {fit.normalised_cost:.2f}'}
     return entry
+
+
+def _road(passes: Sequence[FittedPass], network: SensorNetwork) -> Road:
+    """Road along the unambiguous fits."""
+    fits = [fitted.chosen for fitted in passes if fitted.chosen is not None]
+    return road_of(network.positions[:, :2], [
+        fit.x[:2] + np.outer(np.linspace(fit.data.t.min(), fit.data.t.max(), N_POSES), fit.x[3:5])
+        for fit in fits if not fit.ambiguous])
 
 
 def _order_chart(passes: Sequence[FittedPass]) -> Chart:

@@ -8,6 +8,7 @@ import numpy as np
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration.doubtful_times import DOUBTFUL_BACKGROUND, are_doubtful
 from mag_tracking.calibration.saturation import saturated_readings, with_margin
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
@@ -16,6 +17,7 @@ from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.stage import rejected
+from mag_tracking.stages.track.doubts import MEANINGS
 from mag_tracking.units import NS
 
 PAD_S = 1.0
@@ -43,8 +45,8 @@ class PassCollector:
                  on_frame: Callable[[FieldFrame], object] | None = None) -> None:
         self._network, self._settings, self._on_frame = network, settings, on_frame
         self._max_field = settings.calibrate.max_field
-        self._stages = (Calibrate(network, settings.calibrate), Align(network, settings.align),
-                        Detect(network, settings.detect))
+        self._stages = (Calibrate(network, settings.calibrate, survey=settings.survey),
+                        Align(network, settings.align), Detect(network, settings.detect))
         # Raw and calibrated readings, in network time, from `PAD_S` before the onset or, without a
         # detection, before the latest frame.
         self._raw: deque[Readings] = deque()
@@ -187,7 +189,19 @@ class PassCollector:
                                  'adjacent ones are not used')
         self._onset_ns = None
         t = (readings.stamp_ns - begin) / NS
-        return PassData(self._network, begin, t, sensor, field, covariance), tuple(notes)
+        return PassData(self._network, begin, t, sensor, field, covariance,
+                        doubt=self._doubt_at(onset_ns)), tuple(notes)
+
+    def _doubt_at(self, stamp_ns: int) -> str:
+        """Reason why the readings of a sensor are wrong at a time; empty if none is known.
+
+        A doubtful background is no reason, because the background of a fit is free.
+        """
+        for reason, by_sensor in self.calibrate.input_doubts().items():
+            names = [name for name, times in by_sensor.items() if are_doubtful(times, stamp_ns)]
+            if names and reason != DOUBTFUL_BACKGROUND:
+                return f'{", ".join(names)}: {MEANINGS[reason]}'
+        return ''
 
     def _raw_fields(self, calibrated: Readings) -> FloatArray:
         """Raw fields (n, 3) [T] of calibrated readings; NaN if the raw reading is unavailable."""

@@ -155,7 +155,7 @@ class PassFitter:
 
     def _track(self, frame: FieldFrame) -> None:
         """Track the targets in a frame."""
-        self._tracker.set_doubtful_times(self.collector.calibrate.doubtful_intervals())
+        self._tracker.set_input_doubts(self.collector.calibrate.input_doubts())
         self._tracks.add(self._tracker.feed(frame))
 
     def _fit_passes(self, passes: Iterable[tuple[PassData, tuple[str, ...]]],

@@ -127,10 +127,11 @@ def _maps(plan: Plan) -> list[Chart]:
     x, y = f * plan.x, f * plan.y
     bound = np.log10(f * np.clip(plan.position_std, None, np.ptp(plan.x)))
     low, high = np.nanquantile(bound, [LOW_QUANTILE, 1.0 - LOW_QUANTILE])
-    bar = _log_bar(low, high, f'standard deviation [{unit}]')
-    position = heat_map(x, y, bound, 'Viridis', '', float(low), float(high)) | {
-        'colorbar': bar, 'text': [[f'{10.0**v:.3g} {unit}' for v in row] for row in bound],
-        'hoverinfo': 'x+y+text'}
+    position = heat_map(x, y, bound, 'Viridis', f'standard deviation [{unit}]', float(low),
+                        float(high))
+    position['colorbar'] |= _log_ticks(low, high)
+    position |= {'text': [[f'{10.0**v:.3g} {unit}' for v in row] for row in bound],
+                 'hoverinfo': 'x+y+text'}
     gain = 100.0 * (1.0 - plan.std_with_added_sensor / plan.std_without_added_sensor)
     ny, nx = gain.shape
     charts = [Chart('Position bound from a whole pass', [position, *_site_traces(plan, f)], layout),
@@ -148,12 +149,11 @@ def _maps(plan: Plan) -> list[Chart]:
     return charts
 
 
-def _log_bar(low: float, high: float, title: str) -> dict[str, Any]:
-    """Create a colour bar that labels logarithmic values with linear numbers."""
+def _log_ticks(low: float, high: float) -> dict[str, Any]:
+    """Create the ticks of a colour bar that label logarithmic values with linear numbers."""
     steps = [10.0**k * m for k in range(-7, 8) for m in (1, 2, 5)]
     ticks = [v for v in steps if low <= np.log10(v) <= high] or [10.0 ** (0.5 * (low + high))]
-    return {'title': {'text': title, 'side': 'right'}, 'tickvals': np.log10(ticks).tolist(),
-            'ticktext': [f'{v:.3g}' for v in ticks]}
+    return {'tickvals': np.log10(ticks).tolist(), 'ticktext': [f'{v:.3g}' for v in ticks]}
 
 
 def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:

@@ -39,6 +39,7 @@ from mag_tracking.report.metrics import (
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.stages.align.frame_period import frame_period_warning
 from mag_tracking.stages.health.diagnosis import ranked
+from mag_tracking.stages.track.plausibility import lane_note
 from mag_tracking.stages.track.settings import acceleration_density
 
 SUSPECT_MOUNTING_RATIO = 2.0
@@ -111,7 +112,8 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
         raise OutputError(f'{out} is the folder of the recording; choose another output folder')
     # Topic names contain no dot: a name with a dot is a file, even if it does not exist.
     is_table = truth is not None and (Path(truth).is_file() or '.' in truth)
-    table = read_truth_table(truth) if truth is not None and is_table else None
+    table = read_truth_table(truth, settings.track.magnet.axis) \
+        if truth is not None and is_table else None
     reader = SampleReader(recording, network, truth if table is None else None)
     pipeline = Pipeline(network, settings)
     prescan = prescan_of(recording, network, settings.calibrate, stopped)
@@ -279,6 +281,7 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
                 replay_findings(recording, reader, pipeline, reason))),
             'close_network': len(pipeline.network) > 1 and pipeline.network.is_compact,
             'frames_too_long': frame_period_warning(pipeline.settings.align, pipeline.network),
+            'lanes': lane_note(pipeline.settings.track.vehicle, pipeline.network),
             'clocks_apart': pipeline.track.clock_warning,
             'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks,
             'disturbances': disturbances,

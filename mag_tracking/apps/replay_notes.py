@@ -3,9 +3,8 @@
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from mag_tracking.apps.doctor import background_findings, recording_findings
-from mag_tracking.apps.doctor_covariances import covariance_findings
-from mag_tracking.apps.doctor_rejections import driver_findings, rejection_findings
+from mag_tracking.apps.input_findings import input_findings
+from mag_tracking.physics import bounds
 from mag_tracking.pipeline import Pipeline
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
@@ -37,16 +36,8 @@ def replay_findings(recording: Recording, reader: SampleReader, pipeline: Pipeli
     -------
     list of Finding
     """
-    network, calibrate, missing = pipeline.network, pipeline.calibrate, reader.missing_topics()
-    found = recording_findings(recording, reader)
-    for name, topic in zip(network.names, network.absolute_topics, strict=True):
-        if topic in missing:
-            found.append(Finding(True, name, f'no messages on {topic}', 'check the topic in the '
-                                 'network file', Cause.NO_MESSAGES))
-        found += driver_findings(name, calibrate)
-        found += rejection_findings(name, calibrate)
-        found += background_findings(name, calibrate, None)
-        found += covariance_findings(name, topic, calibrate)
+    found = input_findings(recording, reader, pipeline.network, pipeline.calibrate,
+                           pipeline.settings.track)
     for stage, counts in pipeline.counts().items():
         if stage != 'calibrate' and (causes := rejected(counts)):
             found.append(Finding(False, stage, ', '.join(
@@ -135,6 +126,8 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(NOTE, 'all sensors are within two metres: range and moment are poorly '
                    'observable, and all tracks are ambiguous; use the speed and direction from the '
                    'delays between the sensors')
+    if summary['lanes'] and summary['target'] == 'vehicle' and counts.get('tracks', 0):
+        yield Note(NOTE, summary['lanes'])
     if summary['frames_too_long']:
         yield Note(WARNING, summary['frames_too_long'])
     if summary['clocks_apart']:
@@ -144,6 +137,9 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(WARNING, quantity(n_lost, 'track lost its target', 'tracks lost their target')
                    + ': check the orientations in the network file; other possible causes are '
                    'simultaneous targets, or a kind of target that the settings do not include')
+    for reason in bounds.REASONS:
+        if n := counts.get(f'tracks ended: {reason}', 0):
+            yield Note(WARNING, f'{quantity(n, "track")} ended: {reason}; {bounds.ADVICE}')
     n_uncertain = counts.get(UNCERTAIN_ORIENTATIONS, 0)
     if n_uncertain:
         yield Note(WARNING, quantity(n_uncertain, 'sensor has', 'sensors have')

@@ -24,6 +24,7 @@ from mag_tracking.report.page_scene import (
     thin_poses,
     track_entry,
 )
+from mag_tracking.report.road import Road, road_of
 from mag_tracking.report.track_log import TrackLog
 
 
@@ -105,7 +106,15 @@ def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
             entry['truth'] = path_entry(log.id, interpolate_truth(
                 run.truth[facts['truth']['name']], [log.stamp_ns[k] for k in rows]))
         tracks.append(entry)
-    return scene_of(network, begin_ns, max(log.stamp_ns[-1] for log in logs), tracks)
+    return scene_of(network, begin_ns, max(log.stamp_ns[-1] for log in logs), tracks,
+                    _road(run, network, logs))
+
+
+def _road(run: Run, network: SensorNetwork, logs: Sequence[TrackLog]) -> Road:
+    """Road along the smoothed paths of the vehicles whose tracks ended unambiguously."""
+    paths = [np.array(run.smoothed[log.id].position)[:, :2] for log in logs
+             if log.kind[-1] and not log.ambiguous[-1] and log.id in run.smoothed]
+    return road_of(network.positions[:, :2], paths)
 
 
 def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) -> Table:

@@ -16,7 +16,7 @@ from mag_tracking.apps.readings import (
     recorded_readings,
 )
 from mag_tracking.apps.replay import RunCollector, errors_against_truth
-from mag_tracking.arrays import StructArray
+from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.errors import UnknownTrackError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.network import SensorNetwork
@@ -184,8 +184,37 @@ class TrackingResult:
         log, errors = self._track_log(track_id), self.errors(track_id)
         truth = None if errors is None else interpolate_truth(self.truth[errors['name']],
                                                               log.stamp_ns)
-        smoothed = self.smoothed[(self.smoothed['track_id'] == log.id) & self.smoothed['complete']]
-        return map_figure(log, self.network, truth, smoothed['position'] if len(smoothed) else None)
+        return map_figure(log, self.network, truth, self._smoothed_path(log.id))
+
+    def pass_figure(self, track_id: int | None = None, max_std: float = float('inf')) -> 'Figure':
+        """Draw the pass of a vehicle: road, sensors, vehicle to scale, published and smoothed path.
+
+        Parameters
+        ----------
+        track_id : int, optional
+            Default: the first track.
+        max_std : float, m, optional
+            Poses with a larger standard deviation of the horizontal position are omitted.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        UnknownTrackError
+            If there is no such track.
+        """
+        from mag_tracking.report.pass_picture import pass_figure
+
+        log = self._track_log(track_id)
+        return pass_figure(log, self.network, self._smoothed_path(log.id), max_std)
+
+    def _smoothed_path(self, track_id: int) -> FloatArray | None:
+        """Smoothed positions (n, 3) [m] of a track; None if the track is not smoothed."""
+        smoothed = self.smoothed[(self.smoothed['track_id'] == track_id)
+                                 & self.smoothed['complete']]
+        return smoothed['position'] if len(smoothed) else None
 
     def weights_figure(self, track_id: int | None = None) -> 'Figure':
         """Draw the weight of each arrival direction over time.
@@ -253,7 +282,7 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
     source : Readings, RecordedReadings, or path of a recording
         A recording is read in batches and need not fit into memory.
     network : SensorNetwork or path of a network file
-    target : 'vehicle' or 'magnet'
+    target : 'vehicle', 'magnet' (in a hand) or 'bench' (a magnet on a bench)
     settings : {name: value}, optional
         Settings that differ from the defaults of the target, such as {'track.iterations': 5};
         config/default.yaml lists all settings.

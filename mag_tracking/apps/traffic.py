@@ -17,7 +17,7 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.apps.readings import network_of
-from mag_tracking.apps.replay_notes import no_track_reason
+from mag_tracking.apps.replay_notes import no_track_reason, replay_findings
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import TrafficSummary, VehiclePassage
 from mag_tracking.network import SensorNetwork
@@ -27,6 +27,7 @@ from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame, Track
+from mag_tracking.stages.health.diagnosis import Diagnosis, ranked
 from mag_tracking.units import NS
 
 RETENTION_S = 300.0
@@ -72,6 +73,8 @@ class TrafficResult:
     """Explanation, in one sentence, of why nothing was detected; None if a target was detected."""
     no_track_reason: str | None
     """Explanation if nothing was tracked because only one sensor measured the target, else None."""
+    diagnoses: tuple[Diagnosis, ...]
+    """Diagnoses of the recording, the sensors and the stages."""
 
     def __repr__(self) -> str:
         lines = dict(Counter(v.passage.line for v in self.vehicles))
@@ -153,7 +156,8 @@ def count_traffic(recording: Recording, network: SensorNetwork, settings: Settin
     return TrafficResult(settings.traffic.class_names, tuple(collector.vehicles),
                          tuple(collector.summaries), dict(pipeline.traffic.counts), rejections,
                          tuple(reader.missing_topics()), tuple(pipeline.calibrate.unready()),
-                         reason, no_track_reason(pipeline.counts()['track']))
+                         reason, no_track_reason(pipeline.counts()['track']),
+                         tuple(ranked(replay_findings(recording, reader, pipeline, reason))))
 
 
 class _TrafficCollector:

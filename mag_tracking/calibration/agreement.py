@@ -1,7 +1,8 @@
 """Comparison of measured fields with the Earth's field, and explanations of differences.
 
 Without a target, all sensors measure the same field in different frames. Flipped axes, swapped
-axes, a wrong unit or two exchanged sensors are therefore detected and named.
+axes, a wrong unit, a wrong gain or two exchanged sensors are therefore detected and named. Such a
+fault also distorts the field of a target. A constant offset does not.
 """
 
 import functools
@@ -17,6 +18,20 @@ from mag_tracking.arrays import FloatArray
 
 FALSE_ALARM_PROBABILITY = 1e-5
 """Probability that a correct sensor is reported."""
+
+OFFSET_PROBABILITY = 1e-3
+"""Probability that a sensor with a constant offset is regarded as misleading."""
+
+EXPLAINED_PROBABILITY = 0.05
+"""Probability that the difference that remains after the correction of a fault is larger. A fault
+that explains the field this well is more probable than an offset that resembles it."""
+
+GAIN_STDS = 2.0
+"""Half of the stated interval of a gain, in standard deviations."""
+
+MIN_GAIN_ERROR, MIN_GAIN, MAX_GAIN = 0.1, 0.1, 10.0
+"""A gain is an explanation if it differs from 1 by more than the first value, and is between the
+other two."""
 
 MAX_HEADING_STDS = 5.0
 """Maximum tested heading error, in standard deviations."""
@@ -39,6 +54,13 @@ _AxisChange: TypeAlias = tuple[str, tuple[int, ...], FloatArray]
 """Description, order and signs (3,) of a signed permutation of the axes."""
 
 
+ADVICE = 'fix the sensor, its orientation in the network file, or earth_field'
+"""Remedy for a misleading sensor."""
+
+OFFSET_ADVICE = 'measure the offset with mag-tracking tumble if the orientations are calibrated'
+"""Remedy for a sensor with a constant offset."""
+
+
 @dataclass(frozen=True)
 class FieldInconsistency:
     """A sensor whose measured field is inconsistent with the Earth's field."""
@@ -48,11 +70,19 @@ class FieldInconsistency:
     """[T] Magnitude of the measured field minus the Earth's field, over the reported axes."""
     explanations: tuple[str, ...]
     """The simplest possible explanations; empty if no known fault explains the difference."""
+    misleads: bool
+    """Whether the field of a target is probably distorted, too, so that tracks are wrong. False if
+    the difference may be a constant offset."""
+
+    @property
+    def advice(self) -> str:
+        """Remedy."""
+        return ADVICE if self.misleads else OFFSET_ADVICE
 
     def __str__(self) -> str:
         cause = ' or '.join(self.explanations) or (
-            'not explained by swapped or flipped axes, a wrong unit or exchanged sensors; check '
-            'for iron or magnets nearby, and check the configured orientation')
+            'not explained by swapped or flipped axes, a wrong unit, a wrong gain or exchanged '
+            'sensors; check for iron or magnets nearby, and check the configured orientation')
         return (f'{self.sensor} differs from the Earth\'s field by {self.magnitude * 1e6:.3g} uT: '
                 f'{cause}')
 
@@ -88,7 +118,7 @@ def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
 
 def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
                   orientation_std: FloatArray, earth_field: FloatArray,
-                  bias_std: float) -> list[FieldInconsistency]:
+                  bias_std: float, offset_std: float) -> list[FieldInconsistency]:
     """Find the sensors that do not measure the Earth's field.
 
     Parameters
@@ -103,6 +133,9 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     earth_field : (3,) array, T, world frame
     bias_std : float, T
         Standard deviation of the bias of a sensor, including nearby iron, per axis.
+    offset_std : float, T
+        Standard deviation of the offset of an uncalibrated sensor, per axis. A difference that it
+        explains is not misleading; 0 makes no difference misleading.
 
     Returns
     -------
@@ -110,21 +143,53 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
         In the order of `names`.
     """
     B0 = np.asarray(earth_field, dtype=float)
-    suspects = [j for j in range(len(names))
-                if not _is_consistent(fields[j], R_ws[j], orientation_std[j], B0, bias_std)]
+    sensors = [_Sensor(names[j], fields[j], R_ws[j], orientation_std[j], B0, bias_std)
+               for j in range(len(names))]
+    suspects = [s for s in sensors if not s.fits(s.field)]
     inconsistencies = []
-    for j in suspects:
-        magnitude = np.sqrt(np.nansum((fields[j] - R_ws[j].T @ B0)**2))
-        inconsistencies.append(FieldInconsistency(names[j], float(magnitude), _explanations(
-            j, suspects, names, fields, R_ws, orientation_std, B0, bias_std)))
+    for s in suspects:
+        exact = _exact_explanations(s, suspects)
+        is_offset = offset_std > 0.0 \
+            and s.probability(s.field, offset_std) > OFFSET_PROBABILITY \
+            and not any(p > EXPLAINED_PROBABILITY for _, p in exact)
+        gains = _gain_explanations(s)
+        explanations = tuple(text for text, _ in exact) or (
+            ('a constant offset of the sensor or of iron nearby', *gains) if is_offset else
+            gains or _partial_explanation(s.field, s.R_ws, s.std, B0)
+            or _orientation_explanation(s))
+        magnitude = float(np.sqrt(np.nansum((s.field - s.R_ws.T @ B0)**2)))
+        inconsistencies.append(FieldInconsistency(
+            s.name, magnitude, explanations, offset_std > 0.0 and not is_offset))
     return inconsistencies
 
 
-def _is_consistent(y: FloatArray, R_ws: FloatArray, std: FloatArray, B0: FloatArray,
-                   bias_std: float) -> bool:
-    """Whether a measured field is consistent with the Earth's field at the best heading."""
-    return _is_consistent_cached(
-        _cache_key(y), _cache_key(R_ws), _cache_key(std), _cache_key(B0), bias_std)
+@dataclass(frozen=True, eq=False)
+class _Sensor:
+    """Field and orientation of one sensor, compared with the Earth's field."""
+
+    name: str
+    field: FloatArray
+    """(3,) [T] NaN for an unreported axis."""
+    R_ws: FloatArray
+    std: FloatArray
+    """(3,) [rad] Standard deviation of the orientation about the world axes."""
+    B0: FloatArray
+    """(3,) [T] Earth's field in the world frame."""
+    bias_std: float
+
+    def probability(self, y: FloatArray, bias_std: float | None = None) -> float:
+        """Probability that a field differs more from the Earth's field than `y` does."""
+        return _probability(*map(_cache_key, (y, self.R_ws, self.std, self.B0)),
+                            self.bias_std if bias_std is None else bias_std)
+
+    def fits(self, y: FloatArray) -> bool:
+        """Whether a field is consistent with the Earth's field."""
+        return self.probability(y) >= FALSE_ALARM_PROBABILITY
+
+    def nominal_field(self) -> FloatArray:
+        """Earth's field (3,) [T] in the sensor frame, NaN for an unreported axis."""
+        field: FloatArray = np.where(np.isnan(self.field), np.nan, self.R_ws.T @ self.B0)
+        return field
 
 
 def _cache_key(a: FloatArray) -> tuple[float, ...]:
@@ -133,46 +198,78 @@ def _cache_key(a: FloatArray) -> tuple[float, ...]:
 
 
 @functools.lru_cache(maxsize=4096)
-def _is_consistent_cached(field: tuple[float, ...], orientation: tuple[float, ...],
-                          orientation_std: tuple[float, ...], B0: tuple[float, ...],
-                          bias_std: float) -> bool:
-    """Compute `_is_consistent` from tuples, which are hashable, and cache the result."""
-    y, R_ws, std = (np.array(field), np.array(orientation).reshape(3, 3),
-                    np.array(orientation_std))
+def _probability(field: tuple[float, ...], orientation: tuple[float, ...],
+                 orientation_std: tuple[float, ...], earth_field: tuple[float, ...],
+                 bias_std: float) -> float:
+    """Probability of a larger difference from the Earth's field, at the best heading.
+
+    The arguments are tuples, which are hashable, so that the result is cached.
+    """
+    y, R_ws, std, B0 = (np.array(field), np.array(orientation).reshape(3, 3),
+                        np.array(orientation_std), np.array(earth_field))
     is_reported = ~np.isnan(y)
     if not is_reported.any():
-        return True
+        return 1.0
     # Heading errors may be large, so a grid is tested; tilts are small and are linearised.
-    yaw, B = _headings(std, np.array(B0))
-    tilt_effect = (R_ws.T @ np.cross(np.eye(3), np.array(B0)).T * std)[:, :2]
+    yaw, B = _headings(std, B0)
+    tilt_effect = (R_ws.T @ np.cross(np.eye(3), B0).T * std)[:, :2]
     S = (bias_std**2 * np.eye(3) + tilt_effect @ tilt_effect.T)[np.ix_(is_reported, is_reported)]
     r = (y - B @ R_ws)[:, is_reported]
     energy = np.einsum('ni,ij,nj->n', r, np.linalg.inv(S), r) + (yaw / std[2])**2
-    return bool(energy.min() <= chi2.isf(FALSE_ALARM_PROBABILITY, np.count_nonzero(is_reported)))
+    return float(chi2.sf(energy.min(), np.count_nonzero(is_reported)))
 
 
-def _explanations(j: int, suspects: Sequence[int], names: Sequence[str], fields: FloatArray,
-                  R_ws: FloatArray, orientation_std: FloatArray, B0: FloatArray,
-                  bias_std: float) -> tuple[str, ...]:
-    """Simplest faults that explain the field of sensor `j`; empty if no fault does."""
-    def fits(y: FloatArray, R: FloatArray = R_ws[j],
-             std: FloatArray = orientation_std[j]) -> bool:
-        return _is_consistent(y, R, std, B0, bias_std)
-
-    y = fields[j]
+def _exact_explanations(s: _Sensor, suspects: Sequence[_Sensor]) -> list[tuple[str, float]]:
+    """Simplest faults without a free parameter that explain the field, and their probabilities."""
+    y = s.field
     # Exchanged sensors: both must be suspect, and both must fit after the exchange.
-    explanations = [f'it is exchanged with {names[i]}' for i in suspects if i != j
-                    and fits(y, R_ws[i], orientation_std[i])
-                    and fits(fields[i], R_ws[j], orientation_std[j])]
-    explanations += [f'its unit is {unit}' for unit, scale in UNITS if fits(y / scale)]
-    if explanations:
-        return tuple(explanations)
-    for changes in _axis_changes():
-        explanations = [description for description, order, signs in changes
-                        if fits(signs * y[list(order)])]
-        if explanations:
-            return tuple(explanations)
-    return _partial_explanation(y, R_ws[j], orientation_std[j], B0)
+    candidates = [(f'it is exchanged with {other.name}',
+                   min(other.probability(y), s.probability(other.field)))
+                  for other in suspects if other is not s]
+    candidates += [(f'its unit is {unit}', s.probability(y / scale)) for unit, scale in UNITS]
+    for group in (candidates, *([(description, s.probability(signs * y[list(order)]))
+                                 for description, order, signs in changes]
+                                for changes in _axis_changes())):
+        if explanations := [(text, p) for text, p in group if p >= FALSE_ALARM_PROBABILITY]:
+            return explanations
+    return []
+
+
+def _gain_explanations(s: _Sensor) -> tuple[str, ...]:
+    """Gains of all axes, or of one axis, that explain the field."""
+    y, B = s.field, s.nominal_field()
+    found = []
+    gain = np.sqrt(np.nansum(y**2) / np.nansum(B**2))
+    relative_std = s.bias_std / np.sqrt(np.nansum(B**2))
+    for sign, text in ((1.0, ''), (-1.0, 'x, y and z are flipped, with ')):
+        if _is_wrong_gain(gain) and s.fits(sign * y / gain):
+            found.append(f'{text}{_gain_text(gain, relative_std)} (the direction agrees)')
+    for a, axis in enumerate(_AXES):
+        # A field along the axis that is below the noise has no gain.
+        if np.isnan(y[a]) or not abs(B[a]) > 2.0 * GAIN_STDS * s.bias_std:
+            continue
+        corrected = np.where(np.arange(3) == a, B, y)
+        if _is_wrong_gain(y[a] / B[a]) and s.fits(corrected):
+            found.append(f'{_gain_text(y[a] / B[a], s.bias_std / abs(B[a]))} of {axis} alone')
+    return tuple(found)
+
+
+def _orientation_explanation(s: _Sensor) -> tuple[str, ...]:
+    """A wrong orientation, if the magnitude of the field agrees."""
+    difference = abs(np.linalg.norm(s.field) - np.linalg.norm(s.B0))
+    return ('another orientation (the magnitude agrees)',) \
+        if difference < MAX_HEADING_STDS * s.bias_std else ()
+
+
+def _is_wrong_gain(gain: float) -> bool:
+    """Whether a gain differs from 1, and is possible."""
+    return abs(gain - 1.0) > MIN_GAIN_ERROR and MIN_GAIN < gain < MAX_GAIN
+
+
+def _gain_text(gain: float, relative_std: float) -> str:
+    """Interval of a gain with a relative standard deviation."""
+    low, high = (f'{gain * (1.0 + sign * GAIN_STDS * relative_std):.2g}' for sign in (-1.0, 1.0))
+    return f'gain {low}' if low == high else f'gain {low} to {high}'
 
 
 def _partial_explanation(y: FloatArray, R_ws: FloatArray, std: FloatArray,
@@ -230,9 +327,13 @@ def _axis_changes() -> list[list[_AxisChange]]:
             elif n_moved:
                 parts.append('its axes are in the order '
                              + ', '.join(_AXES[order.index(i)] for i in range(3)))
-            if flipped_axes:
+            if len(flipped_axes) == 3:
+                parts.append('x, y and z are flipped')
+            elif flipped_axes:
                 parts.append(f'{" and ".join(flipped_axes)} '
                              f'{"is" if len(flipped_axes) == 1 else "are"} flipped')
-            groups.setdefault((n_moved + len(flipped_axes) + (n_moved > 0), n_moved), []).append(
+            # An inverted sensor is as simple as one that is mounted upside down.
+            n_changes = n_moved + min(len(flipped_axes), 2) + (n_moved > 0)
+            groups.setdefault((n_changes, n_moved), []).append(
                 (', '.join(parts), order, np.array(signs)))
     return [groups[key] for key in sorted(groups)]

@@ -11,6 +11,7 @@ covariance of a target-free interval; the line and the freezing are additions of
 from collections import deque
 from functools import partial
 from math import inf
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,6 +28,23 @@ from mag_tracking.calibration.provisional import MIN_OBSERVED_S, FrequentLevel, 
 from mag_tracking.calibration.quiet_interval import QuietInterval, line_of
 from mag_tracking.calibration.resolution import MIN_STD, corrected_steps
 from mag_tracking.units import NS
+
+MAX_CHANGES = 16
+"""Maximum number of stored changes of the background."""
+
+
+class RelearntBackground(NamedTuple):
+    """Replacement of a background by another level."""
+
+    stamp_ns: int
+    """Timestamp of the first reading to which the new background applies."""
+    has_departed: bool
+    """Whether the background contained the field of a target, which has departed. Otherwise,
+    another level lasted, or a former level returned."""
+    before: FloatArray
+    """Previous background, (3,) T, sensor frame. NaN for a missing axis."""
+    after: FloatArray
+    """New background, (3,) T, sensor frame. NaN for a missing axis."""
 
 
 class RunningBackground:
@@ -74,6 +92,8 @@ class RunningBackground:
         Whether the readings do not change.
     n_relearnt : int
         Number of times another steady level became the background.
+    relearnt : tuple of RelearntBackground
+        The latest of these changes.
     doubtful_times : DoubtfulTimes
         Intervals in which the background was doubtful.
     """
@@ -93,6 +113,10 @@ class RunningBackground:
             None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
         self._level = BackgroundLevel(sensors, freeze_std)
         self.n_relearnt = 0
+        self.relearnt: tuple[RelearntBackground, ...] = ()
+        # Background and level (3,) [T] of the latest departure.
+        self._previous_level: FloatArray = np.full(3, np.nan)
+        self._departure_level: FloatArray = np.full(3, np.nan)
         self.doubtful_times: DoubtfulTimes = ()
         self._provisional = ProvisionalLevel(learn)
         self._departure = LevelDeparture(
@@ -297,6 +321,7 @@ class RunningBackground:
     def _change_if_steady(self, block: Block) -> None:
         """While frozen, adopt another level that persists or that was the background earlier."""
         self._observed_until = np.nan
+        self._previous_level, self._departure_level = self._level.at(block.time), block.mean
         departure = self._departure
         duration = block.time - departure.blocks[0].time
         relearn_time = departure.relearn_time(
@@ -320,13 +345,20 @@ class RunningBackground:
         if duration < relearn_time:
             return
         if self._adopt_if_steady(departure.blocks):
-            self.n_relearnt += 1
+            self._count_relearnt(False)
             self.frozen = self._is_ambiguous = False
         elif other_level is not None and other_level.is_certain:
-            self.n_relearnt += 1
+            self._count_relearnt(False)
             self._start_with_frequent(other_level)
         else:
             departure.shorten()
+
+    def _count_relearnt(self, has_departed: bool) -> None:
+        """Count another background, which applies from the latest reading on."""
+        self.n_relearnt += 1
+        change = RelearntBackground(int(self._state['last_ns']), has_departed,
+                                    self._previous_level, self._departure_level)
+        self.relearnt = (*self.relearnt, change)[-MAX_CHANGES:]
 
     def _adopt_if_background(self, new_blocks: deque[Block]) -> bool:
         """Adopt the level of `new_blocks` if it is a former level or a vehicle has departed.
@@ -335,18 +367,18 @@ class RunningBackground:
         """
         former_observed_s = self._departure.former_observed_s()
         if former_observed_s:
-            self._change_to(new_blocks, former_observed_s)
+            self._change_to(new_blocks, former_observed_s, False)
             return True
         is_known = self._known_background is not None and self._departure.former is None
         if not self._departure.has_departed(new_blocks) or is_known:
             return False
         since_ns = int(self._state['first_ns']) + round(np.nan_to_num(self._start_time) * NS)
-        self._change_to(new_blocks, self._learn)
+        self._change_to(new_blocks, self._learn, True)
         # The earlier background contained the field of the vehicle.
         self.doubtful_times = doubtful_since(self.doubtful_times, since_ns)
         return True
 
-    def _change_to(self, new_blocks: deque[Block], observed_s: float) -> None:
+    def _change_to(self, new_blocks: deque[Block], observed_s: float, has_departed: bool) -> None:
         """Change the background to the level of `new_blocks`, observed for `observed_s` [s]."""
         # The first half may contain the tail of the departing vehicle's field.
         second_half = list(new_blocks)[len(new_blocks) // 2:]
@@ -354,7 +386,7 @@ class RunningBackground:
         self._level.set_constant(stacked(second_half))
         self._is_resumed, self._relearns_soon, self._observed_s = True, False, observed_s
         self._quiet.begin(second_half)
-        self.n_relearnt += 1
+        self._count_relearnt(has_departed)
         self.frozen = self._is_ambiguous = self._is_steep = False
 
     def _store_former_level(self, begin: float) -> None:

@@ -35,7 +35,8 @@ examples:
       --scheduler tcp://10.0.0.5:8786
 
 The workers of a Dask scheduler need this package, and access to the recordings and DIR under the
-same paths.
+same paths. A scheduler executes the code of whoever reaches it; the guide "Track an archive" shows
+how to use one with certificates (tls://...).
 '''
 
 
@@ -63,7 +64,8 @@ def _archive(args: argparse.Namespace) -> int:
     """Run `mag-tracking archive`."""
     if args.workers < 1:
         raise SettingsError(f'--workers: expected 1 or more, got {args.workers}')
-    network, settings = recorded_network(args), settings_of(args)
+    network = recorded_network(args)
+    settings = settings_of(args, network)
     recordings = recordings_of(args.recordings)
     with recorded_signals(signal.SIGINT) as signals, \
             tqdm(total=sum(map(size_of, recordings)), unit='B', unit_scale=True, desc='archive',

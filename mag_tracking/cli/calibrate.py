@@ -65,7 +65,8 @@ def add(commands: Commands) -> None:
 
 def _calibrate(args: argparse.Namespace) -> int:
     """Run `mag-tracking calibrate`."""
-    network, settings = recorded_network(args), settings_of(args)
+    network = recorded_network(args)
+    settings = settings_of(args, network)
     recording = Recording(args.recording)
     check_outputs(args)
     check_report(args, args.recording, args.network, args.out, args.figure)

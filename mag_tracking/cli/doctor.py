@@ -57,7 +57,8 @@ def _doctor(args: argparse.Namespace) -> int:
     """Run `mag-tracking doctor`."""
     if (args.recording is None) == (args.live is None):
         raise SettingsError('doctor: give either RECORDING or --live SECONDS')
-    network, settings = recorded_network(args), settings_of(args)
+    network = recorded_network(args)
+    settings = settings_of(args, network)
     check_report(args, args.recording, args.network)
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
         if args.live is not None:

@@ -9,7 +9,13 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.apps.events import EventsResult, find_events
-from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
+from mag_tracking.cli.options import (
+    Commands,
+    add_command,
+    add_recorded_network,
+    print_diagnoses,
+    recorded_network,
+)
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import PassEvent
@@ -17,6 +23,7 @@ from mag_tracking.interrupts import recorded_signals
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.event_tables import write_events
 from mag_tracking.recording.reader import Recording
+from mag_tracking.stages.events.stage import MAX_DURATION_S
 from mag_tracking.units import NS
 
 _EVENTS_HELP = '''
@@ -50,7 +57,8 @@ def add(commands: Commands) -> None:
 
 def _events(args: argparse.Namespace) -> int:
     """Run `mag-tracking events`."""
-    network, settings = recorded_network(args), settings_of(args)
+    network = recorded_network(args)
+    settings = settings_of(args, network)
     recording = Recording(args.recording)
     if args.out is not None and recording.lies_in(args.out):
         raise OutputError(f'--out: {args.out} is the folder of the recording; choose another one')
@@ -59,8 +67,6 @@ def _events(args: argparse.Namespace) -> int:
                  disable=None) as bar:
         result = find_events(recording, network, settings, bar.update, lambda: bool(signals))
     _print(result, network.names)
-    for cause, n in {**result.rejections, **recording.losses}.items():
-        print(f'  warning: {cause}: {n}')
     if args.out is not None:
         write_events(args.out, result.events)
         print(f'tables in {args.out}')
@@ -71,16 +77,12 @@ def _events(args: argparse.Namespace) -> int:
 
 
 def _print(result: EventsResult, names: tuple[str, ...]) -> None:
-    """Print one line per event, the number of events of each sensor, and warnings."""
+    """Print the diagnoses, one line per event, and the number of events of each sensor."""
+    print_diagnoses(result.diagnoses)
     for event in result.events:
         print(line_of(event))
     counts = result.counts()
     print(', '.join(f'{name}: {quantity(counts.get(name, 0), "event")}' for name in names))
-    for topic in result.missing_topics:
-        print(f'  warning: no messages on {topic}')
-    for name in result.sensors_without_background:
-        print(f'  warning: no background was learnt for {name}: the intervals without a target are '
-              'too short')
 
 
 def line_of(event: PassEvent) -> str:
@@ -94,14 +96,21 @@ def line_of(event: PassEvent) -> str:
     -------
     str
     """
-    closest_time = datetime.fromtimestamp(event.closest_ns / NS, tz=timezone.utc)
     p = event.left_to_right
     direction = f'left to right ({p:.0%})' if p > 0.9 else f'right to left ({1.0 - p:.0%})' \
         if p < 0.1 else 'direction unknown'
-    time = f'{closest_time:%H:%M:%S}.{closest_time.microsecond // 10000:02d}'
+    duration = (event.release_ns - event.onset_ns) / NS
+    time = _time_of(event.closest_ns)
     closest = f'closest {time} ± {event.closest_std:.2f} s' if np.isfinite(event.closest_std) \
         else f'peak at {time}, closest point unknown'
-    duration = (event.release_ns - event.onset_ns) / NS
+    if duration > MAX_DURATION_S:
+        closest = f'from {_time_of(event.onset_ns)} to {_time_of(event.release_ns)}'
     return (f'{event.sensor} {event.number}: {closest}, duration {duration:.2f} s, peak '
             f'{1e9 * np.sqrt(np.nansum(event.peak**2)):.0f} nT on {event.axes}, {direction}'
             + ('' if event.ended else ', not ended'))
+
+
+def _time_of(stamp_ns: int) -> str:
+    """Time of day of a timestamp."""
+    time = datetime.fromtimestamp(stamp_ns / NS, tz=timezone.utc)
+    return f'{time:%H:%M:%S}.{time.microsecond // 10000:02d}'

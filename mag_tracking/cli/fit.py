@@ -217,7 +217,7 @@ def _print_delay(fitted_pass: FittedPass) -> None:
 
 def _formatted_estimates(fit: PassFit) -> str:
     """Format the estimates of a fit, with standard deviations in parentheses."""
-    sd = np.sqrt(np.diagonal(fit.robust_covariance))[:3]
+    sd = np.sqrt(np.diagonal(fit.position_covariance))
     position = ' '.join(f'{v:6.2f}({s:.2f})' for v, s in zip(fit.position, sd, strict=True))
     moment, P = fit.moment
     magnitude = np.linalg.norm(moment)

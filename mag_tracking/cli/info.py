@@ -1,9 +1,15 @@
 """Command `mag-tracking info`."""
 
 import argparse
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from tqdm import tqdm
+
+from mag_tracking.apps.info import Source, Timing, time_topics
 from mag_tracking.cli.options import Commands, add_command, add_network
+from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.network.topics import absolute, namespaces_of
 from mag_tracking.quantities import quantity
@@ -26,26 +32,58 @@ def add(commands: Commands) -> None:
 def _info(args: argparse.Namespace) -> int:
     """Run `mag-tracking info`."""
     recording = Recording(args.recording)
-    if not recording.message_counts:
-        for message in recording.messages():
-            recording.message_counts[message.topic] += 1
-    print(f'{recording.path}: {recording.size / 1e6:.2f} MB, '
-          f'{quantity(sum(recording.message_counts.values()), "message")}')
-    if recording.start_ns is not None and recording.end_ns is not None:
-        print(f'  {(recording.end_ns - recording.start_ns) / 1e9:.2f} s')
-    if not recording.message_counts:
+    with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
+              disable=None) as bar:
+        timings, faults = time_topics(recording, bar.update)
+    n_messages = sum(recording.message_counts.values()) or sum(
+        timing.n_messages for timing in timings.values())
+    print(f'{recording.path}: {recording.size / 1e6:.2f} MB, {quantity(n_messages, "message")}')
+    _print_duration(recording, list(timings.values()))
+    if not n_messages:
         print('  warning: the recording contains no messages')
     for topic in sorted(recording.types):
-        print(f'  {topic}  {recording.types[topic]}  {recording.message_counts[topic]}')
-    for cause, n in recording.losses.items():
+        _print_topic(topic, recording, {source.sensor: timing for source, timing in timings.items()
+                                        if source.topic == topic})
+    for cause, n in {**faults, **recording.losses}.items():
         print(f'  warning: {cause}: {n}')
     if args.network:
-        network = read_network(args.network)
-        namespaces = namespaces_of(network.topics, recording.types) or ['/']
-        if len(namespaces) > 1:
-            print(f'  namespaces with topics of the network: {", ".join(namespaces)}')
-        for name, topic in zip(network.names, network.topics, strict=True):
-            topic = absolute(topic, namespaces[0])
-            state = 'recorded' if topic in recording.types else 'MISSING'
-            print(f'  sensor {name}: {topic} is {state}')
+        _print_sensors(read_network(args.network), recording, timings)
     return 0
+
+
+def _print_duration(recording: Recording, timings: Sequence[Timing]) -> None:
+    """Print the duration by the log times, or by the timestamps if they contradict each other."""
+    wrong = next((timing for timing in timings if timing.clocks_disagree), None)
+    if wrong is not None:
+        print(f'  {wrong.span_s:.2f} s by the timestamps\n  warning: the log times span '
+              f'{wrong.log_span_s:.2f} s: the clock of the recorder jumped or was wrong, or the '
+              'timestamps are')
+    elif recording.start_ns is not None and recording.end_ns is not None:
+        print(f'  {(recording.end_ns - recording.start_ns) / 1e9:.2f} s')
+
+
+def _print_topic(topic: str, recording: Recording, timings: Mapping[str, Timing]) -> None:
+    """Print a topic with its rate and gaps, by sensor if there are several."""
+    n = recording.message_counts[topic] or sum(t.n_messages for t in timings.values())
+    rate = next(iter(timings.values())).describe() if len(timings) == 1 else ''
+    print(f'  {topic}  {recording.types[topic]}  {n}' + (f'  {rate}' if rate else ''))
+    if len(timings) > 1:
+        for sensor, timing in timings.items():
+            print(f'    {sensor or "no frame_id"}  {timing.n_messages}  {timing.describe()}')
+
+
+def _print_sensors(network: SensorNetwork, recording: Recording,
+                   timings: Mapping[Source, Timing]) -> None:
+    """Print which sensors of the network are recorded."""
+    namespaces = namespaces_of(network.topics, recording.types) or ['/']
+    if len(namespaces) > 1:
+        print(f'  namespaces with topics of the network: {", ".join(namespaces)}')
+    for name, topic in zip(network.names, network.topics, strict=True):
+        topic = absolute(topic, namespaces[0])
+        kind = recording.types.get(topic)
+        state = 'MISSING' if kind is None else 'recorded' if kind == MAGNETIC_FIELD \
+            else f'recorded as {kind}, not {MAGNETIC_FIELD}'
+        shared = sorted({source.topic for source in timings if source.sensor == name})
+        if kind is None and shared:
+            state = f'not recorded, but its frame_id is on {", ".join(shared)}'
+        print(f'  sensor {name}: {topic} is {state}')

@@ -16,6 +16,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.drivers.configuration import read_drivers
 from mag_tracking.drivers.driver import IGNORED, Driver, serve
+from mag_tracking.drivers.field_strength import WEAK_FIELD
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import read_network
@@ -113,8 +114,11 @@ def _sample_line(samples: Sequence[Sample], elapsed_s: float) -> str:
     n_missing = fields.size - np.count_nonzero(is_valid)
     if n_missing and is_valid.any(axis=0).all():
         line += f'  {quantity(n_missing, "value")} missing'
+    strength = np.linalg.norm(fields, axis=1)
     if np.nanmax(np.abs(fields), initial=0.0) > MAX_PLAUSIBLE_FIELD:
         line += '  (very large; check `unit`)'
+    elif np.nanmax(strength, initial=-1.0) < WEAK_FIELD and is_valid.all(axis=1).any():
+        line += "  (below 10 uT, weaker than the Earth's field; check `unit`)"
     return line
 
 

@@ -86,7 +86,8 @@ def _view(args: argparse.Namespace) -> int:
     """Run `mag-tracking view`."""
     if not 0.0 < args.rate < float('inf'):
         raise SettingsError(f'--rate: expected a number above 0, got {args.rate:g}')
-    network, settings = recorded_network(args), settings_of(args)
+    network = recorded_network(args)
+    settings = settings_of(args, network)
     recording = Recording(args.recording)
     scene = LiveScene(args.recording.name, network)
     scene.subtitle = f'{quantity(len(network), "sensor")}, frame {network.frame}'

@@ -12,6 +12,7 @@ from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.network.topics import checked_namespace
+from mag_tracking.stages.health.diagnosis import Diagnosis
 
 # Quoted because the class is not generic at run time.
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
@@ -211,3 +212,14 @@ def check_outputs(args: argparse.Namespace) -> None:
     if args.figure is not None and args.figure.suffix.lower() not in FIGURE_SUFFIXES:
         raise SettingsError(f'--figure: expected a file name ending in '
                             f'{", ".join(FIGURE_SUFFIXES)}; got {args.figure.name}')
+
+
+def print_diagnoses(diagnoses: Iterable[Diagnosis]) -> None:
+    """Print one line per diagnosis.
+
+    Parameters
+    ----------
+    diagnoses : iterable of Diagnosis
+    """
+    for diagnosis in diagnoses:
+        print(f'  {"warning: " if diagnosis.serious else ""}{diagnosis}')

@@ -89,8 +89,8 @@ def add(commands: Commands) -> None:
     add_settings(p)
     p.add_argument('--truth', metavar='TOPIC|FILE.csv', help='ground truth: a topic '
                    'with PoseStamped, PoseWithCovarianceStamped or Odometry, or a CSV table with '
-                   'the columns t [s] or stamp_ns, x, y, z [m], qx, qy, qz, qw (default: all '
-                   'topics below /ground_truth)')
+                   'the columns t [s] or stamp_ns, x, y, z [m], and qx, qy, qz, qw or the '
+                   'direction mx, my, mz of a magnet (default: all topics below /ground_truth)')
     p.add_argument('--tum', action='store_true',
                    help='also write each track as track_N.tum (time x y z qx qy qz qw)')
     p.add_argument('--rerun', action='store_true',
@@ -100,7 +100,8 @@ def add(commands: Commands) -> None:
 
 def _replay(args: argparse.Namespace) -> int:
     """Run `mag-tracking replay`."""
-    network, settings = recorded_network(args), settings_of(args)
+    network = recorded_network(args)
+    settings = settings_of(args, network)
     names = distinct_names(args.recordings)
     if args.rerun:
         check_rerun()

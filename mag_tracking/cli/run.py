@@ -59,12 +59,12 @@ def _run(args: argparse.Namespace) -> int:
     # Imported here because it needs ROS.
     from mag_tracking.nodes.runner import run
 
-    settings, ros_arguments = settings_of(args), list(args.ros_arguments)
+    settings = settings_of(args, read_network(args.network))
+    ros_arguments = list(args.ros_arguments)
     if args.web is None and args.host != LOOPBACK:
         raise SettingsError('--host sets the address of the live page; add --web')
     if args.use_sim_time:
         ros_arguments += ['--ros-args', '-p', 'use_sim_time:=true']
-    read_network(args.network)
     if args.recording:
         Recording(args.recording)
     with nullcontext() if args.web is None else page_process(args.host, args.web, ros_arguments):

@@ -19,6 +19,7 @@ from mag_tracking.cli.options import (
     add_recorded_network,
     check_writable,
     distinct_names,
+    print_diagnoses,
     recorded_network,
 )
 from mag_tracking.cli.tracking_options import add_settings, settings_of
@@ -83,7 +84,8 @@ def add(commands: Commands) -> None:
 
 def _traffic(args: argparse.Namespace) -> int:
     """Run `mag-tracking traffic`."""
-    network, settings = recorded_network(args), settings_of(args)
+    network = recorded_network(args)
+    settings = settings_of(args, network)
     names = distinct_names(args.recordings)
     recordings = _recordings(args, network)
     tables: dict[str, list[dict[str, Any]]] = {'passages': [], 'intervals': []}
@@ -101,7 +103,7 @@ def _traffic(args: argparse.Namespace) -> int:
                 enrolled.append(pass_of(name, [v.passage for v in result.vehicles]))
             identifications = [None if fleet is None else fleet.identify(v.passage)
                                for v in result.vehicles]
-            _print(name, result, recording, identifications)
+            _print(name, result, identifications)
             tables['passages'] += [
                 passage_row(name, v.passage, result.class_names, _delay(v),
                             _vehicle(identification))
@@ -171,9 +173,10 @@ def _delay(vehicle: CountedVehicle) -> dict[str, Any]:
             'speeds_contradict': vehicle.speeds_contradict}
 
 
-def _print(name: str, result: TrafficResult, recording: Recording,
+def _print(name: str, result: TrafficResult,
            identifications: Sequence[Identification | None]) -> None:
-    """Print one line per vehicle of a recording, the counts, and warnings."""
+    """Print the diagnoses of a recording, one line per vehicle, the counts, and warnings."""
+    print_diagnoses(result.diagnoses)
     for vehicle, identification in zip(result.vehicles, identifications, strict=True):
         identity = '' if identification is None else f', vehicle {identification.name}'
         print(f'{line_of(vehicle)}{identity}')
@@ -184,17 +187,9 @@ def _print(name: str, result: TrafficResult, recording: Recording,
         print(f'  {line}, {direction}, {vehicle_class}: {n}')
     n_ambiguous = sum(v.passage.ambiguous for v in result.vehicles)
     warnings = {**({'ambiguous passages': n_ambiguous} if n_ambiguous else {}),
-                **{cause: n for cause, n in result.counts.items() if n and cause != 'passages'},
-                **result.rejections, **recording.losses}
+                **{cause: n for cause, n in result.counts.items() if n and cause != 'passages'}}
     for cause, n in warnings.items():
         print(f'  warning: {cause}: {n}')
-    for topic in result.missing_topics:
-        print(f'  warning: no messages on {topic}')
-    for sensor in result.sensors_without_background:
-        print(f'  warning: no background was learnt for {sensor}: the intervals without '
-              'a target are too short')
-    if result.no_detection_reason:
-        print(f'  nothing was detected: {result.no_detection_reason}')
     if result.no_track_reason:
         print(f'  {result.no_track_reason}')
 

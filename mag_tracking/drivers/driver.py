@@ -7,7 +7,7 @@ measurement on the host clock, and counts losses.
 
 import struct
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray
 from mag_tracking.drivers.device_clock import ArrivalClock, ClockSettings, DeviceClock
+from mag_tracking.drivers.field_strength import FieldStrength
 from mag_tracking.drivers.reading import Arrival, Axes, Device, Reading
 from mag_tracking.drivers.sequence import SequenceCheck
 from mag_tracking.drivers.settings import (
@@ -24,9 +25,10 @@ from mag_tracking.drivers.settings import (
     DriverSettings,
     scale_of,
 )
-from mag_tracking.drivers.single_source import SingleSource
+from mag_tracking.drivers.single_source import SingleSource, contest
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample, Readings
+from mag_tracking.units import NS
 
 POLL_S = 0.2
 """[s] Interval at which `serve` checks whether to stop."""
@@ -34,8 +36,10 @@ IGNORED = '-'
 """Network name assigned to a sensor whose readings are discarded."""
 MAX_NAMES = 20
 """Maximum number of unknown sensors, and of errors of one type, that are counted individually."""
-MAX_SOURCES = 4096
-"""Maximum number of sources, each with its own clock."""
+MAX_CACHED = 4096
+"""Maximum number of (name, source) pairs whose sensor is cached."""
+CONTEST_INTERVAL_NS = NS
+"""[ns] Interval at which sensors with several sources are searched."""
 _AXES_STRUCT = struct.Struct('3d')
 PollResult: TypeAlias = tuple[Readings, Sequence[AccelerationSample]]
 """Fields and accelerations received by one poll."""
@@ -72,9 +76,6 @@ class Driver:
     driver_counts : Counter
         Number of samples by sensor, and number of losses and faults detected by the driver itself,
         by cause.
-    fault : str
-        Message of the latest failure, such as a lost connection or a silent device. Empty before
-        the first failure; cleared when data arrive.
 
     Raises
     ------
@@ -102,16 +103,19 @@ class Driver:
         self._sequences = {s: SequenceCheck(settings.sequence_wrap) for s in sensors.values()
                            if s != IGNORED}
         self._clocks: dict[str, ArrivalClock | DeviceClock] = {}
-        self._is_open, self.fault = False, ''
+        self._is_open, self._failure, self._contest = False, '', ''
         self._retry_s, self._last_receipt_ns = settings.retry_s, 0
         self._retry_ns: int | None = None
         self._offset_ns: int | None = None
-        self._sole_source = SingleSource()
+        # One selection for each sensor and kind of reading (with a field, or acceleration only).
+        self._claims: defaultdict[tuple[str, bool], SingleSource] = defaultdict(SingleSource)
+        self._contest_ns = 0
         self._unknown_names: set[str] = set()
         # (clock, ticks, arrival) of the previous reading. Readings with the same ticks and arrival
         # were measured together and have the same timestamp.
         self._measurement: tuple[ArrivalClock | DeviceClock, float | None, int] | None = None
         self._measured_ns: int | None = None
+        self._strength = FieldStrength()
         self._known_sensors: dict[tuple[str, str], str] = {}
         self._sample_counts = {s: f'samples: {s}' for s in sensors.values()}
 
@@ -135,8 +139,17 @@ class Driver:
         """Whether the device is open."""
         return self._is_open
 
+    @property
+    def fault(self) -> str:
+        """Message of the latest failure, such as a lost connection or a silent device.
+
+        If the device has not failed, or data have arrived since, the sensors whose readings are
+        sent by several sources; otherwise empty.
+        """
+        return self._failure or self._contest
+
     def clocks(self) -> dict[str, ArrivalClock | DeviceClock]:
-        """Clocks of all sources from which readings have arrived.
+        """Clocks of the sources whose readings were accepted.
 
         Returns
         -------
@@ -155,7 +168,8 @@ class Driver:
         """
         # Each counter is copied in one step, because the polling thread may add a cause meanwhile.
         total = self.driver_counts.copy()
-        total.update({'source changes': n} if (n := self._sole_source.changes) else {})
+        n_changes = sum(claim.changes for claim in list(self._claims.values()))
+        total.update({'source changes': n_changes} if n_changes else {})
         total.update(self._device.counts.copy())
         for sensor, check in self._sequences.items():
             total.update({f'{cause}: {sensor}': n for cause, n in check.counts.copy().items() if n})
@@ -195,13 +209,18 @@ class Driver:
             self._schedule_retry(error)
             return EMPTY_RESULT
         now = self._monotonic_ns()
+        if now - self._contest_ns >= CONTEST_INTERVAL_NS:
+            self._contest_ns = now
+            self._contest = '; '.join(dict.fromkeys(
+                text for (sensor, _), claim in self._claims.items()
+                if (text := contest(sensor, claim.selected, claim.rates_hz(now)))))
         if not arrivals:
             timeout_s = self._settings.silence_timeout_s
             if timeout_s and now - self._last_receipt_ns > timeout_s * 1e9:
                 self.driver_counts['reopened after silence'] += 1
                 self._schedule_retry(f'open, but no data received for {timeout_s:g} s')
             return EMPTY_RESULT
-        self._last_receipt_ns, self._retry_s, self.fault = now, self._settings.retry_s, ''
+        self._last_receipt_ns, self._retry_s, self._failure = now, self._settings.retry_s, ''
         return self._samples(arrivals, self._wall_offset(now))
 
     def _read(self, timeout_s: float) -> list[Arrival]:
@@ -257,13 +276,13 @@ class Driver:
 
     def _schedule_retry(self, reason: object) -> None:
         """Close the device, schedule its reopening, and double the delay for the next failure."""
-        self._is_open, self.fault = False, str(reason)
+        self._is_open, self._failure = False, str(reason)
         try:
             self._device.close()
         # A third-party device or a removed port may raise any error; the device is reopened anyway.
         except Exception as error:
             self.driver_counts['failed attempts to close'] += 1
-            self.fault += f'; closing failed as well: {type(error).__name__}: {error}'
+            self._failure += f'; closing failed as well: {type(error).__name__}: {error}'
         self._retry_ns = self._monotonic_ns() + round(self._retry_s * 1e9)
         self._retry_s = min(2.0 * self._retry_s, self._settings.max_retry_s)
 
@@ -305,6 +324,9 @@ class Driver:
         if infinite.any():
             self.driver_counts['readings that overflow in tesla'] += int(infinite.sum())
             readings = readings.part(~infinite)
+        for sensor in self._strength.add(readings):
+            self.driver_counts[f"sensors below 10 uT, weaker than the Earth's field; check the "
+                               f'unit: {sensor}'] += 1
         self.driver_counts.update([self._sample_counts[readings.names[j]]
                                    for j in readings.sensor.tolist()])
         return readings, accelerations
@@ -315,9 +337,14 @@ class Driver:
         Return (network name, monotonic time [ns]). The name is None if the sensor is unknown or
         ignored; the time is None for a duplicate, or if no clock provides it.
         """
-        sensor = self._known_sensors.get((reading.sensor, arrival.source)) \
-            or self._sensor_of(reading.sensor, arrival.source)
-        if sensor is None or reading.sequence is not None and not self._sequences[sensor].is_new(
+        key = reading.sensor, arrival.source
+        sensor = self._known_sensors.get(key) or self._sensor_of(*key)
+        if sensor is None:
+            return None, None
+        if not self._claims[sensor, reading.field is not None].accepts(key, arrival.arrival_ns):
+            self._count_unknown(*key)
+            return None, None
+        if reading.sequence is not None and not self._sequences[sensor].is_new(
                 reading.sequence, _bytes_of(reading.field) + _bytes_of(reading.acceleration)):
             return sensor, None
         return sensor, self._stamp(reading, arrival)
@@ -325,21 +352,25 @@ class Driver:
     def _sensor_of(self, reported_name: str, source: str) -> str | None:
         """Return a sensor's network name; None if ignored or unknown. Count unknown sensors."""
         sensor = next((self.sensors[name] for name in (reported_name, source)
-                       if name and name in self.sensors), None)
-        if sensor is None and '' in self.sensors and self._sole_source.accepts(
-                (reported_name, source), self._monotonic_ns()):
-            return self.sensors['']
+                       if name and name in self.sensors), self.sensors.get(''))
         if sensor is None:
-            name = (reported_name or source)[:80]
-            if len(self._unknown_names) < MAX_NAMES:
-                self._unknown_names.add(name)
-            self.driver_counts['readings of unknown sensors' + (
-                f': {name}' if name in self._unknown_names else ' (and others)')] += 1
+            self._count_unknown(reported_name, source)
         if sensor is None or sensor == IGNORED:
             return None
-        if len(self._known_sensors) < MAX_SOURCES:
-            self._known_sensors[reported_name, source] = sensor
+        if len(self._known_sensors) >= MAX_CACHED:
+            self._known_sensors.clear()
+        self._known_sensors[reported_name, source] = sensor
         return sensor
+
+    def _count_unknown(self, reported_name: str, source: str) -> None:
+        """Count a reading of no sensor, or from another source than the selected one."""
+        is_known = reported_name in self.sensors and reported_name
+        cause = 'readings from other sources' if is_known else 'readings of unknown sensors'
+        name = ((source if is_known else reported_name) or source)[:80]
+        if len(self._unknown_names) < MAX_NAMES:
+            self._unknown_names.add(name)
+        self.driver_counts[cause + (
+            f': {name}' if name in self._unknown_names else ' (and others)')] += 1
 
     def _stamp(self, reading: Reading, arrival: Arrival) -> int | None:
         """Return the monotonic time of the measurement [ns], or None if no clock provides it."""
@@ -347,9 +378,8 @@ class Driver:
         ticks = reading.sequence if stamp_by == 'sequence' else reading.ticks
         clock = self._clocks.get(arrival.source)
         if clock is None:
-            if len(self._clocks) >= MAX_SOURCES:
-                self.driver_counts['readings beyond the maximum number of sources'] += 1
-                return None
+            if len(self._clocks) > len(self._claims):
+                self._drop_clocks()
             uses_arrivals = stamp_by == 'arrival' or stamp_by == 'auto' and ticks is None
             clock = (ArrivalClock if uses_arrivals else DeviceClock)(self._clock_settings)
             self._clocks[arrival.source] = clock
@@ -362,6 +392,14 @@ class Driver:
             self._measured_ns = clock.stamp(ticks, arrival.arrival_ns)
             self._measurement = measurement
         return self._measured_ns
+
+    def _drop_clocks(self) -> None:
+        """Drop the clocks of sources that are no longer selected; keep their counts."""
+        selected = {claim.selected[1] for claim in self._claims.values() if claim.selected}
+        for source in self._clocks.keys() - selected:
+            clock = self._clocks.pop(source)
+            self.driver_counts.update(clock.counts)
+            self.driver_counts.update(clock.restarts)
 
 
 def _bytes_of(axes: Axes | None) -> bytes:

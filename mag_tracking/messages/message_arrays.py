@@ -17,6 +17,8 @@ _HEADER_TYPE = np.dtype([('encapsulation', 'u1', 4), ('sec', '<i4'), ('nanosec',
 """Layout of a message before its frame name; `length` includes the terminating zero of the name."""
 _FIELD_DOUBLES = 12
 """Number of float64 values in a MagneticField: x, y, z and the covariance."""
+_HASH_BASE, _HASH_MASK = np.uint64(6364136223846793005), 2**62 - 1
+"""Base of the hash of a frame name, modulo 2**64, and the bits that are kept."""
 _POSE_DOUBLES = 7
 """Number of float64 values in a pose: x, y, z and the quaternion."""
 
@@ -34,6 +36,8 @@ class FieldArrays(NamedTuple):
     """(n, 3) [T] Field, sensor frame."""
     covariance: FloatArray | None
     """(n, 3, 3) [T^2] Covariance; NaN where unknown, None if all are unknown, as in `Readings`."""
+    frame: IntArray
+    """(n,) Number of the frame name. Equal names have equal numbers; -1 if not decoded."""
 
 
 class PoseArrays(NamedTuple):
@@ -64,10 +68,12 @@ def magnetic_fields(content: bytes, begins: IntArray, ends: IntArray) -> FieldAr
     """
     stamped = _StampedMessages(content, begins, ends, _FIELD_DOUBLES)
     rows = np.flatnonzero(stamped.is_decoded)
-    stamped.is_decoded[rows] = stamped.have_ascii_frames(rows)
+    frames = np.full(len(begins), -1, dtype=np.int64)
+    frames[rows] = stamped.ascii_frames(rows)
+    stamped.is_decoded[rows] = frames[rows] >= 0
     numbers = stamped.numbers()
     return FieldArrays(stamped.is_decoded, stamped.stamp_ns, numbers[:, :3].copy(),
-                       known_covariances(numbers[:, 3:].reshape(-1, 3, 3)))
+                       known_covariances(numbers[:, 3:].reshape(-1, 3, 3)), frames)
 
 
 def poses(content: bytes, begins: IntArray, ends: IntArray, frame: str) -> PoseArrays:
@@ -122,13 +128,17 @@ class _StampedMessages:
         """Bytes (k, length) of the frame names of messages `rows` (k,), which have this length."""
         return self._data[(self._begins[rows] + _HEADER_TYPE.itemsize)[:, None] + np.arange(length)]
 
-    def have_ascii_frames(self, rows: IntArray) -> BoolArray:
-        """Flag which of the messages `rows` (k,) have a zero-terminated ASCII frame name."""
-        out = np.zeros(len(rows), dtype=bool)
+    def ascii_frames(self, rows: IntArray) -> IntArray:
+        """Number the frame names of the messages `rows` (k,) by a hash; -1 for a name that is not
+        zero-terminated ASCII."""
+        out = np.full(len(rows), -1, dtype=np.int64)
         for length in np.unique(self._name_length[rows]):
             same_length = np.flatnonzero(self._name_length[rows] == length)
             names = self._frames(rows[same_length], length)
-            out[same_length] = (names[:, -1] == 0) & (names < 128).all(axis=1)
+            is_ascii = (names[:, -1] == 0) & (names < 128).all(axis=1)
+            weights = _HASH_BASE ** np.arange(length, dtype=np.uint64)
+            numbers = (names @ weights + np.uint64(length)).astype(np.int64) & _HASH_MASK
+            out[same_length] = np.where(is_ascii, numbers, -1)
         return out
 
     def have_frame(self, rows: IntArray, frame: str) -> BoolArray:

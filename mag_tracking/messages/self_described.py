@@ -21,46 +21,40 @@ _STAMPS = ('stamp', 'timestamp')
 _SECONDS = ('sec', 'secs', 'seconds')
 _NANOSECONDS = ('nanosec', 'nsec', 'nsecs', 'nanos')
 
-SUPPORTED_ENCODINGS = ('jsonschema', 'protobuf')
-"""Supported schema encodings."""
+SELF_DESCRIBED = ('json', 'protobuf')
+"""Encodings whose messages are converted by means of their schema or of their own names."""
+UNDECODABLE = 'undecodable message'
+"""Fault of a message whose bytes do not match its type."""
 
 
-def type_of(schema: Schema) -> str:
-    """Message type of a schema.
-
-    Parameters
-    ----------
-    schema : Schema
-
-    Returns
-    -------
-    str
-        The type sensor_msgs/msg/MagneticField if a schema in a supported encoding contains
-        `magnetic_field`; otherwise the name of the schema.
-    """
-    is_field = schema.encoding in SUPPORTED_ENCODINGS and b'magnetic_field' in schema.data
-    return MAGNETIC_FIELD if is_field else schema.name
+class MissingPartError(ValueError):
+    """A message lacks its time or its field; the text names the part."""
 
 
-def cdr_of(schema: Schema, data: bytes) -> bytes:
+def cdr_of_self_described(encoding: str, schema: Schema, data: bytes) -> tuple[bytes, str]:
     """Convert a message to the CDR bytes of sensor_msgs/MagneticField.
 
     Parameters
     ----------
+    encoding : str
+        Encoding of the message, from `SELF_DESCRIBED`.
     schema : Schema
     data : bytes
-        Message in the encoding of the schema.
 
     Returns
     -------
-    bytes
-        Empty if the message cannot be decoded as a magnetic field.
+    data : bytes
+        Empty if the message cannot be converted.
+    fault : str
+        Why the message cannot be converted; empty if it can.
     """
     try:
         return encoder(MAGNETIC_FIELD)(
-            field_decoder(schema.encoding, schema.name, schema.data)(data))
+            field_decoder(encoding, schema.name, schema.data)(data)), ''
+    except MissingPartError as error:
+        return b'', f'message without {error}'
     except decode_errors():
-        return b''
+        return b'', UNDECODABLE
 
 
 @functools.cache
@@ -84,10 +78,12 @@ def field_decoder(encoding: str, name: str, content: bytes) -> Callable[[bytes],
 
     Parameters
     ----------
-    encoding, name : str
-        Encoding and name of the schema.
+    encoding : str
+        Encoding of the messages, from `SELF_DESCRIBED`.
+    name : str
+        Name of the schema.
     content : bytes
-        JSON schema or protobuf descriptor.
+        Protobuf descriptor. Not needed for JSON.
 
     Returns
     -------
@@ -100,25 +96,38 @@ def field_decoder(encoding: str, name: str, content: bytes) -> Callable[[bytes],
     ValueError
         If a protobuf schema cannot be read.
     """
-    if encoding == 'jsonschema':
+    if encoding == 'json':
         return lambda data: _field(json.loads(data, object_hook=lambda d: SimpleNamespace(**d)))
     from mcap_protobuf.decoder import DecoderFactory
 
-    decode = DecoderFactory().decoder_for('protobuf', Schema(1, content, encoding, name))
+    decode = DecoderFactory().decoder_for('protobuf', Schema(1, content, 'protobuf', name))
     if decode is None:
         raise ValueError('the protobuf schema cannot be read')
     return lambda data: _field(decode(data))
 
 
+def _has(message: Any, name: str) -> bool:
+    """Whether a message has a field, and it was set if its encoding can tell."""
+    fields = getattr(getattr(message, 'DESCRIPTOR', None), 'fields_by_name', {})
+    is_unset = name in fields and fields[name].has_presence and not message.HasField(name)
+    return hasattr(message, name) and not is_unset
+
+
+def _part(message: Any, name: str) -> Any:
+    """Value of a field; None if it is missing."""
+    return getattr(message, name) if _has(message, name) else None
+
+
 def _field(message: Any) -> MessageDict:
     """Convert a message to sensor_msgs/MagneticField; raises ValueError for an invalid message."""
-    field = getattr(message, 'magnetic_field', None)
-    header = getattr(message, 'header', message)
-    stamp = next((s for name in _STAMPS for s in (getattr(header, name, None),
-                                                  getattr(message, name, None))
-                  if s is not None), None)
-    if field is None or stamp is None:
-        raise ValueError('magnetic_field or timestamp is missing')
+    field = _part(message, 'magnetic_field')
+    if field is None:
+        raise MissingPartError('magnetic_field')
+    header = message if _part(message, 'header') is None else message.header
+    stamp = next((s for name in _STAMPS for part in (header, message)
+                  if (s := _part(part, name)) is not None), None)
+    if stamp is None:
+        raise MissingPartError('header.stamp or timestamp')
     covariance = [float(v) for v in getattr(message, 'magnetic_field_covariance', ())]
     if len(covariance) not in (0, 9):
         raise ValueError(f'magnetic_field_covariance has {len(covariance)} elements; expected 9')
@@ -141,13 +150,13 @@ def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
             if not 0 <= value < limit:
                 raise ValueError(f'timestamp: {name} is out of range: {str(value)[:20]}')
             return int(value)
-    raise ValueError(f'timestamp: {names[0]} is missing')
+    raise MissingPartError(f'{names[0]} in its time')
 
 
 def _axis_value(field: Any, axis: str) -> float:
     """Field of one axis [T]; NaN for null. Raises ValueError for a missing or non-numeric axis."""
-    if not hasattr(field, axis):
-        raise ValueError(f'magnetic_field.{axis} is missing')
+    if not _has(field, axis):
+        raise MissingPartError(f'magnetic_field.{axis}')
     value = getattr(field, axis)
     if value is None:
         return float('nan')

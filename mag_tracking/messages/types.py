@@ -32,6 +32,8 @@ PATH = 'nav_msgs/msg/Path'
 MARKERS = 'visualization_msgs/msg/MarkerArray'
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 
+ROS_SCHEMA = 'ros2msg'
+"""Encoding of the schemas of ROS 2 messages that can be decoded."""
 RAW_READINGS = 'field_readings'
 """Topic of raw readings of many sensors. Like the topics below, it is relative to the namespace of
 the nodes and independent of the node names."""
@@ -132,7 +134,7 @@ def schema_of(type_name: str) -> Schema:
     """
     is_defined = type_name in DEFINITIONS
     return Schema(1, definition(type_name).encode() if is_defined else b'',
-                  'ros2msg' if is_defined else '', type_name)
+                  ROS_SCHEMA if is_defined else '', type_name)
 
 
 @functools.cache

@@ -1,5 +1,7 @@
 """The sensor network: position, orientation and calibration of each sensor."""
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -13,8 +15,20 @@ from mag_tracking.units import NS
 
 MAX_COMPACT_EXTENT = 2.0
 """Maximum horizontal extent of a compact network [m], half of the length of a car."""
+MAX_SENSORS = 1000
+"""Maximum number of sensors of a network."""
+MAX_EXTENT = 1e5
+"""Maximum distance between two sensors of a network [m]. Over larger distances, the surface of the
+Earth is no plane; positions that are farther apart have another unit than metres."""
+MIN_BOARD_SENSORS, MAX_BOARD_EXTENT = 3, 1.0
+"""Minimum number of sensors of a board, and its maximum extent [m]. A board tracks a magnet."""
 MIN_DELAY_BASELINE = 0.1
 """Minimum horizontal distance between two sensors for the estimation of a delay [m]."""
+
+
+def _duplicates(values: Sequence[str]) -> list[str]:
+    """Values that occur more than once, sorted."""
+    return sorted(value for value, n in Counter(values).items() if n > 1)
 
 
 @dataclass(frozen=True)
@@ -81,16 +95,19 @@ class SensorNetwork:
         n = len(self.names)
         if n == 0:
             raise NetworkError('a network requires at least one sensor')
-        duplicates = sorted({name for name in self.names if self.names.count(name) > 1})
+        if n > MAX_SENSORS:
+            raise NetworkError(f'the network has {n} sensors; the maximum is {MAX_SENSORS}: divide '
+                               'it into several networks')
+        duplicates = _duplicates(self.names)
         if duplicates:
             raise NetworkError(f'duplicate sensor name {duplicates[0]}; names must be unique')
-        topics = [absolute(t) for t in self.topics]
-        duplicate_topics = sorted({t for t in topics if topics.count(t) > 1})
+        duplicate_topics = _duplicates([absolute(t) for t in self.topics])
         if duplicate_topics:
             raise NetworkError(f'topic {duplicate_topics[0]} is assigned to more than one sensor')
         if self.positions.shape != (n, 3) or self.R_ws.shape != (n, 3, 3):
             raise NetworkError(f'{n} sensors require positions of shape ({n}, 3) and orientations '
                                f'of shape ({n}, 3, 3)')
+        self._check_extent()
         names_by_position: dict[tuple[float, ...], str] = {}
         for name, position in zip(self.names, map(tuple, self.positions.tolist()), strict=True):
             other = names_by_position.setdefault(position, name)
@@ -102,6 +119,17 @@ class SensorNetwork:
                 object.__setattr__(self, name, (None,) * n)
         if self.clock_offset is None:
             object.__setattr__(self, 'clock_offset', np.zeros(n))
+
+    def _check_extent(self) -> None:
+        """Raise NetworkError if two sensors are too far apart."""
+        from_centre = np.linalg.norm(self.positions - np.median(self.positions, axis=0), axis=1)
+        far = int(np.argmax(from_centre))
+        distance = np.linalg.norm(self.positions - self.positions[far], axis=1)
+        other = int(np.argmax(distance))
+        if distance[other] > MAX_EXTENT:
+            pair = ' and '.join(self.names[j] for j in sorted((far, other)))
+            raise NetworkError(f'sensors {pair} are {distance[other] / 1e3:,.0f} km apart; the '
+                               f'maximum is {MAX_EXTENT / 1e3:g} km: are the positions in metres?')
 
     def __len__(self) -> int:
         return len(self.names)
@@ -136,6 +164,12 @@ class SensorNetwork:
         network determines range and moment hardly better than a single sensor.
         """
         return bool(np.hypot(*np.ptp(self.positions[:, :2], axis=0)) < MAX_COMPACT_EXTENT)
+
+    @property
+    def is_board(self) -> bool:
+        """Whether the sensors are so close together that they track a magnet, not a vehicle."""
+        extent = np.linalg.norm(np.ptp(self.positions, axis=0))
+        return len(self) >= MIN_BOARD_SENSORS and bool(extent < MAX_BOARD_EXTENT)
 
     def part(self, rows: IntArray) -> 'SensorNetwork':
         """Create a network of selected sensors.

@@ -81,7 +81,8 @@ class CalibrationNode(StageNode):
         super().__init__('calibration_node', 'calibrate', **node_arguments)
         self._next_steps = next_steps
         self.settings = declare_settings(self, self.settings, 'survey')
-        self._stage = Calibrate(self.network, self.settings.calibrate)
+        self._stage = Calibrate(self.network, self.settings.calibrate,
+                                survey=self.settings.survey)
         self._store = BackgroundStore(self._state_path(), self._stage, self.settings.calibrate,
                                       self.get_logger())
         self._store.restore(self.network)
@@ -237,7 +238,7 @@ class CalibrationNode(StageNode):
         calibrated = self._stage.feed(raw)
         if self._next_steps is not None:
             detection, tracker = self._next_steps
-            tracker.set_doubtful_times(self._stage.doubtful_intervals())
+            tracker.set_input_doubts(self._stage.input_doubts())
             for readings in calibrated:
                 detection.receive_readings(readings)
         return calibrated

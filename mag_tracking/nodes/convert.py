@@ -7,14 +7,18 @@ a recording, so the functions that read a recording also read ROS messages.
 
 import functools
 import importlib
+import re
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.records import Hypothesis, Track
+
+_TYPE_NAME = re.compile(r'[A-Za-z]\w*/msg/[A-Za-z]\w*')
 
 
 def message_class(type_name: str) -> Any:
@@ -28,8 +32,10 @@ def message_class(type_name: str) -> Any:
     Returns
     -------
     type or None
-        None if the type is not installed.
+        None if the type is not installed, or the name is not that of a ROS type.
     """
+    if not _TYPE_NAME.fullmatch(type_name):
+        return None
     package, _, name = type_name.split('/')
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name, None)
@@ -81,7 +87,7 @@ def _vector(v: Any) -> FloatArray:
     return np.array([v.x, v.y, v.z])
 
 
-def track_of(message: Any, hypotheses: Any = None) -> Track:
+def track_of(message: Any, hypotheses: Any = None, n_sensors: int | None = None) -> Track:
     """Convert mag_tracking_msgs/Track to a `Track`.
 
     Parameters
@@ -90,18 +96,29 @@ def track_of(message: Any, hypotheses: Any = None) -> Track:
     hypotheses : HypothesisArray message, optional
         Hypotheses of the track; by default the best hypothesis of each arrival direction, from
         `message`.
+    n_sensors : int, optional
+        Number of sensors of the network; by default that of `innovation_by_sensor`.
 
     Returns
     -------
     Track
+
+    Raises
+    ------
+    RecordingError
+        If array lengths do not match the number of sensors, a position, velocity or covariance is
+        not finite, or an active track has no hypothesis.
     """
+    _check_lengths(message, len(message.innovation_by_sensor) if n_sensors is None else n_sensors)
     pose = np.array(message.pose.covariance).reshape(6, 6)
     q = message.pose.pose.orientation
     members = tuple(
         Hypothesis(h.arrival, h.weight, _vector(h.position), _vector(h.velocity),
                    np.array(h.covariance).reshape(6, 6), _vector(h.moment), h.kind)
         for h in (message.arrivals if hypotheses is None else hypotheses.hypotheses))
-    return Track(
+    if not members and message.status != message.ENDED:
+        raise RecordingError(f'Track {message.id} has no arrivals; expected at least one')
+    track = Track(
         stamp_ns(message.header.stamp), message.id, message.status == message.ENDED,
         _vector(message.pose.pose.position), _vector(message.velocity),
         np.array(message.covariance).reshape(6, 6), np.array([q.x, q.y, q.z, q.w]),
@@ -114,3 +131,51 @@ def track_of(message: Any, hypotheses: Any = None) -> Track:
         np.array(message.predicted_field).reshape(-1, 3), np.array(message.mounting).reshape(-1, 3),
         np.array(message.mounting_covariance).reshape(-1, 3, 3), members,
         tuple(message.doubts))
+    _check_finite(f'Track {track.id}', position=track.position, velocity=track.velocity,
+                  covariance=track.covariance)
+    return track
+
+
+def _check_lengths(message: Any, n: int) -> None:
+    """Raise RecordingError if the array lengths of a Track do not match `n` sensors."""
+    lengths = {name: len(getattr(message, name)) for name in (
+        'innovation_by_sensor', 'predicted_field', 'mounting', 'mounting_covariance')}
+    required = dict(zip(lengths, (n, 3 * n, 3 * n, 9 * n), strict=True))
+    without_mounting = required | {'mounting': 0, 'mounting_covariance': 0}
+    if lengths not in (required, without_mounting):
+        raise RecordingError(f'Track {message.id} of {n} sensors: expected array lengths '
+                             f'{required}, or no mounting; got {lengths}')
+
+
+def _check_finite(subject: str, **arrays: FloatArray) -> None:
+    """Raise RecordingError if an array has a NaN or infinite element."""
+    for name, values in arrays.items():
+        if not np.isfinite(values).all():
+            raise RecordingError(f'{subject}: {name} is {values.tolist()}; expected finite values')
+
+
+def smoothed_path_of(message: Any) -> FloatArray:
+    """Return the positions of a mag_tracking_msgs/SmoothedTrack.
+
+    Parameters
+    ----------
+    message : SmoothedTrack message
+
+    Returns
+    -------
+    (n, 3) array, m, world frame
+
+    Raises
+    ------
+    RecordingError
+        If the message has no pose, its array lengths differ, or a position is not finite.
+    """
+    lengths = {name: len(getattr(message, name)) for name in (
+        'poses', 'velocities', 'pose_ambiguous')}
+    n = lengths['poses']
+    if not n or {*lengths.values()} != {n}:
+        raise RecordingError(f'SmoothedTrack {message.track_id}: expected arrays of one length, '
+                             f'at least 1; got {lengths}')
+    path = np.array([_vector(p.pose.pose.position) for p in message.poses])
+    _check_finite(f'SmoothedTrack {message.track_id}', position=path)
+    return path

@@ -63,7 +63,8 @@ class DetectionNode(StageNode):
         warning = frame_period_warning(self.settings.align, self.network)
         if warning:
             self.get_logger().warning(warning)
-        self._events = Events(self.network, self.settings.align, self.settings.detect) \
+        self._events = Events(self.network, self.settings.align, self.settings.detect,
+                              self.settings.track) \
             if len(self.network) <= self.settings.events.max_sensors else None
         self._event_backlog: list[Readings] = []
         if self._events is not None:

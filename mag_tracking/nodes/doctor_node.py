@@ -14,6 +14,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.apps.doctor import Doctor
+from mag_tracking.apps.host_stalls import load_findings
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import reading_of, readings_of
 from mag_tracking.messages.types import RAW_READINGS
@@ -25,7 +26,6 @@ from mag_tracking.nodes.stage_node import SENSOR_QOS, STREAM_QOS, make_executor,
 from mag_tracking.pipeline import Settings
 from mag_tracking.quantities import quantity
 from mag_tracking.stages.health.diagnosis import Cause, Finding
-from mag_tracking.stages.health.host_stalls import load_findings
 
 
 class DoctorNode(Node):

@@ -22,7 +22,7 @@ from mag_tracking.interrupts import recorded_signals
 from mag_tracking.messages.frame import frame_of
 from mag_tracking.messages.markers import SENSOR_NAMESPACES
 from mag_tracking.messages.types import NETWORK_FRAME
-from mag_tracking.nodes.convert import track_of
+from mag_tracking.nodes.convert import smoothed_path_of, track_of
 from mag_tracking.nodes.middleware import init_ros
 from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import LATCHED_QOS, RESULT_QOS, STREAM_QOS, make_executor, spin
@@ -82,6 +82,8 @@ class PageNode(Node):
         self._frames: deque[bytes] = deque(maxlen=MAX_FRAMES)
         self._tracks: deque[Any] = deque(maxlen=MAX_TRACKS)
         self._statuses: dict[str, tuple[float, DiagnosticStatus]] = {}
+        # {topic: (number of invalid messages, reason of the latest)}
+        self._rejected: dict[str, tuple[int, str]] = {}
         self._tracker_subscriptions: list[Subscription] = []
         self._subscribe_to_tracker(self.resolve_topic_name('tracker_node/tracks'))
         # Frames are frequent and large, so only displayed frames are deserialised.
@@ -124,6 +126,9 @@ class PageNode(Node):
         layout = SensorLayout(
             bodies[0].header.frame_id, tuple(labels[m.id] for m in bodies),
             np.array([[m.pose.position.x, m.pose.position.y, m.pose.position.z] for m in bodies]))
+        if not np.isfinite(layout.positions).all():
+            self._reject('sensor_markers', 'the position of a sensor is not finite')
+            return
         if (layout.names, layout.frame) != (self._layout.names, self._layout.frame) \
                 or not np.array_equal(layout.positions, self._layout.positions):
             self._layout = layout
@@ -143,8 +148,15 @@ class PageNode(Node):
     def _receive_smoothed(self, message: SmoothedTrack) -> None:
         """Add the smoothed path of an ended track to the scene."""
         self._tick()
-        points = [p.pose.pose.position for p in message.poses]
-        self._scene.add_smoothed(message.track_id, np.array([[p.x, p.y, p.z] for p in points]))
+        try:
+            self._scene.add_smoothed(message.track_id, smoothed_path_of(message))
+        except RecordingError as error:
+            self._reject('smoothed', str(error))
+
+    def _reject(self, topic: str, reason: str) -> None:
+        """Count an invalid message, which the page names, and log the reason."""
+        self._rejected[topic] = self._rejected.get(topic, (0, ''))[0] + 1, reason
+        self.get_logger().error(f'{topic}: {reason}', throttle_duration_sec=10.0)
 
     def _receive_diagnostics(self, message: DiagnosticArray) -> None:
         """Store the latest diagnostic status of each node and sensor in this namespace."""
@@ -170,12 +182,14 @@ class PageNode(Node):
                 self._scene.add_frame(
                     frame_of(deserialize_message(data, NetworkFrame), self._layout))
             except RecordingError as error:
-                self.get_logger().error(str(error), throttle_duration_sec=10.0)
+                self._reject(NETWORK_FRAME, str(error))
         tracks = list(self._tracks)
         self._tracks.clear()
         for message in tracks:
-            if len(message.predicted_field) == 3 * len(self._layout):
-                self._scene.add_track(track_of(message))
+            try:
+                self._scene.add_track(track_of(message, n_sensors=len(self._layout)))
+            except RecordingError as error:
+                self._reject('tracks', str(error))
 
     def _update_health(self) -> None:
         """Update the notes on faults and the table of all diagnostics on the page."""
@@ -192,7 +206,8 @@ class PageNode(Node):
                                [Table('Health', ['node', 'level', 'message'], rows)])
 
     def _missing_topics(self) -> Iterator[Note]:
-        """Yield notes if a topic, the sensor positions or the selection of a tracker is missing."""
+        """Yield notes if a topic, the sensor positions or the selection of a tracker is missing, or
+        if messages are invalid."""
         topics = self._find_tracker()
         if len(topics) > 1 and self._tracks_topic not in topics:
             yield Note(WARNING, f'several trackers: {", ".join(topics)}; select one (--ros-args -r '
@@ -204,6 +219,8 @@ class PageNode(Node):
             yield Note(WARNING, 'waiting for the sensor positions from the tracker')
         if not self.count_publishers(self._frames_topic):
             yield Note(WARNING, f'no publisher on {self._frames_topic}: fields are not shown')
+        for topic, (n, reason) in sorted(self._rejected.items()):
+            yield Note(WARNING, f'{topic}: {quantity(n, "invalid message")}; the latest: {reason}')
 
 
 def watch(host: str, port: int, report: Callable[[str], object],

@@ -13,7 +13,7 @@ from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from mag_tracking.errors import MagTrackingError
+from mag_tracking.errors import MagTrackingError, RecordingError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network.topics import namespaces_of
@@ -54,8 +54,13 @@ class TrackPrinter(Node):
         self.create_subscription(TrackArray, topic, self._receive, STREAM_QOS)
 
     def _receive(self, message: TrackArray) -> None:
-        """Print the pose of each track, or that the track has ended."""
-        for track in map(track_of, message.tracks):
+        """Print the pose of each track, or that the track has ended; log invalid tracks."""
+        for content in message.tracks:
+            try:
+                track = track_of(content)
+            except RecordingError as error:
+                self.get_logger().error(str(error), throttle_duration_sec=10.0)
+                continue
             line = f'track {track.id} has ended' if track.ended else pose_line(track)
             print(line, file=self._out, flush=True)
 

@@ -9,9 +9,10 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from numpy.typing import ArrayLike
 from rclpy.node import Node
 
-from mag_tracking.apps.doctor import background_findings, network_findings
+from mag_tracking.apps.doctor import background_findings, network_findings, rate_findings
 from mag_tracking.apps.doctor_covariances import covariance_findings
 from mag_tracking.apps.doctor_rejections import driver_findings
+from mag_tracking.apps.host_stalls import TIME_CAUSES, HostStalls, load_findings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute
 from mag_tracking.nodes.flow import SILENCE_TIMEOUT_S
@@ -20,7 +21,6 @@ from mag_tracking.pipeline import Settings
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding, ranked
-from mag_tracking.stages.health.host_stalls import TIME_CAUSES, HostStalls, load_findings
 from mag_tracking.stages.health.reading_buffer import ReadingBuffer
 from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S, WINDOW, SensorHealth
 
@@ -147,7 +147,7 @@ class HealthDiagnostics:
             Calibration stage.
         """
         for name, health in self._current_window.items():
-            if health.faults != (faults := calibrate.faults_of(name)):
+            if health.faults != (faults := calibrate.driver_faults.of(name)):
                 # Earlier statistics include the faulty readings.
                 self._previous_window[name] = None
                 self._current_window[name] = SensorHealth(faults=faults)
@@ -208,6 +208,8 @@ class HealthDiagnostics:
                                          self._settings.calibrate.max_field,
                                          not self._is_replayed):
                     in_windows.setdefault(f.cause, f)
+        findings += rate_findings(name, self._reported_window(name).rate, self._network,
+                                  self._settings.track)
         findings += in_windows.values()
         self._late_findings[name] = [f for f in findings if f.cause in TIME_CAUSES]
         if not self._is_replayed and self._late_findings[name]:

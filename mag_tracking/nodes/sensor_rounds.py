@@ -74,9 +74,8 @@ class SensorRounds:
 
         The tracker flags tracks as ambiguous only after it has received the new calibration.
         """
-        backgrounds = self._stage.backgrounds()
-        latest_doubts = {(j, times[-1]) for j, name in enumerate(self._network.names)
-                         if (times := backgrounds[name].doubtful_times)}
+        latest_doubts = {(j, doubt) for j, name in enumerate(self._network.names)
+                         if (doubt := self._stage.latest_doubt(name)) is not None}
         if changed := latest_doubts - self._reported_doubts:
             for j, _ in changed:
                 self._states[j] = self._state(j)

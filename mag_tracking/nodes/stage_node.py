@@ -103,7 +103,8 @@ class StageNode(Node):
         if not path:
             raise SettingsError(f'{name}: parameter network is empty; set it to the path of a '
                                 'network file')
-        target = fixed_parameter(self, 'target', 'vehicle', 'Kind of target: vehicle or magnet.')
+        target = fixed_parameter(self, 'target', 'vehicle', 'Kind of target: vehicle, magnet '
+                                 '(in a hand) or bench (a magnet on a bench).')
         reliable = fixed_parameter(self, 'reliable_input', False, 'Subscribe to the inputs with '
                                    'reliable QoS, for a replay.')
         self.network_path = Path(path).resolve()
@@ -111,8 +112,9 @@ class StageNode(Node):
         self.input_qos = STREAM_QOS if reliable else SENSOR_QOS
         self.is_replayed = reliable or self.get_parameter('use_sim_time').value
         self.network = read_network(self.network_path)
-        self.settings = declare_settings(self, settings_for(target), group)
-        if self.settings.track.target != target:
+        defaults = settings_for(target)
+        self.settings = declare_settings(self, defaults, group)
+        if self.settings.track.target != defaults.track.target:
             raise SettingsError(f'{name}: parameter track.target is {self.settings.track.target!r}'
                                 f', but target is {target!r}; set target only')
         self._diagnostics_publisher = self.create_publisher(

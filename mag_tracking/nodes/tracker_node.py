@@ -8,7 +8,7 @@ if __name__ == '__main__':
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,12 @@ from tf2_msgs.msg import TFMessage
 from vision_msgs.msg import Detection3DArray
 from visualization_msgs.msg import MarkerArray
 
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes, merged
+from mag_tracking.calibration.doubtful_times import (
+    DOUBTFUL_BACKGROUND,
+    DoubtfulTimes,
+    InputDoubts,
+    merged,
+)
 from mag_tracking.errors import RecordingError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.messages.calibration_state import doubtful_times, with_orientations
@@ -64,6 +69,7 @@ from mag_tracking.nodes.traffic_topics import TrafficTopics
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.track.manager import TrackManager
+from mag_tracking.stages.track.plausibility import lane_note
 from mag_tracking.stages.track.running_track import TrackRecord
 from mag_tracking.stages.track.settings import BEST
 from mag_tracking.stages.traffic.stage import TrackedFrame
@@ -130,7 +136,14 @@ class TrackerNode(StageNode):
         steady_timer(self, 0.25, self.end_tracks_on_timeout)
         self.subscription(CalibrationState, CALIBRATION_STATE, self._receive_calibration,
                           LATCHED_QOS)
+        self._report_start()
+
+    def _report_start(self) -> None:
+        """Report the state; log which lanes are covered if the sensors stand beside a road."""
         self.report_state()
+        note = lane_note(self.settings.track.vehicle, self.network)
+        if note and self.settings.track.target == 'vehicle':
+            self.get_logger().info(note)
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """Stages whose counts are published in diagnostics, by name.
@@ -170,7 +183,8 @@ class TrackerNode(StageNode):
             # The message has only the latest interval of each sensor; frames of earlier intervals
             # may still arrive.
             self._doubtful_times = merged(self._doubtful_times, doubtful_times(message))
-            self._stage.set_doubtful_times(self._doubtful_times)
+            # The message does not state the reason; the diagnostics do.
+            self._stage.set_input_doubts({DOUBTFUL_BACKGROUND: self._doubtful_times})
         if _same_orientations(network, self.network):
             return
         self.network = network
@@ -189,15 +203,14 @@ class TrackerNode(StageNode):
         self._feed(frame)
         self._stage.idle()
 
-    def set_doubtful_times(self, times: Mapping[str, DoubtfulTimes]) -> None:
-        """Set the intervals with doubtful backgrounds, in which tracks are ambiguous.
+    def set_input_doubts(self, doubts: InputDoubts) -> None:
+        """Set the intervals with doubtful readings, in which tracks are ambiguous.
 
         Parameters
         ----------
-        times : mapping of str to DoubtfulTimes
-            Intervals of each sensor.
+        doubts : {reason: {sensor: DoubtfulTimes}}
         """
-        self._stage.set_doubtful_times(times)
+        self._stage.set_input_doubts(doubts)
 
     def idle(self) -> None:
         """Run the deferred work of the stage; called by a calibration node in the same process."""

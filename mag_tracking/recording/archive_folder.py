@@ -17,7 +17,7 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
@@ -26,7 +26,7 @@ from typing import Any
 from mag_tracking.errors import OutputError
 from mag_tracking.files import output_folder, replace_text
 from mag_tracking.recording.archive_tables import TABLES
-from mag_tracking.recording.parquet_table import VERSION, TableWriter, import_pyarrow
+from mag_tracking.recording.parquet_table import VERSION, TableWriter, check_row, import_pyarrow
 from mag_tracking.units import NS
 
 MAX_STEM_BYTES = 100
@@ -169,12 +169,20 @@ class ArchiveFolder:
         -------
         dict or None
             None if the recording must be processed.
+
+        Raises
+        ------
+        OutputError
+            If the summary is damaged.
         """
         path = self.path / _DONE / f'{recording_key(recording)}.json'
         if not path.exists():
             return None
-        summary = _read_json(path)
-        return summary if summary.get('state') == recording_state(recording) else None
+        summary = _read_summary(path)
+        try:
+            return summary if summary.get('state') == recording_state(recording) else None
+        except OSError:
+            return None
 
     def begin(self, recording: Path, state: list[list[Any]]) -> Path:
         """Remove outdated results of a recording, and create the folder for its partial results.
@@ -239,14 +247,24 @@ class ArchiveFolder:
             for row in rows:
                 table.add(row)
 
-    def summaries(self) -> list[dict[str, Any]]:
-        """Return the summaries of all processed recordings, from this run and earlier runs.
+    def summaries(self, report: Callable[[str], object]) -> Iterator[dict[str, Any]]:
+        """Read the summaries of all processed recordings, from this run and earlier runs.
 
-        Returns
-        -------
-        list of dict
+        Parameters
+        ----------
+        report : function
+            Called with a message for each damaged summary, which is left out.
+
+        Yields
+        ------
+        dict
         """
-        return [_read_json(path) for path in sorted((self.path / _DONE).glob('*.json'))]
+        for path in sorted((self.path / _DONE).glob('*.json')):
+            try:
+                yield _read_summary(path)
+            except OutputError as error:
+                report(f'{error}; its recording is missing in recordings.parquet until it is '
+                       'tracked again')
 
 
 def _remove(folder: Path) -> None:
@@ -322,11 +340,23 @@ def common_columns(recording: Path, stamp_ns: int | None) -> dict[str, Any]:
             'time': stamp_ns}
 
 
+def _read_summary(path: Path) -> dict[str, Any]:
+    """Read the summary of a processed recording; raises OutputError."""
+    summary = _read_json(path)
+    try:
+        check_row(summary, TABLES['recordings'])
+        if summary['size'] is None:
+            raise ValueError('size is missing')
+    except ValueError as error:
+        raise OutputError(f'{path} is damaged: {error}') from error
+    return summary
+
+
 def _read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file of the archive; raises OutputError."""
     try:
         content = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise OutputError(f'cannot read {path}: {error}') from error
     if not isinstance(content, dict):
         raise OutputError(f'{path} is not a valid file of an archive')

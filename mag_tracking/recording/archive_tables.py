@@ -12,7 +12,7 @@ _COMMON = (
     Column('recording', 's', '', 'name of the recording: the stem of its file name'),
     Column('source', 's', '', 'path of the recording'),
     Column('stamp_ns', 'i', 'ns', 'timestamp, measured from 1970-01-01 UTC'),
-    Column('time', 't', '', 'timestamp as UTC time'))
+    Column('time', 't', '', 'timestamp as UTC time, without a time zone'))
 _TRACK = (Column('track_id', 'i', '', 'identifier of the track within the recording'),)
 _STATE = (*_axes('', 'm', 'position in the world frame'), *_axes('v', 'm/s', 'velocity'))
 _STATE_SD = (*_axes('sd_', 'm', 'standard deviation of the position'),
@@ -106,4 +106,4 @@ TABLES: dict[str, tuple[Column, ...]] = {
                              'the sensors'),
         *columns_of('i', 'bytes', size='size of the recording')),
 }
-"""Columns by table. Unknown values are null."""
+"""Columns by table. Unknown values are null, and NaN in a covariance."""

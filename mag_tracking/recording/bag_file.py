@@ -1,33 +1,42 @@
 """Reader of one SQLite bag (`.db3`) or ROS 1 bag (`.bag`), with the library `rosbags`."""
 
-import dataclasses
+import bz2
 import functools
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing
-from itertools import islice
+from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
+import lz4.frame
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.definitions import DEFINITIONS
-from mag_tracking.messages.types import encoder, schema_of
+from mag_tracking.messages.ros1 import cdr_of_ros1
+from mag_tracking.messages.types import schema_of
 from mag_tracking.recording.decode_errors import DECODE_ERRORS
+from mag_tracking.recording.expansion import RefusedDataError, expanded, largest_chunk
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.recording.raw_message import RawMessage
+from mag_tracking.units import LATEST_NS
 
 if TYPE_CHECKING:
     from rosbags.rosbag1 import Reader as Ros1Reader
+    from rosbags.rosbag1.reader import IndexData
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
-    from rosbags.typesys.store import Typestore
 
-ROS1_SUFFIX = '.bag'
-BAG_SUFFIXES = ('.db3', ROS1_SUFFIX)
+ROS1_MAGIC = b'#ROSBAG V2.0'
+"""First bytes of a ROS 1 bag."""
+SQLITE_MAGIC = b'SQLite format 3\0'
+"""First bytes of an SQLite database."""
 BLOCK_SIZE = 256
-"""Number of messages that are read at once."""
+"""Largest number of messages that are read at once."""
+BLOCK_BYTES = 16 << 20
+"""Number of bytes after which a block is complete."""
+_ROS1_COMPRESSIONS: dict[object, str] = {bz2.decompress: 'bz2', lz4.frame.decompress: 'lz4'}
+"""Compression of a chunk by the decompressor that the library uses."""
 
 
 class BagFile:
@@ -55,17 +64,23 @@ class BagFile:
     """
 
     def __init__(self, path: Path, losses: 'Counter[str]') -> None:
-        self._path, self._is_ros1, self._losses = path, path.suffix == ROS1_SUFFIX, losses
+        self._path, self._losses = path, losses
+        with open(path, 'rb') as stream:
+            self._is_ros1 = stream.read(len(ROS1_MAGIC)) == ROS1_MAGIC
+        self._lost_offsets: set[int] = set()
         self.types: dict[str, str] = {}
         self.message_counts: Counter[str] = Counter()
         self.start_ns: int | None = None
         self.end_ns: int | None = None
         with self._open_reader() as reader:
             for connection in reader.connections:
+                if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
+                    continue
                 self.types[connection.topic] = connection.msgtype
                 self.message_counts[connection.topic] += connection.msgcount
             time_range = reader if self._is_ros1 else reader.metadata
-            if self.message_counts.total():
+            if self.message_counts.total() and isinstance(time_range.start_time, int) \
+                    and isinstance(time_range.end_time, int):
                 # The end time of the library is one nanosecond after the last message.
                 self.start_ns, self.end_ns = time_range.start_time, time_range.end_time - 1
 
@@ -104,32 +119,93 @@ class BagFile:
         ------
         MessageBlock
         """
-        size, total, reported, n = self._path.stat().st_size, self.message_counts.total(), 0, 0
-        raw = self._raw(start_ns)
-        while messages := list(islice(raw, BLOCK_SIZE)):
-            yield MessageBlock.of_messages([
-                RawMessage(topic, kind, log_time_ns,
-                           cdr_of_ros1(data, kind) if self._is_ros1 else data, schema_of(kind))
-                for topic, kind, log_time_ns, data in messages])
+        size, total = self._path.stat().st_size, max(self.message_counts.total(), 1)
+        reported = n = 0
+        messages: list[RawMessage] = []
+        n_bytes = 0
+        for topic, kind, log_time_ns, data in self._raw(start_ns):
+            if self._is_ros1:
+                data = cdr_of_ros1(data, kind)
+            messages.append(RawMessage(topic, kind, log_time_ns, data, schema_of(kind)))
+            n_bytes += len(data)
+            if len(messages) < BLOCK_SIZE and n_bytes < BLOCK_BYTES:
+                continue
+            yield MessageBlock.of_messages(messages)
             n += len(messages)
+            messages, n_bytes = [], 0
             if progress and (position := size * n // total) > reported:
                 progress(position - reported)
                 reported = position
+        if messages:
+            yield MessageBlock.of_messages(messages)
+            if progress and size > reported:
+                progress(size - reported)
 
     def _raw(self, start_ns: int | None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Iterate over (topic, type, log time [ns], bytes) up to the first damage, if any.
-
-        The damage is counted in `losses`.
-        """
-        n = 0
+        """Iterate over (topic, type, log time [ns], bytes); the losses are counted."""
         with self._open_reader() as reader:
+            yield from (self._ros1_messages if self._is_ros1 else self._sqlite_messages)(
+                reader, start_ns)
+
+    def _sqlite_messages(self, reader: 'Sqlite3Reader', start_ns: int | None
+                         ) -> Iterator[tuple[str, str, int, bytes]]:
+        """Iterate over the messages up to the first damage, except those without time or data."""
+        n = n_null = 0
+        try:
+            for connection, log_time_ns, data in reader.messages(reader.connections, start_ns):
+                n += 1
+                if isinstance(log_time_ns, int) and isinstance(data, bytes) \
+                        and connection.topic in self.types:
+                    yield connection.topic, connection.msgtype, min(log_time_ns, LATEST_NS), data
+                else:
+                    n_null += 1
+        except bag_errors():
+            self._losses[f'partially read files ({self._path.name}, up to message {n} of '
+                         f'{self.message_counts.total()})'] = 1
+        if n_null:
+            self._losses[f'messages without topic, time or data (NULL in {self._path.name})'] \
+                = n_null
+
+    def _ros1_messages(self, reader: 'Ros1Reader', start_ns: int | None
+                       ) -> Iterator[tuple[str, str, int, bytes]]:
+        """Iterate over the messages, except those in damaged chunks."""
+        limit = largest_chunk()
+        # The library trusts the sizes in the file.
+        reader.chunks = {position: chunk._replace(
+            datasize=min(chunk.datasize, limit + 1), decompressor=partial(
+                expanded, _ROS1_COMPRESSIONS.get(chunk.decompressor, 'none'), limit=limit))
+            for position, chunk in reader.chunks.items()}
+        order: list[tuple[int, IndexData]] = []
+        while True:
+            n = 0
             try:
-                for connection, log_time_ns, data in reader.messages(reader.connections, start_ns):
+                for connection, log_time_ns, data in reader.messages(start=start_ns):
                     n += 1
-                    yield connection.topic, connection.msgtype, log_time_ns, bytes(data)
-            except bag_errors():
-                self._losses[f'partially read files ({self._path.name}, up to message {n} of '
-                             f'{self.message_counts.total()})'] = 1
+                    yield connection.topic, connection.msgtype, log_time_ns, data
+                return
+            except bag_errors() as error:
+                # The order in which the library reads the messages.
+                order = order or sorted(
+                    ((number, entry) for number, entries in reader.indexes.items()
+                     for entry in entries if start_ns is None or entry.time >= start_ns),
+                    key=lambda pair: pair[1].time)
+                if n >= len(order):
+                    return
+                damaged = order[n][1].chunk_pos
+                reason = f', {error}' if isinstance(error, RefusedDataError) else ''
+                self._count_loss(damaged, f'damaged chunks ({self._path.name}{reason})')
+            order = [pair for pair in order[n:] if pair[1].chunk_pos != damaged]
+            reader.indexes = {number: [] for number in reader.indexes}
+            for number, entry in order:
+                reader.indexes[number].append(entry)
+            # The library has closed the chunk before the damaged one.
+            reader.current_chunk = (-1, BytesIO())
+
+    def _count_loss(self, offset: int, description: str) -> None:
+        """Count the damaged chunk at byte `offset`, unless it has already been counted."""
+        if offset not in self._lost_offsets:
+            self._lost_offsets.add(offset)
+            self._losses[description] += 1
 
 
 @functools.cache
@@ -147,42 +223,4 @@ def bag_errors() -> tuple[type[Exception], ...]:
 
     # Damaged bytes can also trigger assertions of the library.
     return (Ros1Error, ReaderError, SerdeError, apsw.Error, OSError, AssertionError, IndexError,
-            TypeError, OverflowError, *DECODE_ERRORS)
-
-
-def cdr_of_ros1(data: bytes, type_name: str) -> bytes:
-    """Convert a serialised ROS 1 message to CDR.
-
-    Parameters
-    ----------
-    data : bytes
-    type_name : str
-
-    Returns
-    -------
-    bytes
-        Empty if the message is damaged or its type is not supported.
-    """
-    if type_name not in DEFINITIONS:
-        return b''
-    try:
-        message = _ros1_types().deserialize_ros1(data, type_name)
-    except bag_errors():
-        return b''
-    return encoder(type_name)(_as_dicts(message))
-
-
-@functools.cache
-def _ros1_types() -> 'Typestore':
-    """Definitions of the ROS 1 message types, for `rosbags`."""
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS1_NOETIC)
-
-
-def _as_dicts(value: Any) -> Any:
-    """Convert a message to nested dicts."""
-    if dataclasses.is_dataclass(value):
-        return {f.name: _as_dicts(getattr(value, f.name)) for f in dataclasses.fields(value)
-                if not f.name.startswith('__')}
-    return value.tolist() if isinstance(value, np.ndarray) else value
+            TypeError, AttributeError, OverflowError, *DECODE_ERRORS)

@@ -15,7 +15,8 @@ def number_rows(values: FloatArray) -> list[str]:
         Shortest decimal representations that are parsed to the same numbers.
     """
 
-def records_of(data: bytes, latest_ns: int) -> tuple[IntArray, list[tuple[int, int, int]]]:
+def records_of(data: bytes, latest_ns: int, max_messages: int
+               ) -> tuple[IntArray, list[tuple[int, int, int]], int]:
     """Locate the records of an MCAP chunk.
 
     Parameters
@@ -24,6 +25,8 @@ def records_of(data: bytes, latest_ns: int) -> tuple[IntArray, list[tuple[int, i
         Uncompressed records of the chunk.
     latest_ns : int, ns
         Upper limit of the log times. Later times, which MCAP permits, are clipped.
+    max_messages : int
+        Largest accepted number of messages.
 
     Returns
     -------
@@ -31,9 +34,13 @@ def records_of(data: bytes, latest_ns: int) -> tuple[IntArray, list[tuple[int, i
         Channel, log time [ns], and begin and end of the message bytes in `data`.
     definitions : list of (int, int, int)
         Opcode, begin and end of each schema and channel record.
+    end : int
+        Index in `data` after the last complete record.
 
     Raises
     ------
     EOFError
-        If the chunk is damaged.
+        If a message is shorter than its header.
+    ValueError
+        If there are more messages than `max_messages`.
     """

@@ -26,13 +26,14 @@ FIT_COLUMNS = (
     'mx', 'my', 'mz', 'sd_mx', 'sd_my', 'sd_mz', 'cpa_time', 'sd_cpa_time',
     'cpa_range', 'sd_cpa_range', 'rate', 'sd_rate',
     'delay_speed', 'sd_delay_speed', 'delay_heading_deg', 'sd_delay_heading_deg', 'no_delay')
-"""Columns of `fits.csv`. Standard deviations are from `PassFit.robust_covariance`. The closest
-point of approach (CPA) refers to the centre of the sensors; its time is in seconds after
-`stamp_ns`. `rate` is the speed divided by the CPA range, which a single sensor can observe; the
-corresponding directions are in `fits.json`. For a fit that is not trusted as a whole, only the
-trusted quantities (speed, heading, time of the CPA) are written, and only if the fit is reported
-for its pass. Jointly fitted vehicles share their unknowns and costs. The speed and heading from the
-delays between sensors are model-free and equal for all fits of a pass."""
+"""Columns of `fits.csv`. Standard deviations are from `PassFit.robust_covariance`, those of
+positions from `PassFit.position_covariance`. The closest point of approach (CPA) refers to the
+centre of the sensors; its time is in seconds after `stamp_ns`. `rate` is the speed divided by the
+CPA range, which a single sensor can observe; the corresponding directions are in `fits.json`. For a
+fit that is not trusted as a whole, only the trusted quantities (speed, heading, time of the CPA)
+are written, and only if the fit is reported for its pass. Jointly fitted vehicles share their
+unknowns and costs. The speed and heading from the delays between sensors are model-free and equal
+for all fits of a pass."""
 
 
 class _FittedPass(Protocol):
@@ -90,12 +91,13 @@ def fit_row(fit: PassFit, is_reported: bool = True) -> dict[str, Any]:
     if fit.reason:
         return row | (_trusted_quantities(fit, centre) if is_reported else {})
     row['ambiguous'] = int(fit.ambiguous)
-    sd = np.sqrt(np.diagonal(fit.robust_covariance))
+    sd = np.sqrt(np.concatenate([np.diagonal(fit.position_covariance),
+                                 np.diagonal(fit.robust_covariance)[3:6]]))
     moment, P = fit.moment
     heading = [math.degrees(v) for v in fit.heading]
     groups: tuple[tuple[str, Iterable[float]], ...] = (
         ('x y z', fit.position), ('vx vy vz', fit.velocity),
-        ('sd_x sd_y sd_z sd_vx sd_vy sd_vz', sd[:6]), ('speed sd_speed', fit.speed),
+        ('sd_x sd_y sd_z sd_vx sd_vy sd_vz', sd), ('speed sd_speed', fit.speed),
         ('heading_deg sd_heading_deg', heading), ('length sd_length', fit.length),
         ('mx my mz', moment), ('sd_mx sd_my sd_mz', np.sqrt(np.diagonal(P))),
         ('cpa_time sd_cpa_time cpa_range sd_cpa_range', fit.closest_approach(centre)))

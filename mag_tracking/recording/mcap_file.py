@@ -1,36 +1,61 @@
 """Reader of one MCAP file, which checks each chunk and skips damaged chunks."""
 
-import os
 from collections import Counter
 from collections.abc import Iterator
 from io import BytesIO
-from itertools import accumulate
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, ChunkIndex, Message, Schema
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.records import Channel, Schema, Statistics
+from mcap.summary import Summary
 
+from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.self_described import type_of
 from mag_tracking.recording import core
 from mag_tracking.recording.decode_errors import DECODE_ERRORS
+from mag_tracking.recording.expansion import RefusedDataError, check_size, largest_chunk
 from mag_tracking.recording.interruptible import Progress
+from mag_tracking.recording.mcap_records import (
+    MAGIC,
+    MIN_BYTES_PER_MESSAGE,
+    Record,
+    chunk_content,
+    file_size,
+    has_footer,
+    read_summary,
+    records,
+)
 from mag_tracking.recording.message_block import ChannelKind, MessageBlock
 from mag_tracking.units import LATEST_NS
 
-BATCH_SIZE = 256
-"""Maximum number of messages outside of chunks that are read at once."""
+MAX_MERGED_SIZE = 64 << 20
+"""Size of a chunk above which its messages are not sorted among those of other chunks, because
+that takes several times the memory [bytes]."""
+UNCHUNKED_SIZE = 1 << 20
+"""Number of bytes of consecutive records outside of chunks that are read at once."""
 _DEFINITION_TYPES: dict[int, type[Schema] | type[Channel]] = {
     Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
 
 
+class _Part(NamedTuple):
+    """Part of a file that is read at once: a chunk, or consecutive records outside of chunks."""
+
+    record: Record
+    """Position. The operation code is that of the first record."""
+    start_ns: int
+    """Log time of the first message [ns]."""
+    end_ns: int
+    """Log time of the last message [ns]."""
+
+
 class McapFile:
     """Reader of one MCAP file of a recording.
+
+    Schemas and channels are those of the summary and of the parts that were read. A file without a
+    summary is read once when it is opened, to find its topics and chunks.
 
     Parameters
     ----------
@@ -43,9 +68,9 @@ class McapFile:
     types : dict of str to str
         Message type by topic.
     message_counts : Counter
-        Number of messages by topic. Empty for a truncated file.
+        Number of messages by topic. Empty if unknown.
     start_ns, end_ns : int, ns, or None
-        Log times of the first and last message. None if unknown.
+        Log times of the first and last message. None if there are no messages.
 
     Raises
     ------
@@ -54,51 +79,134 @@ class McapFile:
     """
 
     def __init__(self, path: Path, losses: 'Counter[str]') -> None:
-        self.types: dict[str, str] = {}
         self.message_counts: Counter[str] = Counter()
         self.start_ns: int | None = None
         self.end_ns: int | None = None
-        self._path, self._losses = path, losses
+        self._path, self._losses, self._limit = path, losses, largest_chunk()
         self._lost_offsets: set[int] = set()
-        self._index = self._inspect(path)
+        self._channels, self._counts = _Channels(), Counter[int]()
+        self._parts: list[_Part] = []
+        with open(path, 'rb') as stream:
+            if stream.read(len(MAGIC)) != MAGIC:
+                raise RecordingError(f'{path} is not an MCAP file')
+            summary = read_summary(stream)
+            if summary is None and not has_footer(stream):
+                self._losses[f'files without a valid index ({path.name}, possibly truncated)'] = 1
+            self._inspect(stream, summary or Summary())
+        self._parts.sort(key=lambda part: part.start_ns)
 
-    def _inspect(self, file: Path) -> list[ChunkIndex] | None:
-        """Read topics, message counts and times; return the chunk index, or None if there is no
-        index."""
-        with open(file, 'rb') as stream:
-            if stream.read(5) != b'\x89MCAP':
-                raise RecordingError(f'{file} is not an MCAP file')
-            stream.seek(0)
-            try:
-                summary = make_reader(stream).get_summary()
-            except DECODE_ERRORS:
-                summary = None
-            except OSError:
-                # A file of a few bytes has no valid position of the footer.
-                summary = None
-        if summary is None:
-            self._losses[f'files without a valid index ({file.name}, possibly truncated)'] = 1
-            return None
+    @property
+    def types(self) -> dict[str, str]:
+        """Message type by topic."""
+        return {kind.topic: kind.type for kind in self._channels.kinds.values()}
+
+    def _inspect(self, stream: BinaryIO, summary: Summary) -> None:
+        """Find the parts of the file, the topics, the message counts and the times."""
+        for schema in summary.schemas.values():
+            self._channels.add(schema)
         for channel in summary.channels.values():
-            schema = summary.schemas.get(channel.schema_id)
-            self.types[channel.topic] = type_of(schema) if schema else ''
+            self._channels.add(channel)
         statistics = summary.statistics
+        # A summary may omit channels and schemas; they are then read from the chunks.
+        is_complete = len(self._channels.kinds) >= (statistics.channel_count if statistics else 1)
+        indexed = sorted(summary.chunk_indexes if is_complete else [],
+                         key=lambda entry: entry.chunk_start_offset)
+        position = len(MAGIC)
+        for entry in indexed:
+            begin = entry.chunk_start_offset
+            self._scan(stream, position, begin)
+            self._parts.append(_Part(Record(Opcode.CHUNK, begin, begin + entry.chunk_length),
+                                     min(entry.message_start_time, LATEST_NS),
+                                     min(entry.message_end_time, LATEST_NS)))
+            position = max(position, begin + entry.chunk_length + entry.message_index_length)
+        self._scan(stream, position, file_size(stream))
+        self._set_counts(statistics, not indexed)
+
+    def _set_counts(self, statistics: Statistics | None, is_scanned: bool) -> None:
+        """Set message counts and times from the statistics of the summary, or from the scan."""
+        counts: dict[int, int] = dict(self._counts) if is_scanned else {}
+        if self._parts:
+            self.start_ns = min(part.start_ns for part in self._parts)
+            self.end_ns = max(part.end_ns for part in self._parts)
         if statistics and statistics.message_count:
-            for i, n in statistics.channel_message_counts.items():
-                if i in summary.channels:
-                    self.message_counts[summary.channels[i].topic] += n
+            counts = statistics.channel_message_counts or counts
             self.start_ns = statistics.message_start_time
             self.end_ns = statistics.message_end_time
-        return sorted(summary.chunk_indexes, key=lambda c: c.message_start_time)
+        for channel, n in counts.items():
+            if channel in self._channels.kinds:
+                self.message_counts[self._channels.kinds[channel].topic] += n
+
+    def _scan(self, stream: BinaryIO, begin: int, end: int) -> None:
+        """Find the parts between two offsets that the index does not contain.
+
+        The scan stops at the end of the data section, or at the first record that is cut or
+        invalid, which is counted as a loss.
+        """
+        run: Record | None = None
+        for record in records(stream, begin, end):
+            begin = record.begin
+            is_valid = record.end <= end and record.opcode != 0
+            in_run = is_valid and record.opcode in (*_DEFINITION_TYPES, Opcode.MESSAGE)
+            if run and (not in_run or record.end - run.begin > UNCHUNKED_SIZE):
+                self._add_scanned(stream, run)
+                run = None
+            if record.opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                return
+            if record.opcode == Opcode.CHUNK:
+                self._add_scanned(stream, record)
+            elif in_run:
+                run = (run or record)._replace(end=record.end)
+            if not is_valid:
+                break
+            begin = record.end
+        if run:
+            self._add_scanned(stream, run)
+        if begin < end:
+            self._count_loss(begin, f'partially read files ({self._path.name}, up to byte '
+                                    f'{begin} of {end})')
+
+    def _add_scanned(self, stream: BinaryIO, record: Record) -> None:
+        """Read a part for the first time; add it if it contains messages."""
+        try:
+            _, rows = self._read(stream, record)
+        except DECODE_ERRORS as error:
+            if record.end <= file_size(stream):
+                self._count_loss(record.begin,
+                                 f'damaged chunks ({self._path.name}{_reason(error)})')
+            return
+        if len(rows):
+            self._parts.append(_Part(record, int(rows[:, 1].min()), int(rows[:, 1].max())))
+            self._counts.update(dict(zip(
+                *(a.tolist() for a in np.unique(rows[:, 0], return_counts=True)), strict=True)))
+
+    def _read(self, stream: BinaryIO, record: Record) -> tuple[bytes, IntArray]:
+        """Read the records of a part; return their bytes and the rows of its messages.
+
+        Raises one of `DECODE_ERRORS` if the part is damaged.
+        """
+        if record.opcode == Opcode.CHUNK:
+            data = chunk_content(stream, record, self._limit)
+        else:
+            check_size(record.end - record.begin, self._limit)
+            stream.seek(record.begin)
+            data = stream.read(record.end - record.begin)
+        rows, definitions, end = core.records_of(data, LATEST_NS,
+                                                 self._limit // MIN_BYTES_PER_MESSAGE)
+        if end < len(data) and record.end <= file_size(stream):
+            raise EOFError('the chunk ends within a record')
+        for kind, first, last in definitions:
+            self._channels.add(_DEFINITION_TYPES[kind].read(
+                ReadDataStream(BytesIO(data[first:last]))))
+        return data, rows
 
     def blocks(self, start_ns: int | None = None,
                progress: Progress | None = None) -> Iterator[MessageBlock]:
-        """Iterate over the messages chunk by chunk, in order of log time if the file has an index.
+        """Iterate over the messages chunk by chunk, in order of log time.
 
         Parameters
         ----------
         start_ns : int, ns, optional
-            Skip chunks that end earlier, if the file has an index.
+            Skip chunks that end earlier.
         progress : callable, optional
             Called with the number of bytes read since the last call.
 
@@ -106,141 +214,84 @@ class McapFile:
         ------
         MessageBlock
         """
-        with open(self._path, 'rb') as stream:
-            if self._index:
-                yield from self._indexed_blocks(stream, self._index, start_ns, progress)
-            else:
-                yield from self._streamed_blocks(stream, progress)
-
-    def _indexed_blocks(self, stream: BinaryIO, index: list[ChunkIndex], start_ns: int | None,
-                        progress: Progress | None) -> Iterator[MessageBlock]:
-        """Iterate over the messages of a file with an index, in order of log time across chunks."""
-        channels = _Channels()
         pending = MessageBlock.of_messages([])
-        for k, entry in enumerate(index):
-            if start_ns is not None and entry.message_end_time < start_ns:
-                continue
-            stream.seek(entry.chunk_start_offset)
-            try:
-                chunk = next(iter(StreamReader(stream, skip_magic=True,
-                                               emit_chunks=True).records))
-                if not isinstance(chunk, Chunk):
-                    raise ValueError('no chunk at the indexed offset')
-                pending = pending.merged(channels.block_of(chunk))
-            except DECODE_ERRORS:
-                self._count_lost_chunk(entry)
-            if progress:
-                progress(entry.chunk_length)
-            n = len(pending)
-            if k + 1 < len(index):
-                n = int(np.searchsorted(pending.log_time_ns, index[k + 1].message_start_time))
-            yield pending.part(slice(n))
-            pending = pending.part(slice(n, None))
-        yield pending
+        parts = [p for p in self._parts if start_ns is None or p.end_ns >= start_ns]
+        starts = [p.start_ns for p in parts[1:]]
+        with open(self._path, 'rb') as stream:
+            for part, next_start_ns in zip(parts, [*starts, LATEST_NS + 1], strict=False):
+                try:
+                    block = self._block(stream, part.record)
+                except DECODE_ERRORS as error:
+                    self._count_lost_part(part, error)
+                    block = MessageBlock.of_messages([])
+                if progress:
+                    progress(min(part.record.end, file_size(stream)) - part.record.begin)
+                if len(block.data) > MAX_MERGED_SIZE:
+                    yield pending
+                    pending, next_start_ns = block, LATEST_NS + 1
+                else:
+                    pending = pending.merged(block)
+                n = int(np.searchsorted(pending.log_time_ns, next_start_ns))
+                block, pending = pending.part(slice(n)), pending.part(slice(n, None)).compacted()
+                yield block
+                # The bytes of this chunk are freed before the next chunk is read.
+                del block
 
-    def _count_lost_chunk(self, entry: ChunkIndex) -> None:
+    def _block(self, stream: BinaryIO, record: Record) -> MessageBlock:
+        """Read the messages of a part, except those whose channel or schema is not defined."""
+        data, rows = self._read(stream, record)
+        undefined = np.setdiff1d(rows[:, 0], list(self._channels.kinds))
+        if len(undefined):
+            is_undefined = np.isin(rows[:, 0], undefined)
+            self._count_loss(record.begin, f'messages of undefined channels ({self._path.name}, '
+                             'defined in a damaged part)', int(is_undefined.sum()))
+            rows = rows[~is_undefined]
+        return MessageBlock.of_rows(data, self._channels.kinds, rows)
+
+    def _count_lost_part(self, part: _Part, error: Exception) -> None:
         """Count an unreadable chunk as a loss, described by its duration and start time."""
-        duration_s = (entry.message_end_time - entry.message_start_time) / 1e9
-        start_s = (entry.message_start_time - (self.start_ns or entry.message_start_time)) / 1e9
-        self._count_loss(entry.chunk_start_offset, f'damaged segments ({self._path.name}, '
-                         f'{duration_s:.1f} s long, {start_s:.1f} s after the start)')
+        duration_s = (part.end_ns - part.start_ns) / 1e9
+        start_s = (part.start_ns - (self.start_ns or part.start_ns)) / 1e9
+        self._count_loss(part.record.begin, f'damaged segments ({self._path.name}, '
+                         f'{duration_s:.1f} s long, {start_s:.1f} s after the start'
+                         f'{_reason(error)})')
 
-    def _count_loss(self, offset: int, description: str) -> None:
+    def _count_loss(self, offset: int, description: str, n: int = 1) -> None:
         """Count the unreadable part at byte `offset`, unless it has already been counted."""
         if offset not in self._lost_offsets:
             self._lost_offsets.add(offset)
-            self._losses[description] += 1
-
-    def _streamed_blocks(self, stream: BinaryIO, progress: Progress | None
-                         ) -> Iterator[MessageBlock]:
-        """Iterate over the messages in file order, up to the first damage outside of a chunk."""
-        channels, unchunked = _Channels(), _UnchunkedMessages()
-        end = 0
-        try:
-            for record in StreamReader(stream, emit_chunks=True).records:
-                record_end = stream.tell()
-                if isinstance(record, Chunk):
-                    yield from unchunked.flush(channels)
-                    try:
-                        yield channels.block_of(record)
-                    except DECODE_ERRORS:
-                        self._count_loss(end, f'damaged chunks ({self._path.name})')
-                elif isinstance(record, Schema | Channel):
-                    channels.add(record)
-                elif isinstance(record, Message) and channels.has_schema(record.channel_id):
-                    unchunked.add(record)
-                    if len(unchunked) >= BATCH_SIZE:
-                        yield from unchunked.flush(channels)
-                if progress:
-                    progress(record_end - end)
-                end = record_end
-            yield from unchunked.flush(channels)
-        except DECODE_ERRORS:
-            yield from unchunked.flush(channels)
-            size = os.fstat(stream.fileno()).st_size
-            # A file that ends after a complete record only lacks its index.
-            if end < size:
-                self._count_loss(end, f'partially read files ({self._path.name}, up to byte {end} '
-                                      f'of {size})')
+            self._losses[description] += n
 
 
-class _UnchunkedMessages:
-    """Buffer that collects messages outside of chunks into blocks, which are faster to process."""
-
-    def __init__(self) -> None:
-        self._messages: list[Message] = []
-
-    def __len__(self) -> int:
-        return len(self._messages)
-
-    def add(self, message: Message) -> None:
-        """Add a message."""
-        self._messages.append(message)
-
-    def flush(self, channels: '_Channels') -> Iterator[MessageBlock]:
-        """Yield the buffered messages as one block, if there are any, and empty the buffer."""
-        messages, self._messages = self._messages, []
-        if not messages:
-            return
-        ends = list(accumulate(len(m.data) for m in messages))
-        rows = np.array([(m.channel_id, min(m.log_time, LATEST_NS), end - len(m.data), end)
-                         for m, end in zip(messages, ends, strict=True)], dtype=np.int64)
-        yield MessageBlock.of_rows(b''.join(m.data for m in messages), dict(channels.kinds), rows)
+def _reason(error: Exception) -> str:
+    """Format why an intact chunk is not read; empty for a damaged chunk."""
+    return f', {error}' if isinstance(error, RefusedDataError) else ''
 
 
 class _Channels:
-    """Schemas and channels that have been read from a file."""
+    """Schemas and channels that have been read from a file.
+
+    Attributes
+    ----------
+    kinds : dict of int to ChannelKind
+        Topic and type by number of the channel.
+    """
 
     def __init__(self) -> None:
-        self._schemas: dict[int, Schema] = {}
-        self._schema_of: dict[int, int] = {}
+        self._schemas: dict[int, Schema] = {0: Schema(id=0, data=b'', encoding='', name='')}
+        self._waiting: dict[int, Channel] = {}
         self.kinds: dict[int, ChannelKind] = {}
 
     def add(self, record: Schema | Channel) -> None:
-        """Add a schema or a channel; raises KeyError if the schema of a channel is unknown."""
+        """Add a schema or a channel. A channel is defined when its schema is."""
         if isinstance(record, Schema):
             self._schemas[record.id] = record
+            channels = [c for c in self._waiting.values() if c.schema_id == record.id]
         else:
-            self._schema_of[record.id] = record.schema_id
-            if record.schema_id:
-                self.kinds[record.id] = ChannelKind.of(record.topic,
-                                                       self._schemas[record.schema_id])
-
-    def has_schema(self, channel: int) -> bool:
-        """Whether a channel has a schema; raises KeyError for an unknown channel.
-
-        MCAP permits channels without a schema (id 0); ROS does not.
-        """
-        return self._schema_of[channel] != 0
-
-    def block_of(self, chunk: Chunk) -> MessageBlock:
-        """Read the messages of one chunk; raises one of `DECODE_ERRORS` if the chunk is damaged."""
-        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-        data = stream.read(size)
-        rows, definitions = core.records_of(data, LATEST_NS)
-        for kind, begin, end in definitions:
-            self.add(_DEFINITION_TYPES[kind].read(ReadDataStream(BytesIO(data[begin:end]))))
-        untyped = [c for c in np.unique(rows[:, 0]).tolist() if not self.has_schema(c)]
-        if untyped:
-            rows = rows[~np.isin(rows[:, 0], untyped)]
-        return MessageBlock.of_rows(data, self.kinds, rows)
+            self._waiting[record.id] = record
+            channels = [record]
+        for channel in channels:
+            if channel.schema_id in self._schemas:
+                self.kinds[channel.id] = ChannelKind.of(
+                    channel.topic, channel.message_encoding, self._schemas[channel.schema_id])
+                del self._waiting[channel.id]

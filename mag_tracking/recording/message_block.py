@@ -1,15 +1,16 @@
 """Blocks of messages: their bytes, and arrays of their channels, log times and byte positions."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from mcap.records import Schema
 
 from mag_tracking.arrays import IntArray
-from mag_tracking.messages.self_described import SUPPORTED_ENCODINGS, cdr_of, type_of
-from mag_tracking.messages.types import schema_of
+from mag_tracking.messages.encodings import CDR, cdr_of, type_of
+from mag_tracking.messages.types import ROS_SCHEMA, schema_of
+from mag_tracking.recording.expansion import expanded_message
 from mag_tracking.recording.raw_message import RawMessage
 
 
@@ -19,27 +20,36 @@ class ChannelKind(NamedTuple):
     topic: str
     """Name of the topic."""
     type: str
-    """Message type. A magnetic field in JSON or protobuf has the type sensor_msgs/MagneticField."""
+    """Message type. A magnetic field in a supported encoding has the type
+    sensor_msgs/msg/MagneticField. The type of other messages that are not CDR ends with their
+    encoding, such as 'std_msgs/msg/String (json)'."""
     schema: Schema
     """Schema in the file."""
-    is_cdr: bool
-    """Whether the messages are encoded as CDR. Other encodings must be converted."""
+    encoding: str = CDR
+    """Encoding of the messages. Encodings other than CDR must be converted."""
+
+    @property
+    def is_cdr(self) -> bool:
+        """Whether the messages are encoded as CDR."""
+        return self.encoding == CDR
 
     @classmethod
-    def of(cls, topic: str, schema: Schema) -> 'ChannelKind':
-        """Describe a channel by its topic and the schema in the file.
+    def of(cls, topic: str, encoding: str, schema: Schema) -> 'ChannelKind':
+        """Describe a channel.
 
         Parameters
         ----------
         topic : str
+        encoding : str
+            Encoding of the messages.
         schema : Schema
+            Schema in the file.
 
         Returns
         -------
         ChannelKind
         """
-        kind = type_of(schema) if schema.encoding in SUPPORTED_ENCODINGS else schema.name
-        return cls(topic, kind, schema, kind == schema.name)
+        return cls(topic, type_of(encoding, schema), schema, encoding)
 
 
 @dataclass(frozen=True)
@@ -98,7 +108,7 @@ class MessageBlock:
         channel = []
         for m in messages:
             number = numbers.setdefault((m.topic, m.type), len(numbers))
-            kinds.setdefault(number, ChannelKind(m.topic, m.type, m.schema, True))
+            kinds.setdefault(number, ChannelKind(m.topic, m.type, m.schema))
             channel.append(number)
         end = np.cumsum([len(m.data) for m in messages], dtype=np.int64)
         begin = np.append(0, end[:-1])[:len(messages)]
@@ -123,11 +133,13 @@ class MessageBlock:
         -------
         RawMessage
         """
-        topic, kind, schema, is_cdr = self.kinds[int(self.channel[k])]
-        data = self.data[self.begin[k]:self.end[k]]
-        if not is_cdr:
-            data, schema = cdr_of(schema, data), schema_of(kind)
-        return RawMessage(topic, kind, int(self.log_time_ns[k]), data, schema)
+        topic, kind, schema, encoding = self.kinds[int(self.channel[k])]
+        stored = self.data[self.begin[k]:self.end[k]]
+        data, fault = cdr_of(encoding, kind, schema,
+                             expanded_message(stored) if encoding == CDR else stored)
+        is_defined = encoding == CDR and schema.encoding == ROS_SCHEMA
+        return RawMessage(topic, kind, int(self.log_time_ns[k]), data,
+                          schema if is_defined else schema_of(kind), fault)
 
     def part(self, selection: IntArray | slice) -> 'MessageBlock':
         """Select messages.
@@ -144,6 +156,15 @@ class MessageBlock:
         return MessageBlock(self.data, self.kinds, self.channel[selection],
                             self.log_time_ns[selection], self.begin[selection], self.end[selection])
 
+    def with_used_kinds(self) -> 'MessageBlock':
+        """Copy the block without the channels that have no messages in it.
+
+        Returns
+        -------
+        MessageBlock
+        """
+        return replace(self, kinds={n: self.kinds[n] for n in np.unique(self.channel).tolist()})
+
     def merged(self, other: 'MessageBlock') -> 'MessageBlock':
         """Merge this block with another block of the same file, in order of log time.
 
@@ -157,13 +178,22 @@ class MessageBlock:
         """
         if not len(self):
             return other
-        # Few messages remain from the previous chunk, so only their bytes are kept.
-        remaining = [self.data[b:e] for b, e in zip(self.begin, self.end, strict=True)]
-        length = np.array([len(m) for m in remaining], dtype=np.int64)
-        end = len(other.data) + np.cumsum(length)
+        shift = len(other.data)
         block = MessageBlock(
-            other.data + b''.join(remaining), other.kinds, *(
+            other.data + self.data, other.kinds, *(
                 np.concatenate(pair) for pair in (
                     (self.channel, other.channel), (self.log_time_ns, other.log_time_ns),
-                    (end - length, other.begin), (end, other.end))))
+                    (self.begin + shift, other.begin), (self.end + shift, other.end))))
         return block.part(np.argsort(block.log_time_ns, kind='stable'))
+
+    def compacted(self) -> 'MessageBlock':
+        """Copy the messages, so that the bytes of other messages can be freed.
+
+        Returns
+        -------
+        MessageBlock
+        """
+        end = np.cumsum(self.end - self.begin, dtype=np.int64)
+        return MessageBlock(
+            b''.join(self.data[b:e] for b, e in zip(self.begin, self.end, strict=True)),
+            self.kinds, self.channel, self.log_time_ns, end - (self.end - self.begin), end)

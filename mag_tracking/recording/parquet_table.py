@@ -3,6 +3,7 @@
 pyarrow is imported when a table is written or read.
 """
 
+import math
 import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ from mag_tracking.errors import MissingDependencyError, OutputError
 if TYPE_CHECKING:
     import pyarrow as pa
 
-VERSION = 2
+VERSION = 3
 """Version of the tables. Folders of other versions are rejected, because their rows would not be
 comparable."""
 
@@ -29,7 +30,7 @@ class Column(NamedTuple):
     """Name of the column."""
     kind: str
     """Type: 't' for UTC time, 'i' for integer, 'f' for float, 's' for string, 'b' for boolean, and
-    'C' for a (6, 6) matrix in row-major order."""
+    'C' for a (6, 6) matrix in row-major order, which is NaN if it is unknown."""
     unit: str
     """Unit; empty for a dimensionless column."""
     meaning: str
@@ -53,6 +54,30 @@ def columns_of(kind: str, unit: str, /, **meanings: str) -> tuple[Column, ...]:
     tuple of Column
     """
     return tuple(Column(name, kind, unit, meaning) for name, meaning in meanings.items())
+
+
+def check_row(row: Mapping[str, Any], columns: Iterable[Column]) -> None:
+    """Check a row of texts, integers and times that was read from a file.
+
+    Parameters
+    ----------
+    row : mapping
+        Values by column. Integers and times may be None.
+    columns : iterable of Column
+
+    Raises
+    ------
+    ValueError
+        If a column is missing, or its value has another type or is out of range.
+    """
+    for column in columns:
+        if column.name not in row:
+            raise ValueError(f'{column.name} is missing')
+        value = row[column.name]
+        is_valid = isinstance(value, str) if column.kind == 's' else value is None or (
+            isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63)
+        if not is_valid:
+            raise ValueError(f'invalid {column.name}: {value!r:.40}')
 
 
 def import_pyarrow() -> Any:
@@ -93,8 +118,9 @@ def schema_of(columns: Iterable[Column]) -> 'pa.Schema':
         If pyarrow is not installed.
     """
     pa = import_pyarrow()
+    # DuckDB 1.5 cuts nanoseconds of times with a time zone, and 2.0 has fewer functions for them.
     kinds = {'i': pa.int64(), 'f': pa.float64(), 's': pa.string(), 'b': pa.bool_(),
-             't': pa.timestamp('ns', 'UTC'), 'C': pa.list_(pa.float64(), 36)}
+             't': pa.timestamp('ns'), 'C': pa.list_(pa.float64(), 36)}
     return pa.schema([pa.field(c.name, kinds[c.kind], metadata={'unit': c.unit, 'is': c.meaning})
                       for c in columns], metadata={'mag_tracking.schema': str(VERSION)})
 
@@ -118,7 +144,10 @@ class TableWriter:
     """
 
     def __init__(self, path: Path, columns: Iterable[Column]) -> None:
+        columns = tuple(columns)
         self._path, self._schema = path, schema_of(columns)
+        # pyarrow 25 cannot read a null in a column of lists of fixed size.
+        self._unknown = {c.name: [math.nan] * 36 for c in columns if c.kind == 'C'}
         # A worker that was assumed to be lost may still be writing the same table.
         self._draft = path.with_name(f'.{secrets.token_hex(8)}.part')
         self._rows: list[Mapping[str, Any]] = []
@@ -141,9 +170,9 @@ class TableWriter:
         Parameters
         ----------
         row : mapping
-            Values by column. Missing columns are null.
+            Values by column. Missing columns are null, and NaN in a matrix.
         """
-        self._rows.append(row)
+        self._rows.append({**self._unknown, **row})
         if len(self._rows) >= MAX_BUFFERED_ROWS:
             self._flush()
 

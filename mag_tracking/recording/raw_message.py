@@ -18,3 +18,5 @@ class RawMessage(NamedTuple):
     """Serialised message, CDR. Empty if the stored message cannot be converted."""
     schema: Schema
     """Schema of the message type."""
+    fault: str = ''
+    """Why the stored message cannot be converted. Empty if it can."""

@@ -11,15 +11,20 @@ from pathlib import Path
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path
-from mag_tracking.recording.bag_file import BAG_SUFFIXES, BagFile
+from mag_tracking.recording.bag_file import ROS1_MAGIC, SQLITE_MAGIC, BagFile
+from mag_tracking.recording.file_kind import HEAD_SIZE, describe_file
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.mcap_file import McapFile
+from mag_tracking.recording.mcap_records import MAGIC as MCAP_MAGIC
 from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.recording.raw_message import RawMessage
 from mag_tracking.yaml_file import read_yaml
 
-SUFFIXES = ('.mcap', *BAG_SUFFIXES)
-"""Suffixes of readable files."""
+SUFFIXES = ('.mcap', '.db3', '.bag')
+"""Suffixes of the files that are read in a folder. A file that is given itself may have any
+name."""
+_COMPRESSED_SUFFIXES = {'.zstd': 'zstd', '.zst': 'zstd', '.lz4': 'lz4'}
+"""Suffixes that the compression of whole files in rosbag2 adds, and the names of the programs."""
 
 
 class Recording:
@@ -60,8 +65,7 @@ class Recording:
             # all files are empty, opening them fails.
             self._files = [f for f in self._files if f not in empty_files]
             self.losses.update(f'empty files ({f.name})' for f in empty_files)
-        self._opened = [(BagFile if f.suffix in BAG_SUFFIXES else McapFile)(f, self.losses)
-                        for f in self._files]
+        self._opened = [_open(f, self.losses) for f in self._files]
         for file in self._opened:
             self.types.update(file.types)
             self.message_counts.update(file.message_counts)
@@ -134,6 +138,8 @@ class Recording:
                 for kind in block.kinds.values():
                     self.types.setdefault(kind.topic, kind.type)
                 yield block
+                # The bytes of this chunk are freed before the next chunk is read.
+                del block
 
 
 def _files(path: Path) -> list[Path]:
@@ -155,11 +161,37 @@ def _files(path: Path) -> list[Path]:
             raise RecordingError(f'{metadata} is not rosbag2 metadata: relative_file_paths is '
                                  'missing or not a list') from error
     if not files:
-        raise RecordingError(f'{path} contains no recording ({", ".join(SUFFIXES)})')
-    for file in files:
-        if not file.exists():
-            raise RecordingError(f'{file} is listed in metadata.yaml but does not exist')
-        if file.suffix not in SUFFIXES:
-            raise RecordingError(f'{file} has none of the suffixes {", ".join(SUFFIXES)}: '
-                                 'decompress it, or convert it with `ros2 bag convert`')
-    return files
+        others = sorted(f for f in path.iterdir() if f.is_file())
+        hint = f'; {describe_file(others[0])}' if others else ''
+        raise RecordingError(f'{path} contains no recording ({", ".join(SUFFIXES)}){hint}')
+    return [_listed_file(file) for file in files]
+
+
+def _listed_file(file: Path) -> Path:
+    """Return a file of a folder, or the file that resulted from decompressing it.
+
+    Raises RecordingError if the file does not exist or is compressed.
+    """
+    program = _COMPRESSED_SUFFIXES.get(file.suffix)
+    if program is not None and file.with_suffix('').exists():
+        return file.with_suffix('')
+    if not file.exists():
+        raise RecordingError(f'{file} is listed in metadata.yaml but does not exist')
+    if program is not None:
+        raise RecordingError(f'{file} is compressed with {program} as a whole file: run '
+                             f'`un{program} {file}`')
+    return file
+
+
+def _open(file: Path, losses: 'Counter[str]') -> McapFile | BagFile:
+    """Open a file with the reader of its content; raises RecordingError."""
+    try:
+        with open(file, 'rb') as stream:
+            head = stream.read(HEAD_SIZE)
+        if head.startswith(MCAP_MAGIC):
+            return McapFile(file, losses)
+        if head.startswith((SQLITE_MAGIC, ROS1_MAGIC)):
+            return BagFile(file, losses)
+        raise RecordingError(describe_file(file))
+    except OSError as error:
+        raise RecordingError(f'cannot read {file}: {error.strerror}') from error

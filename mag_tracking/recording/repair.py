@@ -7,10 +7,13 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
+import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
@@ -20,18 +23,29 @@ from mcap.records import (
     ChunkIndex,
     DataEnd,
     Footer,
-    McapRecord,
-    Message,
-    MessageIndex,
     Schema,
     Statistics,
 )
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
-from mcap.summary import Summary
 
+from mag_tracking.arrays import IntArray
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path, new_binary_file
+from mag_tracking.recording import core
+from mag_tracking.recording.bag_file import ROS1_MAGIC, SQLITE_MAGIC
 from mag_tracking.recording.decode_errors import DECODE_ERRORS
+from mag_tracking.recording.expansion import largest_chunk
+from mag_tracking.recording.file_kind import HEAD_SIZE, describe_file
+from mag_tracking.recording.mcap_records import (
+    MAGIC,
+    MIN_BYTES_PER_MESSAGE,
+    RECORD_HEADER,
+    Record,
+    chunk_content,
+    chunk_header,
+    file_size,
+    read_summary,
+    records,
+)
 from mag_tracking.recording.rosbag2_folder import (
     FileSummary,
     Topic,
@@ -39,7 +53,8 @@ from mag_tracking.recording.rosbag2_folder import (
     write_metadata,
 )
 
-_MAGIC = b'\x89MCAP0\r\n'
+MESSAGE_PREFIX = 31
+"""Number of bytes of a message record before its data."""
 
 
 class _Scan:
@@ -52,76 +67,97 @@ class _Scan:
         self.counts: Counter[int] = Counter()
         self.times: list[int] = []
         self.chunks: list[ChunkIndex] = []
-        self.end, self.damaged = 0, 0
-        self.has_data_end = False
-        self._index: dict[int, MessageIndex] = {}
-        try:
-            for record in StreamReader(stream, emit_chunks=True).records:
-                if isinstance(record, (DataEnd, Footer)):
-                    self.has_data_end = True
-                    break
-                self._add_record(record, stream.tell())
-                self.end = stream.tell()
-        except DECODE_ERRORS:
-            pass
-        self._rebuilt_index = b''
+        self.end, self.damaged, self.n_from_cut_chunk = len(MAGIC), 0, 0
+        self.has_data_end = self._is_damaged = False
+        self._stream, self._limit = stream, largest_chunk()
+        self._rows: IntArray = np.zeros((0, 4), dtype=np.int64)
+        self._appended = b''
+        size = file_size(stream)
+        for record in records(stream, self.end, size):
+            self.has_data_end = record.opcode in (Opcode.DATA_END, Opcode.FOOTER)
+            if self.has_data_end or record.opcode == 0:
+                break
+            if record.end > size:
+                with suppress(*DECODE_ERRORS):
+                    self._recover_chunk(record)
+                break
+            try:
+                self._add_record(record)
+            except DECODE_ERRORS:
+                self.damaged += 1
+            self.end = record.end
         if self._lacks_index():
             self._rebuild_index()
 
-    def _add_record(self, record: McapRecord, end: int) -> None:
-        """Add a record that ends at byte `end`."""
-        if isinstance(record, Schema):
-            self.schemas[record.id] = record
-        elif isinstance(record, Channel):
-            self.channels[record.id] = record
-        elif isinstance(record, Message):
-            self._count(record.channel_id, record.log_time)
-        elif isinstance(record, Chunk):
+    def _add_record(self, record: Record) -> None:
+        """Add a complete record; raises one of `DECODE_ERRORS` if it is damaged."""
+        if record.opcode == Opcode.CHUNK:
             if self._lacks_index():
                 self._drop_index()
-            try:
-                self._add_chunk(record, end)
-            except DECODE_ERRORS:
-                self.damaged += 1
-        elif isinstance(record, MessageIndex) and self.chunks:
-            index, length = self.chunks[-1], 15 + 16 * len(record.records)
-            index.message_index_offsets[record.channel_id] = end - length
-            index.message_index_length += length
+            # The message indexes of a damaged chunk are not used.
+            self._is_damaged = True
+            self._add_chunk(record)
+            self._is_damaged = False
+        elif record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            self._stream.seek(record.begin)
+            self._add_content(self._stream.read(record.end - record.begin))
+        elif record.opcode == Opcode.MESSAGE_INDEX and self.chunks and not self._is_damaged:
+            self._stream.seek(record.begin + RECORD_HEADER.size)
+            (channel,) = struct.unpack('<H', self._stream.read(2))
+            self.chunks[-1].message_index_offsets[channel] = record.begin
+            self.chunks[-1].message_index_length += record.end - record.begin
 
-    def _count(self, channel: int, time_ns: int) -> None:
-        """Update the message counts and the time range with a message."""
-        self.counts[channel] += 1
-        low, high = self.times or (time_ns, time_ns)
-        self.times = [min(low, time_ns), max(high, time_ns)]
+    def _add_content(self, data: bytes) -> tuple[IntArray, int]:
+        """Add records and count their messages; return the rows of the messages, as `records_of`,
+        and the length of the complete records."""
+        rows, definitions, end = core.records_of(
+            data, 2**63 - 1, self._limit // MIN_BYTES_PER_MESSAGE)
+        for opcode, first, last in definitions:
+            content = ReadDataStream(io.BytesIO(data[first:last]))
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(content)
+                self.schemas[schema.id] = schema
+            else:
+                channel = Channel.read(content)
+                self.channels[channel.id] = channel
+        numbers, counts = np.unique(rows[:, 0], return_counts=True)
+        self.counts.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
+        if len(rows):
+            times = (*self.times, int(rows[:, 1].min()), int(rows[:, 1].max()))
+            self.times = [min(times), max(times)]
+        return rows, end
 
-    def _add_chunk(self, chunk: Chunk, end: int) -> None:
-        """Add a chunk and its records; raises one of `DECODE_ERRORS` if the chunk is damaged."""
-        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-        data = stream.read(length)
-        self._index, offset = {}, 0
-        while offset < length:
-            opcode, size = struct.unpack_from('<BQ', data, offset)
-            offset += 9
-            if opcode == Opcode.MESSAGE:
-                channel, _, time_ns = struct.unpack_from('<HIQ', data, offset)
-                index = self._index.setdefault(channel, MessageIndex(channel, []))
-                index.records.append((time_ns, offset - 9))
-                self._count(channel, time_ns)
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                kind: type[Schema] | type[Channel] = (
-                    Schema if opcode == Opcode.SCHEMA else Channel)
-                self._add_record(
-                    kind.read(ReadDataStream(io.BytesIO(data[offset:offset + size]))), end)
-            offset += size
-        record_length = 9 + 40 + len(chunk.compression.encode()) + len(chunk.data)
+    def _add_chunk(self, record: Record) -> None:
+        """Add a chunk and its records."""
+        header = chunk_header(self._stream, record)
+        data = chunk_content(self._stream, record, self._limit)
+        self._rows, _ = self._add_content(data)
         self.chunks.append(ChunkIndex(
-            record_length, end - record_length, chunk.compression, len(chunk.data),
-            chunk.message_end_time, 0, {}, chunk.message_start_time, chunk.uncompressed_size))
+            record.end - record.begin, record.begin, header.compression, header.size,
+            header.end_ns, 0, {}, header.start_ns, len(data)))
+
+    def _recover_chunk(self, record: Record) -> None:
+        """Write the complete records at the beginning of a cut chunk as a new chunk."""
+        if record.opcode != Opcode.CHUNK:
+            return
+        data = chunk_content(self._stream, record, self._limit)
+        rows, end = self._add_content(data)
+        if not len(rows):
+            return
+        if self._lacks_index():
+            self._drop_index()
+        self._rows, self.n_from_cut_chunk, data = rows, len(rows), data[:end]
+        first_ns, last_ns = int(rows[:, 1].min()), int(rows[:, 1].max())
+        content, builder = zstandard.compress(data), RecordBuilder()
+        Chunk('zstd', content, last_ns, first_ns, zlib.crc32(data), len(data)).write(builder)
+        self._appended = builder.end()
+        self.chunks.append(ChunkIndex(len(self._appended), record.begin, 'zstd', len(content),
+                                      last_ns, 0, {}, first_ns, len(data)))
 
     def _lacks_index(self) -> bool:
         """Whether the message index of any channel in the last chunk is missing."""
         return bool(self.chunks) and (
-            set(self.chunks[-1].message_index_offsets) != set(self._index))
+            set(self.chunks[-1].message_index_offsets) != set(self._rows[:, 0].tolist()))
 
     def _drop_index(self) -> None:
         """Discard the message indexes of the last chunk: an incomplete set would hide channels."""
@@ -131,19 +167,25 @@ class _Scan:
     def _rebuild_index(self) -> None:
         """Rebuild the message indexes of the last chunk, which directly follow the chunk."""
         self._drop_index()
-        chunk, builder = self.chunks[-1], RecordBuilder()
-        self.end = chunk.chunk_start_offset + chunk.chunk_length
-        for channel, index in self._index.items():
-            chunk.message_index_offsets[channel] = self.end + builder.count
-            index.write(builder)
-        chunk.message_index_length = builder.count
-        self._rebuilt_index = builder.end()
+        chunk, indexes = self.chunks[-1], b''
+        end = chunk.chunk_start_offset + chunk.chunk_length
+        if not self._appended:
+            self.end = end
+        # Channels are in order of their first messages.
+        for channel in dict.fromkeys(self._rows[:, 0].tolist()):
+            chunk.message_index_offsets[channel] = end + len(indexes)
+            rows = self._rows[self._rows[:, 0] == channel]
+            entries = np.stack((rows[:, 1], rows[:, 2] - MESSAGE_PREFIX), axis=1).astype('<u8')
+            indexes += RECORD_HEADER.pack(Opcode.MESSAGE_INDEX, 6 + entries.nbytes) + struct.pack(
+                '<HI', channel, entries.nbytes) + entries.tobytes()
+        chunk.message_index_length = len(indexes)
+        self._appended += indexes
 
     def index(self) -> bytes:
         """Serialise the indexes and the footer of the file, which are written from byte `end`."""
         builder = RecordBuilder()
         DataEnd(0).write(builder)
-        data_end: bytes = self._rebuilt_index + builder.end()
+        data_end: bytes = self._appended + builder.end()
         times = self.times or [0, 0]
         for record in (*self.schemas.values(), *self.channels.values(), Statistics(
                 0, len(self.channels), dict(self.counts), len(self.chunks), self.counts.total(),
@@ -154,16 +196,7 @@ class _Scan:
         crc = zlib.crc32(struct.pack('<BQQQ', Opcode.FOOTER, 20, start, 0), zlib.crc32(summary))
         Footer(start, 0, crc).write(builder)
         footer: bytes = builder.end()
-        return data_end + summary + footer + _MAGIC
-
-
-def _summary(stream: BinaryIO) -> Summary | None:
-    """Read the index of a file; return None if there is no valid index."""
-    stream.seek(0)
-    try:
-        return make_reader(stream).get_summary()
-    except DECODE_ERRORS:
-        return None
+        return data_end + summary + footer + MAGIC
 
 
 def finish_file(path: str | PathLike[str]) -> list[str]:
@@ -195,12 +228,13 @@ def finish_file(path: str | PathLike[str]) -> list[str]:
             fcntl.flock(raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise OutputError(f'{path} is being recorded: stop the recording first') from None
-        if _summary(stream) is not None:
+        head = stream.read(HEAD_SIZE)
+        if head.startswith((SQLITE_MAGIC, ROS1_MAGIC)):
+            raise RecordingError(f'{path} is a bag: only MCAP files can be repaired')
+        if not head.startswith(MAGIC):
+            raise RecordingError(describe_file(path))
+        if read_summary(stream) is not None:
             return []
-        stream.seek(0)
-        if stream.read(len(_MAGIC)) != _MAGIC:
-            raise RecordingError(f'{path} is not an MCAP file')
-        stream.seek(0)
         scan = _Scan(stream)
         n_cut = 0 if scan.has_data_end else path.stat().st_size - scan.end
         if n_cut:
@@ -212,6 +246,9 @@ def finish_file(path: str | PathLike[str]) -> list[str]:
     if n_cut:
         lines.append(f'{path.name}: the incomplete end was moved to {path.name}.cut; bytes: '
                      f'{n_cut}')
+    if scan.n_from_cut_chunk:
+        lines.append(f'{path.name}: messages recovered from the incomplete chunk at the end: '
+                     f'{scan.n_from_cut_chunk}')
     if scan.damaged:
         lines.append(f'{path.name}: damaged chunks skipped: {scan.damaged}')
     return lines
@@ -246,7 +283,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     Raises
     ------
     RecordingError
-        If `path` does not contain a recording.
+        If `path` does not contain a recording, or no message can be recovered.
     OutputError
         If the recording cannot be written or is still being recorded.
     """
@@ -257,7 +294,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     n, summaries = 0, []
     topics: dict[str, Topic] = {}
     # A crash at a split leaves an empty file.
-    empty_files = [file for file in files if file.stat().st_size < len(_MAGIC)]
+    empty_files = [file for file in files if file.stat().st_size < len(MAGIC)]
     if len(empty_files) == len(files):
         raise RecordingError(f'{path} cannot be repaired: all .mcap files are empty')
     for file in empty_files:
@@ -271,6 +308,8 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
         for line in lines:
             report(line)
         summaries.append(_summary_of(file, topics))
+    if n and not any(summary.counts.total() for summary in summaries):
+        raise RecordingError(f'{path}: nothing recovered: there is no complete message')
     if path.is_dir():
         try:
             write_metadata(path, summaries, topics)

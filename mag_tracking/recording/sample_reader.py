@@ -2,12 +2,15 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.message_arrays import magnetic_fields
 from mag_tracking.messages.schema import acceleration_of, reading_of, readings_of
+from mag_tracking.messages.shapes import MagneticField
 from mag_tracking.messages.types import (
     FIELD_READINGS,
     IMU,
@@ -21,9 +24,11 @@ from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.recording.raw_message import RawMessage
 from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sensor_topics import FrameCheck, examine_topics, fault_of
 from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
 from mag_tracking.report.metrics import Truth
+from mag_tracking.stages.health.clocks import ClockSpan
 
 TRUTH_PREFIX = 'ground_truth/'
 """Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
@@ -31,6 +36,10 @@ never for tracking."""
 BATCH_SIZE = 256
 """Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
 few readings. The caller can stop only between batches."""
+MAX_UNKNOWN_SENSORS = 20
+"""Number of sensors outside the network whose readings are counted by sensor."""
+MAX_TOPICS = 10
+"""Number of topics that an error lists."""
 
 
 class SampleReader:
@@ -46,15 +55,17 @@ class SampleReader:
     Attributes
     ----------
     rejected : Counter
-        Number of messages and readings that cannot be used, by cause.
+        Number of messages and readings that cannot be used, or not as they are, by cause.
+    clocks : dict of str to ClockSpan
+        First and last timestamp of each sensor so far, with their log times.
     namespace : str
         Namespace of the network's relative topics in the recording.
 
     Raises
     ------
     RecordingError
-        If the recording contains no topic of the network, its namespace is ambiguous, or `truth`
-        is not a topic with poses.
+        If the recording contains no topic of the network, its namespace is ambiguous, `truth` is
+        not a topic with poses, or the messages of the sensors have another type or encoding.
     """
 
     def __init__(self, recording: Recording, network: SensorNetwork,
@@ -77,18 +88,30 @@ class SampleReader:
                                  f'{recording.types.get(truth, "not in the recording")}; '
                                  f'topics with poses: {", ".join(pose_topics) or "none found"}')
         self.rejected: Counter[str] = Counter()
+        self._unknown_sensors: set[str] = set()
+        self.clocks: dict[str, ClockSpan] = {}
         self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
-        if recording.types and not self._is_batched \
-                and not any(t in recording.types for t in self._sensors):
-            field_topics = sorted(t for t, k in recording.types.items() if k == MAGNETIC_FIELD)
+        self._frames = FrameCheck(recording.path)
+        self._unstamped, self._shared = self._examine_topics(network)
+
+    def _examine_topics(self, network: SensorNetwork) -> tuple[frozenset[str], frozenset[str]]:
+        """Find the topics without timestamps and those of several sensors; check the types."""
+        types = self._recording.types
+        topics = [topic for topic in self._sensors if topic in types]
+        for topic in topics:
+            if types[topic] != MAGNETIC_FIELD:
+                raise RecordingError(f'{self._recording.path}: {topic} carries {types[topic]}, not '
+                                     f'{MAGNETIC_FIELD} in tesla: convert the messages')
+        if self._is_batched:
+            return frozenset(), frozenset()
+        found = examine_topics(self._recording, topics or [
+            topic for topic, kind in types.items() if kind == MAGNETIC_FIELD])
+        shared = found.shared(network.names)
+        if types and not topics and not shared:
             raise RecordingError(
-                f'{recording.path} has none of the network\'s topics ({", ".join(self._sensors)}); '
-                f'topics with magnetic fields: {", ".join(field_topics) or "none found"}')
-        for topic in self._sensors:
-            kind = recording.types.get(topic)
-            if kind not in (None, MAGNETIC_FIELD):
-                raise RecordingError(f'{recording.path}: {topic} carries {kind}, '
-                                     f'not {MAGNETIC_FIELD}')
+                f'{self._recording.path} has none of the network\'s topics '
+                f'({", ".join(self._sensors)}); {_candidates(types, found.frames)}')
+        return found.unstamped, shared
 
     def missing_topics(self) -> list[str]:
         """List the network's topics that are not in the recording.
@@ -96,9 +119,9 @@ class SampleReader:
         Returns
         -------
         list of str
-            Empty if one topic carries the readings of all sensors.
+            Empty if one topic carries the readings of several sensors.
         """
-        if self._is_batched:
+        if self._is_batched or self._shared:
             return []
         return [t for t in self._sensors if t not in self._recording.types]
 
@@ -116,14 +139,19 @@ class SampleReader:
         """
         for block in self._recording.blocks(progress=progress):
             for first in range(0, len(block), BATCH_SIZE):
-                readings = self._block_readings(block.part(slice(first, first + BATCH_SIZE)))
+                # A recording may have thousands of other topics.
+                part = block.part(slice(first, first + BATCH_SIZE)).with_used_kinds()
+                readings = self._block_readings(part)
                 if len(readings):
                     yield readings
+            # The bytes of this chunk are freed before the next chunk is read.
+            del block
 
     def _block_readings(self, block: MessageBlock) -> Readings:
         """Decode the readings in a block, in order of log time, and collect the true poses."""
         names = {number: self._sensors[kind.topic] for number, kind in block.kinds.items()
-                 if kind.topic in self._sensors and kind.type == MAGNETIC_FIELD and kind.is_cdr}
+                 if kind.topic in self._sensors and kind.type == MAGNETIC_FIELD and kind.is_cdr
+                 and kind.topic not in self._shared}
         rows = np.flatnonzero(np.isin(block.channel, list(names)))
         fields = magnetic_fields(block.data, block.begin[rows], block.end[rows])
         rows = rows[fields.is_decoded]
@@ -131,10 +159,13 @@ class SampleReader:
         sensors = tuple(dict.fromkeys(names.values()))
         sensor_index = np.zeros(max(names, default=0) + 1, dtype=np.int64)
         sensor_index[list(names)] = [sensors.index(name) for name in names.values()]
+        self._check_frames(block, rows, fields.frame[fields.is_decoded])
         C = fields.covariance
         batch = Readings(
-            sensors, sensor_index[block.channel[rows]], fields.stamp_ns[fields.is_decoded],
+            sensors, sensor_index[block.channel[rows]],
+            self._stamps(block, rows, fields.stamp_ns[fields.is_decoded]),
             fields.field[fields.is_decoded], None if C is None else C[fields.is_decoded])
+        self._note_clocks(batch, block.log_time_ns[rows])
         other_messages = np.setdiff1d(np.arange(len(block)),
                                       np.append(rows, self._truth.add_block(block)))
         parts, n_added = [], 0
@@ -145,6 +176,29 @@ class SampleReader:
                     parts += [batch.part(slice(n_added, n)), record]
                     n_added = n
         return Readings.joined([*parts, batch.part(slice(n_added, None))])
+
+    def _check_frames(self, block: MessageBlock, rows: IntArray, frames: IntArray) -> None:
+        """Check the frames, numbered (k,), of the messages `rows` (k,) of a block."""
+        expected = np.full(max(block.kinds, default=0) + 1, -1, dtype=np.int64)
+        for number, kind in block.kinds.items():
+            expected[number] = self._frames.number(kind.topic)
+        for i in np.flatnonzero(frames != expected[block.channel[rows]]):
+            message = block.message(int(rows[i]))
+            self._frames.check(message.topic, decode(message).header.frame_id, int(frames[i]))
+
+    def _stamps(self, block: MessageBlock, rows: IntArray, stamps_ns: IntArray) -> IntArray:
+        """Timestamps of the messages `rows` (k,) of a block; log times on unstamped topics."""
+        for number, kind in block.kinds.items() if self._unstamped else ():
+            if kind.topic in self._unstamped:
+                is_zero = (block.channel[rows] == number) & (stamps_ns == 0)
+                stamps_ns = np.where(is_zero, block.log_time_ns[rows], stamps_ns)
+                self._count_unstamped(kind.topic, int(is_zero.sum()))
+        return stamps_ns
+
+    def _count_unstamped(self, topic: str, n: int) -> None:
+        """Count messages whose log time is used."""
+        if n:
+            self.rejected[f'message with header.stamp 0 on {topic}, read with its log time'] += n
 
     def readings_as_received(self, progress: Progress | None = None
                              ) -> Iterator[tuple[Readings, int]]:
@@ -198,23 +252,55 @@ class SampleReader:
             is_truth = self._truth.accepts(message.topic, message.type)
             is_batch = message.topic == self._batch_topic and message.type == FIELD_READINGS
             imu_sensors = imus.get(message.topic) if message.type == IMU else None
-            if sensor is None and imu_sensors is None and not is_truth and not is_batch:
+            is_shared = message.topic in self._shared
+            if sensor is None and not (is_shared or imu_sensors or is_truth or is_batch):
                 continue
             try:
+                if (sensor is not None or is_shared) and message.type != MAGNETIC_FIELD:
+                    raise RecordingError(f'{message.topic} carries {message.type}')
                 content = decode(message)
                 readings = readings_of(content) if is_batch else None
             except RecordingError:
-                self.rejected[f'undecodable message on {message.topic}'] += 1
+                self.rejected[fault_of(message)] += 1
                 continue
             if is_truth:
                 self._truth.add(message.topic, content)
             elif readings is not None:
-                yield self._network_readings(readings), message.log_time_ns
+                readings = self._network_readings(readings)
+                self._note_clocks(readings, np.full(len(readings), message.log_time_ns))
+                yield readings, message.log_time_ns
             elif imu_sensors is not None:
                 for name in imu_sensors:
                     yield acceleration_of(content, name), message.log_time_ns
-            elif sensor is not None:
-                yield reading_of(content, sensor), message.log_time_ns
+            elif sensor is not None or is_shared:
+                frame = content.header.frame_id
+                if not is_shared:
+                    self._frames.check(message.topic, frame)
+                yield from self._single(content, frame if sensor is None or is_shared else sensor,
+                                        message)
+
+    def _single(self, content: MagneticField, sensor: str, message: RawMessage
+                ) -> Iterator[tuple[Readings, int]]:
+        """Convert a decoded message, unless its sensor is not in the network."""
+        reading = reading_of(content, sensor)
+        if message.topic in self._unstamped and reading.stamp_ns[0] == 0:
+            reading = replace(reading, stamp_ns=np.array([message.log_time_ns]))
+            self._count_unstamped(message.topic, 1)
+        self._note_clocks(reading, np.array([message.log_time_ns]))
+        reading = self._network_readings(reading)
+        if len(reading):
+            yield reading, message.log_time_ns
+
+    def _note_clocks(self, readings: Readings, log_time_ns: IntArray) -> None:
+        """Extend the clock of each sensor by readings, which were logged at `log_time_ns` (n,)."""
+        for j in np.unique(readings.sensor).tolist():
+            stamps, received = readings.stamp_ns, log_time_ns
+            if len(readings.names) > 1:
+                is_own = readings.sensor == j
+                stamps, received = stamps[is_own], received[is_own]
+            span = ClockSpan.of(stamps, received)
+            earlier = self.clocks.get(readings.names[j], span)
+            self.clocks[readings.names[j]] = earlier.until(span)
 
     def _network_readings(self, readings: Readings) -> Readings:
         """Select the readings of the network's sensors, and count readings of other sensors."""
@@ -223,8 +309,11 @@ class SampleReader:
                             dtype=bool)[readings.sensor]
         if is_known.all():
             return readings
-        self.rejected.update(f'reading of {name}, which is not in the network'
-                             for name in readings.part(~is_known).sensor_names())
+        for name in readings.part(~is_known).sensor_names():
+            if len(self._unknown_sensors) < MAX_UNKNOWN_SENSORS:
+                self._unknown_sensors.add(name)
+            label = name if name in self._unknown_sensors else 'another sensor'
+            self.rejected[f'reading of {label}, which is not in the network'] += 1
         return readings.part(is_known)
 
     def truth_arrays(self) -> dict[str, Truth]:
@@ -238,6 +327,17 @@ class SampleReader:
         self.rejected.update(self._truth.rejected)
         self._truth.rejected.clear()
         return self._truth.arrays()
+
+
+def _candidates(types: Mapping[str, str], frames: Mapping[str, set[str]]) -> str:
+    """Format the topics with magnetic fields and several `frames`, or all topics if there are
+    none."""
+    fields = [topic + (f' (with the frame_ids {", ".join(sorted(frames[topic]))})'
+                       if len(frames.get(topic, ())) > 1 else '')
+              for topic, kind in sorted(types.items()) if kind == MAGNETIC_FIELD]
+    topics = [f'{topic} ({kind})' for topic, kind in sorted(types.items())[:MAX_TOPICS]]
+    return f'topics with magnetic fields: {", ".join(fields)}' if fields else \
+        f'topics with magnetic fields: none found; topics: {", ".join(topics)}'
 
 
 def _namespace(recording: Recording, network: SensorNetwork) -> str:

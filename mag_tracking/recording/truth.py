@@ -6,13 +6,15 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import RecordingError
+from mag_tracking.geometry import quaternion_between
 from mag_tracking.messages.message_arrays import poses
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.messages.types import ODOMETRY, POSE, POSE_WITH_COVARIANCE
-from mag_tracking.recording.csv_file import number, read_csv
+from mag_tracking.recording.csv_file import Lines, number, read_csv
 from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.report.metrics import Truth
 from mag_tracking.units import LATEST_NS, NS
@@ -23,6 +25,8 @@ _Rows: TypeAlias = tuple[IntArray, FloatArray]
 """Times (n,) [ns], and positions and quaternions (n, 7)."""
 _NS_PER_UNIT = {'stamp_ns': 1, 't': NS, 'time': NS}
 """Nanoseconds per unit, by column."""
+_POSITION, _QUATERNION, _MOMENT = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw'), ('mx', 'my', 'mz')
+"""Columns of a truth table."""
 
 
 class TruthTopics:
@@ -119,23 +123,28 @@ class TruthTopics:
             order = np.argsort(stamps, kind='stable')
             if len(order):
                 out[topic.removeprefix(self._prefix).removesuffix('/pose')] = (
-                    stamps[order], pose[order, :3], pose[order, 3:])
+                    stamps[order], pose[order, :3], _unit(pose[order, 3:]))
         return out
 
 
-def read_truth_table(path: str | PathLike[str]) -> dict[str, Truth]:
+def read_truth_table(path: str | PathLike[str],
+                     axis: ArrayLike = (0.0, 0.0, 1.0)) -> dict[str, Truth]:
     """Read true poses in the frame of the network from a CSV file.
 
     Parameters
     ----------
     path : path_like
-        Columns: `stamp_ns` [ns], or `t` or `time` [s], since 1970; `x`, `y` [m]; optionally `z` [m]
-        and `qx`, `qy`, `qz`, `qw`. Other columns are ignored.
+        Columns: `stamp_ns` [ns], or `t` or `time` [s], since 1970; `x`, `y` [m]; optionally `z`
+        [m], and `qx`, `qy`, `qz`, `qw` or, for a magnet, the direction `mx`, `my`, `mz` of its
+        moment. Other columns are ignored.
+    axis : (3,) array
+        Direction of the moment in the frame of the magnet, for `mx`, `my`, `mz`.
 
     Returns
     -------
     dict of str to Truth
-        One target, named after the file without its suffix.
+        One target, named after the file without its suffix. Quaternions are NaN if the file has no
+        orientations.
 
     Raises
     ------
@@ -144,19 +153,39 @@ def read_truth_table(path: str | PathLike[str]) -> dict[str, Truth]:
     """
     header, rows = read_csv(path)
     time = next((name for name in _NS_PER_UNIT if name in header), None)
-    missing = [name for name in ('x', 'y') if name not in header]
-    if time is None or missing:
-        raise RecordingError(f'{path}: column {(missing or ["stamp_ns, t or time"])[0]} is missing')
-    names = [name for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw') if name in header]
+    if time is None:
+        raise RecordingError(f'{path}: column stamp_ns, t or time is missing')
     stamps = np.array([_stamp(path, line, time, row[header.index(time)]) for line, row in rows],
                       dtype=np.int64)
-    values = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(rows), 1))
-    columns = ['x', 'y', 'z', 'qx', 'qy', 'qz', 'qw']
-    for name in names:
-        values[:, columns.index(name)] = [
-            number(path, line, name, row[header.index(name)], True) for line, row in rows]
+
+    position = _columns(path, header, rows, _POSITION[:2 + ('z' in header)])
+    if any(name in header for name in _QUATERNION):
+        quaternion = _unit(_columns(path, header, rows, _QUATERNION))
+    elif any(name in header for name in _MOMENT):
+        quaternion = np.array([quaternion_between(axis, m) if m.any() else np.full(4, np.nan)
+                               for m in _columns(path, header, rows, _MOMENT)])
+    else:
+        quaternion = np.full((len(rows), 4), np.nan)
+    position = np.pad(position, ((0, 0), (0, 3 - position.shape[1])))
     order = np.argsort(stamps, kind='stable')
-    return {Path(path).stem: (stamps[order], values[order, :3], values[order, 3:])}
+    return {Path(path).stem: (stamps[order], position[order], quaternion[order])}
+
+
+def _unit(quaternion: FloatArray) -> FloatArray:
+    """Normalise quaternions (n, 4); zeros, which mark an unknown orientation, become NaN."""
+    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    unit: FloatArray = quaternion / np.where(norm > 0.0, norm, np.nan)
+    return unit
+
+
+def _columns(path: str | PathLike[str], header: list[str], rows: Lines,
+             names: tuple[str, ...]) -> FloatArray:
+    """Values (n, len(names)) of columns that must exist and be finite."""
+    for name in names:
+        if name not in header:
+            raise RecordingError(f'{path}: column {name} is missing')
+    return np.array([[number(path, line, name, row[header.index(name)], True) for name in names]
+                     for line, row in rows])
 
 
 def _stamp(path: str | PathLike[str], line: int, column: str, text: str) -> int:

@@ -39,8 +39,20 @@ class _Network(Protocol):
     def __len__(self) -> int: ...
 
 
-def _ellipse(position: FloatArray, covariance: FloatArray, n: int = 48) -> FloatArray:
-    """Points (n, 2) on the edge of the 90 % region of a position in the plane."""
+def ellipse_points(position: FloatArray, covariance: FloatArray, n: int = 48) -> FloatArray:
+    """Return points on the edge of the 90 % region of a position in the plane.
+
+    Parameters
+    ----------
+    position : (2,) or (3,) array, m
+    covariance : (2, 2) array, m²
+    n : int
+        Number of points.
+
+    Returns
+    -------
+    (n, 2) array, m
+    """
     values, vectors = np.linalg.eigh(covariance)
     angle = np.linspace(0.0, 2.0 * np.pi, n)
     circle = np.stack([np.cos(angle), np.sin(angle)])
@@ -91,7 +103,7 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
     f, unit = scale_of(span)
     _draw_arrivals(axes, log, f)
     for k in range(0, len(positions), max(1, len(positions) // 14)):
-        axes.fill(*(f * _ellipse(positions[k], covariance[k])).T, color='k', lw=0,
+        axes.fill(*(f * ellipse_points(positions[k], covariance[k])).T, color='k', lw=0,
                   alpha=0.04 if ambiguous[k] else 0.10)
     axes.plot(*(f * _without_switches(positions, covariance)).T, color='k', lw=1.8, label='track')
     if ambiguous.any():

@@ -11,7 +11,8 @@ from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 
 Truth: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
-"""Timestamps (n,) [ns], positions (n, 3) [m] and quaternions (n, 4) xyzw of a target."""
+"""Timestamps (n,) [ns], positions (n, 3) [m] and quaternions (n, 4) xyzw of a target; quaternions
+are NaN if the orientation is unknown."""
 
 
 class PassErrors(TypedDict):
@@ -37,8 +38,9 @@ class MagnetErrors(TypedDict):
     """Mean position error [m]."""
     position_max: float
     """Maximum position error [m]."""
-    axis_median_deg: float
-    """Median angle between the estimated and the true axis [deg]."""
+    axis_median_deg: float | None
+    """Median angle between the estimated and the true axis [deg]; None if the truth has no
+    orientations."""
     anees: float
     """Mean NEES per axis of the position."""
     n: int
@@ -204,13 +206,16 @@ def magnet_errors(log: TrackLog | SmoothedLog, truth: Truth, axis: ArrayLike = (
         return None
     nearest = np.abs(truth[0][None, :] - stamps[:, None]).argmin(axis=1)
     error = np.array(log.position)[skip:] - truth[1][nearest]
-    true_axis = rotation_from_quaternion(truth[2][nearest]) @ np.asarray(axis, dtype=float)
-    moment = np.array(log.moment)[skip:]
+    has_axis = np.isfinite(truth[2][nearest]).all(axis=1)
+    true_axis = rotation_from_quaternion(truth[2][nearest][has_axis]) \
+        @ np.asarray(axis, dtype=float)
+    moment = np.array(log.moment)[skip:][has_axis]
     cosine = np.einsum('ni,ni->n', moment, true_axis) / (
         np.linalg.norm(moment, axis=1) * np.linalg.norm(true_axis, axis=1))
     C = np.array(log.covariance)[skip:, :3, :3]
     nees = np.einsum('ni,ni->n', error, np.linalg.solve(C, error[:, :, None])[:, :, 0]) / 3
     magnitude = np.linalg.norm(error, axis=1)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     return {'position_mean': float(magnitude.mean()), 'position_max': float(magnitude.max()),
-            'axis_median_deg': float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1))))),
+            'axis_median_deg': float(np.median(angle)) if len(angle) else None,
             'anees': float(nees.mean()), 'n': len(stamps)}

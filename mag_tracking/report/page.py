@@ -1,7 +1,7 @@
 """Self-contained HTML pages of reports and of the live view.
 
-The template and the scripts are in the folder `page`. The plotting library comes from the package
-plotly.
+The template and the scripts are in the folder `page`. The folder `plotly` contains the bundle
+plotly.js-cartesian-dist-min of npm, a third of the size of the bundle with all chart types.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from typing import Any
 
 from mag_tracking.report.json_text import json_text
 
-SCRIPTS = ('scene', 'map', 'curves', 'tables', 'live', 'main', 'start')
+SCRIPTS = ('scene', 'map', 'body', 'overview', 'curves', 'tables', 'live', 'main', 'start')
 """Script files, in loading order."""
 REPORT = 'report.html'
 """File name of the report in a result folder."""
@@ -93,8 +93,8 @@ def _html(title: str, data: Mapping[str, Any]) -> str:
 
     In the data, `<` is escaped so that no string can close the script element.
     """
-    folder = resources.files('mag_tracking.report') / 'page'
-    plotly = resources.files('plotly') / 'package_data' / 'plotly.min.js'
+    report = resources.files('mag_tracking.report')
+    folder, plotly = report / 'page', report / 'plotly' / 'plotly-cartesian.min.js'
     script = '\n'.join(_read(folder / f'{name}.js') for name in SCRIPTS)
     parts = (('@TITLE@', escape(title)), ('@STYLE@', _read(folder / 'page.css')),
              ('@PLOTLY@', _read(plotly)), ('@SCRIPT@', script),

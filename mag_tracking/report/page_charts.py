@@ -90,7 +90,8 @@ def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str
     """
     return {'type': 'heatmap', 'x': numbers(x), 'y': numbers(y), 'z': numbers(z),
             'colorscale': scale, 'zmin': low, 'zmax': high, 'hoverongaps': False,
-            'colorbar': {'title': {'text': title, 'side': 'right'}}}
+            # The padding contains the buttons, as the right margin of `map.js`.
+            'colorbar': {'title': {'text': title, 'side': 'right'}, 'x': 1.0, 'xpad': 42}}
 
 
 def sensor_trace(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:

@@ -8,13 +8,14 @@ from scipy.special import chdtri
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.report.packed import Packed, packed
+from mag_tracking.report.road import Road
 from mag_tracking.report.scales import scale_of
 from mag_tracking.report.track_log import TrackLog
 from mag_tracking.units import NS
 
 MAX_SENSORS = 8
 """Maximum number of sensors per track; those with the strongest fields are included."""
-MAX_BYTES = 4_000_000
+MAX_BYTES = 2_300_000
 """Approximate size limit of the track data [bytes]. Larger reports show fewer poses per track."""
 MAX_TRACKS = 1_000
 """Maximum number of tracks in a report."""
@@ -24,6 +25,9 @@ MAX_MARGIN_RATIO = 6.0
 """Maximum margin of the map around the network, as a multiple of the span of the network."""
 SINGLE_SENSOR_MARGIN_M = 10.0
 """Maximum margin of the map around a network without extent, such as a single sensor [m]."""
+
+
+NO_ROAD = Road()
 
 
 class Sensors(Protocol):
@@ -44,8 +48,8 @@ class Sensors(Protocol):
     def __len__(self) -> int: ...
 
 
-def scene_of(network: Sensors, begin_ns: int, end_ns: int,
-             tracks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def scene_of(network: Sensors, begin_ns: int, end_ns: int, tracks: Sequence[Mapping[str, Any]],
+             road: Road = NO_ROAD) -> dict[str, Any]:
     """Return the content of the map with a time slider as JSON-compatible values.
 
     Parameters
@@ -55,6 +59,7 @@ def scene_of(network: Sensors, begin_ns: int, end_ns: int,
         Time range; the page shows seconds since `begin_ns`.
     tracks : sequence of dict
         Tracks, as returned by `track_entry`.
+    road : Road, optional
 
     Returns
     -------
@@ -68,7 +73,10 @@ def scene_of(network: Sensors, begin_ns: int, end_ns: int,
     factor, unit = scale_of(span if span > 0.0 else SINGLE_SENSOR_MARGIN_M)
     return {'frame': network.frame, 'begin_ns': str(begin_ns), 'begin': 0.0,
             'end': (end_ns - begin_ns) / NS, 'scale': {'factor': factor, 'unit': unit},
-            'sensors': {'names': list(network.names), 'x': packed(xy[:, 0]), 'y': packed(xy[:, 1])},
+            'sensors': {'names': list(network.names), 'x': packed(xy[:, 0]), 'y': packed(xy[:, 1]),
+                        'z': packed(network.positions[:, 2])},
+            'road': {name: [{'x': packed(line[:, 0]), 'y': packed(line[:, 1])} for line in lines]
+                     for name, lines in (('areas', road.areas), ('markings', road.markings))},
             'reach': _box(low - margin, high + margin),
             'most_reach': _box(low - max_margin, high + max_margin),
             'tracks': list(tracks)}
@@ -133,7 +141,7 @@ def _pose_size(log: TrackLog) -> int:
     n_sensors = min(MAX_SENSORS, len(log.measured[0]))
     n_arrivals = len({name for row in log.arrivals for name in row})
     # Base64 needs four bytes for three.
-    return (4 * (120 + 24 * n_sensors + 32 * n_arrivals)) // 3
+    return (4 * (160 + 24 * n_sensors + 32 * n_arrivals)) // 3
 
 
 def thin_poses(log: TrackLog, max_poses: int) -> list[int]:
@@ -182,6 +190,9 @@ def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
                        _array([log.velocity[k] for k in rows], 3),
                        _array([log.covariance[k] for k in rows], 6, 6),
                        np.array([log.ambiguous[k] for k in rows], bool))
+    # A magnet, which has no kind, is drawn by its moment in place of its length.
+    length = np.array([log.length[k] if log.kind[k] else np.nan for k in rows], dtype=float)
+    columns |= _body(length, _array([log.moment[k] for k in rows], 3))
     columns |= _innovation(np.array([log.nis[k] for k in rows], dtype=float),
                            np.array([log.degrees_of_freedom[k] for k in rows], dtype=float))
     return {'id': log.id, 'key': log.id, 'ended': log.ended, 'columns': columns,
@@ -191,7 +202,8 @@ def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
 
 
 def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance: FloatArray,
-                 ambiguous: bool, fields: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+                 ambiguous: bool, length: float,
+                 fields: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return a fitted pass as a track with constant velocity, in JSON-compatible values.
 
     Parameters
@@ -203,6 +215,8 @@ def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance
     covariance : (n, 6, 6) array
     ambiguous : bool
         Whether all poses are marked as ambiguous.
+    length : float, m
+        Length of the row of dipoles.
     fields : sequence of dict
         Fields, as returned by `field_entry`.
 
@@ -212,6 +226,7 @@ def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance
     """
     n = len(times)
     columns = _columns(times, state[:, :3], state[:, 3:], covariance, np.full(n, ambiguous))
+    columns |= _body(np.full(n, length), np.full((n, 3), np.nan))
     columns |= _innovation(np.full(n, np.nan), np.zeros(n))
     return {'id': track_id, 'key': track_id, 'ended': True, 'columns': columns, 'arrivals': {},
             'fields': list(fields), 'doubts': [''] * n, 'smoothed': None, 'truth': None,
@@ -245,13 +260,13 @@ def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
     Parameters
     ----------
     track_id : int
-    points : (n, 2) or (n, 3) array, m, world frame
+    points : (n, 3) array, m, world frame
 
     Returns
     -------
     dict
     """
-    return {'id': track_id, 'x': packed(points[:, 0]), 'y': packed(points[:, 1])}
+    return {'id': track_id, **{name: packed(points[:, a]) for a, name in enumerate('xyz')}}
 
 
 def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -299,8 +314,15 @@ def _columns(times: FloatArray, position: FloatArray, velocity: FloatArray, C: F
         't': packed(times), 'x': packed(position[:, 0]), 'y': packed(position[:, 1]),
         'z': packed(position[:, 2]), 'vx': packed(velocity[:, 0]), 'vy': packed(velocity[:, 1]),
         'xx': packed(C[:, 0, 0], 'f4'), 'xy': packed(C[:, 0, 1], 'f4'),
-        'yy': packed(C[:, 1, 1], 'f4'), 'speed_sd': packed(_speed_std(velocity, C), 'f4'),
+        'yy': packed(C[:, 1, 1], 'f4'), 'xz': packed(C[:, 0, 2], 'f4'),
+        'zz': packed(C[:, 2, 2], 'f4'), 'speed_sd': packed(_speed_std(velocity, C), 'f4'),
         'ambiguous': packed(ambiguous, 'u1')}
+
+
+def _body(length: FloatArray, moment: FloatArray) -> dict[str, Packed]:
+    """Lengths (n,) of the rows of dipoles, NaN for magnets, and moments (n, 3) of n poses."""
+    return {'length': packed(length, 'f4'),
+            **{f'm{axis}': packed(moment[:, a], 'f4') for a, axis in enumerate('xyz')}}
 
 
 def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Packed]:

@@ -6,7 +6,7 @@ import ipaddress
 import secrets
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from logging import getLogger
 from typing import Protocol
@@ -141,8 +141,8 @@ class PageServer:
         # Compression would be repeated for every viewer.
         async with serve(self._handle_viewer, sock=self._socket,
                          process_request=self._process_request, compression=None, max_size=1024,
-                         max_queue=4, logger=LOG, open_timeout=10.0, close_timeout=1.0,
-                         ping_interval=10.0, ping_timeout=60.0):
+                         max_queue=4, logger=LOG, server_header=None, open_timeout=10.0,
+                         close_timeout=1.0, ping_interval=10.0, ping_timeout=60.0):
             while not self._stop.is_set():
                 self._send_updates()
                 try:
@@ -220,8 +220,17 @@ class PageServer:
 
     def _process_request(self, _: ServerConnection, request: Request) -> Response | None:
         """Return the response to an HTTP request, or None to accept a WebSocket connection."""
-        address = urlsplit(request.path)
-        refusal = self._refusal(request, parse_qs(address.query).get('token', [''])[0])
+        try:
+            address = urlsplit(request.path)
+            origins = [urlsplit(text).netloc for text in request.headers.get_all('Origin')]
+            hosts = request.headers.get_all('Host')
+        except ValueError:
+            return _response(HTTPStatus.BAD_REQUEST, b'Malformed address or origin.\n',
+                             'text/plain')
+        if len(hosts) != 1 or len(origins) > 1:
+            return _response(HTTPStatus.BAD_REQUEST, b'Expected one Host and at most one Origin.\n',
+                             'text/plain')
+        refusal = self._refusal(hosts[0], origins, self._tokens_of(request, address.query))
         if refusal:
             return _response(HTTPStatus.FORBIDDEN, refusal.encode('utf-8'), 'text/plain')
         if address.path == STREAM:
@@ -229,19 +238,36 @@ class PageServer:
         if address.path != PAGE:
             return _response(HTTPStatus.NOT_FOUND, b'Not found.\n',
                              'text/plain')
-        return _response(HTTPStatus.OK, self._page, 'text/html', 'gzip')
-
-    def _refusal(self, request: Request, token: str) -> str:
-        """Reason for refusing a request; empty if the request is permitted."""
-        host = request.headers.get('Host', '')
+        response = _response(HTTPStatus.OK, self._page, 'text/html', 'gzip')
         if self._token:
-            if not secrets.compare_digest(token.encode('utf-8'), self._token.encode('utf-8')):
+            # The page removes the token from its address; reloads and the stream use the cookie.
+            response.headers['Set-Cookie'] = \
+                f'{self._cookie}={self._token}; HttpOnly; SameSite=Strict'
+        return response
+
+    @property
+    def _cookie(self) -> str:
+        """Name of the cookie with the token. Servers on other ports receive it too."""
+        return f'mag_tracking_{self.port}'
+
+    def _tokens_of(self, request: Request, query: str) -> list[str]:
+        """Tokens in the query and in the cookies of a request."""
+        pairs = [part.strip().partition('=')
+                 for line in request.headers.get_all('Cookie') for part in line.split(';')]
+        return [*parse_qs(query).get('token', []),
+                *(value for name, _, value in pairs if name == self._cookie)]
+
+    def _refusal(self, host: str, origins: Sequence[str], tokens: Sequence[str]) -> str:
+        """Reason for refusing a request; empty if the request is permitted."""
+        if self._token:
+            # Bytes outside ASCII are surrogates.
+            if not any(secrets.compare_digest(token.encode('utf-8', 'surrogatepass'),
+                                              self._token.encode('utf-8')) for token in tokens):
                 return 'Missing or wrong token. Open the address that was printed at startup.\n'
         # DNS rebinding: a foreign page can make its own host name resolve to this address.
         elif not is_loopback(_host_name(host)):
             return 'This page is available on the local machine only.\n'
-        origin = request.headers.get('Origin')
-        if origin is not None and urlsplit(origin).netloc != host:
+        if any(origin != host for origin in origins):
             return 'Connections from pages of other origins are refused.\n'
         return ''
 

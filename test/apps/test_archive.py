@@ -27,6 +27,7 @@ from mag_tracking.stages.track.doubts import CLOCKS_APART
 from support.archives import command, rows, same_tables, wait_for
 from support.bundled import DATA, NETWORK_FILE, QUICK
 
+NETWORK = read_network(NETWORK_FILE)
 ROAD = DATA / 'two_way_road' / 'two_way_road.mcap'
 
 
@@ -121,7 +122,7 @@ def test_an_archive_contains_all_valid_recordings(tmp_path, recordings, capsys):
         np.testing.assert_array_equal(poses.sort_values('stamp_ns')[['x', 'y']].values,
                                       result.poses['position'][:, :2])
     row_of = {row[1]: row for row in rows(out, 'recordings')}
-    assert len(row_of) == 4 and 'not an MCAP file' in row_of[str(damaged)][3]
+    assert len(row_of) == 4 and 'not an MCAP file' in row_of[str(damaged)][4]
     sensors = duckdb.sql(f"SELECT DISTINCT sensor, accepted > 500, noise_x BETWEEN 1e-9 AND 1e-7 "
                          f"FROM read_parquet('{out}/health/**/*.parquet') ORDER BY 1").fetchall()
     assert sensors == [('mag_1', True, True), ('mag_2', True, True)]
@@ -208,14 +209,14 @@ def test_quiet_intervals_longer_than_the_lookback_separate_segments(
     writer.close()
     assert writer.n_segments == n
     for k in range(n):
-        stored = [frame for chunk in read_segment(tmp_path / f'segment-{k}.pickle')
+        stored = [frame for chunk in read_segment(tmp_path / f'segment-{k}', NETWORK)
                   for frame, _ in chunk.frames()]
         first = next(i for i, frame in enumerate(stored) if frame.target_present)
         # The segment contains all frames that a new track may use, and the frame that ends it.
         assert stored[first].stamp_ns - stored[0].stamp_ns in (3_000_000_000, 3_100_000_000)
         assert not stored[-1].target_present
     assert max(len(chunk.stamp_ns) for k in range(n) for chunk in read_segment(
-        tmp_path / f'segment-{k}.pickle')) <= 7 + 31
+        tmp_path / f'segment-{k}', NETWORK)) <= 7 + 31
 
 
 def test_a_backward_time_jump_between_segments_loses_no_frames(tmp_path):
@@ -223,20 +224,20 @@ def test_a_backward_time_jump_between_segments_loses_no_frames(tmp_path):
     for frame in frames((60.0, False)) + frames((60.0, False), (2.0, True), (9.0, False)):
         writer.add_frame(frame, {})
     writer.close()
-    stored = [frame for chunk in read_segment(tmp_path / 'segment-0.pickle')
+    stored = [frame for chunk in read_segment(tmp_path / 'segment-0', NETWORK)
               for frame, _ in chunk.frames()]
     assert len(stored) == 31 + 20 + 1
-    assert not (tmp_path / 'segment-1.pickle').exists()
+    assert not (tmp_path / 'segment-1').exists()
 
 
 def test_doubts_are_stored_with_the_frames_of_a_segment(tmp_path):
     """Doubts are stored at the start of each segment and whenever they change."""
     writer = SegmentWriter(tmp_path, 3.0)
-    first, second = {'mag_1': ((1, None),)}, {'mag_1': ((1, 5),)}
+    first, second = ({'doubtful_background': {'mag_1': ((1, end),)}} for end in (None, 5))
     for k, frame in enumerate(frames((5.0, False), (2.0, True), (9.0, False))):
         writer.add_frame(frame, first if k < 60 else second)
     writer.close()
-    stored = [(frame.stamp_ns, doubts) for chunk in read_segment(tmp_path / 'segment-0.pickle')
+    stored = [(frame.stamp_ns, doubts) for chunk in read_segment(tmp_path / 'segment-0', NETWORK)
               for frame, doubts in chunk.frames() if doubts is not None]
     assert [doubts for _, doubts in stored] == [first, second]
     assert stored[0][0] < 5_000_000_000 and stored[1][0] == 6_000_000_000

@@ -5,11 +5,13 @@ import errno
 import gc
 import json
 import os
-import pickle
+import re
 import shutil
 import subprocess
 import threading
+from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 
@@ -63,7 +65,7 @@ def test_an_incompatible_folder_is_refused(tmp_path, recordings, complete_archiv
     shutil.copytree(complete_archive, old_archive)
     metadata = json.loads((old_archive / 'archive.json').read_text())
     (old_archive / 'archive.json').write_text(json.dumps({**metadata, 'schema': 0}))
-    with pytest.raises(OutputError, match='tables of version 0; this program writes version 2'):
+    with pytest.raises(OutputError, match='tables of version 0; this program writes version 3'):
         archive(paths, NETWORK_FILE, settings, old_archive)
     (old_archive / 'archive.json').write_text('{"schema"')
     with pytest.raises(OutputError, match='cannot read'):
@@ -108,6 +110,40 @@ def test_a_scheduler_requires_workers(tmp_path, recordings, monkeypatch):
         run = archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
                       scheduler=local_cluster.scheduler_address)
         assert len(run.done) == 3
+
+
+def test_a_scheduler_with_certificates_is_used(tmp_path, recordings, complete_archive):
+    from distributed import LocalCluster
+    from distributed.security import Security
+
+    certificate, key = str(tmp_path / 'certificate.pem'), str(tmp_path / 'key.pem')
+    subprocess.run(['openssl', 'req', '-x509', '-newkey', 'rsa:2048', '-nodes', '-days', '2',
+                    '-subj', '/CN=localhost', '-addext', 'subjectAltName=IP:127.0.0.1',
+                    '-keyout', key, '-out', certificate], check=True, capture_output=True)
+    security = Security(require_encryption=True, tls_ca_file=certificate, **{
+        f'tls_{role}_{name}': path for role in ('client', 'scheduler', 'worker')
+        for name, path in (('cert', certificate), ('key', key))})
+    with LocalCluster(n_workers=1, threads_per_worker=1, processes=True, host='127.0.0.1',
+                      protocol='tls://', security=security, dashboard_address='127.0.0.1:0') as tls:
+        address = tls.scheduler_address
+        assert address.startswith('tls://')
+        arguments = command(recordings, tmp_path / 'out', tmp_path, '--scheduler', address)
+        refused = subprocess.run(arguments, capture_output=True, text=True)
+        names = re.findall(r'DASK_\w+', refused.stderr)
+        assert refused.returncode == 1 and 'requires certificates' in refused.stderr
+        files = {name: key if name.endswith('KEY') else certificate for name in names}
+        finished = subprocess.run(arguments, capture_output=True, text=True,
+                                  env=os.environ | files)
+    assert 'recordings failed: 1' in finished.stdout, finished.stderr
+    assert same_tables(tmp_path / 'out', complete_archive)
+
+
+def test_a_worker_that_is_lost_during_the_start_is_reported(tmp_path, recordings, monkeypatch):
+    (tmp_path / 'sitecustomize.py').write_text(
+        "import os, sys\nif '--multiprocessing-fork' in sys.argv: os._exit(1)\n")
+    monkeypatch.setenv('PYTHONPATH', f'{tmp_path}:{os.environ.get("PYTHONPATH", "")}')
+    with pytest.raises(ClusterError, match='the worker processes did not start'):
+        archive([recordings], NETWORK_FILE, settings_for('vehicle', QUICK), tmp_path / 'out')
 
 
 def test_a_failed_client_does_not_block_the_next_one(tmp_path, recordings, monkeypatch):
@@ -277,17 +313,83 @@ def test_an_empty_recording_has_null_values(tmp_path):
         vehicle_path('straight_car_right').read_bytes()[:500])
     archive([tmp_path], NETWORK_FILE, settings_for('vehicle', QUICK), tmp_path / 'out')
     (row,) = rows(tmp_path / 'out', 'recordings')
-    assert row[2] is None and row[3] == ''
+    assert row[2:4] == (None, None) and row[4] == ''
 
 
-def test_a_full_disk_is_reported_even_if_the_file_has_been_created(tmp_path, monkeypatch):
+@pytest.fixture
+def job(tmp_path):
+    """Tasks of a bundled recording, of which the first has been executed."""
     job = archive_work.Job(vehicle_path('straight_car_right'), tmp_path / 'work', tmp_path / 'out',
                            read_network(NETWORK_FILE), settings_for('vehicle', QUICK))
     job.work_folder.mkdir()
     archive_work.cut(job)
+    return job
 
-    def dump(content, stream):
+
+def test_damaged_intermediate_results_are_reported(job):
+    """A file of Python objects is damaged, too: to read it would execute code."""
+    chunk = job.cut_folder / 'segment-0' / '0.npz'
+    with np.load(chunk) as arrays:
+        content = dict(arrays)
+    for damaged in ({'stamp_ns': content['stamp_ns']},
+                    content | {'field': np.array([object])},
+                    content | {'text': np.array('{"doubts"')}):
+        np.savez(chunk, **damaged)
+        with pytest.raises(RecordingError, match='0.npz is damaged'):
+            archive_work.track_segment(job, 0)
+    np.savez(chunk, **content)
+    archive_work.track_segment(job, 0)
+    result = job.segment_folder(0) / 'tracked.json'
+    for text in ('', '[]', '{"n_tracks": 1}', result.read_text().replace('rows', 'sensors')
+                 .replace('n_passes', 'passes')):
+        result.write_text(text)
+        with pytest.raises(RecordingError, match='tracked.json is damaged'):
+            archive_work.join(job)
+    (job.cut_folder / 'columns.json').write_text('{"frames": 1}')
+    with pytest.raises(RecordingError, match='columns.json is damaged'):
+        archive_work.cut(job)
+
+
+def test_a_recording_with_a_damaged_summary_is_tracked_again(
+        tmp_path, complete_archive, recordings):
+    """If it is not tracked in this run, its row is missing, which is reported."""
+    out, settings, lines = tmp_path / 'out', settings_for('vehicle', QUICK), []
+    shutil.copytree(complete_archive, out)
+    other, path = sorted(out.glob('done/straight_*.json'))
+    for summary in (other, path):
+        summary.write_text(summary.read_text().replace('"size"', '"sice"'))
+    run = archive([recordings / 'straight_small_left.mcap'], NETWORK_FILE, settings, out,
+                  report=lines.append)
+    assert len(run.done) == 1 and not run.failed and len(rows(out, 'recordings')) == 2
+    assert len(lines) == 2 and str(path) in lines[0] and str(other) in lines[1]
+    archive([recordings], NETWORK_FILE, settings, out, report=lines.append)
+    assert same_tables(out, complete_archive)
+
+
+@pytest.mark.parametrize('damage', [
+    lambda text: '', lambda text: '[' * 100_000, lambda text: text[:len(text) // 2],
+    lambda text: '{}', lambda text: '[]',
+    lambda text: text.replace('"size": ', '"size": null, "_": '),
+    lambda text: text.replace('"tracks": ', '"tracks": 9e99, "_": '),
+    lambda text: text.replace('"frames": ', '"frames": 9223372036854775808, "_": '),
+    lambda text: text.replace('"error": ""', '"error": null')])
+def test_damaged_summaries_are_named(tmp_path, complete_archive, damage):
+    shutil.copytree(complete_archive / 'done', tmp_path / 'done')
+    path, *others = sorted(tmp_path.glob('done/*.json'))
+    recording = Path(json.loads(path.read_text())['source'])
+    path.write_text(damage(path.read_text()))
+    (tmp_path / 'archive.json').write_text('{"schema": 3}')
+    lines = []
+    with ArchiveFolder(tmp_path, {}) as dataset:
+        with pytest.raises(OutputError, match=path.name):
+            dataset.done(recording)
+        assert len(list(dataset.summaries(lines.append))) == len(others) == 2
+    assert len(lines) == 1 and path.name in lines[0]
+
+
+def test_a_full_disk_is_reported_even_if_the_file_has_been_created(job, monkeypatch):
+    def no_space(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    monkeypatch.setattr(pickle, 'dump', dump)
+    monkeypatch.setattr(os, 'fsync', no_space)
     with pytest.raises(OutputError, match='No space left on device'):
         archive_work.track_segment(job, 0)

@@ -8,7 +8,8 @@ import pytest
 from mag_tracking.apps.doctor import Doctor
 from mag_tracking.apps.doctor_rejections import ADVICE, rejection_findings
 from mag_tracking.pipeline import settings_for
-from mag_tracking.stages.calibrate.stage import REJECTIONS, Calibrate
+from mag_tracking.stages.calibrate.rejections import REJECTIONS
+from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.diagnosis import Cause
 from support.networks import line_network
 from support.samples import MagSample, one

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mag_tracking.calibration.doubtful_times import (
+    DOUBTFUL_BACKGROUND,
     are_doubtful,
     doubtful_since,
     merged,
@@ -165,7 +166,7 @@ def calibrated(parts, network=None, **changes):
 
 def test_covariance_includes_the_error_of_a_provisional_background():
     stage, covariance, stamps = calibrated([readings(traffic(2.0), 60.0)])
-    times = stage.doubtful_intervals()['mag_1']
+    times = stage.input_doubts()[DOUBTFUL_BACKGROUND]['mag_1']
     doubtful = np.array([are_doubtful(times, s) for s in stamps.tolist()])
     (begin, end), = times
     assert 6e9 <= begin < 15e9 < end < 60e9
@@ -179,22 +180,22 @@ def test_doubtful_intervals_do_not_depend_on_the_batches():
     stage, covariance, _ = calibrated([batch_of_all])
     parts = [batch_of_all.part(slice(i, i + 7)) for i in range(0, len(batch_of_all), 7)]
     other_stage, other_covariance, _ = calibrated(parts)
-    assert stage.doubtful_intervals() == other_stage.doubtful_intervals() != {}
+    assert stage.input_doubts() == other_stage.input_doubts() != {}
     np.testing.assert_array_equal(covariance, other_covariance)
 
 
 def test_doubtful_intervals_follow_the_clock():
     network = line_network(1)
     stage, *_ = calibrated([readings(traffic(2.0), 14.0)], network)
-    (begin, _), = stage.doubtful_intervals()['mag_1']
+    (begin, _), = stage.input_doubts()[DOUBTFUL_BACKGROUND]['mag_1']
     stage.update_network(dataclasses.replace(network, clock_offset=np.array([0.5])))
-    assert stage.doubtful_intervals()['mag_1'] == ((begin - 500_000_000, None),)
+    assert stage.input_doubts()[DOUBTFUL_BACKGROUND]['mag_1'] == ((begin - 500_000_000, None),)
 
 
 def test_a_given_background_is_not_doubtful():
     network = dataclasses.replace(line_network(1), background=(EARTH,))
     stage, covariance, _ = calibrated([readings(traffic(2.0), 30.0)], network)
-    assert stage.doubtful_intervals() == {}
+    assert stage.input_doubts() == {}
     np.testing.assert_array_equal(stage.background('mag_1'), EARTH)
 
 

@@ -328,6 +328,73 @@ def test_a_single_sensor_accepts_only_its_first_name():
     assert driver.counts()['readings of unknown sensors: B'] == 1
 
 
+def contested(sensors, *sources, seconds=30):
+    """Poll a driver to which each of `sources`, as (rate [Hz], reading, source), sends; return
+    (driver, simulated host, number of samples from each source).
+
+    The next poll returns one more reading of the last source.
+    """
+    sent = sorted((k / rate + 1e-3 * i, i) for i, (rate, _, _) in enumerate(sources)
+                  for k in range(round(seconds * rate)))
+    # The field tells the sources apart.
+    script = [[(reading if reading.field is None else reading._replace(field=(float(i), 0.0, 0.0)),
+                source)] for _, i in sent for _, reading, source in [sources[i]]]
+    driver, _, machine = driver_of([*script, script[-1]], sensors=sensors)
+    start_ns, n = machine.now_ns, [0] * len(sources)
+    for t, i in sent:
+        machine.now_ns = max(machine.now_ns, start_ns + round(t * 1e9))
+        for sample in poll_samples(driver, 0.0):
+            n[i] += isinstance(sample, AccelerationSample) or sample.field[0] == i
+    return driver, machine, n
+
+
+FIELD = Reading('', (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize('sensors, device, stray, named', [
+    ({'': 'mag_1'}, (FIELD, '10.0.0.5'), (FIELD, '10.0.0.66'), ('10.0.0.5', '10.0.0.66')),
+    # Topics of a broker, and one name of a sensor in the messages of two devices.
+    ({'': 'mag_1'}, (FIELD, 'road/1/mag'), (FIELD, 'test/mag'), ('road/1/mag', 'test/mag')),
+    ({'A': 'mag_1'}, (FIELD._replace(sensor='A'), 'road/1'), (FIELD._replace(sensor='A'), 'road/2'),
+     ('A from road/1', 'A from road/2')),
+    ({'': 'mag_1'}, (FIELD._replace(sensor='A'), ''), (FIELD._replace(sensor='B'), ''),
+     ('A (', 'B ('))])
+def test_two_sources_of_one_sensor_are_named_and_the_steadier_one_is_used(
+        sensors, device, stray, named):
+    driver, machine, (n_stray, n_device) = contested(sensors, (0.25, *stray), (20.0, *device))
+    assert n_device >= 0.9 * 600 and n_stray <= 1
+    assert all(name in driver.fault for name in named)
+    assert driver.counts()['source changes'] == 1
+    assert sum(driver.counts().values()) == 1 + 600 + 8
+    # The fault ends when the second source is silent.
+    machine.now_ns += 20_000_000_000
+    assert len(poll_samples(driver, 0.0)) == 1 and driver.fault == ''
+
+
+def test_a_sensor_weaker_than_the_earth_is_counted_once():
+    # The field of the first source is 0.
+    driver, *_ = contested({'': 'mag_1'}, (20.0, FIELD, ''), seconds=12)
+    assert [n for cause, n in driver.counts().items() if 'unit: mag_1' in cause] == [1]
+    driver, *_ = contested({'': 'mag_1'}, (20.0, FIELD, ''), seconds=4)
+    assert driver.counts() == {'samples: mag_1': 80}
+
+
+def test_a_field_and_an_acceleration_may_come_from_different_sources():
+    driver, _, n = contested({'A': 'mag_1'}, (20.0, FIELD._replace(sensor='A'), 'a/mag'),
+                             (20.0, Reading('A', None, (0.0, 0.0, 1.0)), 'a/acc'), seconds=5)
+    assert n == [100, 100] and driver.fault == '' and set(driver.clocks()) == {'a/mag', 'a/acc'}
+
+
+def test_thousands_of_sources_lock_no_sensor_out_and_keep_no_clocks():
+    strays = [(0.125, Reading('A', (0.0, 0.0, 0.0), ticks=k), f'10.1.{k // 256}.{k % 256}')
+              for k in range(5000)]
+    driver, _, n = contested({'A': 'mag_1'}, (50.0, Reading('A', (0.0,) * 3), '10.0.0.5'), *strays,
+                             seconds=8)
+    assert n[0] >= 0.7 * 400 and len(driver.clocks()) <= 2
+    assert '10.0.0.5' in driver.fault and len(driver.fault) < 400
+    assert len(driver.counts()) < 40
+
+
 def test_an_unused_sensor_is_ignored_without_a_count():
     driver, *_ = driver_of([[Reading('A', (1.0, 0.0, 0.0), sequence=1),
                              Reading('B', (2.0, 0.0, 0.0), sequence=1)]],

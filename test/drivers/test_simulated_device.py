@@ -144,11 +144,11 @@ def test_unsuitable_settings_and_networks_are_refused(tmp_path):
         SimulatedDevice(SimulatorSettings(network=str(NETWORK_FILE), lead=0.0))
 
 
-def drivers_file(tmp_path, sensors):
+def drivers_file(tmp_path, sensors, unit='T'):
     """Write a drivers file for the simulator; return its path."""
     path = tmp_path / 'drivers.yaml'
     path.write_text(f'road:\n  device: simulator\n  simulator: {{network: {NETWORK_FILE}, '
-                    f'moment: 0.0}}\n  sensors: {sensors}\n')
+                    f'moment: 0.0}}\n  sensors: {sensors}\n  unit: {unit}\n')
     return path
 
 
@@ -159,6 +159,15 @@ def test_listen_prints_rate_and_field_of_each_sensor(tmp_path, capsys):
     assert lines[0] == 'road: open'
     [rate] = re.findall(r'mag_2 +([\d.]+) Hz +2.0\d\d +15.\d+ +-4[89].\d+ uT', lines[-1])
     assert 80.0 < float(rate) < 120.0
+    assert 'unit' not in lines[-1]
+
+
+@pytest.mark.parametrize('unit, remark', [('G', 'below 10 uT'), ('100.0', 'very large')])
+def test_listen_names_a_field_of_implausible_strength(tmp_path, capsys, unit, remark):
+    path = drivers_file(tmp_path, '{mag_1: mag_1, mag_2: mag_2}', unit)
+    assert cli.main(['listen', str(path), '--seconds', '1']) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert re.search(f'mag_1 .*{remark}.*check `unit`', lines[1])
 
 
 def test_listen_reports_silent_sensors_and_invalid_arguments(tmp_path, capsys):

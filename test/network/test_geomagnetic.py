@@ -46,6 +46,20 @@ def test_the_field_in_sweden_points_north_and_down():
     assert 1.4e-5 < north < 1.7e-5 and 0.0 < east < 3e-6 and -5.2e-5 < up < -4.7e-5
 
 
+def test_the_field_at_a_pole_is_the_limit_of_the_field_beside_it():
+    for latitude in (-90.0, 90.0):
+        site = replace(LINKOPING, latitude=latitude)
+        beside = earth_field(replace(site, latitude=latitude * (1.0 - 1e-7)))
+        np.testing.assert_allclose(earth_field(site), beside, atol=1e-9)
+
+
+def test_the_field_is_linear_in_time():
+    days = (2026.0, 2026.5, 2026.501, 2027.0)
+    first, *between, last = (earth_field(replace(LINKOPING, year=year)) for year in days)
+    for year, field in zip(days[1:], between, strict=False):
+        np.testing.assert_allclose(field, first + (year - 2026.0) * (last - first), atol=1e-13)
+
+
 def test_longitudes_are_periodic():
     np.testing.assert_allclose(earth_field(replace(LINKOPING, longitude=-70.0)),
                                earth_field(replace(LINKOPING, longitude=290.0)), rtol=1e-12)

@@ -1,6 +1,8 @@
 """Driver node: published readings, diagnostics and lifecycle."""
 
+import socket
 import time
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from sensor_msgs.msg import Imu, MagneticField
 from mag_tracking.messages.schema import readings_of, stamp_ns
 from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
 from support.bundled import NETWORK_FILE
+from support.mqtt_broker import free_port
 from support.node_processes import MAX_S, call, start, stop
 from support.samples import samples_of
 from support.serial_line import SerialLine
@@ -266,4 +269,30 @@ def test_a_missing_port_is_reported_until_it_appears(board):
         assert spin_until(lambda: fields, 2.0)
     finally:
         exit_codes, outputs = stop([process])
+    assert exit_codes == [0], outputs
+
+
+def test_two_senders_of_one_sensor_are_named(ros, tmp_path):
+    node, spin_until = ros
+    port = free_port(socket.SOCK_DGRAM)
+    drivers = tmp_path / 'drivers.yaml'
+    drivers.write_text(f'board:\n  transport: udp\n  udp: {{port: {port}}}\n  framing: text\n'
+                       '  text: {fields: [x, y, z]}\n  unit: uT\n  sensor: mag_1\n')
+    diagnostics = listen(node, DiagnosticArray, '/diagnostics', RESULT_QOS)
+    fields = listen(node, MagneticField, '/mag_1/imu/mag')
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as device, \
+            closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as stray:
+        device.bind(('127.0.0.2', 0))
+        node.create_timer(0.02, lambda: device.sendto(b'20,3,-45\n', ('127.0.0.1', port)))
+        node.create_timer(1.5, lambda: stray.sendto(b'1,2,3\n', ('127.0.0.1', port)))
+        process = start('driver_node', '-p', f'drivers:={drivers}')
+        try:
+            assert spin_until(lambda: (s := status_of(diagnostics)) and '127.0.0.2' in s.message)
+            status = status_of(diagnostics)
+            assert status.level == DiagnosticStatus.ERROR and '127.0.0.1' in status.message
+            n = len(fields)
+            assert spin_until(lambda: len(fields) > n + 100)
+            assert {m.magnetic_field.y for _, m in fields[-100:]} == {3e-6}
+        finally:
+            exit_codes, outputs = stop([process])
     assert exit_codes == [0], outputs

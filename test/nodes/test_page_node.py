@@ -1,5 +1,6 @@
 """Live page of running nodes, over the middleware and in a browser."""
 
+import io
 import json
 import re
 import subprocess
@@ -7,19 +8,27 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from array import array
 
 import numpy as np
 import pytest
-from mag_tracking_msgs.msg import TrackArray
+from mag_tracking_msgs.msg import SmoothedTrack, TrackArray
+from visualization_msgs.msg import MarkerArray
 from websockets.sync.client import connect
 
 from mag_tracking.cli import main
-from mag_tracking.nodes.convert import track_of
-from mag_tracking.nodes.stage_node import STREAM_QOS
+from mag_tracking.errors import RecordingError
+from mag_tracking.messages.markers import sensor_markers
+from mag_tracking.messages.schema import track_dict
+from mag_tracking.network.file import read_network
+from mag_tracking.nodes.convert import to_message, track_of
+from mag_tracking.nodes.runner import TrackPrinter
+from mag_tracking.nodes.stage_node import LATCHED_QOS, RESULT_QOS, STREAM_QOS
 from support.browser import Page as Opened
 from support.browser import browser, needs_browser
 from support.bundled import NETWORK_FILE, vehicle_path
 from support.node_processes import MAX_S, environment
+from support.track_records import track_pose
 
 COMMAND = [sys.executable, '-m', 'mag_tracking.cli']
 RECORDING = vehicle_path('straight_car_right')
@@ -117,6 +126,81 @@ def test_a_renamed_tracker_is_found_and_may_be_restarted():
             run.communicate(timeout=MAX_S)
     finally:
         assert terminate(watch) == 0
+
+
+def track_message(**changes):
+    """TrackArray with one valid pose of a track at two sensors, with `changes` to the Track."""
+    content = track_dict(track_pose(1.0, 0.0), 'map')
+    content['arrivals'] = [{'arrival': 'left', 'weight': 1.0}]
+    return to_message(TrackArray, {'tracks': [content | changes]})
+
+
+MALFORMED_TRACKS = {
+    'mounting_of_5': {'mounting': array('d', 5 * [0.0])},
+    'covariance_of_10': {'mounting': array('d', 6 * [0.0]),
+                         'mounting_covariance': array('d', 10 * [0.0])},
+    'field_of_4': {'predicted_field': array('d', 4 * [0.0])},
+    'innovations_of_3': {'innovation_by_sensor': array('d', 3 * [0.0])},
+    'no_sensors': {'innovation_by_sensor': array('d'), 'predicted_field': array('d')},
+    'infinite_velocity': {'velocity': {'x': float('inf'), 'y': 0.0, 'z': 0.0}},
+    'nan_covariance': {'covariance': [float('nan')] * 36},
+    'no_arrivals': {'arrivals': []}}
+
+
+def publish_malformed_messages(node, spin_until):
+    """Publish the sensor markers, all malformed messages, and then a valid track."""
+    def publish(cls, topic, message, qos):
+        publisher = node.create_publisher(cls, f'/tracker_node/{topic}', qos)
+        assert spin_until(lambda: publisher.get_subscription_count())
+        publisher.publish(message)
+        return publisher
+
+    markers = sensor_markers(read_network(NETWORK_FILE))
+    publish(MarkerArray, 'sensor_markers', to_message(MarkerArray, markers), LATCHED_QOS)
+    publish(SmoothedTrack, 'smoothed', SmoothedTrack(track_id=1), RESULT_QOS)
+    publisher = publish(TrackArray, 'tracks', track_message(**MALFORMED_TRACKS['mounting_of_5']),
+                        RESULT_QOS)
+    for changes in MALFORMED_TRACKS.values():
+        publisher.publish(track_message(**changes))
+    publisher.publish(track_message())
+
+
+def test_malformed_messages_are_named_on_the_page(ros):
+    """The page names each topic with invalid messages, and shows the valid track."""
+    watch = command('watch', '--port', 0)
+    try:
+        url = address(watch)
+        publish_malformed_messages(*ros)
+        *_, last = messages_of(url, lambda m: f'tracks: {len(MALFORMED_TRACKS) + 1} invalid'
+                               in json.dumps(m))
+        assert any('smoothed: 1 invalid' in note['text'] for note in last['notes'])
+        tracks = next(messages_of(url, lambda m: m['type'] == 'scene'))['scene']['tracks']
+        assert len(tracks) == 1
+    finally:
+        assert terminate(watch) == 0
+
+
+@pytest.mark.parametrize('changes', MALFORMED_TRACKS.values(), ids=MALFORMED_TRACKS)
+def test_a_malformed_track_is_rejected(changes):
+    with pytest.raises(RecordingError, match='Track 1'):
+        track_of(track_message(**changes).tracks[0], n_sensors=2)
+
+
+def test_a_malformed_track_does_not_end_the_printing_of_poses(ros):
+    node, spin_until = ros
+    out = io.StringIO()
+    printer = TrackPrinter(out=out)
+    publisher = node.create_publisher(TrackArray, 'tracker_node/tracks', RESULT_QOS)
+    node.executor.add_node(printer)
+    try:
+        assert spin_until(lambda: publisher.get_subscription_count())
+        publisher.publish(track_message(**MALFORMED_TRACKS['mounting_of_5']))
+        publisher.publish(track_message())
+        assert spin_until(lambda: out.getvalue())
+        assert out.getvalue().count('\n') == 1
+    finally:
+        node.executor.remove_node(printer)
+        printer.destroy_node()
 
 
 def test_a_page_ends_with_the_command_that_started_it():

@@ -5,7 +5,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from mag_tracking.calibration.doubtful_times import merged
+from mag_tracking.calibration.doubtful_times import DOUBTFUL_BACKGROUND, merged
 from mag_tracking.messages.calibration_state import doubtful_times
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.sensor_rounds import SensorRounds
@@ -41,15 +41,16 @@ class Listener:
     @property
     def is_consistent(self):
         """Whether the received intervals equal the intervals of the calibration stage."""
-        return {n: t for n, t in self.times.items() if t} == self.stage.doubtful_intervals()
+        return {n: t for n, t in self.times.items() if t} == self.stage.input_doubts().get(
+            DOUBTFUL_BACKGROUND, {})
 
 
 def test_each_begin_and_end_of_a_doubt_is_reported_once_without_delay():
     listener, changes = Listener(), 0
     for k in range(len(READINGS) // BATCH_SIZE):
-        before = listener.stage.doubtful_intervals()
+        before = listener.stage.input_doubts()
         listener.feed(k)
-        changes += listener.stage.doubtful_intervals() != before
+        changes += listener.stage.input_doubts() != before
         listener.rounds.report_doubts()
         assert listener.is_consistent and listener.n == changes
     assert [len(t) for t in listener.times.values()] == [2, 2]
@@ -71,7 +72,7 @@ def test_rounds_of_any_length_agree_with_the_reports(steps, phase):
 def test_relearning_ends_a_doubt():
     """The doubt also ends if it began with the latest reading."""
     listener, n = Listener(), 0
-    while not listener.stage.doubtful_intervals():
+    while not listener.stage.input_doubts():
         listener.feed(n)
         n += 1
     listener.stage.forget(())

@@ -159,31 +159,39 @@ def test_json_messages_of_a_magnetic_field_are_read(seconds, nanoseconds, source
 
 
 @pytest.mark.parametrize('change, cause', [
-    (lambda m: m.pop('magnetic_field'), 'magnetic_field or timestamp is missing'),
-    (lambda m: m.pop('header'), 'magnetic_field or timestamp is missing'),
-    (lambda m: m['header'].update(stamp={'sec': 'x'}), 'sec is missing'),
-    (lambda m: m['header'].update(stamp={'sec': True, 'nanosec': 0}), 'sec is missing'),
+    (lambda m: m.pop('magnetic_field'), '^magnetic_field$'),
+    (lambda m: m.pop('header'), 'header.stamp or timestamp'),
+    (lambda m: m['header'].update(stamp={'sec': 'x'}), 'sec in its time'),
+    (lambda m: m['header'].update(stamp={'sec': True, 'nanosec': 0}), 'sec in its time'),
     (lambda m: m['header']['stamp'].update(sec=10**10), ' sec is out of range: 1'),
     (lambda m: m['header']['stamp'].update(nanosec=10**25), 'nanosec is out of range: 1'),
-    (lambda m: m['magnetic_field'].pop('z'), r'magnetic_field\.z is missing'),
+    (lambda m: m['magnetic_field'].pop('z'), r'magnetic_field\.z$'),
     (lambda m: m['magnetic_field'].update(z='1'), "is not a number: '1'"),
     (lambda m: m.update(magnetic_field_covariance=[1.0]), 'covariance'),
-    (lambda m: m.update(magnetic_field=3.0), r'magnetic_field\.x is missing')])
+    (lambda m: m.update(magnetic_field=3.0), r'magnetic_field\.x$')])
 def test_invalid_json_messages_are_rejected(change, cause, tmp_path):
     message = {'header': {'stamp': {'sec': 1, 'nanosec': 2}},
                'magnetic_field': {'x': 1e-5, 'y': None, 'z': 2}}
-    read = field_decoder('jsonschema', 'M', SCHEMA)
+    read = field_decoder('json', 'M', SCHEMA)
     good = read(json.dumps(message).encode())
     assert np.isnan(good['magnetic_field']['y']) and good['header']['stamp']['nanosec'] == 2
     change(message)
     bad = json.dumps(message).encode()
     with pytest.raises(ValueError, match=cause):
         read(bad)
-    path = write_mcap(tmp_path / 'a.mcap', 'json', ('M', 'jsonschema', SCHEMA), [
-        ('/mag_1/imu/mag', k, data) for k, data in enumerate((bad, b'\xff{', b'[' * 100_000, b''))])
-    found = mt.read_recording(path, NETWORK_FILE)
-    assert len(found.readings) == 0
-    assert found.rejected == {'undecodable message on /mag_1/imu/mag': 4}
+    rest = json.dumps({'header': {'stamp': {'sec': 1, 'nanosec': 2}},
+                       'magnetic_field': {'x': 1e-5, 'y': None, 'z': 2}}).encode()
+    for last, n in ((rest, 1), (b'', 0)):
+        path = write_mcap(tmp_path / 'a.mcap', 'json', ('M', 'jsonschema', SCHEMA), [
+            ('/mag_1/imu/mag', k, data)
+            for k, data in enumerate((bad, b'\xff{', b'[' * 100_000, last))])
+        if n == 0:
+            with pytest.raises(RecordingError, match='no message of the sensors can be read'):
+                mt.read_recording(path, NETWORK_FILE)
+            continue
+        found = mt.read_recording(path, NETWORK_FILE)
+        assert len(found.readings) == n and sum(found.rejected.values()) == 3
+        assert all('/mag_1/imu/mag' in cause for cause in found.rejected)
 
 
 def protobuf_class():
@@ -219,6 +227,27 @@ def test_protobuf_messages_of_a_magnetic_field_are_read(source, expected, tmp_pa
                       messages)
     found = mt.track(path, NETWORK_FILE, settings=QUICK)
     np.testing.assert_array_equal(found.poses, expected.poses)
+
+
+@pytest.mark.parametrize('part, cause', [
+    ('timestamp', 'message without header.stamp or timestamp'),
+    ('magnetic_field', 'message without magnetic_field')])
+def test_protobuf_messages_without_a_part_are_rejected_by_its_name(part, cause, tmp_path):
+    """Protobuf does not encode default values, so a message that was not set reads as zero."""
+    Magnetic, descriptors = protobuf_class()
+    messages = []
+    for k in range(100):
+        m = Magnetic()
+        # The value 0 of a field that was set is a reading.
+        m.timestamp.seconds, m.magnetic_field.x = 1_790_000_000 + k, 1e-5 if k else 0.0
+        if k % 4 == 1:
+            m.ClearField(part)
+        messages.append(('/mag_1/imu/mag', k, m.SerializeToString()))
+    found = mt.read_recording(write_mcap(
+        tmp_path / 'p.mcap', 'protobuf', ('lab.Magnetic', 'protobuf', descriptors), messages),
+        NETWORK_FILE)
+    assert found.rejected == {f'{cause} on /mag_1/imu/mag': 25}
+    assert len(found.readings) == 75 and found.readings.stamp_ns.min() == 1_790_000_000 * 10**9
 
 
 def test_a_table_of_readings_becomes_a_recording(source, expected, tmp_path, capsys):

@@ -256,7 +256,7 @@ def test_unusable_recordings_are_refused(tmp_path, road_network):
     folder = tmp_path / 'folder'
     folder.mkdir()
     for path, message in ((tmp_path / 'nowhere.mcap', 'does not exist'), (empty, 'is empty'),
-                          (text, 'not an MCAP file'), (sqlite, 'cannot be read as a bag'),
+                          (text, 'not a recording but a text file'), (sqlite, 'not a recording'),
                           (folder, 'contains no recording')):
         with pytest.raises(RecordingError, match=message):
             Recording(path)

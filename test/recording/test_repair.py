@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
+from mag_tracking.cli import main
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.messages.types import MAGNETIC_FIELD, definition
 from mag_tracking.recording.reader import Recording
@@ -47,6 +48,10 @@ def test_repair_recovers_a_file_truncated_at_any_byte(tmp_path):
         file.write_bytes(data[:cut])
         before = {t: numbers(file, t)[0] for t in (TOPIC, '/other')}
         reports = []
+        if not any(before.values()):
+            with pytest.raises(RecordingError, match='nothing recovered'):
+                repair(file.parent, reports.append)
+            continue
         assert repair(file.parent, reports.append) == 1
         with open(file, 'rb') as stream:
             reader = make_reader(stream, validate_crcs=True)
@@ -68,6 +73,48 @@ def test_repair_recovers_a_file_truncated_at_any_byte(tmp_path):
             # The rebuilt indexes of the last chunk equal the original indexes.
             assert repaired.startswith(unfinished)
         assert repair(file.parent) == 0 and file.read_bytes() == repaired
+
+
+@pytest.mark.parametrize('compression', list(CompressionType))
+def test_repair_saves_the_beginning_of_a_cut_chunk(compression, tmp_path):
+    path = tmp_path / 'a.mcap'
+    with open(path, 'wb') as stream:
+        writer = Writer(stream, chunk_size=1 << 30, compression=compression)
+        writer.start('ros2')
+        channel = writer.register_channel('/x', 'json', 0)
+        rng = np.random.default_rng(0)
+        for k in range(4000):
+            writer.add_message(channel, k, rng.bytes(200) + struct.pack('<I', k), k)
+        writer.finish()
+    data = path.read_bytes()
+    entry, = make_reader(io.BytesIO(data)).get_summary().chunk_indexes
+    for share, least in ((0.0, 0), (0.5, 0.3), (0.95, 0.7)):
+        cut = data[:entry.chunk_start_offset + 60 + int(share * entry.compressed_size)]
+        path.write_bytes(cut)
+        n_before, reports = len(list(Recording(path).messages())), []
+        if not n_before:
+            assert main(['repair', str(path)]) == 1
+            continue
+        assert n_before >= least * 4000 and repair(path, reports.append) == 1
+        assert any(f'{n_before}' in line for line in reports)
+        with open(path, 'rb') as stream:
+            found = [m for _, _, m in make_reader(stream, validate_crcs=True).iter_messages()]
+        assert [struct.unpack('<I', m.data[-4:])[0] for m in found] == list(range(n_before))
+        assert [m.log_time for m in found] == list(range(n_before))
+        repaired = Recording(path)
+        assert not repaired.losses and len(list(repaired.messages())) == n_before
+        # The original end is kept beside the file.
+        kept = (tmp_path / 'a.mcap.cut').read_bytes()
+        assert cut.endswith(kept) and len(kept) > entry.compressed_size * share
+        (tmp_path / 'a.mcap.cut').unlink()
+
+
+def test_nothing_recovered_is_an_error(tmp_path, capsys):
+    unfinished, _ = unfinished_recording(tmp_path)
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(unfinished[:50])
+    assert main(['repair', str(path)]) == 1
+    assert 'nothing recovered' in capsys.readouterr().err
 
 
 def stamp_ns_of(message):
@@ -138,7 +185,7 @@ def test_repair_refuses_files_that_are_no_recording(tmp_path):
     with pytest.raises(RecordingError, match='contains no .mcap file'):
         repair(tmp_path / 'nothing')
     (tmp_path / 'x.mcap').write_text('nonsense of some length')
-    with pytest.raises(RecordingError, match='x.mcap is not an MCAP file'):
+    with pytest.raises(RecordingError, match='x.mcap is not a recording'):
         finish_file(tmp_path / 'x.mcap')
     assert (tmp_path / 'x.mcap').read_text() == 'nonsense of some length'
 

@@ -24,6 +24,8 @@ from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.truth import TruthTopics, read_truth_table
 from mag_tracking.recording.tum_file import write_tum
 from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.report.metrics import magnet_errors
+from mag_tracking.report.track_log import SmoothedLog
 from support.bundled import QUICK, vehicle_path
 from support.networks import line_network
 from support.samples import MagSample, sample_dict
@@ -82,7 +84,7 @@ def test_poses_are_read_in_blocks_and_sorted_by_timestamp():
         message('/ground_truth/car/pose', 10, 'utm'), message('/elsewhere', 40),
         message('/ground_truth/truck/pose', 50)])
     assert sorted(topics.add_block(block).tolist()) == [0, 1, 4]
-    coded = MessageBlock(block.data, {n: kind._replace(is_cdr=False)
+    coded = MessageBlock(block.data, {n: kind._replace(encoding='json')
                                       for n, kind in block.kinds.items()}, block.channel,
                          block.log_time_ns, block.begin, block.end)
     assert not len(topics.add_block(coded))
@@ -133,6 +135,8 @@ def test_a_table_gives_the_same_errors_as_the_topic(tmp_path, road_network):
 
 @pytest.mark.parametrize('text, message', [
     ('t,y\n1,2\n', 'column x is missing'), ('x,y\n1,2\n', 'column stamp_ns, t or time is missing'),
+    ('t,x,y,qx,qy,qz\n1,2,3,0,0,0\n', 'column qw is missing'),
+    ('t,x,y,mx\n1,2,3,0\n', 'column my is missing'),
     ('t,x,y\n1,2\n', 'row 2: expected 3 columns'), ('t,x,y\n1,2,north\n', "row 2: y is 'north'"),
     ('t,x,y\n,1,2\n', 'row 2: t is not a finite number'), ('t,x,y\n', 'has no rows'),
     ('t,x,y\n1,2,inf\n', 'row 2: y is not a finite number'),
@@ -149,7 +153,31 @@ def test_a_table_with_a_byte_order_mark_is_read(tmp_path):
     stamps, position, quaternion = read_truth_table(tmp_path / 'truth.csv')['truth']
     assert stamps.tolist() == [10**9, 2 * 10**9]
     assert position.tolist() == [[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]]
-    assert quaternion.tolist() == [[0.0, 0.0, 0.0, 1.0]] * 2
+    assert quaternion.shape == (2, 4) and np.isnan(quaternion).all()
+
+
+@pytest.mark.parametrize('columns, row, expected', [
+    ('qx,qy,qz,qw', '0,0,0,1', 45.0), ('mx,my,mz', '1,0,0', 45.0), ('mx,my,mz', '0,0,-2', 135.0),
+    ('mx,my,mz', '0,0,0', None), ('note', 'none', None)])
+def test_the_axis_of_a_magnet_is_compared_only_with_true_orientations(tmp_path, columns, row,
+                                                                      expected):
+    """The magnet is magnetised along its x axis; its track has a moment between x and z."""
+    (tmp_path / 'truth.csv').write_text(f't,x,y,z,{columns}\n' + f'0,0,0,0,{row}\n1,0,0,0,{row}\n')
+    axis = (1.0, 0.0, 0.0)
+    (truth,) = read_truth_table(tmp_path / 'truth.csv', axis).values()
+    log = SmoothedLog(1)
+    log.stamp_ns, log.position = [0, 10**9], [np.zeros(3)] * 2
+    log.moment, log.covariance = [np.array([1.0, 0.0, 1.0])] * 2, [np.eye(6)] * 2
+    errors = magnet_errors(log, truth, axis, 0)
+    assert errors['axis_median_deg'] == (expected if expected is None else pytest.approx(expected))
+
+
+def test_a_pose_with_a_quaternion_of_zeros_has_no_true_orientation():
+    zeros = {**pose(1.0), 'orientation': {'w': 0.0}}
+    topics = TruthTopics('/ground_truth/', 'map')
+    topics.add_block(MessageBlock.of_messages([RawMessage('/ground_truth/a/pose', POSE, 0, encoder(
+        POSE)({'header': header_dict(1, 'map'), 'pose': zeros}), schema_of(POSE))]))
+    assert np.isnan(topics.arrays()['a'][2]).all()
 
 
 def test_a_missing_table_is_reported(tmp_path, road_network):

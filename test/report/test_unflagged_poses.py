@@ -48,7 +48,7 @@ def test_a_pose_near_any_present_vehicle_is_not_wrong():
 def test_the_fraction_of_wrong_poses_is_reported():
     summary = {'diagnoses': [], 'sensors': {}, 'counts': {'track': {}}, 'close_network': False,
                'tracks': [],
-               'frames_too_long': None, 'clocks_apart': '', 'disturbances': [],
+               'frames_too_long': None, 'lanes': None, 'clocks_apart': '', 'disturbances': [],
                'target': 'vehicle', 'unflagged_poses': counts(200, 3)}
     assert [n.text.partition(':')[2][:27] for n in notes_of(summary)] == [
         ' 200, of which 3 (1.5%) are']

@@ -26,9 +26,8 @@ def archive_recordings(folder):
 
 
 def rows(folder, table):
-    """Read all rows of an archive table, sorted, without its columns of times with a time zone."""
-    # DuckDB requires another library for times with a time zone.
-    columns = [c.name for c in TABLES[table] if c.kind != 't']
+    """Read all rows of an archive table, sorted."""
+    columns = [c.name for c in TABLES[table]]
     files = folder / ('recordings.parquet' if table == 'recordings' else f'{table}/**/*.parquet')
     # The number makes the order unique for rows with the same source and timestamp.
     order = [n for n in ('source', 'track_id', 'number', 'stamp_ns', 'sensor') if n in columns]

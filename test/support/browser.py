@@ -3,10 +3,14 @@
 import contextlib
 import shutil
 import time
+from urllib.parse import urlsplit
 
 import pytest
 
 NAMES = ('chromium', 'chromium-browser', 'google-chrome', 'chrome')
+BUTTONS = {'Download plot as a PNG', 'Zoom', 'Pan', 'Zoom in', 'Zoom out', 'Reset axes', 'Play',
+           'Latest', 'Show this track'}
+"""Labels of all buttons of the pages. None of them sends data to another machine."""
 
 
 def chromium():
@@ -42,16 +46,19 @@ class Page:
         self.page.on('console', self._record_message)
         self.page.on('pageerror', lambda error: self.page_errors.append(str(error)))
         self.requests = []
-        self.page.on('request', lambda request: self.requests.append(request.url))
+        # The context also reports the requests of windows that the page opens.
+        self.page.context.on('request', lambda request: self.requests.append(request.url))
+        self.page.on('websocket', lambda socket: self.requests.append(socket.url))
+        self.url = url
         self.page.goto(url)
 
     def _record_message(self, message):
         if message.type in ('error', 'warning'):
             self.page_errors.append(message.text)
 
-    def value(self, expression):
-        """Evaluate a JavaScript expression in the page, and return its value."""
-        return self.page.evaluate(expression)
+    def value(self, expression, argument=None):
+        """Evaluate a JavaScript expression or function in the page, and return its value."""
+        return self.page.evaluate(expression, argument)
 
     def wait(self, expression, seconds=60.0):
         """Wait until a JavaScript expression is true; fail after `seconds`."""
@@ -60,6 +67,38 @@ class Page:
         while not self.value(expression):
             assert time.monotonic() < end, f'{expression} has not become true'
             self.page.wait_for_timeout(20)
+
+    def assert_private(self):
+        """Assert that all buttons are known, and that none of them requests another origin."""
+        found = self.value('''[...document.querySelectorAll('button, a[href], form, [role=button]')]
+            .map(e => e.dataset.title || e.title || e.ariaLabel || e.textContent)''')
+        assert {*found} <= BUTTONS
+        self.value('''[...document.querySelectorAll('button')]
+            .filter(e => e.checkVisibility()).forEach(e => e.click())''')
+        self.page.wait_for_timeout(100)
+        assert len(self.page.context.pages) == 1
+        own = urlsplit(self.url)
+        assert [url for url in self.requests if urlsplit(url).scheme not in ('blob', 'data')
+                and (urlsplit(url).netloc != own.netloc
+                     or own.scheme == 'file' and url != self.url)] == []
+
+    def assert_complete(self):
+        """Assert that each visible plot has content, and that its buttons cover none of it."""
+        empty, covered = self.value('''(() => {
+            const shown = [...document.querySelectorAll('.js-plotly-plot')]
+              .filter(plot => plot.checkVisibility());
+            const name = plot => plot.id || plot.closest('.card').innerText;
+            const overlaps = (a, b) => a.left < b.right && b.left < a.right
+              && a.top < b.bottom && b.top < a.bottom;
+            const parts = '.nsewdrag, .legend, .g-xtitle, .g-ytitle, .cbtitle, .cbaxis, .xtick';
+            return [
+              shown.filter(plot => !plot.data.some(d => Array.from(d.y).some(v => v !== null)))
+                .map(name),
+              shown.filter(plot => [...plot.querySelectorAll('.modebar-group')].some(group =>
+                [...plot.querySelectorAll(parts)].some(part => overlaps(
+                  group.getBoundingClientRect(), part.getBoundingClientRect())))).map(name)];
+            })()''')
+        assert empty == [] and covered == []
 
     def move_slider(self, t):
         """Move the slider to time `t` [s] as a user does, and wait until the page is redrawn."""
@@ -74,6 +113,15 @@ class Page:
         return self.value('''(() => {
             const pose = document.getElementById('map').data.find(d => d.meta === 'pose');
             return pose ? [pose.x[0], pose.y[0]] : null; })()''')
+
+    def is_within_map(self, names):
+        """Whether the traces of the map with these names or `meta` are within its axes."""
+        return self.value('''names => { const map = document.getElementById('map');
+            const [[x0, x1], [y0, y1]] = ['xaxis', 'yaxis'].map(a => map._fullLayout[a].range);
+            const traces = map.data.filter(d => names.includes(d.name) || names.includes(d.meta));
+            return traces.length >= names.length && traces.every(d =>
+              d.x.every(x => x === null || x0 <= x && x <= x1)
+              && d.y.every(y => y === null || y0 <= y && y <= y1)); }''', names)
 
     def line_times(self):
         """Times [s] of the vertical lines that mark the current time, one per plot."""

@@ -235,6 +235,9 @@ class FakeRm3100(ContinuousChip):
         if register == 0x0B:
             self.stop()
         self.memory[register] = value
+        if register == 0x00:
+            assert value == 0x70, 'all axes must be measured'
+            self.begin(round(1e9 / self.GAIN[self.cycles][1]))
         if register == 0x01:
             self.stop()
             if value & 1:

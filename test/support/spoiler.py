@@ -172,3 +172,30 @@ def temperature_step(size, at, time_constant=3.0, sensor=None):
         added = size * -np.expm1(-since / time_constant) * _of(readings, sensor)
         return _with(readings, readings.field + added[:, None])
     return modify
+
+
+def transformed(sensor, matrix):
+    """Fault: the field of `sensor` (all if None) is multiplied by a gain or a matrix (3, 3)."""
+    def modify(readings):
+        changed = readings.field @ (np.eye(3) * matrix if np.isscalar(matrix) else matrix).T
+        return _with(readings, np.where(_of(readings, sensor)[:, None], changed, readings.field))
+    return modify
+
+
+def offset(sensor, vector):
+    """Fault: a constant `vector` (3,) [T] is added to the field of `sensor`."""
+    def modify(readings):
+        return _with(readings, readings.field + np.where(_of(readings, sensor)[:, None], vector,
+                                                         0.0))
+    return modify
+
+
+def exchanged(first, second):
+    """Fault: two sensors are connected to each other's topics."""
+    def modify(readings):
+        names = list(readings.names)
+        a, b = names.index(first), names.index(second)
+        sensor = readings.sensor.copy()
+        sensor[readings.sensor == a], sensor[readings.sensor == b] = b, a
+        return dataclasses.replace(readings, sensor=sensor)
+    return modify

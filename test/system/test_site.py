@@ -9,6 +9,8 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
+from support.browser import Page as Opened
+from support.browser import browser, needs_browser
 from support.bundled import ROOT
 
 BUILD_TIMEOUT_S = 900.0
@@ -76,6 +78,16 @@ def test_every_internal_link_leads_to_a_page_and_an_anchor(site):
                     and anchor not in pages[target].anchors:
                 broken.append((str(path.relative_to(site)), link))
     assert n > 1000 and broken == []
+
+
+@needs_browser
+@pytest.mark.timeout(BUILD_TIMEOUT_S)
+def test_pages_contact_no_other_machine(site):
+    with browser() as chromium:
+        for name in PAGES:
+            page = Opened(chromium, (site / f'{name}.html').as_uri())
+            assert {urlsplit(url).scheme for url in page.requests} <= {'file', 'data'}, name
+            page.page.close()
 
 
 @pytest.mark.timeout(BUILD_TIMEOUT_S)

@@ -12,7 +12,7 @@ from bench.bench import Peer, bank_ratio
 from support.bundled import NETWORK_FILE, vehicle_path
 
 HEAVY_MODULES = ('dask', 'distributed', 'pyarrow', 'scipy', 'matplotlib', 'rclpy',
-                 'google.protobuf', 'rosbags', 'plotly')
+                 'google.protobuf', 'rosbags')
 RECORDING = str(vehicle_path('straight_car_right'))
 IMPORT_SCRIPT = '''
 import contextlib, io, json, sys

@@ -47,6 +47,69 @@ def test_the_page_shows_all_tracked_poses(chromium, scene, server, records):
 
 
 @needs_browser
+def test_no_button_contacts_another_origin(chromium, scene, server, records):
+    feed(scene, records)
+    page = Opened(chromium, server.url)
+    page.wait('magTracking.connected && magTracking.drawn > 0')
+    page.assert_private()
+    page.page.close()
+
+
+@needs_browser
+def test_the_map_keeps_an_extent_that_holds_the_vehicle(chromium, scene, server, records):
+    """The extent changes at most once during a pass."""
+    page, extents, n = Opened(chromium, server.url), [], 0
+    page.wait('magTracking.connected')
+    for record in records:
+        feed(scene, [record])
+        if isinstance(record, FieldFrame) or record.ended or record.ambiguous:
+            continue
+        page.wait(f'magTracking.latestDrawn === "{record.stamp_ns}"')
+        assert page.is_within_map(['body', '90 % region'])
+        extents.append(tuple(page.value('magTracking.scene.reach.map')))
+        n += 1
+    assert n > 10 and len(set(extents)) <= 2
+    page.page.close()
+
+
+@needs_browser
+def test_fields_scroll_before_during_and_after_a_pass(chromium, scene, server, records):
+    """The panels show the field of each frame, whether or not a target is tracked."""
+    page = Opened(chromium, server.url)
+    page.wait('magTracking.connected')
+    frames = [r for r in records if isinstance(r, FieldFrame)]
+    for n_s, with_track in ((-30, False), (-4, False), (0, True), (5, False), (30, False)):
+        shown = records if with_track else [
+            replace(f, stamp_ns=f.stamp_ns + n_s * SECOND_NS) for f in frames[-3:]]
+        feed(scene, shown)
+        last = [r for r in shown if isinstance(r, FieldFrame)][-1]
+        page.wait(f'magTracking.latestDrawn === "{last.stamp_ns}"')
+        t = (last.stamp_ns - int(page.value('magTracking.scene.begin_ns'))) / 1e9
+        page.wait(f'''[...document.querySelectorAll('#field .plot')].every(plot =>
+            Math.abs(plot.data[0].x.at(-1) - {t}) < 1e-6
+            && plot.layout.xaxis.range[0] <= {t} && {t} <= plot.layout.xaxis.range[1])''')
+        assert page.value(f'''Math.min(...[...document.querySelectorAll('#field .plot')]
+            .map(plot => plot.data[0].x[0])) >= {t} - 20.001''')
+    page.assert_complete()
+    assert page.page_errors == []
+    page.page.close()
+
+
+@needs_browser
+def test_a_phone_shows_map_and_curves_without_scrolling(chromium, scene, server, records):
+    feed(scene, records)
+    page = Opened(chromium, server.url, viewport={'width': 390, 'height': 844}, is_mobile=True,
+                  has_touch=True)
+    page.wait('magTracking.connected && document.querySelector("#field .plot .main-svg")')
+    bottom = page.value('document.getElementById("time").getBoundingClientRect().top')
+    for selector in ('#map', '#field .plot'):
+        box = page.value(f'document.querySelector("{selector}").getBoundingClientRect().toJSON()')
+        assert 0 <= box['top'] and box['bottom'] <= bottom, selector
+    assert page.value('document.querySelectorAll(".modebar-btn").length') == 0
+    page.page.close()
+
+
+@needs_browser
 @pytest.mark.alone
 def test_the_median_delay_of_a_pose_is_below_200_ms(chromium, scene, server, records):
     page = Opened(chromium, server.url)

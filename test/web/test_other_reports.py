@@ -30,10 +30,11 @@ def open_page(chromium, path):
     return page
 
 
-def check_and_close(page, path):
-    """Check that the page logged no error and loaded no other file, and close the page."""
+def check_and_close(page):
+    """Check that the page is complete, logged no error and contacts no other origin; close it."""
+    page.assert_complete()
+    page.assert_private()
     assert page.page_errors == []
-    assert page.requests == [path.as_uri()]
     page.page.close()
 
 
@@ -58,7 +59,7 @@ def test_a_fit_report_shows_the_paths_of_its_table(chromium, tmp_path):
     page.wait('magTracking.current === 2')
     assert 'Track 2' in page.value('document.getElementById("readout").textContent')
     assert not page.value('document.getElementById("weights-card").checkVisibility()')
-    check_and_close(page, path)
+    check_and_close(page)
 
 
 def test_a_plan_report_shows_its_maps(chromium, tmp_path, capsys):
@@ -75,7 +76,7 @@ def test_a_plan_report_shows_its_maps(chromium, tmp_path, capsys):
     np.testing.assert_allclose(np.array(maps[0], dtype=float), bound, atol=1e-4)
     notes = page.value('[...document.querySelectorAll("#notes li")].map(e => e.textContent)')
     assert notes == [line.strip() for line in lines[:-1]]
-    check_and_close(page, path)
+    check_and_close(page)
 
 
 def test_a_calibration_report_shows_each_sensor(chromium, tmp_path):
@@ -87,7 +88,7 @@ def test_a_calibration_report_shows_each_sensor(chromium, tmp_path):
     assert cells == ['mag_1', 'mag_2']
     titles = page.value('[...document.querySelectorAll("#charts h2")].map(e => e.innerText)')
     assert 'First knock, corrected clocks' in titles
-    check_and_close(page, path)
+    check_and_close(page)
 
 
 def test_the_doctor_report_shows_its_findings(chromium, tmp_path, capsys):
@@ -96,7 +97,7 @@ def test_the_doctor_report_shows_its_findings(chromium, tmp_path, capsys):
     assert 'no faults found' in capsys.readouterr().out
     page = open_page(chromium, path)
     assert page.value('document.getElementById("notes").innerText').strip() == 'no faults found'
-    check_and_close(page, path)
+    check_and_close(page)
 
 
 def test_a_plan_report_keeps_the_digits_of_large_coordinates(chromium, tmp_path):
@@ -113,7 +114,7 @@ def test_a_plan_report_keeps_the_digits_of_large_coordinates(chromium, tmp_path)
     x = page.value('document.querySelector("#charts .plot").data.find(d => d.type === "heatmap").x')
     np.testing.assert_allclose(x, json.loads((tmp_path / 'plan.json').read_text())['x'], rtol=1e-9)
     assert len(set(x)) == len(x)
-    check_and_close(page, path)
+    check_and_close(page)
 
 
 @pytest.mark.parametrize('arguments', [
@@ -147,7 +148,7 @@ def test_the_doctor_reports_on_a_single_reading(chromium, tmp_path):
     page = open_page(chromium, path)
     assert 'Error' in page.value('getComputedStyle(document.querySelector("#notes .error"), '
                                  '"::before").content')
-    check_and_close(page, path)
+    check_and_close(page)
 
 
 @pytest.mark.parametrize('where', ['missing/health.html', 'folder.html'])

@@ -15,6 +15,8 @@ from websockets.sync.client import connect
 from mag_tracking.errors import DeviceError
 from mag_tracking.records import FieldFrame
 from mag_tracking.web.page_server import PageServer
+from support.browser import Page as Opened
+from support.browser import needs_browser
 from support.live_records import feed, poses
 
 
@@ -233,6 +235,54 @@ def test_remote_requests_require_the_token(scene):
                 connect(address.replace('http', 'ws') + 'stream' + wrong)
         assert status_of(f'{address}?token={token}') == 200
         connect(f'{address.replace("http", "ws")}stream?token={token}').close()
+
+
+def response_to(server, path, headers):
+    """Response to a GET request with the given header lines."""
+    with socket.create_connection(('127.0.0.1', server.port)) as raw:
+        raw.sendall('\r\n'.join([f'GET {path} HTTP/1.1', *headers, '', '']).encode('latin-1'))
+        raw.settimeout(60.0)
+        return b''.join(iter(lambda: raw.recv(4096), b'')).decode('latin-1')
+
+
+@pytest.mark.parametrize('path, headers', [
+    ('/', ['Host: 127.0.0.1', 'Host: 127.0.0.1']), ('/', []),
+    ('/', ['Host: 127.0.0.1', 'Origin: http://[']),
+    ('/', ['Host: 127.0.0.1', 'Origin: http://127.0.0.1', 'Origin: http://evil.example']),
+    ('/stream', ['Host: 127.0.0.1', 'Origin: http://[::1']),
+    ('//[', ['Host: 127.0.0.1']), ('http://[x/', ['Host: 127.0.0.1'])])
+def test_malformed_headers_and_addresses_are_bad_requests(server, caplog, path, headers):
+    response = response_to(server, path, headers)
+    assert response.startswith('HTTP/1.1 400 ')
+    assert 'server:' not in response.lower()
+    assert caplog.records == []
+
+
+@pytest.mark.parametrize('path, cookie', [('/?token=\xff', 'x'), ('/', 'mag_tracking_{}=\xe9')])
+def test_a_token_outside_ascii_is_wrong(scene, path, cookie):
+    with PageServer(scene, host='0.0.0.0', port=0) as server:
+        headers = ['Host: x', f'Cookie: {cookie.format(server.port)}']
+        assert response_to(server, path, headers).startswith('HTTP/1.1 403 ')
+
+
+@needs_browser
+def test_the_token_leaves_the_address_bar(chromium, scene, records):
+    """The page is connected, and can be reloaded, although its address has no token."""
+    with PageServer(scene, host='0.0.0.0', port=0) as server:
+        feed(scene, records)
+        address, token = server.url.replace(socket.gethostname(), '127.0.0.1').split('?')
+        page = Opened(chromium, f'{address}?{token}')
+        for _ in range(2):
+            page.wait('magTracking.connected && magTracking.drawn > 0')
+            assert page.page.url == address
+            page.page.reload()
+        assert page.page_errors == []
+        page.page.close()
+
+
+def test_responses_name_no_software_versions(server):
+    with urllib.request.urlopen(server.url, timeout=60.0) as response:
+        assert 'Server' not in response.headers
 
 
 def test_invalid_requests_do_not_stop_the_server(server):

@@ -1,14 +1,16 @@
-"""Parser of sensor entries in the I2C settings: name:chip:address[@multiplexer.channel]."""
+"""Parser of sensor entries in the I2C settings: name:chip:address[@multiplexer.channel][:unit]."""
 
 import re
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 from mag_tracking.drivers.chips.chip import ChipLocation
+from mag_tracking.drivers.chips.circuitpython import UNITS
+from mag_tracking.drivers.settings import FIELD_UNITS, scale_of
 from mag_tracking.errors import SettingsError
 
 ENTRY = re.compile(r'(?P<name>[^:]+):(?P<chip>[^:]+):0x(?P<address>[0-9a-fA-F]{2})'
-                   r'(@0x(?P<multiplexer>[0-9a-fA-F]{2})\.(?P<channel>[0-7]))?')
+                   r'(@0x(?P<multiplexer>[0-9a-fA-F]{2})\.(?P<channel>[0-7]))?(:(?P<unit>[^:]+))?')
 
 
 class Sensor(NamedTuple):
@@ -17,6 +19,8 @@ class Sensor(NamedTuple):
     name: str
     chip: str
     location: ChipLocation
+    scale: float = 1.0
+    """[T] Unit of the driver of the chip."""
 
 
 def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor]:
@@ -25,7 +29,7 @@ def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor
     Parameters
     ----------
     entries : sequence of str
-        Each as name:chip:address[@multiplexer.channel].
+        Each as name:chip:address[@multiplexer.channel][:unit].
     known : collection of str
         Names of the supported chips; any other chip must be a module.Class.
 
@@ -65,7 +69,7 @@ def parse_sensor(entry: str, known: Collection[str]) -> Sensor:
     Parameters
     ----------
     entry : str
-        As name:chip:address[@multiplexer.channel].
+        As name:chip:address[@multiplexer.channel][:unit].
     known : collection of str
         Names of the supported chips.
 
@@ -81,16 +85,26 @@ def parse_sensor(entry: str, known: Collection[str]) -> Sensor:
     match = ENTRY.fullmatch(entry)
     if match is None:
         raise SettingsError('sensors: expected name:chip:0xNN or name:chip:0xNN@0xNN.channel, '
-                            f'got {entry!r}')
+                            f'followed by :unit for a CircuitPython driver, got {entry!r}')
     name, chip = match['name'], match['chip']
     if chip not in known and '.' not in chip:
         raise SettingsError(f'sensors: {name}: chip {chip} is neither one of '
                             f'{", ".join(known)} nor a module.Class')
     address = _parse_address(name, 'address', match['address'], 0x08)
-    if match['multiplexer'] is None:
-        return Sensor(name, chip, ChipLocation(address))
-    multiplexer = _parse_address(name, 'multiplexer', match['multiplexer'], 0x70)
-    return Sensor(name, chip, ChipLocation(address, multiplexer, int(match['channel'])))
+    location = ChipLocation(address)
+    if match['multiplexer'] is not None:
+        location = ChipLocation(address, _parse_address(
+            name, 'multiplexer', match['multiplexer'], 0x70), int(match['channel']))
+    if chip in known:
+        if match['unit'] is not None:
+            raise SettingsError(f'sensors: {name}: the unit of {chip} is known; remove '
+                                f':{match["unit"]}')
+        return Sensor(name, chip, location)
+    unit = match['unit'] or UNITS.get(chip)
+    if unit is None:
+        raise SettingsError(f'sensors: {name}: the unit of {chip} is not known; add it to the '
+                            f'entry, as in {entry}:uT')
+    return Sensor(name, chip, location, scale_of(unit, FIELD_UNITS, f'sensors: {name}: unit'))
 
 
 def _parse_address(name: str, role: str, digits: str, lowest: int) -> int:

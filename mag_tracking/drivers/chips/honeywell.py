@@ -10,10 +10,15 @@ Scale: 73, 92, 122, 152, 227, 256, 303, 435 nT per count for ranges of ±88, 130
 560, 810 µT. The noise is about 200 nT. The offset may be tens of microtesla and drifts with
 temperature. The HMC5983 is configured to correct its scale for temperature.
 
-Chips sold as HMC5883L are often QMC5883L, which answer at 0x0d and are not supported.
+Chips sold as HMC5883L are often QMC5883L, which answer at 0x0d and are not supported. An LSM303DLHC
+has the same address, identity and registers, but other gains: 1100, 855, 670, 450, 400, 330, 230
+counts per gauss on x and y, and 980, 760, 600, 400, 355, 295, 205 on z, for the ranges from ±130 µT
+on. Its z axis therefore reads 11 % less than x and y. The CircuitPython class LSM303DLH_Mag has the
+gains of that chip.
 
 Sources: HMC5883L data sheet 900405 Rev E (2013), tables 2 to 21; HMC5983 data sheet 900425 (2012),
-whose registers differ in bit 7 of configuration register A.
+whose registers differ in bit 7 of configuration register A; LSM303DLHC data sheet, ST DocID018771,
+register CRB_REG_M.
 """
 
 import errno

@@ -63,7 +63,8 @@ class I2cSettings:
     sensors: tuple[str, ...] = param(
         ('',), 'Sensors as name:chip:address, such as A:lis3mdl:0x1c, or A:lis3mdl:0x1c@0x70.3 on '
         'channel 3 of a TCA9548A at 0x70. Chips: mmc5983ma, mmc5603, hmc5883l, hmc5983, rm3100, '
-        'lis3mdl, or the module.Class of a CircuitPython driver.')
+        'lis3mdl, or the module.Class of a CircuitPython driver. If the guide does not list the '
+        'class, its unit follows, as in A:my_driver.Sensor:0x1c:uT.')
     rate_hz: float = param(
         50.0, 'Polling rate. Each sensor is read once per polling cycle.', 'Hz', (0.01, 1000.0))
     max_failures: int = param(
@@ -169,7 +170,8 @@ class I2cDevice(Closable):
                 chips[name] = CHIPS[sensor.chip](registers, getattr(self._settings, sensor.chip),
                                                  partial(self._count, name=name))
             else:
-                chips[name] = CircuitpythonChip(registers, sensor.chip, sensor.location.address)
+                chips[name] = CircuitpythonChip(registers, sensor.chip, sensor.location.address,
+                                                sensor.scale)
         return chips
 
     def _count(self, cause: str, name: str) -> None:

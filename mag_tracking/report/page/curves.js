@@ -11,7 +11,7 @@ const DENSE_READINGS = 250;
 const AXES = [[VERMILLION, 'solid'], [SERIES[2], 'dash'], [SERIES[0], 'dot']];
 
 function curveLayout(title, t, range, more) {
-  return {font: FONT, margin: {l: 60, r: 10, t: 8, b: 40}, hovermode: 'closest',
+  return {...LAYOUT, margin: {l: 60, r: BUTTONS_PX, t: 8, b: 40},
     xaxis: {title: {text: 'time [s]'}, range: range, gridcolor: '#e3e3e3', zeroline: false},
     yaxis: {title: {text: title}, gridcolor: '#e3e3e3', zeroline: false, ...more},
     legend: {orientation: 'h', y: 1.02, yanchor: 'bottom', font: {size: 12}},
@@ -29,19 +29,23 @@ function largest(axes) {
   return max;
 }
 
-// [{name, t, measured, predicted}] of a track, or of the latest frames if `track` is null; the
-// predicted field is then null.
-function fieldsOf(scene, track) {
-  if (track) {
-    return track.fields.map(field => ({name: scene.sensors.names[field.sensor],
-      t: field.t || track.columns.t, measured: field.measured, predicted: field.predicted}));
+// [{name, t, measured, predictions: [{t, field}]}] of a track, or of the latest frames on a live page
+// that follows the time, with the tracks that end in `range` or later.
+function fieldsOf(scene, track, range) {
+  if (!page.follows) {
+    return !track ? [] : track.fields.map(field => ({name: scene.sensors.names[field.sensor],
+      t: field.t || track.columns.t, measured: field.measured,
+      predictions: [{t: field.t || track.columns.t, field: field.predicted}]}));
   }
-  return scene.recent ? scene.sensors.names.map((name, j) => ({name: name, t: scene.recent.t,
-    measured: scene.recent.fields.map(axis => axis[j]), predicted: null})) : [];
+  const tracks = scene.tracks.filter(other => endOf(other) > range[0]);
+  return scene.sensors.names.map((name, j) => ({name: name, t: scene.recent.t,
+    measured: scene.recent.fields.map(axis => axis[j]),
+    predictions: tracks.flatMap(other => other.fields.filter(field => field.sensor === j)
+      .map(field => ({t: other.columns.t, field: field.predicted})))}));
 }
 
 function chosenFields(scene, track, choice, range) {
-  const fields = fieldsOf(scene, track);
+  const fields = fieldsOf(scene, track, range);
   if (choice !== STRONGEST) return fields.filter(field => field.name === choice);
   const strength = new Map(fields.map(field => {
     const first = indexAt(field.t, range[0]) + 1, end = indexAt(field.t, range[1]) + 1;
@@ -75,9 +79,9 @@ function drawFields(scene, track, choice, t, range) {
       traces.push({type: 'scatter', mode: 'markers', x: field.t, name: `${name} measured`,
         y: Array.from(field.measured[a], v => f * v), showlegend: false,
         marker: {color: colour, symbol: SYMBOLS[a], ...dots}});
-      if (field.predicted) {
-        traces.push({type: 'scatter', mode: 'lines', x: field.t, name: `${name} predicted`,
-          y: Array.from(field.predicted[a], v => f * v), showlegend: false,
+      for (const {t: times, field: predicted} of field.predictions) {
+        traces.push({type: 'scatter', mode: 'lines', x: times, name: `${name} predicted`,
+          y: Array.from(predicted[a], v => f * v), showlegend: false,
           line: {color: many ? BLACK : colour, width: 1.8, dash: dash}});
       }
     });
@@ -88,7 +92,8 @@ function drawFields(scene, track, choice, t, range) {
 }
 
 function drawWeights(track, t, range) {
-  const traces = !track ? [] : Object.entries(stylesOf(track)).map(([name, [colour, dash]]) => ({
+  const traces = !track ? [] : Object.entries(stylesOf(page.scene)).filter(
+    ([name]) => name in track.arrivals).map(([name, [colour, dash]]) => ({
     type: 'scatter', mode: 'lines', x: track.columns.t, y: track.arrivals[name].weight,
     name: plain(name) || 'all hypotheses', showlegend: true,
     line: {color: colour, dash: dash, width: 2}}));

@@ -8,9 +8,9 @@ const HISTORY_S = 600;
 function connect() {
   page.live = true;
   page.follows = true;
-  const token = new URLSearchParams(location.search).get('token');
-  const address = new URL('stream' + (token ? `?token=${encodeURIComponent(token)}` : ''),
-    location.href);
+  // The server has stored the token in a cookie. The address must not show it to bystanders.
+  if (location.search) history.replaceState(null, '', location.pathname);
+  const address = new URL('stream', location.href);
   address.protocol = location.protocol === 'https:' ? 'wss:' : 'ws:';
   const socket = new WebSocket(address);
   socket.addEventListener('message', event => receive(JSON.parse(event.data)));
@@ -51,7 +51,8 @@ function addRows(message) {
   for (const rows of message.tracks) {
     const track = scene.tracks.find(other => other.key === rows.key);
     if (track) append(track, rows); else scene.tracks.push(rows);
-    extendReach(scene, track || rows);
+    extendReach(scene, scene.reach, rows);
+    if (!track) showPanels(scene);
     if (!track || rows.ended) page.tableDue = 0;
   }
   for (const one of message.smoothed) {

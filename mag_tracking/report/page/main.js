@@ -3,8 +3,12 @@
 
 const page = {scene: null, t: 0, follows: false, choice: STRONGEST, current: undefined,
   plays: false, drawn: 0, tableDue: 0};
-// Interval between updates of the track table of a live page [ms].
-const TABLE_MS = 1000;
+// Intervals between updates of the track table and of the curves of a live page [ms].
+const TABLE_MS = 1000, CURVES_MS = 250;
+// Width and height of the axis labels and margins of a map [px].
+const MAP_FRAME_PX = 90;
+// Margin of a live map and maximum height of the side view, relative to the extent of the map.
+const LIVE_MARGIN = 0.3, MAX_HEIGHT = 0.5;
 // Public for debugging and tests.
 window.magTracking = page;
 
@@ -22,7 +26,17 @@ function begin(data) {
 
 function setScene(packed) {
   const scene = page.scene = decodedAll(packed);
-  scene.tracks.forEach(track => extendReach(scene, track));
+  const z = Array.from(scene.sensors.z);
+  const side = ([x0, x1, y0, y1], n) => [x0, x1, Math.min(...z) - n * Math.max(x1 - x0, y1 - y0),
+    Math.max(...z) + n * Math.max(x1 - x0, y1 - y0)];
+  scene.network_reach = {map: scene.reach, side: side(scene.reach, MARGIN)};
+  scene.most_side = side(scene.most_reach, MAX_HEIGHT);
+  scene.reach = copyOf(scene.network_reach);
+  if (page.live) {
+    // The targets are still to come.
+    scene.reach.map = scene.reach.map.map((v, i) => v + LIVE_MARGIN * (scene.most_reach[i] - v));
+  }
+  scene.tracks.forEach(track => extendReach(scene, scene.reach, track));
   at('scene').hidden = at('time').hidden = false;
   at('sensors').replaceChildren(
     element('option', `${MAX_PANELS} strongest`, {value: STRONGEST}),
@@ -31,14 +45,37 @@ function setScene(packed) {
   at('sensors').value = page.choice;
   page.current = undefined;
   page.tableDue = 0;
-  // Fitted passes have neither weights nor innovations.
-  at('weights-card').hidden = !page.live && scene.tracks.every(
-    track => !Object.keys(track.arrivals).length);
-  at('innovation-card').hidden = !page.live && scene.tracks.every(
-    track => track.columns.nis.every(Number.isNaN));
+  showPanels(scene);
+  if (!page.live) fitMaps(scene);
   boundSlider();
   const first = scene.tracks[0];
   moveTo(page.follows ? scene.end : first ? mostAccurateTime(first) : 0);
+}
+
+// Show the panels that have a content. The last one of an odd number is wide.
+function showPanels(scene) {
+  const tracks = scene.tracks, contents = {
+    map: true, overview: !page.live && tracks.length >= MIN_TRACKS, side: tracks.some(isMagnet),
+    field: page.live || tracks.some(track => track.fields.length),
+    weights: tracks.some(track => Object.keys(track.arrivals).some(Boolean)),
+    innovation: tracks.some(track => !track.columns.nis.every(Number.isNaN)),
+    speed: tracks.length > 0};
+  for (const row of [['map', 'overview', 'side', 'field'], ['weights', 'innovation', 'speed']]) {
+    const shown = row.filter(name => contents[name]);
+    for (const name of row) {
+      const card = at(`${name}-card`), is_wide = name === shown.at(-1) && shown.length % 2 === 1;
+      card.hidden = !contents[name];
+      card.classList.toggle('wide', is_wide);
+    }
+  }
+}
+
+// Set the height of the maps of a report to the median of their contents, within limits of the style.
+function fitMaps(scene) {
+  const ratios = [scene.reach, ...scene.tracks.map(track => reachAt(scene, track))]
+    .map(({map: [x0, x1, y0, y1]}) => (y1 - y0) / (x1 - x0)).sort((a, b) => a - b);
+  const height = MAP_FRAME_PX + ratios[ratios.length >> 1] * (at('map').clientWidth - MAP_FRAME_PX);
+  at('scene').style.setProperty('--map-height', `${Math.round(height)}px`);
 }
 
 // Time of the most accurate pose of a track.
@@ -70,28 +107,38 @@ function moveTo(t) {
 }
 
 function rangeOf(track, t) {
-  if (page.follows) return [Math.max(page.scene.begin, t - WINDOW_S), t];
+  if (page.follows && (!track || t <= endOf(track) + SHOWN_AFTER_S)) {
+    const from = Math.max(page.scene.begin, t - WINDOW_S);
+    return [from, from + WINDOW_S];
+  }
   if (!track) return [t - WINDOW_S, t];
   const margin = 0.03 * (endOf(track) - beginOf(track)) + 0.01;
   return [beginOf(track) - margin, endOf(track) + margin];
 }
 
-let curvesDue = 0;
+let curvesDue = 0, lastCurves = null;
 function draw() {
-  const scene = page.scene, t = page.t;
-  const nearest = currentTrack(scene, t);
-  // While there is no target, a live page shows the current fields.
-  const track = page.follows && !tracksAt(scene, t).length ? null : nearest;
+  const scene = page.scene, t = page.t, track = currentTrack(scene, t);
   at('slider').value = t;
   at('clock').textContent = `${t.toFixed(2)} s`;
   at('latest').hidden = !page.live || page.follows;
   at('readout').textContent = readout(scene, t);
-  Plotly.react('map', mapTraces(scene, t), mapLayout(scene), CONFIG);
+  const traces = mapTraces(scene, t);
+  Plotly.react('map', traces,
+    mapLayout(scene, reachAt(scene, track).map, page.live || track?.key), CONFIG);
+  showLegend('map-legend', traces);
+  drawSide(scene, track, t);
   const key = track ? track.key : null;
   if (page.follows ? performance.now() > curvesDue : key !== page.current) {
     drawCurves(track, t);
-    if (page.follows) curvesDue = performance.now() + 250;
-  } else if (!page.follows) {
+    drawOverview(scene, track);
+    if (page.follows) curvesDue = performance.now() + CURVES_MS;
+    clearTimeout(lastCurves);
+  } else if (page.follows) {
+    // The curves of the last message, if no other message follows.
+    clearTimeout(lastCurves);
+    lastCurves = setTimeout(() => moveTo(page.t), CURVES_MS);
+  } else {
     moveLines(t);
   }
   page.current = key;
@@ -106,7 +153,9 @@ function draw() {
 
 function drawCurves(track, t) {
   const range = rangeOf(track, t);
-  drawFields(page.scene, track, page.choice, t, range);
+  // On a live page, the fields are always those of the latest seconds.
+  drawFields(page.scene, track, page.choice, t, page.follows ? rangeOf(null, t) : range);
+  if (!track) return;
   drawWeights(track, t, range);
   drawInnovation(track, t, range);
   drawSpeed(track, t, range);

@@ -10,9 +10,18 @@ const SYMBOLS = ['circle', 'square', 'diamond'];
 const SCALE_2D = Math.sqrt(-2 * Math.log(0.1)), SCALE_1D = 1.645;
 // Minimum weight of a hypothesis that is drawn, and maximum number of sensors with labels.
 const MIN_DRAWN = 0.01, MAX_LABELS = 24;
+// A touch screen has no pointer that hovers, and a drag scrolls the page.
+const IS_TOUCHED = matchMedia('(hover: none)').matches;
 const FONT = {size: 13, color: '#1b1b1b'};
+// Width of the right margin, which contains the buttons [px].
+const BUTTONS_PX = 34;
+const LAYOUT = {font: FONT, hovermode: 'closest', dragmode: IS_TOUCHED ? false : 'zoom',
+  modebar: {orientation: 'v', bgcolor: 'rgba(0,0,0,0)'}};
+// The buttons are listed, because Plotly adds buttons of its own, such as the upload of a chart to a
+// server. Without an address, no upload is possible.
 const CONFIG = {responsive: true, displaylogo: false,
-  modeBarButtonsToRemove: ['select2d', 'lasso2d', 'sendDataToCloud']};
+  displayModeBar: IS_TOUCHED ? false : 'hover', plotlyServerURL: '', showSendToCloud: false,
+  modeBarButtons: [['toImage'], ['zoom2d', 'pan2d'], ['zoomIn2d', 'zoomOut2d', 'resetScale2d']]};
 
 // Outline [xs, ys] of the 90 % region of a position.
 function ellipse(x, y, xx, xy, yy) {
@@ -28,9 +37,10 @@ function ellipse(x, y, xx, xy, yy) {
   return [xs, ys];
 }
 
-// {arrival: [colour, dash]} in a fixed order.
-function stylesOf(track) {
-  return Object.fromEntries(Object.keys(track.arrivals).sort().map(
+// {arrival: [colour, dash]} of all tracks, in a fixed order.
+function stylesOf(scene) {
+  const names = new Set(scene.tracks.flatMap(track => Object.keys(track.arrivals)));
+  return Object.fromEntries([...names].sort().map(
     (name, i) => [name, [SERIES[i % SERIES.length], DASHES[i % DASHES.length]]]));
 }
 
@@ -39,11 +49,11 @@ function line(xs, ys, name, style, more) {
     hoverinfo: name ? 'name' : 'skip', showlegend: Boolean(name), ...more};
 }
 
-// Labels of the sensors; sensors one above the other share a label.
-function labelsOf(sensors, factor) {
+// Labels of the sensors; sensors at one place of the map share a label.
+function labelsOf(x, y, sensors) {
   const groups = new Map();
   sensors.names.forEach((name, j) => {
-    const place = `${(factor * sensors.x[j]).toFixed(1)} ${(factor * sensors.y[j]).toFixed(1)}`;
+    const place = `${x[j].toFixed(1)} ${y[j].toFixed(1)}`;
     groups.set(place, [...(groups.get(place) || []), j]);
   });
   const labels = sensors.names.map(() => '');
@@ -53,43 +63,57 @@ function labelsOf(sensors, factor) {
   return labels;
 }
 
-function mapTraces(scene, t) {
-  const f = scene.scale.factor, scaled = values => Array.from(values, v => f * v);
-  const traces = [], current = currentTrack(scene, t);
-  for (const track of tracksAt(scene, t).concat(current ? [current] : [])
-    .filter((track, i, all) => all.indexOf(track) === i)) {
-    const c = track.columns, k = Math.max(0, indexAt(c.t, t)), first = track === current;
-    const named = name => first ? name : '';
-    if (track.truth) {
-      traces.push(line(scaled(track.truth.x), scaled(track.truth.y), named('truth'),
-        {color: '#666666', width: 1.5, dash: 'dash'}));
-    }
-    if (track.smoothed) {
-      traces.push(line(scaled(track.smoothed.x), scaled(track.smoothed.y), named('smoothed'),
-        {color: VERMILLION, width: 1.5}));
-    }
-    // Ambiguous poses may jump, so they are not connected by a line.
-    const sure = axis => Array.from(axis, (v, i) => c.ambiguous[i] ? null : f * v);
-    const doubtful = axis => scaled(axis.slice(0, k + 1).filter((_, i) => c.ambiguous[i]));
-    traces.push(line(sure(c.x), sure(c.y), '', {color: '#a8a8a8', width: 1.5}));
-    traces.push(line(sure(c.x).slice(0, k + 1), sure(c.y).slice(0, k + 1),
-      named('track'), {color: BLACK, width: 2.5}));
-    traces.push({type: 'scatter', mode: 'markers', x: doubtful(c.x), y: doubtful(c.y),
-      name: 'ambiguous poses', hoverinfo: 'skip', showlegend: first && c.ambiguous.includes(1),
-      marker: {size: 5, color: '#ffffff', line: {color: '#707070', width: 1.2}}});
-    if (tracksAt(scene, t).includes(track)) traces.push(...nowTraces(track, k, f, named));
+// Sensors on a map whose vertical axis is 'y', or 'z' in the side view.
+function sensorTrace(scene, f, vertical) {
+  const sensors = scene.sensors, scaled = values => Array.from(values, v => f * v);
+  const x = scaled(sensors.x), y = scaled(sensors[vertical]);
+  return {type: 'scatter', mode: sensors.names.length > MAX_LABELS ? 'markers' : 'markers+text',
+    x: x, y: y, text: labelsOf(x, y, sensors), hovertext: sensors.names.map(plain),
+    textposition: 'top center', hoverinfo: 'text', name: 'magnetometers', cliponaxis: false,
+    marker: {symbol: 'triangle-up', size: 11, color: '#333333'}};
+}
+
+// Paths of a track up to pose `k`; `axis` is 'y', or 'z' in the side view.
+function pathTraces(track, k, f, named, axis) {
+  const c = track.columns, traces = [], scaled = values => Array.from(values, v => f * v);
+  if (track.truth) {
+    traces.push(line(scaled(track.truth.x), scaled(track.truth[axis]), named('truth'),
+      {color: '#666666', width: 1.5, dash: 'dash'}));
   }
-  traces.push({type: 'scatter', mode: scene.sensors.names.length > MAX_LABELS ? 'markers'
-    : 'markers+text', x: scaled(scene.sensors.x), y: scaled(scene.sensors.y),
-  text: labelsOf(scene.sensors, f), hovertext: scene.sensors.names.map(plain),
-  textposition: 'top center', hoverinfo: 'text', name: 'magnetometers', cliponaxis: false,
-  marker: {symbol: 'triangle-up', size: 11, color: '#333333'}});
+  if (track.smoothed) {
+    traces.push(line(scaled(track.smoothed.x), scaled(track.smoothed[axis]), named('smoothed'),
+      {color: VERMILLION, width: 1.5}));
+  }
+  // Ambiguous poses may jump, so they are not connected by a line.
+  const sure = values => Array.from(values, (v, i) => c.ambiguous[i] ? null : f * v);
+  const doubtful = values => scaled(values.slice(0, k + 1).filter((_, i) => c.ambiguous[i]));
+  traces.push(line(sure(c.x), sure(c[axis]), '', {color: '#a8a8a8', width: 1.5}));
+  traces.push(line(sure(c.x).slice(0, k + 1), sure(c[axis]).slice(0, k + 1),
+    named('track'), {color: BLACK, width: 2.5}));
+  traces.push({type: 'scatter', mode: 'markers', x: doubtful(c.x), y: doubtful(c[axis]),
+    name: 'ambiguous poses', hoverinfo: 'skip',
+    showlegend: Boolean(named('x')) && c.ambiguous.includes(1),
+    marker: {size: 5, color: '#ffffff', line: {color: '#707070', width: 1.2}}});
   return traces;
 }
 
-// Hypotheses, 90 % region, pose and velocity of a track.
-function nowTraces(track, k, f, named) {
-  const c = track.columns, traces = [], styles = stylesOf(track);
+function mapTraces(scene, t) {
+  const f = scene.scale.factor, traces = roadTraces(scene, f), current = currentTrack(scene, t);
+  const reach = reachAt(scene, current).map;
+  const there = tracksAt(scene, t);
+  for (const track of there.concat(current ? [current] : [])
+    .filter((track, i, all) => all.indexOf(track) === i)) {
+    const k = Math.max(0, indexAt(track.columns.t, t)), named = name => track === current ? name : '';
+    traces.push(...pathTraces(track, k, f, named, 'y'), ...timeMarks(track, reach, f));
+    if (there.includes(track)) traces.push(...nowTraces(scene, track, k, f, named));
+  }
+  traces.push(sensorTrace(scene, f, 'y'));
+  return traces;
+}
+
+// Hypotheses, 90 % region, body, pose and velocity of a track.
+function nowTraces(scene, track, k, f, named) {
+  const c = track.columns, traces = [], styles = stylesOf(scene);
   const arrivals = Object.entries(track.arrivals).filter(
     ([name, a]) => name !== '' && a.weight[k] > MIN_DRAWN);
   for (const [name, a] of arrivals) {
@@ -106,34 +130,68 @@ function nowTraces(track, k, f, named) {
     f * f * c.yy[k]);
   traces.push(line(xs, ys, named('90 % region'), {color: BLACK, width: 1},
     {fill: 'toself', fillcolor: c.ambiguous[k] ? 'rgba(0,0,0,0.05)' : 'rgba(0,0,0,0.16)'}));
-  traces.push(line([f * c.x[k], f * (c.x[k] + c.vx[k])], [f * c.y[k], f * (c.y[k] + c.vy[k])],
-    '', {color: BLACK, width: 1.5, dash: 'dot'}));
+  traces.push(...bodyTraces(scene.reach.map, c, k, f, named, 'y'));
+  traces.push({type: 'scatter', mode: 'lines+markers', x: [f * c.x[k], f * (c.x[k] + c.vx[k])],
+    y: [f * c.y[k], f * (c.y[k] + c.vy[k])], name: named('path in the next second'),
+    showlegend: Boolean(named('x')), hoverinfo: 'skip', line: {color: BLACK, width: 1.5, dash: 'dot'},
+    marker: {symbol: ['circle', 'arrow'], size: [0, 12], angleref: 'previous', color: BLACK}});
   traces.push({type: 'scatter', mode: 'markers', x: [f * c.x[k]], y: [f * c.y[k]],
     name: c.ambiguous[k] ? 'pose (ambiguous)' : 'pose', showlegend: false,
-    hoverinfo: 'x+y', meta: 'pose', marker: {size: 11, symbol: 'circle',
+    hoverinfo: 'x+y', meta: 'pose', marker: {size: 7, symbol: 'circle',
       color: c.ambiguous[k] ? '#ffffff' : BLACK, line: {color: BLACK, width: 2}}});
   return traces;
 }
 
-function mapLayout(scene) {
-  const unit = scene.scale.unit, f = scene.scale.factor, r = scene.reach;
-  const axis = (title, low, high) => ({title: {text: `${title} [${unit}]`}, zeroline: false,
-    range: [f * low, f * high], gridcolor: '#e3e3e3', exponentformat: 'none', automargin: true});
-  return {font: FONT, margin: {l: 55, r: 10, t: 25, b: 45}, uirevision: `${scene.begin_ns} ${scene.sensors.names.join(' ')}`, hovermode: 'closest',
-    xaxis: {...axis('x', r[0], r[1]), constrain: 'range'},
-    yaxis: {...axis('y', r[2], r[3]), scaleanchor: 'x', constrain: 'range'},
-    legend: {orientation: 'h', y: 1.04, yanchor: 'bottom', font: {size: 12}}};
+// Layout of a map with the extent [x0, x1, y0, y1] [m]; the vertical axis is y or z. A zoom by the
+// user is kept while `id` is unchanged.
+function mapLayout(scene, reach, id, vertical = 'y') {
+  const unit = scene.scale.unit, f = scene.scale.factor;
+  const axis = (name, from, to) => ({title: {text: `${name} [${unit}]`}, zeroline: false,
+    range: [f * from, f * to], gridcolor: '#e3e3e3', exponentformat: 'none', automargin: true});
+  return {...LAYOUT, showlegend: false, margin: {l: 55, r: BUTTONS_PX, t: 10, b: 45},
+    uirevision: `${scene.begin_ns} ${scene.sensors.names.join(' ')} ${id}`,
+    xaxis: {...axis('x', reach[0], reach[1]), constrain: 'range'},
+    yaxis: {...axis(vertical, reach[2], reach[3]), scaleanchor: 'x', constrain: 'range'}};
 }
 
-// Extend the map to the unambiguous poses of a track, up to a limit.
-function extendReach(scene, track) {
-  const c = track.columns, r = scene.reach, edge = scene.most_reach;
+// Extents [x0, x1, y0, y1] of the map and [x0, x1, z0, z1] of the side view that hold the bodies and
+// 90 % regions of the unambiguous poses of a track, up to a limit.
+function extendReach(scene, reach, track) {
+  const c = track.columns;
   for (let k = 0; k < c.t.length; k++) {
     if (c.ambiguous[k]) continue;
-    r[0] = Math.max(Math.min(r[0], c.x[k]), edge[0]);
-    r[1] = Math.min(Math.max(r[1], c.x[k]), edge[1]);
-    r[2] = Math.max(Math.min(r[2], c.y[k]), edge[2]);
-    r[3] = Math.min(Math.max(r[3], c.y[k]), edge[3]);
+    const half = variance => Math.max(SCALE_2D * Math.sqrt(variance), bodyRadius(c.length[k]));
+    hold(reach.map, 0, c.x[k], half(c.xx[k]), scene.most_reach);
+    hold(reach.map, 2, c.y[k], half(c.yy[k]), scene.most_reach);
+    hold(reach.side, 2, c.z[k], half(c.zz[k]), scene.most_side);
+  }
+  reach.side.splice(0, 2, reach.map[0], reach.map[1]);
+}
+
+const copyOf = reach => ({map: [...reach.map], side: [...reach.side]});
+
+// A live page keeps its extent, and a report shows the whole current track.
+function reachAt(scene, track) {
+  if (page.live || !track) return scene.reach;
+  if (!track.reach) {
+    track.reach = copyOf(scene.network_reach);
+    extendReach(scene, track.reach, track);
+  }
+  return track.reach;
+}
+
+// Fractions of a range: distance from its end at which it is extended, and margin beyond the value. The
+// margin of a live page is larger, so that a pass changes it once at most.
+const NEAR_END = 0.02, MARGIN = 0.1, LIVE_STEP = 0.4;
+
+// Extend the range from `range[i]` to `range[i + 1]` to `value` ± `half` with a margin, up to `edge`.
+function hold(range, i, value, half, edge) {
+  const span = range[i + 1] - range[i], margin = (page.live ? LIVE_STEP : MARGIN) * span;
+  if (value - half < range[i] + NEAR_END * span) {
+    range[i] = Math.min(range[i], Math.max(value - half - margin, edge[i]));
+  }
+  if (value + half > range[i + 1] - NEAR_END * span) {
+    range[i + 1] = Math.max(range[i + 1], Math.min(value + half + margin, edge[i + 1]));
   }
 }
 

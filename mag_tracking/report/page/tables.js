@@ -54,15 +54,19 @@ function showTables(tables) {
   }));
 }
 
-// A chart consists of Plotly traces and a layout.
-function showCharts(charts) {
+const isEmpty = trace => !(trace.z || trace.y).flat().some(value => value !== null);
+
+// A chart consists of Plotly traces and a layout. Charts without a value are omitted.
+function showCharts(all) {
   const holder = document.getElementById('charts');
+  const charts = all.filter(chart => !chart.traces.every(isEmpty));
   for (const chart of charts) {
     const out = card(chart.title), plot = element('div', null, {className: 'plot'});
     out.append(plot);
     holder.append(out);
-    Plotly.newPlot(plot, chart.traces, {font: FONT, margin: {l: 65, r: 15, t: 10, b: 50},
-      hovermode: 'closest', legend: {orientation: 'h', y: 1.02, yanchor: 'bottom'},
+    out.classList.toggle('wide', chart === charts.at(-1) && charts.length % 2 === 1);
+    Plotly.newPlot(plot, chart.traces, {...LAYOUT, margin: {l: 65, r: BUTTONS_PX, t: 10, b: 50},
+      legend: {orientation: 'h', y: 1.02, yanchor: 'bottom'},
       ...chart.layout}, CONFIG);
   }
 }

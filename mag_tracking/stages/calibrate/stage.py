@@ -8,9 +8,16 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray, Record
 from mag_tracking.calibration import core
-from mag_tracking.calibration.background import RunningBackground
+from mag_tracking.calibration.agreement import FieldInconsistency
+from mag_tracking.calibration.background import RelearntBackground, RunningBackground
 from mag_tracking.calibration.decimation import Decimator
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted
+from mag_tracking.calibration.doubtful_times import (
+    CONTRADICTS_EARTH_FIELD,
+    DOUBTFUL_BACKGROUND,
+    WRONG_TIMESTAMPS,
+    DoubtfulTimes,
+    shifted,
+)
 from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.level_change import SharedChanges
 from mag_tracking.calibration.reading_faults import ReadingFaults
@@ -20,8 +27,10 @@ from mag_tracking.errors import NetworkError
 from mag_tracking.inference.axes import are_valid_covariances
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
-from mag_tracking.stages.calibrate.driver_faults import DriverFaults
+from mag_tracking.stages.calibrate.driver_faults import MAX_MARKED, DriverFaults
+from mag_tracking.stages.calibrate.field_comparison import FieldComparison
 from mag_tracking.stages.calibrate.output_buffer import OutputBuffer
+from mag_tracking.stages.calibrate.rejections import REJECTIONS, Rejections
 from mag_tracking.stages.calibrate.restoration import (
     BackgroundRestoration,
     StoredBackground,
@@ -29,6 +38,8 @@ from mag_tracking.stages.calibrate.restoration import (
 )
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.health.diagnosis import Cause
+from mag_tracking.stages.health.timestamps import TimestampFault, TimestampMonitor
+from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NEVER, NS
 
 MAX_SYNCHRONOUS = 16
@@ -38,23 +49,8 @@ are staggered, because evaluating all blocks at once would delay the readings.""
 OVERRULED = 'message covariances overruled by the measured noise'
 """Key in the counts for message covariances that were replaced by the measured noise."""
 
-MAX_MARKED = 0.2
-"""Fraction of readings with a mark above which a background is learnt again when they are found."""
-
 FAULTS_FOUND = 'faults of drivers found'
-"""Key in the counts for the events after which `faults_of` returns other faults."""
-
-REJECTIONS = {
-    core.NO_AXIS: (Cause.NO_AXIS, 'no axis reported (all NaN)'),
-    core.INFINITE: (Cause.INFINITE, 'infinite value'),
-    core.BAD_COVARIANCE: (Cause.WRONG_COVARIANCE, 'covariance is not positive definite'),
-    core.AXIS_MISSING: (Cause.MISSING_AXIS, 'an axis that the correction needs is missing'),
-    core.TOO_FAR_AHEAD: (Cause.TOO_FAR_AHEAD, 'timestamp too far ahead'),
-    core.DUPLICATE: (Cause.DUPLICATE_STAMPS, 'duplicate timestamp'),
-    core.OUT_OF_ORDER: (Cause.BACKWARD_STAMPS, 'out of order'),
-    core.STUCK: (Cause.STUCK, 'stuck sensor (repeated reading)'),
-}
-"""Cause and description of the rejection for each reason code, except descriptions with a value."""
+"""Key in the counts for the events after which `driver_faults` are others."""
 
 
 class Calibrate:
@@ -74,21 +70,27 @@ class Calibrate:
     settings : CalibrateSettings
     background_type : type, optional
         Class that estimates the background of each sensor.
+    survey : SurveySettings, optional
+        Settings of the comparison of the backgrounds with the Earth's field.
 
     Attributes
     ----------
     counts : Counter of str
         Number of readings by outcome, and of events such as time jumps.
+    rejections : Rejections
+        Number of rejected readings of each sensor by cause.
+    driver_faults : DriverFaults
+        Marks and repetitions, which are left out.
     """
 
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
-                 background_type: type[RunningBackground] = RunningBackground) -> None:
+                 background_type: type[RunningBackground] = RunningBackground,
+                 survey: SurveySettings | None = None) -> None:
         self.counts: Counter[str] = Counter()
-        self._rejections: dict[str, Counter[tuple[Cause, str]]] = {
-            name: Counter() for name in network.names}
+        self.rejections = Rejections(network.names)
         self._settings, self._sensors = settings, new_sensors(len(network))
         self._batches = np.zeros(1, core.BATCH)
-        self._driver_faults = DriverFaults(self._sensors)
+        self.driver_faults = DriverFaults(network.names, self._sensors)
         self._limits = np.array([(
             settings.max_field, settings.max_forward_jump_s * NS, settings.max_backward_jump_s * NS,
             settings.reject_stuck, settings.spike_std, settings.decimate_to_hz > 0.0,
@@ -101,6 +103,8 @@ class Calibrate:
         self._background: dict[str, RunningBackground] = {}
         self._changes = SharedChanges()
         self._restoration = BackgroundRestoration(settings.max_resume_gap_s)
+        self._timestamps = TimestampMonitor(len(network))
+        self._comparison = FieldComparison(network, survey or SurveySettings())
         self.update_network(network)
 
     def update_network(self, network: SensorNetwork) -> None:
@@ -122,6 +126,7 @@ class Calibrate:
             raise NetworkError(f'the new network has the sensors {", ".join(network.names)}; '
                                f'expected {", ".join(self._index)}')
         previous, self._network = self._network if self._background else None, network
+        self._comparison.use(network)
         self._decimators = {name: Decimator(self._settings.decimate_to_hz)
                             for name in network.names}
         for i, name in enumerate(network.names):
@@ -146,6 +151,7 @@ class Calibrate:
                 s[name] += shift
         background = self._background[network.names[i]]
         background.doubtful_times = shifted(background.doubtful_times, shift)
+        self._comparison.shift(network.names[i], shift)
         offset, correction = network.offset[i], network.correction[i]
         s['clock_offset_ns'] = network.clock_offset_ns[i]
         s['offset'] = 0.0 if offset is None else offset
@@ -171,15 +177,88 @@ class Calibrate:
         """
         return [name for name, b in self._background.items() if not b.ready]
 
-    def doubtful_intervals(self) -> dict[str, DoubtfulTimes]:
-        """Intervals in which a background was provisional or may have contained a target's field.
+    def input_doubts(self) -> dict[str, dict[str, DoubtfulTimes]]:
+        """Intervals in which the background or the timestamps of a sensor were doubtful.
+
+        A background is doubtful while it is provisional or may contain the field of a target, and
+        while it contradicts the Earth's field.
 
         Returns
         -------
-        dict of str to DoubtfulTimes
-            Intervals ((begin, end) [ns], ...) of each sensor that has any.
+        dict of str to dict of str to DoubtfulTimes
+            {reason: {sensor: intervals}}, for each sensor that has any.
         """
-        return {n: b.doubtful_times for n, b in self._background.items() if b.doubtful_times}
+        out = {DOUBTFUL_BACKGROUND: {n: b.doubtful_times for n, b in self._background.items()
+                                     if b.doubtful_times},
+               CONTRADICTS_EARTH_FIELD: self._comparison.doubtful_times(),
+               WRONG_TIMESTAMPS: {n: times for n, i in self._index.items()
+                                  if (times := self._timestamps.doubtful_times[i])}}
+        return {reason: by_sensor for reason, by_sensor in out.items() if by_sensor}
+
+    def latest_doubt(self, sensor: str) -> tuple[int, int | None] | None:
+        """Latest interval in which the background or the timestamps of a sensor were doubtful.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        (begin, end), int, ns, or None
+            Open intervals (end None) come first. None if there is no interval.
+        """
+        times = [interval for by_sensor in (
+            self._background[sensor].doubtful_times, self._comparison.times_of(sensor),
+            self._timestamps.doubtful_times[self._index[sensor]])
+            for interval in by_sensor[-1:]]
+        return max(times, key=lambda t: (t[1] is None, t[0]), default=None)
+
+    def relearnt(self) -> dict[str, tuple[RelearntBackground, ...]]:
+        """Latest changes of the background of each sensor that had any.
+
+        Returns
+        -------
+        dict of str to tuple of RelearntBackground
+        """
+        return {name: b.relearnt for name, b in self._background.items() if b.relearnt}
+
+    def timestamp_fault(self, sensor: str) -> TimestampFault | None:
+        """Return the worst regular error of the timestamps of a sensor so far.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        TimestampFault or None
+            None if the timestamps are regular.
+        """
+        return self._timestamps.worst_fault(self._index[sensor])
+
+    def lowest_rate(self, sensor: str) -> float:
+        """Return the lowest rate of a sensor so far, from its raw timestamps.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        float, Hz
+            Infinite if unknown.
+        """
+        return self._timestamps.lowest_rate(self._index[sensor])
+
+    def field_inconsistencies(self) -> list[FieldInconsistency]:
+        """Sensors whose background contradicts the Earth's field so much that tracks are wrong.
+
+        Returns
+        -------
+        list of FieldInconsistency
+            The latest inconsistency of each sensor that had any, in the order of the network.
+        """
+        return self._comparison.inconsistencies()
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
         """Number of accepted and rejected readings of a sensor, in total and by cause of rejection.
@@ -192,10 +271,8 @@ class Calibrate:
         -------
         Counter of str
         """
-        rejections = self._rejections[sensor]
-        counts = {f'rejected: {description}': n for (_, description), n in rejections.items()}
-        return Counter(counts) + Counter(accepted=int(self._state_of(sensor)['accepted']),
-                                         rejected=rejections.total())
+        return self.rejections.counts_of(sensor) \
+            + Counter(accepted=int(self._state_of(sensor)['accepted']))
 
     def _state_of(self, sensor: str) -> Record:
         """State of a sensor: its element of the array that compiled code updates."""
@@ -217,6 +294,7 @@ class Calibrate:
         rows = readings.rows(self._index)
         validity, covariances = _own_covariances(readings)
         stamps, fields = plain(readings.stamp_ns, np.int64), plain(readings.field)
+        self._timestamps.add(rows, stamps - self._network.clock_offset_ns[rows], fields)
         out, batch = self._new_output(len(readings)), self._batches[0]
         batch['next'] = 0
         while reason := core.calibrate_readings(
@@ -245,7 +323,7 @@ class Calibrate:
             self._reject(name, (Cause.SPIKES, 'spike'), int(batch['n_spikes']))
             batch['n_spikes'] = 0
         if reason == core.BLOCK_COMPLETE:
-            self._background[name].evaluate_block()
+            self._evaluate_block(i)
         elif reason == core.WINDOW_COMPLETE:
             self._examine_window(i)
         elif reason == core.JUMPED_BACK:
@@ -261,45 +339,18 @@ class Calibrate:
             self._calibrate_released(i, out)
         elif reason != core.SPIKES:
             self._reject(name, self._causes[reason] if reason in self._causes
-                         else self._driver_faults.rejection(i, reason))
+                         else self.driver_faults.rejection(name, reason))
 
     def _examine_window(self, i: int) -> None:
         """Search the latest raw readings of sensor `i` for faults of its driver."""
-        marked_fraction = self._driver_faults.examine(i, int(self._batches[0]['stamp_ns']))
+        name, stamp_ns = self._network.names[i], int(self._batches[0]['stamp_ns'])
+        marked_fraction = self.driver_faults.examine(name, stamp_ns)
         if marked_fraction >= 0.0:
             self._reject_held(i, 'a fault of the driver was found')
             self.counts[FAULTS_FOUND] += 1
             if marked_fraction > MAX_MARKED:
                 # The background has been learnt from the marks.
-                self._background[self._network.names[i]].forget()
-
-    def faults_of(self, sensor: str) -> ReadingFaults:
-        """Faults of the driver of a sensor that have been found so far.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        ReadingFaults
-        """
-        return self._driver_faults.of(self._index[sensor])
-
-    def n_marked(self, sensor: str) -> int:
-        """Number of readings of a sensor with a mark for a missing reading on any axis.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        int
-        """
-        return int(self._state_of(sensor)['n_partly_marked']) + sum(
-            n for (cause, _), n in self._rejections[sensor].items()
-            if cause is Cause.NO_READING_MARK)
+                self._background[name].forget()
 
     def _calibrate_released(self, i: int, out: OutputBuffer) -> None:
         """Calibrate the readings of sensor `i` that the spike filter has released."""
@@ -322,11 +373,19 @@ class Calibrate:
     def _calibrate_reading(self, i: int, stamp: int, field: FloatArray, validity: int,
                            covariance: FloatArray, out: OutputBuffer) -> None:
         """Calibrate one reading of sensor `i`, and append the result to `out`."""
-        background = self._background[self._network.names[i]]
-        background.evaluate_block()
+        self._evaluate_block(i)
         while not core.use_reading(self._sensors, self._limits, self._batches, i, stamp,
                                    plain(field), validity, plain(covariance), *out.arrays):
-            background.evaluate_block()
+            self._evaluate_block(i)
+
+    def _evaluate_block(self, i: int) -> None:
+        """Evaluate the latest complete block of sensor `i`, unless it has been evaluated."""
+        name, s = self._network.names[i], self._sensors[i]
+        if s['is_full']:
+            self._background[name].evaluate_block()
+            if self._background[name].ready:
+                self._comparison.update(i, self.background(name), int(s['first_ns']),
+                                        int(s['last_ns']))
 
     def _finish(self, out: OutputBuffer) -> list[Readings]:
         """Count the calibrated readings of a batch and return them."""
@@ -364,7 +423,7 @@ class Calibrate:
         """
         for name, found in faults.items():
             if found:
-                self._driver_faults.store(self._index[name], found)
+                self.driver_faults.store(name, found)
                 self.counts[FAULTS_FOUND] += 1
         for name, step in steps.items():
             self._state_of(name)['step'] = step
@@ -410,7 +469,7 @@ class Calibrate:
         there the reading that completes a block is calibrated with the previous background.
         """
         for i in np.flatnonzero(self._sensors['is_full']):
-            self._background[self._network.names[i]].evaluate_block()
+            self._evaluate_block(int(i))
 
     def flush(self) -> list[Readings]:
         """Calibrate and return the readings that are still held.
@@ -433,20 +492,7 @@ class Calibrate:
         """Count `n` rejected readings of a sensor by cause and description."""
         if n:
             self.counts[f'rejected: {cause[1]}'] += n
-            self._rejections[sensor][cause] += n
-
-    def rejections_of(self, sensor: str) -> 'Counter[tuple[Cause, str]]':
-        """Number of rejected readings of a sensor, by cause and description.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        Counter of (Cause, str)
-        """
-        return self._rejections[sensor].copy()
+            self.rejections.add(sensor, cause, n)
 
     def forget(self, sensors: Collection[str] = ()) -> None:
         """Discard the backgrounds of sensors and learn them again.

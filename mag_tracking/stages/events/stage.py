@@ -1,10 +1,13 @@
 """Events: detect and describe the passes of targets at individual sensors."""
 
 from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.calibration.background import RelearntBackground
 from mag_tracking.event_records import SIGNATURE_SPAN, PassEvent
 from mag_tracking.inference.driving_direction import (
     MAX_CONFIDENCE,
@@ -17,8 +20,11 @@ from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
-from mag_tracking.stages.events.single_sensor_pass import closest_point
-from mag_tracking.units import NS
+from mag_tracking.stages.events.single_sensor_pass import ClosestPoint, closest_point
+from mag_tracking.stages.events.stays import Stays
+from mag_tracking.stages.track.low_rate import SampleRates
+from mag_tracking.stages.track.settings import TrackSettings
+from mag_tracking.units import NEVER, NS
 
 PAD_S = 1.0
 """[s] Length of the margins without a target, before the onset and after the release."""
@@ -41,6 +47,8 @@ class Events:
     network : SensorNetwork
     align : AlignSettings
     detect : DetectSettings
+    track : TrackSettings
+        They determine the rate below which a pass is not resolved.
 
     Attributes
     ----------
@@ -48,12 +56,26 @@ class Events:
         Number of events.
     """
 
-    def __init__(self, network: SensorNetwork, align: AlignSettings,
-                 detect: DetectSettings) -> None:
+    def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
+                 track: TrackSettings) -> None:
         self.counts: Counter[str] = Counter()
+        rates = SampleRates(network, track)
         self._index = {name: j for j, name in enumerate(network.names)}
         parts = [network.part(np.array([j])) for j in range(len(network))]
-        self._sensors = [_SensorEvents(part, align, detect, self.counts) for part in parts]
+        self._sensors = [_SensorEvents(j, part, align, detect, rates, self.counts)
+                         for j, part in enumerate(parts)]
+
+    def set_relearnt(self, relearnt: Mapping[str, Sequence[RelearntBackground]]) -> None:
+        """Set the changes of the backgrounds, which are not the departure of a target.
+
+        Parameters
+        ----------
+        relearnt : mapping of str to sequence of RelearntBackground
+            Latest changes of each sensor. Without them, the event of a parked vehicle ends when
+            its field has become the background.
+        """
+        for name, changes in relearnt.items():
+            self._sensors[self._index[name]].relearnt = changes
 
     def feed(self, readings: Readings) -> list[PassEvent]:
         """Add calibrated readings.
@@ -89,12 +111,16 @@ class Events:
 class _SensorEvents:
     """Detects the passes of targets at one sensor, and creates an event for each pass."""
 
-    def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
-                 counts: 'Counter[str]') -> None:
+    def __init__(self, j: int, network: SensorNetwork, align: AlignSettings,
+                 detect: DetectSettings, rates: SampleRates, counts: 'Counter[str]') -> None:
+        self._j, self._rates = j, rates
         self._name, self._R_ws = network.names[0], network.R_ws[0]
         self._network, self._settings = network, (align, detect)
         self._hold_ns, self._counts = int(detect.hold_s * NS), counts
-        self._n = 0
+        earth_field = network.earth_field
+        self._n, self._stays = 0, Stays(
+            np.full(3, np.nan) if earth_field is None else network.R_sw[0] @ earth_field)
+        self.relearnt: Sequence[RelearntBackground] = ()
         self._reset()
 
     def _reset(self) -> None:
@@ -103,6 +129,7 @@ class _SensorEvents:
         self._detect = Detect(self._network, self._settings[1])
         self._buffer: deque[Readings] = deque()
         self._onset_ns: int | None = None
+        self._frame_stamps: deque[int] = deque(maxlen=self._settings[1].onset_frames)
 
     def feed(self, readings: Readings) -> list[PassEvent]:
         """Add readings of this sensor and return the completed events."""
@@ -121,8 +148,12 @@ class _SensorEvents:
         if not len(readings):
             return []
         self._buffer.append(readings)
+        if self._stays.first_ns == NEVER:
+            self._stays.first_ns = int(readings.stamp_ns[0])
         out: list[PassEvent] = []
         for frame in self._align.feed(readings):
+            self._rates.add(frame, self._j)
+            self._frame_stamps.append(frame.stamp_ns)
             for record in self._detect.feed(frame):
                 if isinstance(record, Detection):
                     out += self._on_detection(record)
@@ -139,15 +170,19 @@ class _SensorEvents:
             for record in self._detect.feed(frame):
                 if isinstance(record, Detection):
                     out += self._on_detection(record)
-        if self._onset_ns is not None and self._buffer:
-            out += self._event(int(self._buffer[-1].stamp_ns[-1]), False)
+        if self._buffer:
+            last_ns = int(self._buffer[-1].stamp_ns[-1])
+            if self._onset_ns is not None:
+                out += self._event(last_ns, False)
+            out += self._numbered(self._stays.flush(last_ns))
         self._onset_ns = None
         return out
 
     def _on_detection(self, detection: Detection) -> list[PassEvent]:
         """Store the time of an onset, or return the event that a release completes."""
         if detection.onset:
-            self._onset_ns = detection.stamp_ns
+            # The frames that confirm a detection take long at a low rate.
+            self._onset_ns = self._frame_stamps[0] if self._is_slow else detection.stamp_ns
             return []
         return self._event(detection.stamp_ns - self._hold_ns, True)
 
@@ -162,9 +197,19 @@ class _SensorEvents:
                                  & (readings.stamp_ns <= release_ns + margin_ns))
         if not len(readings) or np.isnan(readings.field).all():
             return []
-        self._n += 1
-        self._counts['events'] += 1
-        return [self._describe(readings, onset_ns, max(release_ns, onset_ns), ended)]
+        event = self._describe(readings, onset_ns, max(release_ns, onset_ns), ended)
+        return self._numbered(self._stays.add(event, readings, self.relearnt))
+
+    def _numbered(self, events: list[PassEvent]) -> list[PassEvent]:
+        """Count and number completed events."""
+        first, self._n = self._n + 1, self._n + len(events)
+        self._counts['events'] += len(events)
+        return [replace(event, number=first + k) for k, event in enumerate(events)]
+
+    @property
+    def _is_slow(self) -> bool:
+        """Whether the rate of the sensor is too low to show passes."""
+        return bool(self._rates.are_slow()[self._j])
 
     def _describe(self, readings: Readings, onset_ns: int, release_ns: int,
                   ended: bool) -> PassEvent:
@@ -176,14 +221,18 @@ class _SensorEvents:
         peak = int(np.argmax(squared_field))
         is_detected = (onset_ns <= stamp) & (stamp <= release_ns)
         present = ~np.all(np.isnan(field), axis=0)
-        closest = closest_point(t, field, noise)
-        horizontal = horizontal_field(field, self._R_ws)
-        is_complete = ~np.isnan(horizontal).any(axis=1)
-        left_to_right = _left_to_right(
-            horizontal[is_complete], float(np.nanmean(noise)) if is_complete.any() else 0.0,
-            int(np.count_nonzero(stamp < onset_ns)))
+        closest, left_to_right = ClosestPoint((int(stamp[peak]) - onset_ns) / NS, np.inf, np.nan), \
+            0.5
+        # A slow sensor, or the end of a long stay, does not show a pass.
+        if not self._is_slow and release_ns - onset_ns <= MAX_DURATION_S * NS:
+            closest = closest_point(t, field, noise)
+            horizontal = horizontal_field(field, self._R_ws)
+            is_complete = ~np.isnan(horizontal).any(axis=1)
+            left_to_right = _left_to_right(
+                horizontal[is_complete], float(np.nanmean(noise)) if is_complete.any() else 0.0,
+                int(np.count_nonzero(stamp < onset_ns)))
         return PassEvent(
-            self._name, self._n, ended, onset_ns, release_ns, int(stamp[peak]), field[peak],
+            self._name, 0, ended, onset_ns, release_ns, int(stamp[peak]), field[peak],
             float(np.sum(squared_field[is_detected]) * _median_interval(stamp)),
             ''.join(np.array(list('xyz'))[present]), noise,
             onset_ns + int(round(closest.time * NS)), closest.time_std, closest.time_scale,

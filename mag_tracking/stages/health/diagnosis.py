@@ -19,7 +19,7 @@ class Cause(enum.Enum):
     MILLISECOND_STAMPS = 'timestamps in milliseconds'
     ZERO_STAMPS = 'timestamps of zero'
     BOOT_STAMPS = 'timestamps since the start of the device'
-    WHOLE_SECOND_STAMPS = 'timestamps in whole seconds'
+    COARSE_STAMPS = 'coarse timestamps'
     BURST_STAMPS = 'readings in bursts'
     PACKET_STAMPS = 'one timestamp per packet'
     CLOCK_DIFFERS = 'clock differs'
@@ -46,11 +46,6 @@ class Cause(enum.Enum):
     NOISY = 'noisy'
     WRONG_COVARIANCE = 'wrong covariance'
     # Comparison of the sensors with each other and with the Earth's field.
-    SENSORS_EXCHANGED = 'sensors exchanged'
-    WRONG_GAIN = 'wrong gain'
-    AXES_INVERTED = 'axes inverted'
-    AXES_EXCHANGED = 'axes exchanged'
-    WRONG_ORIENTATION = 'wrong orientation'
     CONTRADICTS_EARTH = "contradicts the Earth's field"
     NOT_COMPARED = 'not compared'
     # Backgrounds.
@@ -117,9 +112,9 @@ def _explained(symptoms: str, artefacts: str = '') -> _Explained:
 
 _UNUSABLE = 'NO_BACKGROUND NO_DETECTION MISSED_TARGETS CONSTANT'
 _WRONG_STAMPS = _explained(
-    'DUPLICATE_STAMPS BACKWARD_STAMPS TOO_FAR_AHEAD FRAMES_TOO_LONG REJECTED ' + _UNUSABLE,
-    'CLOCK_DIFFERS CLOCK_STEPPED DELAY_VARIES DELAYED LOST SPIKES')
-_WRONG_GEOMETRY = _explained('CONTRADICTS_EARTH WRONG_ORIENTATION')
+    'DUPLICATE_STAMPS BACKWARD_STAMPS TOO_FAR_AHEAD FRAMES_TOO_LONG REJECTED RATE_TOO_LOW '
+    'RELEARNT_BACKGROUND ' + _UNUSABLE,
+    'CLOCK_DIFFERS CLOCK_STEPPED DELAY_VARIES DELAYED LOST SPIKES STUCK')
 
 _EXPLAINED = {
     Cause.OVERLOADED: _explained('LOST DELAY_VARIES DELAYED REJECTED', 'CLOCK_STEPPED'),
@@ -132,7 +127,7 @@ _EXPLAINED = {
     Cause.MILLISECOND_STAMPS: _WRONG_STAMPS,
     Cause.ZERO_STAMPS: _WRONG_STAMPS,
     Cause.BOOT_STAMPS: _WRONG_STAMPS,
-    Cause.WHOLE_SECOND_STAMPS: _WRONG_STAMPS,
+    Cause.COARSE_STAMPS: _WRONG_STAMPS,
     Cause.BURST_STAMPS: _WRONG_STAMPS,
     Cause.PACKET_STAMPS: _WRONG_STAMPS,
     Cause.CLOCK_STEPPED: _explained('BACKWARD_STAMPS DUPLICATE_STAMPS TOO_FAR_AHEAD REJECTED',
@@ -143,27 +138,22 @@ _EXPLAINED = {
                                       'WRONG_UNIT SATURATED SPIKES STUCK DEAD_AXIS NOISY'),
     Cause.REPEATED: _explained('RATE_TOO_LOW NO_DETECTION',
                                'SATURATED STUCK SPIKES NOISY WRONG_COVARIANCE'),
-    Cause.WRONG_UNIT: _explained('TOO_LARGE CONTRADICTS_EARTH WRONG_GAIN NOISY WRONG_COVARIANCE '
+    Cause.WRONG_UNIT: _explained('TOO_LARGE CONTRADICTS_EARTH NOISY WRONG_COVARIANCE '
                                  + _UNUSABLE, 'SATURATED SPIKES STUCK'),
     Cause.SPIKES: _explained('TOO_LARGE'),
     Cause.TOO_LARGE: _explained(_UNUSABLE),
     Cause.SATURATED: _explained(_UNUSABLE, 'STUCK DEAD_AXIS SPIKES'),
     Cause.STUCK: _explained(_UNUSABLE),
-    Cause.DEAD_AXIS: _explained('CONTRADICTS_EARTH WRONG_ORIENTATION ' + _UNUSABLE),
+    Cause.DEAD_AXIS: _explained('CONTRADICTS_EARTH ' + _UNUSABLE),
     Cause.NO_AXIS: _explained('MISSING_AXIS ' + _UNUSABLE),
     Cause.INFINITE: _explained(_UNUSABLE),
-    Cause.SENSORS_EXCHANGED: _WRONG_GEOMETRY,
-    Cause.WRONG_GAIN: _WRONG_GEOMETRY,
-    Cause.AXES_INVERTED: _WRONG_GEOMETRY,
-    Cause.AXES_EXCHANGED: _WRONG_GEOMETRY,
-    Cause.WRONG_ORIENTATION: _explained('CONTRADICTS_EARTH'),
     Cause.CONSTANT: _explained('NO_BACKGROUND NO_DETECTION MISSED_TARGETS'),
     Cause.NO_BACKGROUND: _explained('NO_DETECTION'),
 }
 """What each cause explains."""
 
 _NETWORK_WIDE = frozenset({
-    Cause.OVERLOADED, Cause.DAMAGED_RECORDING, Cause.UNDECODABLE, Cause.SENSORS_EXCHANGED,
+    Cause.OVERLOADED, Cause.DAMAGED_RECORDING, Cause.UNDECODABLE,
     Cause.FRAMES_TOO_LONG, Cause.REJECTED, Cause.NO_DETECTION})
 """Causes that are related to findings about every subject; other causes only to findings about
 their own subject."""

@@ -66,5 +66,23 @@ class ReadingBuffer:
         fields : (k, 3) array, T
         received : (k,) int array, ns
         """
-        k, self._count[j] = int(self._count[j]), 0
+        out = self.peek(j)
+        self._count[j] = 0
+        return out
+
+    def peek(self, j: int) -> tuple[IntArray, FloatArray, IntArray]:
+        """Return the readings of a sensor, as `pop`, and keep them in the buffer.
+
+        Parameters
+        ----------
+        j : int
+            Index of the sensor.
+
+        Returns
+        -------
+        stamps : (k,) int array, ns
+        fields : (k, 3) array, T
+        received : (k,) int array, ns
+        """
+        k = int(self._count[j])
         return self._stamp[j, :k], self._field[j, :k], self._received[j, :k]

@@ -14,7 +14,14 @@ from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
 from mag_tracking.quantities import occurrences
+from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.stages.health.diagnosis import Cause, Finding
+from mag_tracking.stages.health.timestamps import WINDOW as TIMESTAMP_WINDOW
+from mag_tracking.stages.health.timestamps import (
+    TimestampFault,
+    latest_interval_s,
+    timestamp_fault,
+)
 from mag_tracking.stages.health.window import median_field, quantiles, sample_noise_std
 from mag_tracking.units import NEVER, NS
 
@@ -34,6 +41,8 @@ MAX_JITTER = 0.3
 readings are not counted."""
 STUCK_S = 1.0
 """[s] A sensor is stuck if its readings are identical for longer than this."""
+MIN_STUCK_READINGS = 8
+"""A slow sensor is stuck if more than this number of readings are identical."""
 MAX_PLATEAU_S = 0.5
 """[s] Maximum time for which a target that passes saturates a sensor."""
 MIN_MOVED_STEPS = 10.0
@@ -70,18 +79,19 @@ class SensorHealth:
         self._buffered: list[tuple[int, FloatArray, int]] = []
         self._stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._received: IntArray = np.zeros(0, dtype=np.int64)
+        self._raw_fields: FloatArray = np.zeros((0, 3))
         # Latest reading; window of the readings without marks and repetitions, and its timestamps.
         self._latest: FloatArray = np.zeros((0, 3))
         self._fields: FloatArray = np.zeros((0, 3))
         self._field_stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._is_saturated: BoolArray = np.zeros(0, dtype=bool)
         self._interval_ns, self._jitter = float('nan'), float('inf')
+        self._timestamp_fault: TimestampFault | None = None
         self._noise: FloatArray = np.full(3, np.nan)
         # Results for the current window; cleared when readings are added.
         self._cache: dict[str, FloatArray] = {}
         self._delays: list[float] | None = None
-        # Timestamp of the first reading in the current run of identical readings; number of
-        # readings since the last stuck reading.
+        # Start of the current run of identical readings; number of readings after a stuck one.
         self._unchanged_since_ns: int | None = None
         self._n_since_stuck = WINDOW
         # Length of the current run of identical readings; number of readings that repeated the
@@ -143,25 +153,33 @@ class SensorHealth:
             return
         self._stamps = np.append(self._stamps, stamps)[-WINDOW:]
         self._received = np.append(self._received, received)[-WINDOW:]
+        self._raw_fields = np.append(self._raw_fields, fields, axis=0)[-TIMESTAMP_WINDOW:]
         self._counts['readings'] += n
         self._check_timestamps(n)
         missing = np.isnan(fields)
         for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
             self._counts[axis] += count
         self._counts['without any axis'] += int(missing.all(axis=1).sum())
-        with_latest = np.append(self._latest, fields, axis=0)
-        self._latest = with_latest[-1:].copy()
-        kept = self.faults.without(with_latest)[-n:]
+        kept = self.faults.without(np.append(self._latest, fields, axis=0))[-n:]
+        self._latest = fields[-1:].copy()
         is_kept = ~np.isnan(kept).all(axis=1) | missing.all(axis=1)
+        self._field_stamps = np.append(self._field_stamps, stamps[is_kept])[-WINDOW:]
+        self._fields = np.append(self._fields, kept[is_kept], axis=0)[-WINDOW:]
         if is_kept.any():
-            self._field_stamps = np.append(self._field_stamps, stamps[is_kept])[-WINDOW:]
-            self._fields = np.append(self._fields, kept[is_kept], axis=0)[-WINDOW:]
             self._check_fields(int(is_kept.sum()))
 
     def _check_timestamps(self, n: int) -> None:
         """Count the faults in the timestamps of the `n` latest readings."""
         # The first interval starts at the preceding reading, if there is one.
         intervals = np.diff(self._stamps[-n - 1:])
+        self._counts['duplicates'] += int((intervals == 0).sum())
+        self._counts['backward timestamps'] += int((intervals < 0).sum())
+        fault = timestamp_fault(self._stamps[-TIMESTAMP_WINDOW:], self._raw_fields)
+        if fault is not None:
+            # The intervals of such timestamps show neither lost readings nor clock steps.
+            self._timestamp_fault = fault.after(self._timestamp_fault)
+            self._interval_ns, self._jitter = fault.interval_s * NS, float('inf')
+            return
         is_received = self._received[-n - 1:] != NEVER
         receipts = np.diff(np.where(is_received, self._received[-n - 1:], 0)) / NS
         steps = receipts - intervals / NS
@@ -174,10 +192,13 @@ class SensorHealth:
         if is_step.any():
             self._counts['clock steps'] += int(is_step.sum())
             self._largest_step_s = max(self._largest_step_s, *steps[is_step].tolist(), key=abs)
-        self._counts['duplicates'] += int((intervals == 0).sum())
-        self._counts['backward timestamps'] += int((intervals < 0).sum())
         if self._jitter < MAX_JITTER:
-            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) & ~is_step
+            # Intervals like the latest ones are those of another rate.
+            latest_ns = latest_interval_s(self._stamps) * NS
+            is_other_rate = (latest_ns > GAP_RATIO * self._interval_ns) \
+                & (np.abs(intervals - latest_ns) < 0.2 * latest_ns)
+            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) \
+                & ~is_step & ~is_other_rate
             self._counts['lost'] += int(np.sum(np.round(intervals[gaps] / self._interval_ns) - 1))
         forward = np.diff(self._stamps)
         forward = forward[forward > 0]
@@ -217,7 +238,8 @@ class SensorHealth:
         # Index of the first reading of each run of identical readings; -1 = in an earlier batch.
         run_start = np.maximum.accumulate(np.where(is_repeated, -1, np.arange(n)))
         unchanged_since = np.where(run_start < 0, self._unchanged_since_ns or 0, stamps[run_start])
-        stuck = np.flatnonzero(stamps - unchanged_since > STUCK_S * NS)
+        min_duration = np.nanmax([STUCK_S * NS, MIN_STUCK_READINGS * self._interval_ns])
+        stuck = np.flatnonzero(stamps - unchanged_since > min_duration)
         self._unchanged_since_ns = int(unchanged_since[-1])
         self._count_runs(is_repeated, unchanged_since, stamps)
         if not self.is_coarse:
@@ -301,6 +323,14 @@ class SensorHealth:
         return ''.join(np.array(list('xyz'))[unchanged]) if unchanged.sum() < present.sum() else ''
 
     @property
+    def clock(self) -> ClockSpan | None:
+        """Timestamps and times of receipt of the window; None if no time of receipt is known."""
+        self.update()
+        is_received = self._received != NEVER
+        return ClockSpan.of(self._stamps[is_received], self._received[is_received]) \
+            if is_received.any() else None
+
+    @property
     def delay_s(self) -> list[float]:
         """Delay [s] from timestamp to receipt: median, 5 % and 95 % quantiles; NaN if unknown."""
         self.update()
@@ -361,6 +391,8 @@ class SensorHealth:
         """Yield findings about duplicate timestamps, lost readings and delays."""
         c = self.counts
         median, low, high = self.delay_s
+        if self._timestamp_fault is not None:
+            yield self._timestamp_fault.finding(name)
         if c['duplicates'] > 0.001 * n:
             yield Finding(False, name, f'{c["duplicates"]} of {n} readings repeat the previous '
                           'timestamp', 'check whether the driver publishes readings twice, or '
@@ -391,9 +423,9 @@ class SensorHealth:
             yield Finding(True, name, f'{c["without any axis"]} of {n} readings have no valid '
                           'axis', 'check the sensor and its driver', Cause.NO_AXIS)
         if dead := self.dead_axes:
-            yield Finding(True, name, ' and '.join(dead) + (
-                ' does not change' if len(dead) == 1 else ' do not change'),
-                'the axis is dead: check the sensor and its driver', Cause.DEAD_AXIS)
+            verb = 'does' if len(dead) == 1 else 'do'
+            yield Finding(True, name, f'{" and ".join(dead)} {verb} not change', 'the axis is '
+                          'dead: check the sensor and its driver', Cause.DEAD_AXIS)
         if missing := ', '.join(f'{axis} is missing in {c[axis]}' for axis in 'xyz'
                                 if 0.01 * n < c[axis] - c['without any axis']
                                 and c[axis] < 0.99 * n):

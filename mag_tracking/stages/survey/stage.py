@@ -224,7 +224,8 @@ class Survey:
         except ValueError as error:
             warnings[network.names[0]].append(str(error))
             return []
-        return disagreements(network.names, field, R, std, earth, self._settings.compass_bias_std)
+        return disagreements(network.names, field, R, std, earth, self._settings.compass_bias_std,
+                             self._settings.offset_std)
 
     def _compass(self, ups: Mapping[int, UpDirection], field: FloatArray, nominal_std: FloatArray,
                  warnings: Mapping[str, list[str]]

@@ -2,13 +2,18 @@
 
 from collections.abc import Set
 
+from mag_tracking.calibration.doubtful_times import (
+    CONTRADICTS_EARTH_FIELD,
+    DOUBTFUL_BACKGROUND,
+    WRONG_TIMESTAMPS,
+)
+
 ANOTHER_PLACE = 'another_place'
 ANOTHER_ARRIVAL = 'another_arrival'
 NOT_SEEN_APPROACHING = 'not_seen_approaching'
 SENSORS_AT_ONE_PLACE = 'sensors_at_one_place'
 ONE_SENSOR = 'one_sensor'
 FELT_BY_ONE_SENSOR = 'felt_by_one_sensor'
-DOUBTFUL_BACKGROUND = 'doubtful_background'
 SENSORS_CONTRADICT = 'sensors_contradict'
 MISFIT = 'misfit'
 CONTRADICTION = 'contradiction'
@@ -39,6 +44,10 @@ MEANINGS = {
     FELT_BY_ONE_SENSOR: 'only one sensor senses the target: range and moment are not observable '
                         'and follow from the settings',
     DOUBTFUL_BACKGROUND: 'the background of a sensor is doubtful',
+    CONTRADICTS_EARTH_FIELD: 'a sensor contradicts the Earth\'s field: its axes, its gain or its '
+                             'orientation in the network file are wrong',
+    WRONG_TIMESTAMPS: 'the timestamps of a sensor are wrong by more than 20 ms: they are coarse, '
+                      'or those of packets or bursts',
     SENSORS_CONTRADICT: 'the sensors contradict each other, and no majority agrees',
     MISFIT: 'the field does not fit the best hypothesis',
     CONTRADICTION: 'the probability of the field given the best hypothesis is below 1e-5',
@@ -49,7 +58,8 @@ MEANINGS = {
                  'their covariance',
     SENSORS_ROTATED: 'the track requires larger mounting errors than configured',
     HEIGHT: 'the height of the source is implausible for its kind of vehicle',
-    OFF_THE_ROAD: 'the target passes all sensors on one side, outside the configured lanes',
+    OFF_THE_ROAD: 'the target passes all sensors on one side, outside the lanes of '
+                  'track.vehicle.lateral_offsets',
     FRAMES_TOO_LONG: 'the target moves too far within one frame',
     CLOCKS_APART: 'the clocks of the sensors appear to differ in this or an earlier pass',
     ANOTHER_VEHICLE: 'the number of vehicles, or the position of one of them, is still uncertain',

@@ -56,6 +56,28 @@ def magnet_model(settings: MagnetSettings) -> Magnet:
     return Magnet(np.full(3, settings.acceleration**2), settings.angular_acceleration**2)
 
 
+def is_lost_after(settings: MagnetSettings, network: SensorNetwork, dt: float) -> bool:
+    """Whether a magnet may have moved anywhere near the sensors during a gap.
+
+    A prediction over such a gap does not help to find the magnet again, and an update linearised
+    there may diverge.
+
+    Parameters
+    ----------
+    settings : MagnetSettings
+    network : SensorNetwork
+    dt : float, s
+        Duration of the gap.
+
+    Returns
+    -------
+    bool
+    """
+    std = settings.acceleration * np.sqrt(dt**3 / 3.0)
+    extent = np.ptp(network.positions, axis=0).max()
+    return bool(std > settings.start_margin + 0.5 * extent)
+
+
 def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldFrame,
                  background_std: float, own_covariance: FloatArray, relative_std: float
                  ) -> FilterBank | None:

@@ -5,11 +5,11 @@ is updated with each frame. It ends with the release of the detection, or when i
 """
 
 from collections import Counter, deque
-from collections.abc import Mapping
 
 import numpy as np
 
-from mag_tracking.calibration.doubtful_times import DoubtfulTimes, are_doubtful
+from mag_tracking.arrays import BoolArray
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, InputDoubts, are_doubtful
 from mag_tracking.errors import NetworkError
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
@@ -19,6 +19,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.bank_size import sensors_at_start
 from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.disturbances import Disturbances
+from mag_tracking.stages.track.low_rate import SampleRates
 from mag_tracking.stages.track.observation import MAX_ROTATION
 from mag_tracking.stages.track.running_track import RunningTrack, TrackRecord
 from mag_tracking.stages.track.sensor_selection import SensorSubset
@@ -28,6 +29,8 @@ from mag_tracking.units import NS
 
 NO_SCALE = 'detections not tracked (scale not observable with one sensor)'
 NO_SCALE_FRAMES = 'frames in which no track could start (scale not observable with one sensor)'
+
+TOO_SLOW = 'detections not tracked (the rate of the sensors is too low)'
 
 UNCERTAIN_ORIENTATIONS = ('sensors with an orientation uncertainty above '
                           f'{np.degrees(MAX_ROTATION):g} degrees')
@@ -84,8 +87,9 @@ class TrackManager:
         self._restart_energy: float | None = None
         self._next_network: SensorNetwork | None = None
         self._disturbances = Disturbances(network.names)
-        self._doubtful_times: Mapping[str, DoubtfulTimes] = {}
-        self._doubtful_by_sensor: dict[int, DoubtfulTimes] = {}
+        self._rates = SampleRates(network, settings)
+        self._input_doubts: InputDoubts = {}
+        self._doubtful_rows: dict[str, dict[int, DoubtfulTimes]] = {}
         n_uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
                           for s in network.orientation_std)
         if n_uncertain:
@@ -119,24 +123,27 @@ class TrackManager:
         for track in self._tracks:
             track.configure(settings)
 
-    def set_doubtful_times(self, times: Mapping[str, DoubtfulTimes]) -> None:
-        """Set the times at which the backgrounds of the sensors are doubtful.
+    def set_input_doubts(self, doubts: InputDoubts) -> None:
+        """Set the times at which the readings of the sensors are doubtful.
 
         Tracks with frames at these times are marked as doubtful.
 
         Parameters
         ----------
-        times : dict of str to DoubtfulTimes
-            Doubtful intervals by sensor name; they replace all previous intervals.
+        doubts : {reason: {sensor: DoubtfulTimes}}
+            Doubtful intervals; they replace all previous intervals.
         """
-        if times != self._doubtful_times:
-            self._doubtful_times = times
-            self._doubtful_by_sensor = {self._network.index(name): t for name, t in times.items()}
+        if doubts != self._input_doubts:
+            self._input_doubts = doubts
+            self._doubtful_rows = {reason: {self._network.index(name): t for name, t in
+                                            by_sensor.items()}
+                                   for reason, by_sensor in doubts.items()}
 
-    def _doubtful_sensors(self, *frames: FieldFrame) -> list[int]:
-        """Indices of the sensors that measured with a doubtful background in any of the frames."""
-        return [j for j, times in self._doubtful_by_sensor.items()
-                if any(f.n_samples[j] and are_doubtful(times, f.stamp_ns) for f in frames)]
+    def _doubtful_sensors(self, *frames: FieldFrame) -> dict[str, list[int]]:
+        """Indices of the sensors with doubtful readings in any of the frames, by reason."""
+        return {reason: [j for j, times in by_row.items()
+                         if any(f.n_samples[j] and are_doubtful(times, f.stamp_ns) for f in frames)]
+                for reason, by_row in self._doubtful_rows.items()}
 
     @property
     def clock_warning(self) -> str:
@@ -168,6 +175,7 @@ class TrackManager:
         out, previous = self._end_at_gap(frame), self._last_ns
         self._last_ns = frame.stamp_ns
         self.counts['frames'] += 1
+        self._rates.add(frame)
         if not self._tracks:
             self._disturbances.feed(frame)
         if not frame.target_present:
@@ -246,7 +254,7 @@ class TrackManager:
         doubtful = self._doubtful_sensors(frame)
         self._max_energy = max(self._max_energy, _energy(frame))
         for track in self._tracks:
-            track.flag_doubtful_backgrounds(doubtful)
+            track.flag_doubtful_sensors(doubtful)
         out = [record for track in self._tracks for record in track.step(frame, dt)]
         return out + self._delete_ended(frame.stamp_ns)
 
@@ -275,8 +283,13 @@ class TrackManager:
             return []
         s = self._settings
         recent = [f for f in self._recent if frame.stamp_ns - f.stamp_ns <= s.lookback_s * NS]
-        if not (s.single_sensor_prior or self._target.starts_anywhere) \
-                and _n_sensors(frame, *recent) < 2:
+        n_required = 1 if s.single_sensor_prior or self._target.starts_anywhere else 2
+        is_slow = self._rates.are_slow()
+        if is_slow.any() and _n_sensors(frame, *recent, without=is_slow) < n_required:
+            self.counts[TOO_SLOW] += 1
+            self._restart_energy = np.inf
+            return []
+        if _n_sensors(frame, *recent) < n_required:
             self.counts[NO_SCALE_FRAMES] += 1
             self._store_frame(frame)
             return []
@@ -300,7 +313,7 @@ class TrackManager:
                              self.counts, self._clocks, later_sensors)
         self._next_id += 1
         self._tracks.append(track)
-        track.flag_doubtful_backgrounds(self._doubtful_sensors(*recent, frame))
+        track.flag_doubtful_sensors(self._doubtful_sensors(*recent, frame))
         out = track.begin(
             frame, recent,
             approach_unobserved=is_in_tail or bool(recent) and _n_sensors(*recent) < 2)
@@ -323,6 +336,7 @@ def _energy(frame: FieldFrame) -> float:
     return float(np.nansum(np.square(frame.field)))
 
 
-def _n_sensors(*frames: FieldFrame) -> int:
-    """Number of sensors that measured in at least one frame."""
-    return int(np.count_nonzero(np.any([~np.isnan(f.field) for f in frames], axis=(0, 2))))
+def _n_sensors(*frames: FieldFrame, without: BoolArray | bool = False) -> int:
+    """Number of sensors, `without` some (n_sensors,), that measured in at least one frame."""
+    have_measured = np.any([~np.isnan(f.field) for f in frames], axis=(0, 2))
+    return int(np.count_nonzero(have_measured & ~np.asarray(without)))

@@ -8,6 +8,7 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.physics.bounds import impossible_reason
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.bank_filter import BankFilter
@@ -103,6 +104,8 @@ class Member:
         self.is_lost = False
         self.early: list[TrackState] = []
         self.slot = 0
+        # Reason why the latest state is impossible and was not published; empty if it is possible.
+        self._impossible = ''
         self._position_std = np.inf
         self._unobserved_length = target.unobserved_length()
         self._was_unambiguous = False
@@ -167,7 +170,7 @@ class Member:
                      for stamp_ns, position in self._recent_positions if stamp_ns in position_at]
         return float(np.mean(distances)) if distances else 0.0
 
-    def publish(self, update: BankUpdate, view: MemberView) -> Track:
+    def publish(self, update: BankUpdate, view: MemberView) -> list[Track]:
         """Create and store the `Track` record of this member for a frame.
 
         Parameters
@@ -177,14 +180,19 @@ class Member:
 
         Returns
         -------
-        Track
+        list of Track
+            The record; empty if the state is impossible, which ends the member.
         """
-        self.last = self._create_record(update, view)
+        record = self._create_record(update, view)
+        self._impossible = impossible_reason(record.velocity, record.moment, record.mounting)
+        if self._impossible:
+            return []
+        self.last = record
         self._position_std = float(np.sqrt(np.trace(view.bank.P[view.best, :2, :2])))
         self._was_unambiguous |= not self.last.ambiguous
         self._recent_positions.append((self.last.stamp_ns, self.last.position[:2]))
         self._counts['poses'] += 1
-        return self.last
+        return [self.last]
 
     def _create_record(self, update: BankUpdate, view: MemberView) -> Track:
         """Update the evidence with a frame, and return the `Track` record for this frame."""
@@ -272,6 +280,8 @@ class Member:
         str or None
             None if the track continues.
         """
+        if self._impossible:
+            return self._impossible
         assert self.last is not None
         is_approaching = not self._target.starts_anywhere and sensors.is_approached_by(self.last)
         return self.evidence.reason_to_end(self.last, self._position_std, is_approaching, settings)
@@ -342,13 +352,16 @@ class Member:
         list of SmoothedPose
         """
         ambiguous = doubtful or bool(ambiguities(bank, best, bank.is_separated(best)))
-        return [smoothed_pose(
+        poses = [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
             kind=int(bank.kind[best]), kinds=self._target.kinds,
             unobserved_length=self._unobserved_length, complete=complete, difference=difference,
             ambiguous=ambiguous or self.evidence.was_filter_doubtful(stamp_ns))
             for (stamp_ns, x, P), difference in zip(states, self.cross_check.differences(states),
                                                     strict=True)]
+        possible = [p for p in poses if not impossible_reason(p.velocity, p.moment)]
+        self._counts['smoothed poses not published: impossible'] += len(poses) - len(possible)
+        return possible
 
 
 def members_in_order(members: Sequence[Member], new: Member | None, joint: JointExplanation,

@@ -5,6 +5,7 @@ from scipy.special import chdtri, ndtri
 
 from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.network import SensorNetwork
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
 from mag_tracking.stages.track.observation import Observation
@@ -20,6 +21,10 @@ LANE_STDS, LANE_STDS_LATER = 1.645, 3.0
 """Maximum distance of a vehicle from the outermost configured lane, in standard deviations: at its
 closest point to any sensor, and at later times, when it may have turned off. One in twenty vehicles
 on that lane exceeds the first limit."""
+
+MAX_ONE_SIDED_WIDTH = 2.0
+"""[m] Maximum lateral extent of sensors that are assumed to stand on one side of a road, because no
+lane fits between them."""
 
 MIN_SPEED = 1.0
 """[m/s] Minimum speed of a vehicle at which its heading is defined."""
@@ -112,6 +117,32 @@ def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray
     on_one_side = (lateral > 0.0).all(axis=0) | (lateral < 0.0).all(axis=0)
     is_off_road: BoolArray = on_one_side & (np.abs(lateral.mean(axis=0)) > edge) & _is_moving(x)
     return is_off_road
+
+
+def lane_note(settings: VehicleSettings, network: SensorNetwork) -> str | None:
+    """Explain which lanes are covered if the sensors stand on one side of the road.
+
+    Parameters
+    ----------
+    settings : VehicleSettings
+    network : SensorNetwork
+
+    Returns
+    -------
+    str or None
+        None for one sensor, for a compact network, and unless the sensors are in a line along most
+        of the arrival directions.
+    """
+    headings = np.deg2rad(settings.arrival_headings_deg)
+    across = np.array([-np.sin(headings), np.cos(headings)])
+    is_one_sided = np.ptp(network.positions[:, :2] @ across, axis=0) < MAX_ONE_SIDED_WIDTH
+    if len(network) < 2 or network.is_compact or 2 * is_one_sided.sum() <= len(headings):
+        return None
+    edge = max(map(abs, settings.lateral_offsets)) + LANE_STDS * settings.lateral_std
+    offsets = ', '.join(f'{offset:g}' for offset in settings.lateral_offsets)
+    return (f'the sensors stand in a line along the road: vehicles up to {edge:.1f} m beside the '
+            'line are expected. If a lane is farther away, add its distance to '
+            f'track.vehicle.lateral_offsets ({offsets}; positive to the left of the heading)')
 
 
 def _is_moving(x: FloatArray) -> BoolArray:

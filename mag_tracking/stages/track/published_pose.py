@@ -16,6 +16,7 @@ from mag_tracking.geometry import (
 from mag_tracking.inference.covariance_union import inflated_to_cover
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.mixture import second_moment
+from mag_tracking.physics.bounds import are_possible
 from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import Hypotheses, PoseUncertainty, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
@@ -216,6 +217,7 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     weights = np.exp(bank.log_w)
     moments = model.dipoles(bank.x[:, :n_t]).m.sum(axis=1)
     order = np.argsort(-bank.log_w, kind='stable')
+    order = order[are_possible(bank.x[order, 3:6], moments[order])]
     hypotheses = Hypotheses(
         tuple(arrivals[k] for k in bank.label[order].tolist()), weights[order], bank.x[order, :6],
         bank.P[order, :6, :6], moments[order], tuple(kinds[k] for k in bank.kind[order].tolist()))

@@ -8,7 +8,7 @@ Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -123,20 +123,21 @@ class RunningTrack:
             for member in self.members:
                 member.use(self._bank.sensors)
 
-    def flag_doubtful_backgrounds(self, sensors: Sequence[int]) -> None:
-        """Mark the track as doubtful if it uses a sensor with a doubtful background.
+    def flag_doubtful_sensors(self, sensors: Mapping[str, Sequence[int]]) -> None:
+        """Mark the track as doubtful if it uses a sensor with doubtful readings.
 
         Parameters
         ----------
-        sensors : sequence of int
-            Indices of the sensors with a doubtful background.
+        sensors : mapping of str to sequence of int
+            Indices of the sensors with doubtful readings, by reason.
         """
-        if not np.isin(self._final_sensors.rows, sensors).any():
-            return
-        for member in self.members:
-            if doubts.DOUBTFUL_BACKGROUND not in member.evidence.doubts:
-                self.counts['tracks with a doubtful background'] += 1
-                member.evidence.flag(doubts.DOUBTFUL_BACKGROUND)
+        for reason, rows in sensors.items():
+            if not np.isin(self._final_sensors.rows, rows).any():
+                continue
+            for member in self.members:
+                if reason not in member.evidence.doubts:
+                    self.counts[f'tracks with doubtful readings: {reason}'] += 1
+                    member.evidence.flag(reason)
 
     def begin(self, frame: FieldFrame, recent: list[FieldFrame], approach_unobserved: bool = False
               ) -> list[TrackRecord]:
@@ -194,8 +195,9 @@ class RunningTrack:
             return []
         for member in () if self._target.starts_anywhere else self.members:
             member.evidence.check_approach(self._final_sensors.part_of(frame))
-        frame_update = self._bank.advance(self._bank.sensors.part_of(frame), dt)
-        if not self._update_evidence(frame_update):
+        used = self._bank.sensors.part_of(frame)
+        frame_update = self._bank.advance(used, 0.0 if self._restart_after_gap(used, dt) else dt)
+        if not self._update_evidence(frame_update, dt):
             return self.end('no hypothesis explains the field')
         self._bank.store_and_prune(frame_update, publish)
         best = self.bank.best()
@@ -210,8 +212,9 @@ class RunningTrack:
             return []
         update = BankUpdate(frame_update.frame, dt, self.bank, self._bank.filter,
                             self._bank.sensors, self._settings)
-        out: list[TrackRecord] = [member.publish(update, view)
-                                  for member, view in zip(self.members, views, strict=True)]
+        out: list[TrackRecord] = [
+            record for member, view in zip(self.members, views, strict=True)
+            for record in member.publish(update, view)]
         self._handover_due = best if self._bank.sensors.is_part else None
         return [*out, *lagged_poses, *self._end_lost_members(frame_update.frame)]
 
@@ -221,9 +224,19 @@ class RunningTrack:
         row = best if bank is self.bank else bank.best()
         return MemberView(bank, row, self._bank.single_target, self._bank.gain(row))
 
-    def _update_evidence(self, frame_update: FrameUpdate) -> bool:
+    def _restart_after_gap(self, frame: FieldFrame, dt: float) -> bool:
+        """Start the hypotheses again if the target was lost in a gap; return whether they were."""
+        states = self._bank.smoothed(self.bank.best(), False) \
+            if self._target.is_lost_after(self._settings, self._bank.sensors.network, dt) else []
+        if not self._bank.restart_after_gap(frame, dt):
+            return False
+        # The path before the gap was smoothed on its own.
+        self.members[0].early += states
+        return True
+
+    def _update_evidence(self, frame_update: FrameUpdate, dt: float) -> bool:
         """Update the evidence of the members; return False if no hypothesis explains the frame."""
-        frame, dt = frame_update.frame, frame_update.dt
+        frame = frame_update.frame
         if frame_update.n_rejected and np.count_nonzero(frame.n_samples) <= frame_update.n_rejected:
             # Without a majority of sensors, the track itself may be wrong.
             for member in self.members:

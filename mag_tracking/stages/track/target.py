@@ -13,7 +13,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_size import check_magnet_bank, check_vehicle_bank
-from mag_tracking.stages.track.initiation_magnet import magnet_model, start_magnet
+from mag_tracking.stages.track.initiation_magnet import is_lost_after, magnet_model, start_magnet
 from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
 from mag_tracking.stages.track.published_pose import (
     MagnetOrientation,
@@ -44,6 +44,9 @@ class Target:
     """Function that returns the first hypotheses from the settings, a network, a frame and the
     covariances (n_sensors, n_own, n_own) of mounting angles and model errors; None if the frame
     does not allow a start."""
+    is_lost_after: Callable[[TrackSettings, SensorNetwork, float], bool] = lambda *_: False
+    """Function that returns whether the target may be anywhere after a gap [s], so that its
+    hypotheses are started again."""
 
 
 def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
@@ -80,7 +83,8 @@ def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
         check_magnet_bank(settings, network, model)
         return Target(model,
                       MagnetOrientation(np.array(magnet.axis)),
-                      ('',), ('',), lambda: None, True, _start_magnet)
+                      ('',), ('',), lambda: None, True, _start_magnet,
+                      lambda s, network, dt: is_lost_after(s.magnet, network, dt))
     raise SettingsError(f'track.target: expected vehicle or magnet, got {settings.target!r}')
 
 

@@ -177,6 +177,34 @@ class TrackBank:
         return FrameUpdate(used, dt, predicted, log_likelihood, self.bank.reweight(log_likelihood),
                            len(rejected))
 
+    def restart_after_gap(self, frame: FieldFrame, dt: float) -> bool:
+        """Start the hypotheses again if the target was lost in a gap before a frame.
+
+        Parameters
+        ----------
+        frame : FieldFrame
+            First frame after the gap, of the sensors in use.
+        dt : float, s
+            Time since the previous frame.
+
+        Returns
+        -------
+        bool
+            Whether the hypotheses were started again, at the time of `frame`.
+        """
+        network = self.sensors.network
+        if not self._target.is_lost_after(self._settings, network, dt):
+            return False
+        bank = self._target.start(self._settings, network, frame,
+                                  self.filter.observation.own_covariance)
+        if bank is None:
+            return False
+        self.bank = bank
+        self._counts['hypotheses started again after a gap'] += 1
+        self._clear_lag()
+        self.begin(frame, frame)
+        return True
+
     def store_and_prune(self, frame_update: FrameUpdate, publish: bool) -> None:
         """Store a frame, drop improbable hypotheses, and relinearise the leading ones if due.
 

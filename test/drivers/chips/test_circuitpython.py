@@ -1,58 +1,95 @@
 """Adafruit's CircuitPython drivers with simulated chips, and custom drivers."""
 
+import importlib.util
 import sys
-from types import ModuleType, SimpleNamespace
+import time
+from types import ModuleType
 
 import numpy as np
 import pytest
 
+from mag_tracking.drivers.chips.circuitpython import UNITS
 from mag_tracking.drivers.transports.i2c import I2cDevice, I2cSettings
 from mag_tracking.errors import DeviceError
 from mag_tracking.settings import replace
+from support.circuitpython_chips import CASES, FakeMlx90393
 from support.i2c_bus import B, FakeBus, FakeMultiplexer, rig
-from support.i2c_chips import Clock, FakeLis3mdl, FakeMmc5603
+from support.i2c_chips import Clock, FakeLis3mdl, FakeMmc5603, FakeMmc5983ma
 
-LIS3MDL, MMC5603 = 'adafruit_lis3mdl.LIS3MDL', 'adafruit_mmc56x3.MMC5603'
+MMC5603 = 'adafruit_mmc56x3.MMC5603'
 
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Simulated clock that also replaces the sleep of the drivers."""
+    """Simulated clock, which also replaces the clock and the sleep of all drivers."""
     clock = Clock()
-    lis3mdl = pytest.importorskip('adafruit_lis3mdl')
-    monkeypatch.setattr(lis3mdl, 'sleep', clock.sleep)
-    mmc56x3 = pytest.importorskip('adafruit_mmc56x3')
-    monkeypatch.setattr(mmc56x3, 'time', SimpleNamespace(sleep=clock.sleep))
+    monkeypatch.setattr(time, 'sleep', clock.sleep)
+    monkeypatch.setattr(time, 'monotonic', lambda: clock.ns * 1e-9)
+    for name in UNITS:
+        # Some drivers import the function.
+        module = name.rpartition('.')[0]
+        if importlib.util.find_spec(module.partition('.')[0]) and hasattr(
+                importlib.import_module(module), 'sleep'):
+            monkeypatch.setattr(f'{module}.sleep', clock.sleep)
     return clock
 
 
-def open_device(clock, chip, fake, **changes):
+def open_device(clock, chip, chips, address, **changes):
     """Open a device with the single sensor A; return (bus, device)."""
-    address = 0x1C if chip == LIS3MDL else 0x30
-    _, bus, device = rig([f'A:{chip}:{address:#04x}'], {address: fake}, clock, **changes)
+    pytest.importorskip(chip.rpartition('.')[0])
+    _, bus, device = rig([f'A:{chip}:{address:#04x}'], chips, clock, **changes)
     device.open()
     return bus, device
 
 
-@pytest.mark.parametrize('chip, fake, scale, count', [
-    (LIS3MDL, FakeLis3mdl, 1.0, 1e-4 / 6842),
-    # The driver scales a count of 1 / 16384 G as 0.0625 mG.
-    (MMC5603, FakeMmc5603, 0.0625e-3 * 16384, 6.25e-9)])
-@pytest.mark.parametrize('field', [B, (-3.1e-4, 2.2e-4, -1e-9)])
-def test_adafruit_drivers_read_the_field(clock, chip, fake, scale, count, field):
-    fake = fake(clock, field)
-    # Adafruit's driver reads six registers without the auto-increment bit.
-    fake.strict = False
-    _, device = open_device(clock, chip, fake)
+@pytest.mark.parametrize('field', [B, (-1.3e-4, 1.1e-4, -1.2e-5)])
+@pytest.mark.parametrize('case', CASES, ids=lambda case: case.name)
+def test_drivers_as_users_install_them_read_the_field_in_tesla(clock, case, field):
+    _, device = open_device(clock, case.name, case.chips(clock, field), case.address)
     for _ in range(3):
         (arrival,) = device.read(1.0)
-        assert arrival.reading.sensor == 'A'
-        np.testing.assert_allclose(arrival.reading.field, np.multiply(field, scale), rtol=1e-9,
-                                   atol=0.51 * count)
-    assert not device.counts
+        np.testing.assert_allclose(arrival.reading.field, np.multiply(field, case.scale),
+                                   rtol=1e-6, atol=0.51 * case.count)
+    assert set(device.counts) <= {'polling cycles missed'}
+
+
+def test_every_class_with_a_known_unit_is_tested():
+    assert {case.name for case in CASES} == set(UNITS)
+
+
+@pytest.mark.parametrize('case', [c for c in CASES if c.address == 0x1E and not c.others],
+                         ids=lambda case: case.name)
+def test_a_class_with_a_fixed_address_refuses_any_other(clock, case):
+    chips = {**case.chips(clock, B), 0x1C: FakeMmc5603(clock)}
+    with pytest.raises(DeviceError, match='does not use this address, but 0x1e'):
+        open_device(clock, case.name, chips, 0x1C)
+
+
+def test_a_chip_that_disappears_during_the_set_up_is_an_error(clock):
+    # This driver ignores OSError while it waits for the answer to a command.
+    chip = FakeMlx90393(clock)
+    write = chip.write
+
+    def write_and_disappear(data):
+        write(data)
+        chip.answers = len(data) < 4
+
+    chip.write = write_and_disappear
+    with pytest.raises(DeviceError, match='timeout while the driver waited'):
+        open_device(clock, 'adafruit_mlx90393.MLX90393', {0x0C: chip}, 0x0C)
+
+
+def test_the_unit_of_an_entry_has_priority(clock):
+    pytest.importorskip('adafruit_qmc5883p')
+    entry = 'A:adafruit_qmc5883p.QMC5883P:0x2c:uT'
+    (case,) = (c for c in CASES if c.name in entry)
+    _, _, device = rig([entry], case.chips(clock, B), clock)
+    device.open()
+    np.testing.assert_allclose(device.read(1.0)[0].reading.field, np.multiply(B, 1e-2), atol=1e-9)
 
 
 def test_adafruit_drivers_work_behind_a_multiplexer(clock):
+    pytest.importorskip('adafruit_mmc56x3')
     fakes = [FakeMmc5603(clock, (n * 1e-5, 0.0, 0.0)) for n in range(3)]
     _, _, device = rig([f'{n}:{MMC5603}:0x30@0x70.{n}' for n in range(3)],
                        {0x70: FakeMultiplexer(clock, {n: {0x30: f} for n, f in enumerate(fakes)})},
@@ -63,18 +100,17 @@ def test_adafruit_drivers_work_behind_a_multiplexer(clock):
                                                          abs=1e-8)
 
 
-def test_wrong_and_missing_chips_are_reported(clock):
-    with pytest.raises(DeviceError, match=r'A \(adafruit_lis3mdl.LIS3MDL, address 0x1c\).*Failed'):
-        open_device(clock, LIS3MDL, FakeMmc5603(clock))
-    silent = FakeLis3mdl(clock)
-    silent.answers = False
-    with pytest.raises(DeviceError, match='No I2C device at address: 0x1c'):
-        open_device(clock, LIS3MDL, silent)
+@pytest.mark.parametrize('case', CASES, ids=lambda case: case.name)
+def test_wrong_and_missing_chips_are_errors_of_the_device(clock, case):
+    wrong = {address: FakeMmc5983ma(clock) for address in case.chips(clock, B)}
+    for chips in [{}] + [wrong] * case.identifies:
+        with pytest.raises(DeviceError, match=fr'A \({case.name}, address {case.address:#04x}'):
+            open_device(clock, case.name, chips, case.address)
 
 
 def test_failed_readings_are_counted_and_repeated_failures_raise(clock):
     fake = FakeMmc5603(clock)
-    _, device = open_device(clock, MMC5603, fake, max_failures=3)
+    _, device = open_device(clock, MMC5603, {0x30: fake}, 0x30, max_failures=3)
     fake.answers = False
     assert device.read(0.01) == [] and device.counts['failed readings: A'] == 1
     fake.answers = True
@@ -86,7 +122,7 @@ def test_failed_readings_are_counted_and_repeated_failures_raise(clock):
 
 def test_a_driver_that_waits_forever_times_out(clock):
     fake = FakeMmc5603(clock)
-    _, device = open_device(clock, MMC5603, fake, max_failures=2)
+    _, device = open_device(clock, MMC5603, {0x30: fake}, 0x30, max_failures=2)
     assert device.read(1.0)
     fake.finish = lambda: None
     start = clock.ns
@@ -99,7 +135,7 @@ def test_a_driver_that_waits_forever_times_out(clock):
 def custom_device(name, cls, **changes):
     """Return (clock, bus, device) of a LIS3MDL whose driver is the class `name`.Sensor."""
     clock = Clock()
-    settings = replace(I2cSettings(), {'sensors': [f'A:{name}.Sensor:0x1c'], **changes})
+    settings = replace(I2cSettings(), {'sensors': [f'A:{name}.Sensor:0x1c:uT'], **changes})
     bus = FakeBus(clock, {0x1C: FakeLis3mdl(clock)})
     return clock, bus, I2cDevice(settings, bus.open_bus, clock.monotonic_ns, clock.sleep)
 
@@ -212,7 +248,7 @@ def test_slices_of_buffers_are_transferred(module):
 
 
 def test_the_error_of_a_missing_driver_names_its_package():
-    _, bus, device = rig(['A:adafruit_no_such.Sensor:0x1c'], {})
+    _, bus, device = rig(['A:adafruit_no_such.Sensor:0x1c:uT'], {})
     with pytest.raises(DeviceError, match='is adafruit-circuitpython-no_such installed'):
         device.open()
     assert not bus.open

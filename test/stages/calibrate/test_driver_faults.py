@@ -112,5 +112,5 @@ def test_the_number_of_marks_is_that_of_the_recording():
     prescan([readings], NETWORK, SETTINGS.calibrate).apply(pipeline.calibrate)
     pipeline.feed(readings)
     for j, name in enumerate(NETWORK.names):
-        assert pipeline.calibrate.n_marked(name) == (readings.sensor == j).sum() // 40
+        assert pipeline.calibrate.driver_faults.n_marked(name) == (readings.sensor == j).sum() // 40
     assert any('99999 nT' in cause for cause in pipeline.rejections())

@@ -117,7 +117,7 @@ def events_of(readings, network=NETWORK, batch=None):
     """Calibrate raw readings and create the events; return [PassEvent]."""
     settings = settings_for('vehicle')
     calibrate, stage = Calibrate(network, settings.calibrate), Events(
-        network, settings.align, settings.detect)
+        network, settings.align, settings.detect, settings.track)
     size, out = batch or len(readings), []
     for i in range(0, len(readings), size):
         for calibrated in calibrate.feed(readings.part(slice(i, i + size))):

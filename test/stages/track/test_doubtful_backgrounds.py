@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from mag_tracking.calibration.doubtful_times import DOUBTFUL_BACKGROUND
 from mag_tracking.messages.calibration_state import doubtful_times, sensor_dict
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
@@ -15,7 +16,7 @@ from support.networks import line_network
 from support.samples import one, simulate
 
 UNAMBIGUOUS_WITHOUT_DOUBT = ('junction_left_to_right', 'junction_left_turns_to_rear')
-DOUBTFUL_TRACKS = 'tracks with a doubtful background'
+DOUBTFUL_TRACKS = f'tracks with doubtful readings: {DOUBTFUL_BACKGROUND}'
 SETTINGS = settings_for('vehicle', QUICK)
 """Settings of a fast target model; the doubt does not depend on the model."""
 
@@ -41,9 +42,9 @@ def run_tracker(pass_frames, times, settings=None):
     network, frames = pass_frames
     manager = TrackManager(network, settings_for('vehicle', {**QUICK, **(settings or {})}).track)
     start = frames[0].stamp_ns
-    manager.set_doubtful_times({name: tuple((start + round(b * 1e9), None if e is None else
-                                             start + round(e * 1e9)) for b, e in segments)
-                                for name, segments in times.items()})
+    manager.set_input_doubts({DOUBTFUL_BACKGROUND: {
+        name: tuple((start + round(b * 1e9), None if e is None else start + round(e * 1e9))
+                    for b, e in segments) for name, segments in times.items()}})
     return manager, [r for f in frames for r in manager.feed(f)
                      if isinstance(r, Track) and not r.ended]
 
@@ -90,8 +91,7 @@ def test_the_calibration_state_message_contains_doubtful_intervals():
     pipeline = Pipeline(network, settings_for('vehicle'))
     assert times_in_message(pipeline) == {name: () for name in network.names}
     pipeline.feed(after_dense_traffic('straight_small_left', 7.0))
-    times = pipeline.calibrate.doubtful_intervals()
-    assert times
+    times = pipeline.calibrate.input_doubts()[DOUBTFUL_BACKGROUND]
     assert times_in_message(pipeline) == {name: times.get(name, ())[-1:] for name in network.names}
 
 
@@ -112,7 +112,7 @@ def test_a_vehicle_after_dense_traffic_is_tracked_and_ambiguous(name):
     network, readings = read_network(NETWORK_FILE), after_dense_traffic(name, 7.0)
     pipeline, other = (Pipeline(network, SETTINGS) for _ in range(2))
     tracks = poses_of(pipeline.feed(readings) + pipeline.flush())
-    assert pipeline.calibrate.doubtful_intervals()
+    assert pipeline.calibrate.input_doubts()
     assert len(tracks) > 10 and all(t.ambiguous for t in tracks)
     parts = [other.feed(readings.part(slice(i, i + 50))) for i in range(0, len(readings), 50)]
     again = poses_of([r for part in parts for r in part] + other.flush())
@@ -128,7 +128,7 @@ def test_poses_after_dense_traffic_are_unambiguous_without_the_doubt(name):
     """The tracker ignores the doubtful intervals here. The ambiguity of these poses is therefore
     due to the intervals."""
     pipeline = Pipeline(read_network(NETWORK_FILE), SETTINGS)
-    pipeline.track.set_doubtful_times = lambda times: None
+    pipeline.track.set_input_doubts = lambda doubts: None
     tracks = poses_of(pipeline.feed(after_dense_traffic(name, 7.0)) + pipeline.flush())
     assert sum(not t.ambiguous for t in tracks) > 10
 

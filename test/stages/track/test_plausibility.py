@@ -9,7 +9,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.initiation_vehicle import vehicle_model
 from mag_tracking.stages.track.observation import Observation
-from mag_tracking.stages.track.plausibility import Plausibility
+from mag_tracking.stages.track.plausibility import Plausibility, lane_note
 from support.networks import line_network
 from support.passes import network_of
 
@@ -52,6 +52,18 @@ def doubts_in_state(mounting=MOUNTING, dt=0.08, **of_state):
     ({'at': (30.0, -6.5)}, {doubts.OFF_THE_ROAD}), ({'at': (0.0, 6.5), 'speed': 0.9}, set())])
 def test_implausible_states_are_flagged(of_state, expected):
     assert doubts_in_state(**of_state) == expected
+
+
+@pytest.mark.parametrize('positions, has_note', [
+    ([(0.0, 0.0), (10.0, 0.0)], True), ([(0.0, 0.0), (10.0, 1.5), (20.0, 0.0)], True),
+    ([(0.0, -4.5), (0.0, 4.5)], False), ([(0.0, 0.0), (10.0, 5.0)], False),
+    ([(0.0, 0.0), (0.5, 0.0)], False), ([(0.0, 0.0)], False)])
+def test_the_covered_lanes_are_stated_if_all_sensors_stand_on_one_side(positions, has_note):
+    note = lane_note(SETTINGS.vehicle, network_of([(x, y, 0.0) for x, y in positions]))
+    assert (note is not None) == has_note
+    if note:
+        # As for the doubt: 4 m and 1.645 standard deviations of 1.5 m.
+        assert 'track.vehicle.lateral_offsets' in note and '6.5 m' in note
 
 
 def observation_of(network=NETWORK):

@@ -159,7 +159,7 @@ def track_frames(frames, changes, doubtful=None, start=slice(None)):
     """(`TrackManager`, live tracks) after the frames have been fed."""
     network, all_frames = frames
     tracker, tracks = manager.TrackManager(network, settings_for('vehicle', changes).track), []
-    tracker.set_doubtful_times(doubtful or {})
+    tracker.set_input_doubts({DOUBTFUL_BACKGROUND: doubtful or {}})
     for frame in all_frames[start]:
         tracks += [r for r in tracker.feed(frame) if isinstance(r, Track) and not r.ended]
     return tracker, tracks
@@ -216,7 +216,7 @@ def test_the_first_pose_is_flagged_for_a_sensor_that_joins_with_it(monkeypatch, 
         monkeypatch.setattr(manager, 'sensors_at_start', lambda *_, n=n: n)
         tracker, tracks = track_frames(frames, POINT, {far: ((0, 2**62),)})
         assert DOUBTFUL_BACKGROUND in tracks[0].doubts
-        assert tracker.counts['tracks with a doubtful background'] == 1
+        assert tracker.counts['tracks with doubtful readings: doubtful_background'] == 1
 
 
 def test_a_network_of_at_most_max_sensors_is_used_completely():

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from mag_tracking.apps.doctor import Doctor
+from mag_tracking.apps.host_stalls import load_findings
 from mag_tracking.pipeline import settings_for
 from mag_tracking.stages.health.diagnosis import Cause, Finding, ranked
-from mag_tracking.stages.health.host_stalls import load_findings
 from support.networks import line_network
 from support.samples import MagSample, one
 

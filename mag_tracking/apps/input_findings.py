@@ -1,0 +1,47 @@
+"""Findings about the input of a program that reads a recording."""
+
+from mag_tracking.apps.doctor import background_findings, rate_findings, recording_findings
+from mag_tracking.apps.doctor_covariances import covariance_findings
+from mag_tracking.apps.doctor_rejections import driver_findings, rejection_findings
+from mag_tracking.network import SensorNetwork
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.stages.calibrate.field_comparison import earth_field_findings
+from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.health.clocks import clock_findings
+from mag_tracking.stages.health.diagnosis import Cause, Finding
+from mag_tracking.stages.track.settings import TrackSettings
+
+
+def input_findings(recording: Recording, reader: SampleReader, network: SensorNetwork,
+                   calibrate: Calibrate, settings: TrackSettings) -> list[Finding]:
+    """Findings about a recording and the sensors, without ranking.
+
+    Parameters
+    ----------
+    recording : Recording
+    reader : SampleReader
+        Reader at the end of the recording.
+    network : SensorNetwork
+    calibrate : Calibrate
+        Calibration stage after the whole recording.
+    settings : TrackSettings
+
+    Returns
+    -------
+    list of Finding
+    """
+    missing = reader.missing_topics()
+    found = [*recording_findings(recording, reader), *clock_findings(reader.clocks)]
+    for name, topic in zip(network.names, network.absolute_topics, strict=True):
+        if topic in missing:
+            found.append(Finding(True, name, f'no messages on {topic}', 'check the topic in the '
+                                 'network file', Cause.NO_MESSAGES))
+        if (timestamps := calibrate.timestamp_fault(name)) is not None:
+            found.append(timestamps.finding(name))
+        found += rate_findings(name, calibrate.lowest_rate(name), network, settings)
+        found += driver_findings(name, calibrate)
+        found += rejection_findings(name, calibrate)
+        found += background_findings(name, calibrate, None)
+        found += covariance_findings(name, topic, calibrate)
+    return [*found, *earth_field_findings(calibrate.field_inconsistencies())]

@@ -1,0 +1,163 @@
+"""Decompression with a limit on the size of the result, whatever size the data declare."""
+
+import bz2
+import os
+from collections.abc import Callable, Iterator
+from io import BytesIO
+
+import lz4.frame
+import zstandard
+
+from mag_tracking.errors import SettingsError
+from mag_tracking.recording.decode_errors import DECODE_ERRORS
+
+LARGEST_CHUNK_MB = 256.0
+"""Largest size of a decompressed chunk, message or record that is read [MB]."""
+LARGEST_CHUNK_VARIABLE = 'MAG_TRACKING_LARGEST_CHUNK_MB'
+"""Environment variable that replaces `LARGEST_CHUNK_MB`, in commands, nodes and workers."""
+_STEP = 4 << 20
+"""Number of bytes that are decompressed at once."""
+_MAGIC = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
+
+
+class RefusedDataError(ValueError):
+    """Data that are intact, but too large or compressed in an unsupported way."""
+
+
+def largest_chunk() -> int:
+    """Largest size of a decompressed chunk, message or record that is read.
+
+    Returns
+    -------
+    int, bytes
+
+    Raises
+    ------
+    SettingsError
+        If the environment variable is not a positive number.
+    """
+    text = os.environ.get(LARGEST_CHUNK_VARIABLE) or str(LARGEST_CHUNK_MB)
+    try:
+        megabytes = float(text)
+    except ValueError:
+        megabytes = 0.0
+    if not 0.0 < megabytes < 1e6:
+        raise SettingsError(f'{LARGEST_CHUNK_VARIABLE}: expected a size in megabytes, between 0 '
+                            f'and 1e6, got {text!r}')
+    return int(megabytes * 1e6)
+
+
+def check_size(size: int, limit: int) -> None:
+    """Check the size of a chunk, message or record.
+
+    Parameters
+    ----------
+    size, limit : int, bytes
+
+    Raises
+    ------
+    RefusedDataError
+        If the size exceeds the limit.
+    """
+    if size > limit:
+        raise RefusedDataError(f'larger than {limit / 1e6:g} MB, the limit of '
+                               f'{LARGEST_CHUNK_VARIABLE}')
+
+
+def expanded(compression: str, data: bytes, limit: int, is_cut: bool = False) -> bytes:
+    """Decompress data.
+
+    Parameters
+    ----------
+    compression : str
+        Name: zstd, lz4 or bz2; empty or none for data that are not compressed.
+    data : bytes
+    limit : int, bytes
+        Largest accepted size of the result.
+    is_cut : bool, optional
+        Whether the end of the data may be missing. The result is then also cut.
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    RefusedDataError
+        If the result exceeds the limit, or the compression is not supported.
+    ValueError, EOFError, OSError, RuntimeError, zstandard.ZstdError
+        If the data are damaged.
+    """
+    if compression in ('', 'none'):
+        check_size(len(data), limit)
+        return data
+    if compression not in _PIECES:
+        raise RefusedDataError(f'compressed with {compression!r}, which is not supported')
+    # The buffer of BytesIO becomes the result without a copy.
+    out = BytesIO()
+    pieces = _PIECES[compression](data)
+    while True:
+        try:
+            piece = next(pieces, None)
+        except (zstandard.ZstdError, RuntimeError, OSError, ValueError, EOFError):
+            if not is_cut:
+                raise
+            piece = None
+        if piece is None:
+            return out.getvalue()
+        check_size(out.tell() + len(piece), limit)
+        out.write(piece)
+
+
+def _zstd_pieces(data: bytes) -> Iterator[bytes]:
+    """Decompress one frame piece by piece."""
+    with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+        while piece := reader.read(_STEP):
+            yield piece
+
+
+def _lz4_pieces(data: bytes) -> Iterator[bytes]:
+    """Decompress one frame piece by piece."""
+    return _pieces(lz4.frame.LZ4FrameDecompressor(), data)
+
+
+def _bz2_pieces(data: bytes) -> Iterator[bytes]:
+    """Decompress one stream piece by piece."""
+    return _pieces(bz2.BZ2Decompressor(), data)
+
+
+def _pieces(decompressor: 'bz2.BZ2Decompressor | lz4.frame.LZ4FrameDecompressor',
+            data: bytes) -> Iterator[bytes]:
+    """Decompress piece by piece; raises EOFError if the end is missing."""
+    while not decompressor.eof:
+        piece = decompressor.decompress(data, max_length=_STEP)
+        if piece:
+            yield piece
+        elif not decompressor.eof:
+            raise EOFError('the compressed data end too early')
+        data = b''
+
+
+_PIECES: dict[str, Callable[[bytes], Iterator[bytes]]] = {
+    'zstd': _zstd_pieces, 'lz4': _lz4_pieces, 'bz2': _bz2_pieces}
+
+
+def expanded_message(data: bytes) -> bytes:
+    """Decompress a CDR message that the recorder has compressed.
+
+    Parameters
+    ----------
+    data : bytes
+
+    Returns
+    -------
+    bytes
+        The data themselves if they are not compressed; empty if they are damaged or too large.
+    """
+    compression = _MAGIC.get(data[:4])
+    if compression is None:
+        return data
+    try:
+        return expanded(compression, data, largest_chunk())
+    except DECODE_ERRORS:
+        return b''

@@ -1,0 +1,167 @@
+"""Comparison of the backgrounds of a network with the Earth's field while they are learnt."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration.agreement import FieldInconsistency, consensus, disagreements
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted, updated
+from mag_tracking.network import SensorNetwork
+from mag_tracking.stages.health.diagnosis import Cause, Finding
+from mag_tracking.stages.survey.settings import SurveySettings
+
+MIN_CHANGE = 1e-7
+"""[T] Change of a background after which it is compared again; the smallest fault that distorts
+tracks changes it by about a hundred times as much."""
+
+
+def compared_with_earth(network: SensorNetwork, survey: SurveySettings,
+                        levels: FloatArray) -> list[FieldInconsistency]:
+    """Find the sensors whose field without a target contradicts the Earth's field.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+        Without `earth_field`, the sensors are compared with their median.
+    survey : SurveySettings
+    levels : (n, 3) array, T, sensor frames
+        Fields without a target; NaN if unknown.
+
+    Returns
+    -------
+    list of FieldInconsistency
+
+    Raises
+    ------
+    ValueError
+        If the Earth's field is unknown, and fewer than three sensors report all axes.
+    """
+    std = np.array([np.full(3, np.deg2rad(survey.nominal_std_deg)) if s is None else s
+                    for s in network.orientation_std])
+    earth_field = network.earth_field
+    if earth_field is None:
+        earth_field = consensus(levels, network.R_ws)
+    return disagreements(network.names, levels, network.R_ws, std, earth_field,
+                         survey.compass_bias_std, survey.offset_std)
+
+
+def earth_field_findings(inconsistencies: Iterable[FieldInconsistency]) -> list[Finding]:
+    """Findings about sensors that contradict the Earth's field.
+
+    Parameters
+    ----------
+    inconsistencies : iterable of FieldInconsistency
+
+    Returns
+    -------
+    list of Finding
+        Serious if the sensor misleads.
+    """
+    return [Finding(d.misleads, d.sensor, str(d).removeprefix(f'{d.sensor} ')
+                    + ('; all its tracks are ambiguous' if d.misleads else ''), d.advice,
+                    Cause.CONTRADICTS_EARTH) for d in inconsistencies]
+
+
+class FieldComparison:
+    """Times at which the background of a sensor contradicts the Earth's field.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    survey : SurveySettings
+    """
+
+    def __init__(self, network: SensorNetwork, survey: SurveySettings) -> None:
+        self._survey = survey
+        self._found: dict[str, FieldInconsistency] = {}
+        # Intervals of each sensor that was compared.
+        self._times: dict[str, DoubtfulTimes] = {}
+        self.use(network)
+
+    def use(self, network: SensorNetwork) -> None:
+        """Compare with another calibration of the same sensors from now on.
+
+        Parameters
+        ----------
+        network : SensorNetwork
+        """
+        self._network = network
+        self._levels = np.full((len(network), 3), np.nan)
+
+    def update(self, j: int, level: FloatArray, first_ns: int, last_ns: int) -> None:
+        """Compare the background of a sensor if it has changed.
+
+        Parameters
+        ----------
+        j : int
+            Index of the sensor.
+        level : (3,) array, T, sensor frame
+        first_ns, last_ns : int, ns
+            Times of the first and of the latest reading of the sensor. The first background also
+            holds for the readings before it was learnt.
+        """
+        previous = self._levels[j]
+        if not self._survey.offset_std or np.array_equal(
+                np.isnan(level), np.isnan(previous)) and not np.nanmax(
+                    np.abs(level - previous), initial=0.0) > MIN_CHANGE:
+            return
+        self._levels[j] = level
+        try:
+            found = {d.sensor: d for d in compared_with_earth(
+                self._network, self._survey, self._levels) if d.misleads}
+        except ValueError:
+            # Too few sensors are known yet.
+            return
+        for name, known in zip(self._network.names, ~np.isnan(self._levels).all(axis=1),
+                               strict=True):
+            if known:
+                self._times[name] = updated(
+                    self._times.get(name, ()), last_ns if name in self._times else first_ns,
+                    name in found)
+        self._found |= found
+
+    def doubtful_times(self) -> dict[str, DoubtfulTimes]:
+        """Intervals in which a background contradicted the Earth's field.
+
+        Returns
+        -------
+        dict of str to DoubtfulTimes
+            Intervals of each sensor that has any.
+        """
+        return {name: times for name, times in self._times.items() if times}
+
+    def times_of(self, sensor: str) -> DoubtfulTimes:
+        """Intervals in which the background of a sensor contradicted the Earth's field.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        DoubtfulTimes
+        """
+        return self._times.get(sensor, ())
+
+    def shift(self, sensor: str, ns: int) -> None:
+        """Shift the intervals of a sensor by a change of its clock offset.
+
+        Parameters
+        ----------
+        sensor : str
+        ns : int, ns
+            Added to all times.
+        """
+        if sensor in self._times:
+            self._times[sensor] = shifted(self._times[sensor], ns)
+
+    def inconsistencies(self) -> list[FieldInconsistency]:
+        """Latest misleading inconsistency of each sensor that had any.
+
+        Returns
+        -------
+        list of FieldInconsistency
+            In the order of the network.
+        """
+        return [self._found[name] for name in self._network.names if name in self._found]

@@ -1,0 +1,128 @@
+"""Stays: events of vehicles that stand beside a sensor until their field is its background.
+
+The calibration learns the field of a parked vehicle as the new background (`calibrate.relearn_s`).
+The calibrated field then steps to zero, and the event ends although the vehicle has not left. When
+it leaves, the calibrated field steps to the opposite of its field, and back to zero. Both events
+are joined to one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration.background import RelearntBackground
+from mag_tracking.event_records import PassEvent
+from mag_tracking.records import Readings
+from mag_tracking.units import NEVER, NS
+
+N_READINGS = 5
+"""Number of readings from which the field before a change of the background is determined."""
+MIN_FIELD_STDS = 3.0
+"""Minimum magnitude of this field, in standard deviations of the noise."""
+MAX_DIFFERENCE = 0.15
+"""Maximum relative difference between the field of a departure and that of the arrival."""
+MIN_APPROACH = 0.3
+"""Minimum decrease of the distance to the field without a vehicle, relative to the change of the
+background, for a vehicle to have left."""
+MAX_OPEN = 8
+"""Maximum number of vehicles that stand beside a sensor; the oldest is reported as not ended."""
+
+
+class _Stay(NamedTuple):
+    """Arrival of a parked vehicle and its field (3,) [T], which has become the background."""
+
+    arrival: PassEvent
+    level: FloatArray
+
+
+class Stays:
+    """Joins the arrivals and the departures of vehicles that park beside one sensor.
+
+    Parameters
+    ----------
+    free_field : (3,) array, T, sensor frame
+        Field without a vehicle; NaN if unknown. If a change of the background leads towards this
+        field, a vehicle that was present from the start has left.
+
+    Attributes
+    ----------
+    first_ns : int
+        Time of the first reading [ns].
+    """
+
+    def __init__(self, free_field: FloatArray) -> None:
+        self._free_field = free_field
+        self.first_ns = NEVER
+        self._open: list[_Stay] = []
+
+    def add(self, event: PassEvent, readings: Readings,
+            relearnt: Sequence[RelearntBackground]) -> list[PassEvent]:
+        """Add an event, and return the completed events.
+
+        Parameters
+        ----------
+        event : PassEvent
+        readings : Readings
+            Calibrated readings from before the onset until after the release.
+        relearnt : sequence of RelearntBackground
+            Changes of the background.
+
+        Returns
+        -------
+        list of PassEvent
+            `event`, unless it is the arrival or the departure of a parked vehicle; a departure
+            completes the event of the arrival. The event of a vehicle that was present from the
+            start begins with the first reading.
+        """
+        end_ns = int(readings.stamp_ns[-1])
+        change = next((c for c in reversed(relearnt)
+                       if event.onset_ns < c.stamp_ns <= end_ns), None)
+        if change is None or not event.ended:
+            return [event]
+        is_before = readings.stamp_ns < change.stamp_ns
+        level: FloatArray = np.nan_to_num(readings.field[is_before][-N_READINGS:].mean(axis=0))
+        noise = float(np.nanmax(event.noise_std))
+        tolerance = MAX_DIFFERENCE * np.linalg.norm(level) + MIN_FIELD_STDS * noise
+        for k in reversed(range(len(self._open))):
+            if np.linalg.norm(self._open[k].level + level) <= tolerance:
+                return [_until(self._open.pop(k), event.onset_ns, True)]
+        if change.has_departed or np.linalg.norm(level) < MIN_FIELD_STDS * noise:
+            return [event]
+        if self._has_departed(change):
+            return [replace(event, onset_ns=self.first_ns, release_ns=event.onset_ns)]
+        self._open.append(_Stay(event, level))
+        if len(self._open) > MAX_OPEN:
+            return [_until(self._open.pop(0), event.release_ns, False)]
+        return []
+
+    def _has_departed(self, change: RelearntBackground) -> bool:
+        """Whether the previous background was further from the field without a vehicle."""
+        before, after = (float(np.linalg.norm(np.nan_to_num(level - self._free_field)))
+                         for level in (change.before, change.after))
+        size = float(np.linalg.norm(np.nan_to_num(change.after - change.before)))
+        return before - after > MIN_APPROACH * size
+
+    def flush(self, last_ns: int) -> list[PassEvent]:
+        """Return the events of the vehicles that have not left, as not ended.
+
+        Parameters
+        ----------
+        last_ns : int, ns
+            Time of the last reading.
+
+        Returns
+        -------
+        list of PassEvent
+        """
+        stays, self._open = self._open, []
+        return [_until(stay, last_ns, False) for stay in stays]
+
+
+def _until(stay: _Stay, release_ns: int, ended: bool) -> PassEvent:
+    """Event of a stay that lasts until `release_ns` [ns]."""
+    rest_s = max(release_ns - stay.arrival.release_ns, 0) / NS
+    return replace(stay.arrival, release_ns=release_ns, ended=ended,
+                   energy=stay.arrival.energy + float(stay.level @ stay.level) * rest_s)

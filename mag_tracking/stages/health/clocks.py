@@ -1,0 +1,118 @@
+"""Findings about the clocks of the timestamps, compared with the times of receipt."""
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from mag_tracking.arrays import IntArray
+from mag_tracking.stages.health.diagnosis import Cause, Finding
+from mag_tracking.units import NS
+
+MAX_CLOCK_DIFFERENCE_S = 60.0
+"""[s] Difference from the clocks of other sensors above which a clock is reported."""
+MAX_BOOT_DIFFERENCE_S = 1.0
+"""[s] The same for clocks that count from the start of their devices."""
+EARLIEST_DATE_S = 20.0 * 365.25 * 86400.0
+"""[s] A clock that shows an earlier date (1990) than this counts from the start of its device."""
+MIN_SPAN_S = 0.2
+"""[s] Minimum time of receipt over which the unit of the timestamps is checked."""
+UNITS = ((1e3, 'milliseconds'), (1e6, 'microseconds'), (1e9, 'nanoseconds'))
+"""Factor by which the timestamps advance too fast if their seconds have another unit."""
+MAX_RATIO_ERROR = 0.1
+"""Maximum relative error of this factor."""
+
+
+class ClockSpan(NamedTuple):
+    """First and last timestamp of a sensor, and their times of receipt."""
+
+    first_ns: int
+    last_ns: int
+    first_received_ns: int
+    last_received_ns: int
+
+    def until(self, later: 'ClockSpan') -> 'ClockSpan':
+        """Span from the begin of this span to the end of a later one.
+
+        Parameters
+        ----------
+        later : ClockSpan
+
+        Returns
+        -------
+        ClockSpan
+        """
+        return ClockSpan(self.first_ns, later.last_ns, self.first_received_ns,
+                         later.last_received_ns)
+
+    @classmethod
+    def of(cls, stamps: IntArray, received: IntArray) -> 'ClockSpan':
+        """Span of consecutive readings.
+
+        Parameters
+        ----------
+        stamps : (n,) int array, ns
+        received : (n,) int array, ns
+
+        Returns
+        -------
+        ClockSpan
+        """
+        return cls(int(stamps[0]), int(stamps[-1]), int(received[0]), int(received[-1]))
+
+    @property
+    def delay_s(self) -> float:
+        """Delay from the last timestamp to its receipt [s]."""
+        return (self.last_received_ns - self.last_ns) / NS
+
+    @property
+    def is_since_boot(self) -> bool:
+        """Whether the timestamps count from the start of the device."""
+        return 0 < self.last_ns < EARLIEST_DATE_S * NS < self.last_received_ns
+
+    @property
+    def unit(self) -> str | None:
+        """Unit of the seconds of the timestamps; None if they are seconds, or unknown."""
+        received_s = (self.last_received_ns - self.first_received_ns) / NS
+        if received_s < MIN_SPAN_S:
+            return None
+        ratio = (self.last_ns - self.first_ns) / NS / received_s
+        return next((name for factor, name in UNITS
+                     if abs(ratio / factor - 1.0) < MAX_RATIO_ERROR), None)
+
+
+def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
+    """Report wrong units of timestamps, and clocks that differ from those of other sensors.
+
+    Parameters
+    ----------
+    clocks : {sensor: ClockSpan}
+
+    Yields
+    ------
+    Finding
+    """
+    # The clock nearest to the host clock is the reference. In a replay, all clocks differ from the
+    # host clock by about the same time.
+    reference_s = min((c.delay_s for c in clocks.values()), key=abs, default=np.nan)
+    for name, clock in clocks.items():
+        if clock.unit is not None:
+            yield Finding(True, name, f'the seconds of its timestamps are {clock.unit}',
+                          'correct the unit of the timestamps in the driver',
+                          Cause.MILLISECOND_STAMPS)
+            continue
+        ahead_s = reference_s - clock.delay_s
+        if clock.is_since_boot:
+            differs = abs(ahead_s) > MAX_BOOT_DIFFERENCE_S
+            yield Finding(
+                differs, name, 'its timestamps count from the start of its device (the latest '
+                f'is {clock.last_ns / NS:.4g} s)' + (
+                    f', and differ by {ahead_s:+.4g} s from those of other sensors'
+                    if differs else ''),
+                'let the driver use the time of arrival, or add the time of the start',
+                Cause.BOOT_STAMPS)
+        elif abs(ahead_s) > MAX_CLOCK_DIFFERENCE_S:
+            yield Finding(True, name, f'its timestamps differ by {ahead_s:+.4g} s from '
+                          'the timestamps of other sensors', 'synchronise its clock (chrony, PTP); '
+                          'knocks correct only offsets below survey.max_clock_offset_s',
+                          Cause.CLOCK_DIFFERS)
