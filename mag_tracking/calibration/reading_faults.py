@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, Record
+from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration import core
 from mag_tracking.calibration.missing_marks import are_marked, missing_marks
 from mag_tracking.calibration.repetition import changes_of, repetition_of
@@ -84,22 +84,4 @@ def reading_faults(fields: FloatArray) -> ReadingFaults:
     ReadingFaults
     """
     marks = missing_marks(fields)
-    readings = np.where(are_marked(fields, marks), np.nan, fields)
-    return ReadingFaults(marks, repetition_of(readings[~np.isnan(readings).all(axis=1)]))
-
-
-def leave_out(state: Record, faults: ReadingFaults) -> None:
-    """Let compiled code leave out the marks and repetitions of a sensor from now on.
-
-    Parameters
-    ----------
-    state : Record
-        State of the sensor; modified.
-    faults : ReadingFaults
-    """
-    state['n_marks'], state['marks'][:len(faults.marks)] = len(faults.marks), faults.marks
-    state['repetition'] = faults.repetition
-    # The steps, repetitions and differences so far are those of the faults.
-    state['step'] = np.inf
-    state['n_same'] = state['n_changed'] = state['n_rest'] = 0
-    state['repeats'] = state['changes'] = state['run'] = 0
+    return ReadingFaults(marks, repetition_of(np.where(are_marked(fields, marks), np.nan, fields)))

@@ -1,4 +1,7 @@
-"""Causes for which readings are rejected, and the validity of covariances in messages."""
+"""Causes and numbers of the readings that the calibration rejects; validity of covariances."""
+
+from collections import Counter
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -17,10 +20,8 @@ REJECTIONS = {
     core.DUPLICATE: (Cause.DUPLICATE_STAMPS, 'duplicate timestamp'),
     core.OUT_OF_ORDER: (Cause.BACKWARD_STAMPS, 'out of order'),
     core.STUCK: (Cause.STUCK, 'stuck sensor (repeated reading)'),
-    core.MARKED: (Cause.NO_READING_MARK, 'mark for a missing reading'),
-    core.REPEATED: (Cause.REPEATED, 'repetition of the previous reading'),
 }
-"""Cause and description of the rejection for each reason code; `TOO_LARGE` depends on a setting."""
+"""Cause and description of the rejection for each reason code, except descriptions with a value."""
 
 
 def own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
@@ -42,3 +43,55 @@ def own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
     C = plain(readings.covariance)
     valid = np.where(are_valid_covariances(plain(readings.field), C), core.VALID, core.INVALID)
     return np.where(readings.has_unknown_covariance(), core.NONE, valid), C
+
+
+class Rejections:
+    """Numbers of the rejected readings of several sensors.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Names of the sensors.
+    """
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._n: dict[str, Counter[tuple[Cause, str]]] = {name: Counter() for name in names}
+
+    def add(self, sensor: str, cause: tuple[Cause, str], n: int) -> None:
+        """Add rejected readings.
+
+        Parameters
+        ----------
+        sensor : str
+        cause : tuple of Cause and str
+            Cause and description.
+        n : int
+        """
+        self._n[sensor][cause] += n
+
+    def of(self, sensor: str) -> 'Counter[tuple[Cause, str]]':
+        """Numbers of a sensor, by cause and description.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        Counter of (Cause, str)
+        """
+        return self._n[sensor].copy()
+
+    def counts_of(self, sensor: str) -> 'Counter[str]':
+        """Numbers of a sensor, in total (`rejected`) and by description (`rejected: ...`).
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        Counter of str
+        """
+        counts = {f'rejected: {description}': n for (_, description), n in self._n[sensor].items()}
+        return Counter(counts) + Counter(rejected=self._n[sensor].total())

@@ -92,8 +92,7 @@ class SensorHealth:
         # Results for the current window; cleared when readings are added.
         self._cache: dict[str, FloatArray] = {}
         self._delays: list[float] | None = None
-        # Timestamp of the first reading in the current run of identical readings; number of
-        # readings since the last stuck reading.
+        # Start of the current run of identical readings; number of readings after a stuck one.
         self._unchanged_since_ns: int | None = None
         self._n_since_stuck = WINDOW
         # Length of the current run of identical readings; number of readings that repeated the
@@ -162,13 +161,12 @@ class SensorHealth:
         for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
             self._counts[axis] += count
         self._counts['without any axis'] += int(missing.all(axis=1).sum())
-        with_latest = np.append(self._latest, fields, axis=0)
-        self._latest = with_latest[-1:].copy()
-        kept = self.faults.without(with_latest)[-n:]
+        kept = self.faults.without(np.append(self._latest, fields, axis=0))[-n:]
+        self._latest = fields[-1:].copy()
         is_kept = ~np.isnan(kept).all(axis=1) | missing.all(axis=1)
+        self._field_stamps = np.append(self._field_stamps, stamps[is_kept])[-WINDOW:]
+        self._fields = np.append(self._fields, kept[is_kept], axis=0)[-WINDOW:]
         if is_kept.any():
-            self._field_stamps = np.append(self._field_stamps, stamps[is_kept])[-WINDOW:]
-            self._fields = np.append(self._fields, kept[is_kept], axis=0)[-WINDOW:]
             self._check_fields(int(is_kept.sum()))
 
     def _check_timestamps(self, n: int) -> None:
@@ -426,9 +424,9 @@ class SensorHealth:
             yield Finding(True, name, f'{c["without any axis"]} of {n} readings have no valid '
                           'axis', 'check the sensor and its driver', Cause.NO_AXIS)
         if dead := self.dead_axes:
-            yield Finding(True, name, ' and '.join(dead) + (
-                ' does not change' if len(dead) == 1 else ' do not change'),
-                'the axis is dead: check the sensor and its driver', Cause.DEAD_AXIS)
+            verb = 'does' if len(dead) == 1 else 'do'
+            yield Finding(True, name, f'{" and ".join(dead)} {verb} not change', 'the axis is '
+                          'dead: check the sensor and its driver', Cause.DEAD_AXIS)
         if missing := ', '.join(f'{axis} is missing in {c[axis]}' for axis in 'xyz'
                                 if 0.01 * n < c[axis] - c['without any axis']
                                 and c[axis] < 0.99 * n):
