@@ -66,9 +66,11 @@ def road_of(sensors: FloatArray, paths: Sequence[FloatArray]) -> Road:
         areas.append(np.vstack([ends + low * across, (ends + high * across)[::-1]]))
         if high - low > 1.5 * LANE_WIDTH_M:
             markings.append(ends + 0.5 * (low + high) * across)
+    side_roads: list[FloatArray] = []
     for path, follow in zip(paths, follows, strict=True):
-        areas += _side_roads(path, follow, beyond)
-    return Road(areas, markings)
+        side_roads += [part for part in _side_roads(path, follow, beyond)
+                       if not _is_within(part, side_roads)]
+    return Road([*areas, *map(_outline, side_roads)], markings)
 
 
 def _thinned(path: FloatArray) -> FloatArray:
@@ -118,8 +120,8 @@ def _edges(lateral: FloatArray, sensors: FloatArray) -> tuple[float, float]:
 
 
 def _side_roads(path: FloatArray, follows: BoolArray, beyond: float) -> list[FloatArray]:
-    """Polygons around the parts of a path that leave the carriageway."""
-    areas = []
+    """Parts of a path that leave the carriageway."""
+    parts = []
     starts = np.flatnonzero(np.diff(follows.astype(int), prepend=1) < 0)
     ends = np.flatnonzero(np.diff(follows.astype(int), append=1) > 0)
     for first, last in zip(starts, ends, strict=True):
@@ -131,11 +133,25 @@ def _side_roads(path: FloatArray, follows: BoolArray, beyond: float) -> list[Flo
             part = np.vstack([part[0] - beyond * _unit(part[2] - part[0]), part])
         if last == len(follows) - 1:
             part = np.vstack([part, part[-1] + beyond * _unit(part[-1] - part[-3])])
-        tangent = np.gradient(part, axis=0)
-        normal = np.column_stack([-tangent[:, 1], tangent[:, 0]]) / np.hypot(*tangent.T)[:, None]
-        areas.append(np.vstack([part + 0.5 * LANE_WIDTH_M * normal,
-                                (part - 0.5 * LANE_WIDTH_M * normal)[::-1]]))
-    return areas
+        parts.append(part)
+    return parts
+
+
+def _is_within(part: FloatArray, side_roads: Sequence[FloatArray]) -> bool:
+    """Whether a path is on a known side road; the points far beyond the path are ignored."""
+    if not side_roads:
+        return False
+    known = np.vstack(side_roads)
+    distance = np.hypot(*(part[1:-1, None] - known).transpose(2, 0, 1)).min(axis=1)
+    return bool((distance < 0.5 * LANE_WIDTH_M).all())
+
+
+def _outline(part: FloatArray) -> FloatArray:
+    """Polygon of one lane around a path (n, 2)."""
+    tangent = np.gradient(part, axis=0)
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]]) / np.hypot(*tangent.T)[:, None]
+    return np.vstack([part + 0.5 * LANE_WIDTH_M * normal,
+                      (part - 0.5 * LANE_WIDTH_M * normal)[::-1]])
 
 
 def _unit(v: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ function bodyRadius(length) {
 
 function roadTraces(scene, f) {
   const scaled = values => Array.from(values, v => f * v);
+  // One trace per area: where areas of one trace overlap, they are not filled.
   return [
     ...scene.road.areas.map(area => line(scaled(area.x), scaled(area.y), '', {width: 0},
       {fill: 'toself', fillcolor: '#e9e9e7'})),

@@ -49,18 +49,24 @@ function overviewTraces(scene, current) {
     end.customdata.push(track.key);
     end.marker.angle.push(90 - 180 / Math.PI * Math.atan2(ys[n - 1] - ys[from], xs[n - 1] - xs[from]));
   }
-  const [xs, ys] = current ? pathOf(current, f) : [[], []];
-  return [...roadTraces(scene, f), ...groups.values(), ...ends.values(),
-    line(xs, ys, 'current track', {color: BLACK, width: 3.5}, {hoverinfo: 'skip'}),
-    sensorTrace(scene, f, 'y')];
+  const [xs, ys] = pathOf(current, f);
+  return [...roadTraces(scene, f), ...groups.values(), ...ends.values(), sensorTrace(scene, f, 'y'),
+    line(xs, ys, 'current track', {color: BLACK, width: 3.5}, {hoverinfo: 'skip'})];
 }
 
+// Draw all tracks once; later only the current track changes.
 function drawOverview(scene, current) {
+  const plot = at('overview');
   if (at('overview-card').hidden) return;
-  const traces = overviewTraces(scene, current), plot = at('overview');
-  Plotly.react(plot, traces, mapLayout(scene, scene.reach.map, ''), CONFIG);
+  if (plot.scene === scene) {
+    const [xs, ys] = pathOf(current, scene.scale.factor);
+    Plotly.restyle(plot, {x: [xs], y: [ys]}, [-1]);
+    return;
+  }
+  plot.scene = scene;
+  const traces = overviewTraces(scene, current);
+  Plotly.newPlot(plot, traces, mapLayout(scene, scene.reach.map, ''), CONFIG);
   showLegend('overview-legend', traces);
-  plot.removeAllListeners('plotly_click');
   plot.on('plotly_click', event => {
     const key = event.points[0].customdata;
     const track = scene.tracks.find(other => other.key === key);
