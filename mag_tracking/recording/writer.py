@@ -13,6 +13,10 @@ from mag_tracking.files import checked_path, new_binary_file, new_text_file
 from mag_tracking.messages.shapes import MessageDict
 from mag_tracking.messages.types import definition, encoder
 
+MAX_TOPICS = 2000
+"""Maximum number of topics; twice the maximum number of sensors. The time to write and to read
+`metadata.yaml` grows with their number."""
+
 
 def check_no_other_recording(path: Path) -> None:
     """Check that the folder of a new MCAP file does not contain another recording.
@@ -102,6 +106,8 @@ class RecordingWriter:
         ------
         RecordingError
             If the definition of the type is unknown.
+        OutputError
+            If the recording would have more than `MAX_TOPICS` topics.
         """
         if topic not in self._channels:
             self._open_channel(topic, type_name)
@@ -114,7 +120,10 @@ class RecordingWriter:
         self._last = time_ns if self._last is None else max(self._last, time_ns)
 
     def _open_channel(self, topic: str, type_name: str) -> None:
-        """Register the schema and the channel of a topic."""
+        """Register the schema and the channel of a topic; raises OutputError."""
+        if len(self._channels) == MAX_TOPICS:
+            raise OutputError(f'{self.path}: the recording would have more than {MAX_TOPICS} '
+                              f'topics; the next one is {topic}')
         if type_name not in self._schemas:
             self._schemas[type_name] = self._writer.register_schema(
                 type_name, 'ros2msg', definition(type_name).encode())

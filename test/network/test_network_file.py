@@ -12,9 +12,10 @@ from mag_tracking.geometry import (
     quaternion_from_rotation_vector,
     rotation_from_quaternion,
 )
-from mag_tracking.network import CalibrationRecord
+from mag_tracking.network import CalibrationRecord, SensorNetwork
 from mag_tracking.network.file import read_network, write_network
 from mag_tracking.network.geomagnetic import Site, earth_field
+from mag_tracking.network.sensor_network import MAX_SENSORS
 
 VALID_FILE = '''
 frame: map
@@ -223,6 +224,13 @@ def test_invalid_networks_are_rejected(tmp_path, old, new, message):
     assert old in VALID_FILE
     with pytest.raises(NetworkError, match=message.replace('[', r'\[')):
         parse(tmp_path, VALID_FILE.replace(old, new))
+
+
+def test_too_many_sensors_are_rejected():
+    n = MAX_SENSORS + 1
+    names = tuple(f'mag_{k}' for k in range(n))
+    with pytest.raises(NetworkError, match=f'{n} sensors; the maximum is {MAX_SENSORS}'):
+        SensorNetwork(names, np.arange(3.0 * n).reshape(n, 3), np.tile(np.eye(3), (n, 1, 1)), names)
 
 
 def test_missing_and_empty_files_are_rejected(tmp_path):

@@ -17,7 +17,7 @@ from mag_tracking.messages.schema import header_dict, reading_of, track_dict
 from mag_tracking.messages.types import MAGNETIC_FIELD, TRACK_ARRAY, decode
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.recording.writer import MAX_TOPICS, RecordingWriter
 from mag_tracking.units import LATEST_NS
 from support.bundled import ROOT, vehicle_path
 from support.samples import MagSample, recorded, sample_dict, samples_of
@@ -44,6 +44,15 @@ def read(path, network=None):
     """Read a recording; return its messages and the `Recording`."""
     recording = Recording(path)
     return list(recording.messages()), recording
+
+
+def test_too_many_topics_are_refused(tmp_path):
+    message = sample_dict(MagSample(10**18, 'mag_1', np.zeros(3)), 'mag_1')
+    with pytest.raises(OutputError, match=f'more than {MAX_TOPICS} topics'), \
+            RecordingWriter(tmp_path / 'a.mcap') as writer:
+        for k in range(MAX_TOPICS + 1):
+            writer.write(f'/mag_{k}/imu/mag', MAGNETIC_FIELD, message, 10**18 + k)
+    assert len(Recording(tmp_path / 'a.mcap').types) == MAX_TOPICS
 
 
 def test_written_samples_are_read_back(tmp_path):

@@ -136,13 +136,13 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
 def _start_grid(settings: MagnetSettings, network: SensorNetwork) -> FloatArray:
     """Grid (n, 3) [m] over the bounding box of the sensors with its margin.
 
-    A side that is shorter than the spacing of the grid has one point, in its middle. The other
-    sides then share the number of points.
+    A side that is shorter than half the spacing of the grid has one point, in its middle. The
+    other sides then share the number of points.
     """
     low, high = network.positions.min(axis=0), network.positions.max(axis=0)
     extent, step, is_long = high - low + 2.0 * settings.start_margin, 0.0, np.full(3, True)
-    while not step or (extent[is_long] < step).any():
-        is_long &= extent >= step
+    while (extent[is_long] <= step / 2).any() or not step:
+        is_long &= extent > step / 2
         step = float((np.prod(extent[is_long]) / settings.grid_points) ** (1.0 / is_long.sum()))
     axes = [np.arange(a - settings.start_margin + step / 2, b + settings.start_margin, step)
             if long else np.array([(a + b) / 2])
