@@ -13,7 +13,7 @@ from mag_tracking.network.file import read_network, write_network
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.background_file import write_backgrounds
 from mag_tracking.recording.event_tables import write_events
-from mag_tracking.recording.field_table import import_field_table
+from mag_tracking.recording.field_table import TableOptions, read_field_table
 from mag_tracking.recording.fit_folder import FitFolder
 from mag_tracking.recording.pose_table import read_readings
 from mag_tracking.recording.reader import Recording
@@ -119,6 +119,6 @@ def test_a_path_with_a_nul_character_is_refused(tmp_path):
             write('a\0b')
     for read in (read_network, read_parameter_file, Recording, repair, read_readings,
                  lambda path: mt.track(path, line_network(2)),
-                 lambda path: import_field_table(path, ['time=t', 'm.x=x'], 'T', 'out')):
+                 lambda path: read_field_table(path, TableOptions())):
         with pytest.raises(mt.MagTrackingError, match=message):
             read('a\0b')

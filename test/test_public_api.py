@@ -265,6 +265,18 @@ def test_masked_axes_become_nan():
     assert len(mt.readings_from_arrays([], [], [])) == 0
 
 
+def test_times_may_be_datetime64_with_or_without_a_time_zone():
+    stamps = 1_777_852_561_123_456_789 + 10_000_000 * np.arange(3)
+    utc = pd.Series(pd.to_datetime(stamps, utc=True))
+    for times in (stamps.astype('M8[ns]'), pd.Series(stamps.astype('M8[ns]')), utc,
+                  utc.dt.tz_convert('Europe/Stockholm'), pd.DatetimeIndex(utc)):
+        found = mt.readings_from_arrays(['a'] * 3, times, np.ones((3, 3)))
+        assert found.stamp_ns.tolist() == stamps.tolist()
+    milliseconds = mt.readings_from_arrays(['a'] * 3, stamps.astype('M8[ns]').astype('M8[ms]'),
+                                           np.ones((3, 3)))
+    assert milliseconds.stamp_ns.tolist() == (stamps // 10**6 * 10**6).tolist()
+
+
 @pytest.mark.parametrize('is_recording', [False, True])
 def test_masked_timestamps_are_refused(
         recorded, is_recording):

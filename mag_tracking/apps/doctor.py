@@ -272,7 +272,7 @@ class Doctor:
             found += covariance_findings(name, self.network.absolute_topics[j], self.calibrate)
             found += driver_findings(name, self.calibrate)
             found += rejection_findings(name, self.calibrate)
-            found += rate_findings(name, self.calibrate.lowest_rate(name), self.network,
+            found += rate_findings(name, self.calibrate.timestamps.lowest_rate(name), self.network,
                                    self._settings.track)
         found += self._missed.findings()
         found += network_findings(self.network, self._settings.survey, self.calibrate,
@@ -337,7 +337,8 @@ def recording_findings(recording: Recording, reader: SampleReader) -> list[Findi
     for counts, advice, cause in (
             (recording.losses, 'the recording is damaged; mag-tracking repair adds the missing '
              'index of a truncated file, but cannot restore lost data', Cause.DAMAGED_RECORDING),
-            (reader.rejected, 'the recording is damaged, or a message type is unsupported',
+            (reader.rejected, 'the messages are damaged or incomplete, or their encoding or type '
+             'is not supported: check the driver and the program that recorded them',
              Cause.UNDECODABLE)):
         if counts:
             found.append(Finding(cause is Cause.DAMAGED_RECORDING, name, ', '.join(

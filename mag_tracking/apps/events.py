@@ -113,7 +113,7 @@ def find_events(recording: Recording, network: SensorNetwork, settings: Settings
     try:
         for readings in until_stopped(reader.readings, progress, stopped):
             for calibrated in calibrate.feed(readings):
-                stage.set_relearnt(calibrate.relearnt())
+                stage.set_relearnt(calibrate.backgrounds())
                 pass_events += stage.feed(calibrated)
     except ReadingStopped:
         pass
@@ -130,6 +130,6 @@ def find_events(recording: Recording, network: SensorNetwork, settings: Settings
 
 def _with_timestamp_error(event: PassEvent, calibrate: Calibrate) -> PassEvent:
     """Event whose `closest_std` includes the error of the timestamps of its sensor."""
-    fault = calibrate.timestamp_fault(event.sensor)
+    fault = calibrate.timestamps.worst_fault(event.sensor)
     return event if fault is None else replace(
         event, closest_std=float(np.hypot(event.closest_std, fault.error_s)))

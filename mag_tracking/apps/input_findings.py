@@ -10,6 +10,7 @@ from mag_tracking.stages.calibrate.field_comparison import earth_field_findings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.clocks import clock_findings
 from mag_tracking.stages.health.diagnosis import Cause, Finding
+from mag_tracking.stages.health.timestamps import timestamp_finding
 from mag_tracking.stages.track.settings import TrackSettings
 
 
@@ -37,9 +38,9 @@ def input_findings(recording: Recording, reader: SampleReader, network: SensorNe
         if topic in missing:
             found.append(Finding(True, name, f'no messages on {topic}', 'check the topic in the '
                                  'network file', Cause.NO_MESSAGES))
-        if (timestamps := calibrate.timestamp_fault(name)) is not None:
-            found.append(timestamps.finding(name))
-        found += rate_findings(name, calibrate.lowest_rate(name), network, settings)
+        if (fault := calibrate.timestamps.worst_fault(name)) is not None:
+            found.append(timestamp_finding(name, fault))
+        found += rate_findings(name, calibrate.timestamps.lowest_rate(name), network, settings)
         found += driver_findings(name, calibrate)
         found += rejection_findings(name, calibrate)
         found += background_findings(name, calibrate, None)

@@ -120,8 +120,9 @@ def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: Arra
     ----------
     sensor : (n,) sequence of str
         Name of the sensor of each reading, as in the network file.
-    stamp_ns : (n,) int array, ns
-        Timestamps in ascending order; sensors may have equal timestamps.
+    stamp_ns : (n,) int array, ns, or datetime64 array
+        Timestamps in ascending order; sensors may have equal timestamps. Times without a time zone
+        are in UTC.
     field : (n, 3) array, T, sensor frame
         Flux density; NaN marks an axis that was not measured.
     covariance : (n, 3, 3) array, T², sensor frame, optional
@@ -143,9 +144,17 @@ def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: Arra
     fields, C = _with_nan(field), None if covariance is None else _with_nan(covariance)
     readings = _to_standard_types(Readings(
         names, np.array([index_of[str(name)] for name in sensor], dtype=np.int64),
-        np.asarray(stamp_ns), fields if fields.size else fields.reshape(0, 3), C))
+        _nanoseconds(stamp_ns), fields if fields.size else fields.reshape(0, 3), C))
     check_order(readings, 0.0)
     return readings
+
+
+def _nanoseconds(stamps: ArrayLike) -> NDArray[Any]:
+    """Convert times (datetime64 of any unit, pandas, with or without time zone) to integers."""
+    # Times of pandas with a time zone have a dtype of this name, too, and become UTC.
+    if str(getattr(stamps, 'dtype', '')).startswith('datetime64'):
+        return np.asarray(stamps, dtype='datetime64[ns]').astype(np.int64)
+    return np.asarray(stamps)
 
 
 def _with_nan(values: ArrayLike) -> NDArray[Any]:

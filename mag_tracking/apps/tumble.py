@@ -1,6 +1,6 @@
 """Calibration of hard and soft iron by tumbling, for the command `mag-tracking tumble`."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -8,13 +8,16 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit, fit_ellipsoid
+from mag_tracking.errors import RecordingError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
+from mag_tracking.recording.interruptible import Progress, ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.records import Readings
 
 
-def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str], date: str,
+def tumble(source: Recording | Sequence[Readings], network: SensorNetwork,
+           sensors: Collection[str], date: str,
            field_magnitude: float | None = None, progress: Callable[[int], object] | None = None,
            stopped: Callable[[], bool] | None = None,
            ) -> tuple[SensorNetwork, dict[str, EllipsoidFit], dict[str, FloatArray], bool]:
@@ -22,7 +25,7 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
 
     Parameters
     ----------
-    recording : Recording
+    source : Recording, or batches of Readings
     network : SensorNetwork
     sensors : collection of str
         Names of the rotated sensors; an empty collection selects all sensors.
@@ -52,15 +55,14 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
     NetworkError
         If a sensor is not in the network.
     RecordingError
-        If the recording has none of the network's topics.
+        If the recording has none of the network's topics, or the readings none of its sensors.
     """
     selected = tuple(sensors) or network.names
     rows = {name: network.index(name) for name in selected}
     collected: dict[str, list[FloatArray]] = {name: [] for name in selected}
     interrupted = False
-    reader = SampleReader(recording, network)
     try:
-        for batch in until_stopped(reader.readings, progress, stopped):
+        for batch in until_stopped(_batches(source, network), progress, stopped):
             sensor = batch.rows({name: k for k, name in enumerate(selected)})
             sensor[np.isinf(batch.field).any(axis=1)] = -1
             for k, name in enumerate(selected):
@@ -86,3 +88,15 @@ def tumble(recording: Recording, network: SensorNetwork, sensors: Collection[str
             else record.clock_offset_std)
     changes: dict[str, Any] = {key: tuple(v) for key, v in columns.items()}
     return replace(network, **changes), fits, readings, interrupted
+
+
+def _batches(source: Recording | Sequence[Readings], network: SensorNetwork
+             ) -> Callable[[Progress | None], Iterator[Readings]]:
+    """Return a function that iterates over the readings of the network."""
+    if isinstance(source, Recording):
+        return SampleReader(source, network).readings
+    names = dict.fromkeys(name for batch in source for name in batch.names)
+    if not set(names) & set(network.names):
+        raise RecordingError(f'the table has the sensors {", ".join(names)}, and the network '
+                             f'{", ".join(network.names)}')
+    return lambda progress: iter(source)

@@ -293,6 +293,7 @@ class RunningBackground:
     def _start_with_frequent(self, frequent: FrequentLevel) -> None:
         """Adopt a frequent level as the background; another level may still replace it."""
         self.start_from(frequent.level.level, frequent.level.covariance)
+        self._quiet.clear()  # Its blocks are those of the previous level.
         self._observed_s, self.frozen, self._is_ambiguous = frequent.observed_s, False, False
         self._learning_window.clear()
         self._departure.end()

@@ -50,9 +50,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         if '\0' in argument:
             print(f'mag-tracking: {argument!r} contains a NUL character', file=sys.stderr)
             return 1
-    # A file name may be invalid UTF-8. By default, stderr escapes it, but stdout raises an error.
-    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == 'strict':
-        sys.stdout.reconfigure(errors='backslashreplace')
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A file that stdout is redirected to shows each line at once, and keeps it after a crash.
+        # A file name may be invalid UTF-8. By default, stderr escapes it, but stdout raises an
+        # error.
+        errors = sys.stdout.errors
+        sys.stdout.reconfigure(line_buffering=True,
+                               errors='backslashreplace' if errors == 'strict' else errors)
     if arguments[:1] == ['run']:
         # Ending the nodes is not a failure, even before they have started.
         with exit_on_signals(0, signal.SIGINT, signal.SIGTERM):

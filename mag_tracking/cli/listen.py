@@ -5,7 +5,7 @@ import math
 import signal
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TypeAlias
@@ -64,6 +64,7 @@ class _ReadingPrinter:
             sensor: deque(maxlen=20_000) for sensor in driver.sensors.values()
             if sensor != IGNORED}
         self.silent_sensors = set(self._samples)
+        self._counts: Counter[str] = Counter()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=serve, daemon=True, args=(
             driver, self._add, self._stop.is_set))
@@ -89,6 +90,9 @@ class _ReadingPrinter:
                            if not count.startswith('samples: '))
         state = self.driver.fault or ('open' if self.driver.is_open else 'opening')
         out = [f'{self.driver.name}: {state}' + (f'  ({errors})' if errors else '')]
+        out += [f'  {cause}, such as {example}' for cause, example in
+                self.driver.examples().items() if counts[cause] > self._counts[cause]]
+        self._counts = counts
         for sensor, queue in self._samples.items():
             samples = [queue.popleft() for _ in range(len(queue))]
             if not samples:

@@ -49,6 +49,7 @@ def add(commands: Commands) -> None:
     p.add_argument('--rate', type=float, default=1.0,
                    help='playback speed of the recording (default: 1)')
     p.add_argument('--loop', action='store_true', help='repeat the recording')
+    p.add_argument('--quiet', action='store_true', help='do not print the poses of tracks')
     p.add_argument('--web', type=int, nargs='?', const=DEFAULT_PORT, metavar='PORT',
                    help=f'serve a live page (default port: {DEFAULT_PORT})')
     add_page(p, port=False)
@@ -69,4 +70,5 @@ def _run(args: argparse.Namespace) -> int:
         Recording(args.recording)
     with nullcontext() if args.web is None else page_process(args.host, args.web, ros_arguments):
         return run(args.network, settings, args.recording, args.rate, args.loop,
-                   drivers=args.drivers, batches=args.batches, ros_arguments=ros_arguments)
+                   () if args.quiet else None, drivers=args.drivers, batches=args.batches,
+                   ros_arguments=ros_arguments)

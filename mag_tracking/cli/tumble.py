@@ -16,22 +16,27 @@ from mag_tracking.cli.options import (
     recorded_network,
     utc_timestamp,
 )
+from mag_tracking.cli.table_options import add_table_options, print_notes, table_options
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
+from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import write_network
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
+from mag_tracking.records import Readings
 
 _TUMBLE_HELP = '''
 Calibrates sensors that can be held in the hand. Rotate each sensor slowly through all orientations,
-far from iron, while `mag-tracking record` runs. The readings lie on an ellipsoid; the correction to
+far from iron, while `mag-tracking record` runs, or write the readings to a table, with or without
+times. The readings lie on an ellipsoid; the correction to
 a sphere (hard iron, soft iron, scale factors, skewness) is written to the network file and applied
 to all later readings. Run this calibration before others, because background and noise in the
 network file refer to uncorrected readings and are removed. The calibration of a sensor is rejected
 if its rotation did not cover enough directions.
 
-example:
+examples:
   mag-tracking tumble hand.mcap --network site.yaml --sensor mag_3 --out site_tumbled.yaml
+  mag-tracking tumble hand.csv --unit uT --network site.yaml --sensor mag_3 --out site_tumbled.yaml
 '''
 
 
@@ -44,7 +49,7 @@ def add(commands: Commands) -> None:
     """
     p = add_command(commands, 'tumble', _tumble, _TUMBLE_HELP)
     p.add_argument('recording', type=Path, metavar='RECORDING',
-                   help='.mcap, .db3 or .bag file, or rosbag2 folder')
+                   help='.mcap, .db3 or .bag file, rosbag2 folder, or table of readings')
     add_recorded_network(p)
     p.add_argument('--sensor', nargs='+', default=[], metavar='NAME',
                    help='sensors that were rotated (default: all)')
@@ -55,6 +60,7 @@ def add(commands: Commands) -> None:
                    help='network file to write')
     p.add_argument('--figure', type=Path, metavar='FILE',
                    help='draw the calibration (.png, .pdf)')
+    add_table_options(p, sensor=False)
 
 
 def _tumble(args: argparse.Namespace) -> int:
@@ -62,18 +68,20 @@ def _tumble(args: argparse.Namespace) -> int:
     magnitude = args.field_magnitude
     if magnitude is not None and not 1e-6 <= magnitude <= 1e-3:
         raise SettingsError(f'--field-magnitude: expected 1e-6 to 1e-3 T, got {magnitude:g}')
-    network, recording = recorded_network(args), Recording(args.recording)
+    network = recorded_network(args)
+    source = _source(args, network)
     check_outputs(args)
     with recorded_signals(signal.SIGINT) as signals:
-        with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
-                  disable=None) as bar:
+        with tqdm(total=getattr(source, 'size', None), unit='B', unit_scale=True,
+                  desc=args.recording.name, disable=None) as bar:
             calibrated, fits, readings, _ = tumble(
-                recording, network, args.sensor, utc_timestamp(), args.field_magnitude,
+                source, network, args.sensor, utc_timestamp(), args.field_magnitude,
                 bar.update, lambda: bool(signals))
     for name, fit in fits.items():
         _print_fit(name, fit)
-    for cause, n in recording.losses.items():
-        print(f'  warning: {cause}: {n}')
+    if isinstance(source, Recording):
+        for cause, n in source.losses.items():
+            print(f'  warning: {cause}: {n}')
     converged_names = [name for name, fit in fits.items() if fit.converged]
     if signals or not converged_names:
         print('interrupted: nothing was written' if signals else 'nothing was written')
@@ -88,6 +96,20 @@ def _tumble(args: argparse.Namespace) -> int:
                     args.figure)
     print(f'network written to {args.out}')
     return 0
+
+
+def _source(args: argparse.Namespace, network: SensorNetwork) -> Recording | list[Readings]:
+    """Open the recording, or read the table of readings."""
+    from mag_tracking.recording.field_table import SUFFIXES, read_field_table
+
+    if args.recording.suffix.lower() not in SUFFIXES:
+        return Recording(args.recording)
+    # The name of the only sensor of a table that does not name it.
+    candidates = args.sensor or network.names
+    table = read_field_table(args.recording, table_options(
+        args, candidates[0] if len(candidates) == 1 else ''), with_times=False)
+    print_notes(args.recording, table.notes)
+    return table.sessions
 
 
 def _print_fit(name: str, fit: EllipsoidFit) -> None:

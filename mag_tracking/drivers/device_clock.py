@@ -19,12 +19,15 @@ from collections import Counter, deque
 from dataclasses import dataclass
 
 from mag_tracking.drivers.lower_line import Point, slope_range
+from mag_tracking.drivers.reading import DeviceDate
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
+from mag_tracking.units import NS, TIME_UNITS, unit_since_1970
 
 NO_TICKS = 'readings without a device time'
 OUT_OF_RANGE = 'device times outside the counter range'
 NO_FIT = 'device times that do not fit the clock'
+STANDING = 'device times that hardly advance, replaced by the time of arrival'
 
 RESET = 'device resets'
 STEP_FORWARD = 'device clock steps forward'
@@ -38,6 +41,10 @@ _MIN_POINTS = 5
 """Minimum number of points for estimating the slope; with fewer, only the height is estimated."""
 _MIN_AGREEING = 3
 """Minimum number of different device times that must agree before a new clock starts."""
+_MIN_STANDING_RUNS = 3
+"""Minimum number of consecutive intervals longer than `min_step_s` in which a clock stands."""
+_MIN_ADVANCE = 0.01
+"""Minimum advance of the device time relative to the time of arrival."""
 _EARLY_TOLERANCE_NS = 1e6
 """[ns] Distance below the line up to which a message is always accepted."""
 
@@ -85,6 +92,8 @@ class ArrivalClock:
         Always empty.
     restarts : Counter
         Always empty.
+    examples : dict of str to str
+        Always empty.
     """
 
     drift_ppm = spread_s = stamp_std = math.nan
@@ -92,6 +101,7 @@ class ArrivalClock:
     def __init__(self, settings: ClockSettings) -> None:
         self.counts: Counter[str] = Counter()
         self.restarts: Counter[str] = Counter()
+        self.examples: dict[str, str] = {}
         self._min_delay_ns = round(settings.min_delay_s * 1e9)
 
     def stamp(self, ticks: float | None, arrival_ns: int) -> int:
@@ -140,6 +150,40 @@ class _ClockCandidate:
         return not self._is_near or self._n_fitted > 4 * self.total
 
 
+class _StandingClock:
+    """Detects device times that do not advance with the readings: whole seconds, a wrong tick."""
+
+    def __init__(self, settings: ClockSettings) -> None:
+        self._limits_ns = settings.min_step_s * 1e9, settings.max_delay_s * 1e9
+        self._tick_ns = settings.tick_s * 1e9
+        self._ticks, self._first_ns, self._last_ns, self._n_runs = math.nan, 0, 0, 0
+
+    def add(self, ticks: float, arrival_ns: int) -> bool:
+        """Add a reading; return whether the clock stands too long."""
+        min_step_ns, max_delay_ns = self._limits_ns
+        run_ns = arrival_ns - self._first_ns
+        # The counter may wrap any number of times during a pause.
+        has_paused = arrival_ns - self._last_ns > max_delay_ns
+        if has_paused or not abs(ticks - self._ticks) * self._tick_ns <= _MIN_ADVANCE * run_ns:
+            is_long = self._last_ns - self._first_ns > min_step_ns
+            self._n_runs = self._n_runs + 1 if is_long else 0
+            self._ticks, self._first_ns, run_ns = ticks, arrival_ns, 0
+        self._last_ns = arrival_ns
+        return self._n_runs >= _MIN_STANDING_RUNS or run_ns > max_delay_ns
+
+
+def _advice(ticks: float, tick_ns: float) -> str:
+    """What to change for a device time that is not plausible."""
+    unit = unit_since_1970(ticks)
+    if isinstance(ticks, DeviceDate) or unit and TIME_UNITS[unit] == tick_ns:
+        return f'{ticks:.15g}: send decimals of the second, or set stamp_by: arrival'
+    if unit:
+        return (f'{ticks:.15g}: it is a time in {unit} since 1970; set clock: '
+                f'{{tick_s: {TIME_UNITS[unit] / NS:g}, wrap: 0}}')
+    return (f'{ticks:.15g}: set clock: {{tick_s: ..., wrap: ...}} to the length of a tick and the '
+            'number of ticks at which the counter returns to 0 (0 = never)')
+
+
 class DeviceClock:
     """Estimates times of measurement on the host's monotonic clock, for all sensors of a device.
 
@@ -148,6 +192,9 @@ class DeviceClock:
     timestamp. A new clock starts when three consecutive different device times agree on it for
     longer than the delivery of queued messages could explain, or when no reading has fitted the old
     clock for `window_s`. If readings of two clocks alternate, the older clock is kept.
+
+    If the device time hardly advances while readings arrive, as in whole seconds or with a wrong
+    `tick_s`, readings are timestamped by their arrival.
 
     The rounding error of float64 is below 1 ns for 30 days, and below 0.1 µs for ten years.
 
@@ -161,6 +208,9 @@ class DeviceClock:
         Number of readings without a timestamp, by cause.
     restarts : Counter
         Number of clocks started after the first, by cause.
+    examples : dict of str to str
+        First device time and what to change, by cause of `counts`. The dict is replaced, never
+        changed.
     drift_ppm : float, ppm
         Ratio of the true to the nominal tick, minus 1; positive for a slow device. NaN until
         estimated.
@@ -197,6 +247,8 @@ class DeviceClock:
         self.drift_ppm = self.spread_s = self.stamp_std = math.nan
         self._delays: deque[float] = deque(maxlen=256)
         self._slope, self._has_begun = 0.0, False
+        self.examples: dict[str, str] = {}
+        self._standing = _StandingClock(settings)
 
     def _begin(self, ticks: float, arrival_ns: int) -> None:
         """Start a new clock at its first point, with the previous drift estimate."""
@@ -230,8 +282,11 @@ class DeviceClock:
             self.counts[NO_TICKS] += 1
             return None
         if not 0 <= ticks < self._counter_limit:
-            self.counts[OUT_OF_RANGE] += 1
+            self._count(OUT_OF_RANGE, ticks)
             return None
+        if self._standing.add(ticks, arrival_ns):
+            self._count(STANDING, ticks)
+            return arrival_ns - self._min_delay_ns
         if not self._has_begun:
             self._begin(ticks, arrival_ns)
         elapsed = arrival_ns - self._arrival_ns
@@ -254,6 +309,12 @@ class DeviceClock:
             self._candidate = None
         return arrival_ns - self._min_delay_ns - self._add_point(
             t, elapsed - t, detrended, arrival_ns)
+
+    def _count(self, cause: str, ticks: float) -> None:
+        """Count a reading, and store the first one as an example."""
+        if cause not in self.examples:
+            self.examples = {**self.examples, cause: _advice(ticks, self._tick_ns)}
+        self.counts[cause] += 1
 
     def _device_time(self, ticks: float, elapsed: int) -> float:
         """Nominal time since the first reading [ns]; the arrival time resolves counter wraps."""

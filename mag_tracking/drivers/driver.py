@@ -9,6 +9,7 @@ import struct
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -16,19 +17,13 @@ import numpy as np
 from mag_tracking.arrays import BoolArray
 from mag_tracking.drivers.device_clock import ArrivalClock, ClockSettings, DeviceClock
 from mag_tracking.drivers.field_strength import FieldStrength
-from mag_tracking.drivers.reading import Arrival, Axes, Device, Reading
+from mag_tracking.drivers.reading import Arrival, Axes, Device, DeviceDate, Reading
 from mag_tracking.drivers.sequence import SequenceCheck
-from mag_tracking.drivers.settings import (
-    ACCELERATION_UNITS,
-    FIELD_UNITS,
-    STAMPED_BY,
-    DriverSettings,
-    scale_of,
-)
+from mag_tracking.drivers.settings import STAMPED_BY, DriverSettings, acceleration_scale
 from mag_tracking.drivers.single_source import SingleSource, contest
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample, Readings
-from mag_tracking.units import NS
+from mag_tracking.units import NS, TIME_UNITS, field_scale, unit_since_1970
 
 POLL_S = 0.2
 """[s] Interval at which `serve` checks whether to stop."""
@@ -93,9 +88,8 @@ class Driver:
         self.driver_counts: Counter[str] = Counter()
         self._device, self._settings = device, settings
         self._clock_settings = clock_settings
-        self._scale = scale_of(settings.unit, FIELD_UNITS, 'unit')
-        self._acceleration_scale = scale_of(
-            settings.acceleration_unit, ACCELERATION_UNITS, 'acceleration_unit')
+        self._scale = field_scale(settings.unit)
+        self._acceleration_scale = acceleration_scale(settings.acceleration_unit)
         if settings.stamp_by not in STAMPED_BY:
             raise SettingsError(f'stamp_by: expected one of {", ".join(STAMPED_BY)}, got '
                                 f'{settings.stamp_by!r}')
@@ -177,6 +171,19 @@ class Driver:
             total.update(clock.counts.copy())
             total.update(clock.restarts.copy())
         return total
+
+    def examples(self) -> dict[str, str]:
+        """Rejected lines and device times, and what to change.
+
+        Returns
+        -------
+        dict of str to str
+            First example and remedy, by cause; the cause is a key of `counts`.
+        """
+        found = dict(getattr(self._device, 'examples', {}))
+        for clock in self.clocks().values():
+            found.update(clock.examples)
+        return found
 
     def poll(self, timeout_s: float) -> PollResult:
         """Return the samples received since the last call.
@@ -381,7 +388,8 @@ class Driver:
             if len(self._clocks) > len(self._claims):
                 self._drop_clocks()
             uses_arrivals = stamp_by == 'arrival' or stamp_by == 'auto' and ticks is None
-            clock = (ArrivalClock if uses_arrivals else DeviceClock)(self._clock_settings)
+            clock = (ArrivalClock if uses_arrivals else DeviceClock)(
+                _clock_settings_for(ticks, self._clock_settings))
             self._clocks[arrival.source] = clock
         if ticks is None and isinstance(clock, DeviceClock):
             self.driver_counts['readings without a device time'] += 1
@@ -400,6 +408,17 @@ class Driver:
             clock = self._clocks.pop(source)
             self.driver_counts.update(clock.counts)
             self.driver_counts.update(clock.restarts)
+
+
+def _clock_settings_for(ticks: float | None, settings: ClockSettings) -> ClockSettings:
+    """Adapt the settings of a clock to a date, or to a number that only a time since 1970 can be.
+    """
+    unit = 'us' if isinstance(ticks, DeviceDate) else None
+    # A counter of microseconds has no decimals.
+    if unit is None and ticks is not None and (
+            0 < settings.wrap <= ticks or settings.tick_s == 1e-6 and ticks % 1.0):
+        unit = unit_since_1970(ticks)
+    return settings if unit is None else replace(settings, tick_s=TIME_UNITS[unit] / NS, wrap=0)
 
 
 def _bytes_of(axes: Axes | None) -> bytes:

@@ -19,12 +19,15 @@ class FramedDevice:
         Clock settings common to all devices with this framing.
     DRIVER : dict of str to int
         Driver settings common to all devices with this framing.
+    examples : dict of str to str
+        The first rejected line and the remedy, by cause. The dict is replaced, never changed.
     """
 
     def __init__(self, transport: Transport, framing: Framing) -> None:
         self._transport, self._framing = transport, framing
         self._unconsumed = b''
         self._rejected: Counter[str] = Counter()
+        self.examples: dict[str, str] = {}
         self.CLOCK, self.DRIVER = (getattr(framing, name, {}) for name in ('CLOCK', 'DRIVER'))
 
     @property
@@ -74,6 +77,8 @@ class FramedDevice:
             if not self._transport.is_message_oriented:
                 self._unconsumed = data[parsed.consumed:]
             self._rejected.update(parsed.rejected)
+            if parsed.examples:
+                self.examples = {**parsed.examples, **self.examples}
             out += [Arrival(chunk.arrival_ns, reading, chunk.source)
                     for reading in parsed.readings]
         return out

@@ -14,6 +14,13 @@ Axes: TypeAlias = tuple[float, float, float]
 """Components x, y and z of a vector."""
 
 
+class DeviceDate(float):
+    """Date and time of a device's clock, in microseconds since 1970 UTC.
+
+    The clock settings `tick_s` and `wrap` do not apply to it.
+    """
+
+
 class Reading(NamedTuple):
     """One measurement of one sensor, in the device's own units."""
 
@@ -25,7 +32,8 @@ class Reading(NamedTuple):
     acceleration: Axes | None = None
     """Acceleration in the device's unit, sensor frame; None if not reported."""
     ticks: float | None = None
-    """Device clock at the time of measurement; None if the device does not send it."""
+    """Device clock at the time of measurement, a `DeviceDate` if it is a date and time; None if the
+    device does not send it."""
     sequence: int | None = None
     """Sequence number; None if the device does not number its readings."""
 
@@ -40,6 +48,8 @@ class Parsed:
     rejected: Mapping[str, int] = field(default_factory=dict)
     """Number of rejections by cause. A cause is a plural noun phrase, such as 'frames with a wrong
     checksum' or 'bytes between frames'."""
+    examples: Mapping[str, str] = field(default_factory=dict)
+    """The first rejected line and the remedy, by cause, where a line explains the cause."""
 
 
 class Framing(Protocol):

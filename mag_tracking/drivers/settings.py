@@ -1,6 +1,5 @@
 """Settings common to all drivers, and the units of field and acceleration."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,8 +7,6 @@ import numpy as np
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
-FIELD_UNITS = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'G': 1e-4, 'mG': 1e-7}
-"""Factor from each unit to tesla."""
 ACCELERATION_UNITS = {'m/s2': 1.0, 'g': 9.80665, 'mg': 9.80665e-3}
 """Factor from each unit to m/s²."""
 STAMPED_BY = ('auto', 'ticks', 'sequence', 'arrival')
@@ -21,7 +18,8 @@ class DriverSettings:
     """Settings common to all drivers."""
 
     unit: str = param(
-        'T', 'Unit of the field: T, mT, uT, nT, G, mG, or a number (tesla per count).')
+        'T', 'Unit of the field: T, mT, uT, nT, G, mG, counts per unit such as 1090/G, or a number '
+        '(tesla per count).')
     acceleration_unit: str = param(
         'm/s2', 'Unit of the acceleration: m/s2, g, mg, or a number (m/s^2 per count).')
     stamp_by: str = param(
@@ -43,34 +41,30 @@ class DriverSettings:
         'timeout.', 's', (0.0, 86400.0))
 
 
-def scale_of(unit: str, units: Mapping[str, float], name: str) -> float:
-    """Factor that converts a unit to SI.
+def acceleration_scale(unit: str) -> float:
+    """Convert the unit of an acceleration to m/s².
 
     Parameters
     ----------
     unit : str
-        Key of `units`, or a number.
-    units : dict of str to float
-        `FIELD_UNITS` or `ACCELERATION_UNITS`.
-    name : str
-        Name of the setting, for the error message.
+        Key of `ACCELERATION_UNITS`, or a number (m/s² per count).
 
     Returns
     -------
-    float
+    float, m/s²
 
     Raises
     ------
     SettingsError
         If `unit` is neither a known unit nor a finite number other than 0.
     """
-    if unit in units:
-        return units[unit]
+    if unit in ACCELERATION_UNITS:
+        return ACCELERATION_UNITS[unit]
     try:
         scale = float(unit)
     except ValueError:
         scale = float('nan')
     if not np.isfinite(scale) or scale == 0.0:
-        raise SettingsError(f'{name}: {unit!r} is neither a number other than 0 nor one of '
-                            f'{", ".join(units)}')
+        raise SettingsError(f'acceleration_unit: {unit!r} is neither a number other than 0 nor '
+                            f'one of {", ".join(ACCELERATION_UNITS)}')
     return scale

@@ -239,6 +239,7 @@ class CalibrationNode(StageNode):
         if self._next_steps is not None:
             detection, tracker = self._next_steps
             tracker.set_input_doubts(self._stage.input_doubts())
+            detection.set_relearnt(self._stage.backgrounds())
             for readings in calibrated:
                 detection.receive_readings(readings)
         return calibrated

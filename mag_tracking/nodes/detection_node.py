@@ -6,6 +6,7 @@ if __name__ == '__main__':
 
     detection_node()
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -14,6 +15,7 @@ from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
 from mag_tracking_msgs.msg import PassEvent as PassEventMessage
 from sensor_msgs.msg import MagneticField
 
+from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.messages.frame import frame_dict
 from mag_tracking.messages.schema import detection_dict, pass_event_dict, reading_of
 from mag_tracking.messages.types import CALIBRATED_READINGS, NETWORK_FRAME, TRACK_ARRAY
@@ -131,6 +133,17 @@ class DetectionNode(StageNode):
             self._event_backlog.append(readings)
             if frames:
                 self._publish_events()
+
+    def set_relearnt(self, backgrounds: Mapping[str, RunningBackground]) -> None:
+        """Set the changes of the backgrounds, so that the event of a parked vehicle is not split.
+
+        Parameters
+        ----------
+        backgrounds : mapping of str to RunningBackground
+            Background of each sensor.
+        """
+        if self._events is not None:
+            self._events.set_relearnt(backgrounds)
 
     def _publish_events(self) -> None:
         """Publish the events completed by the readings received since the last call."""

@@ -51,7 +51,9 @@ class DriverDiagnostics:
         """Return the diagnostics of one device, and log a change."""
         counts = driver.counts()
         previous = self._reported_counts.get(driver.name, {})
+        examples = driver.examples()
         increases = [f'{count}: {n - previous.get(count, 0)} more'
+                     + (f', such as {examples[count]}' if count in examples else '')
                      for count, n in sorted(counts.items())
                      if n > previous.get(count, 0) and not count.startswith(EXPECTED_COUNTS)]
         self._reported_counts[driver.name] = dict(counts)

@@ -189,9 +189,9 @@ def all_connected(stages: list[StageNode], replay: ReplayNode) -> bool:
 
 
 def run(network_path: PathLike, settings: Settings, recording: PathLike | None = None,
-        rate: float = 1.0, loop: bool = False, observers: Sequence[Callable[[], Node]] = (),
-        drivers: PathLike | None = None, batches: bool = False,
-        ros_arguments: Sequence[str] = ()) -> int:
+        rate: float = 1.0, loop: bool = False,
+        observers: Sequence[Callable[[], Node]] | None = None, drivers: PathLike | None = None,
+        batches: bool = False, ros_arguments: Sequence[str] = ()) -> int:
     """Run the nodes until Ctrl-C, or until a recording has been played and processed.
 
     If the middleware hangs at the end, `shut_down` ends the process.
@@ -231,7 +231,7 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
 
 def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Settings,
                recording: PathLike | None, rate: float, loop: bool,
-               observers: Sequence[Callable[[], Node]],
+               observers: Sequence[Callable[[], Node]] | None,
                sources: Sequence[Callable[[], Node]]) -> int:
     """Run the nodes until `stopped()`; see `run`. Nodes created by `sources` start last."""
     executor = make_executor()
@@ -240,8 +240,9 @@ def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Se
     try:
         stages, replay = make_nodes(network_path, settings, recording, rate, loop)
         tracks = stages[-1].resolve_topic_name('~/tracks')
-        nodes = [*stages, *(make() for make in observers or [partial(TrackPrinter, tracks)]),
-                 *(make() for make in sources)]
+        if observers is None:
+            observers = [partial(TrackPrinter, tracks)]
+        nodes = [*stages, *(make() for make in (*observers, *sources))]
         nodes += [replay] if replay else []
         for node in nodes:
             executor.add_node(node)

@@ -1,13 +1,20 @@
 """Reading of CSV files, with error messages that name the file and the row."""
 
-import csv
+from collections.abc import Sequence
 from os import PathLike
 from typing import TypeAlias
 
 import numpy as np
 
+from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
-from mag_tracking.files import checked_path
+from mag_tracking.recording.table_text import (
+    find_decimal,
+    is_number,
+    plain_number,
+    read_text,
+    split_line,
+)
 
 CsvPath: TypeAlias = str | PathLike[str]
 Lines: TypeAlias = list[tuple[int, list[str]]]
@@ -46,6 +53,9 @@ def read_csv(path: CsvPath) -> tuple[list[str], Lines]:
 def csv_lines(path: CsvPath) -> Lines:
     """Read the non-empty lines of a CSV file.
 
+    Tabs, semicolons, bars and white space also separate cells. Decimal commas, which need one of
+    them, become points.
+
     Parameters
     ----------
     path : path_like
@@ -60,15 +70,43 @@ def csv_lines(path: CsvPath) -> Lines:
     RecordingError
         If the file cannot be read.
     """
-    path = checked_path(path, RecordingError)
-    try:
-        with open(path, newline='', encoding='utf-8-sig') as stream:
-            reader = csv.reader(stream)
-            return [(reader.line_num, row) for row in reader if row]
-    except OSError as error:
-        raise RecordingError(f'cannot read {path}: {error.strerror}') from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise RecordingError(f'{path}: {error}') from error
+    lines, _ = read_text(path)
+    first = next((line for line in lines if line.strip() and not line.startswith('#')), '')
+    separator = next((c for c in '\t;|,' if c in first), ' ' if len(first.split()) > 1 else ',')
+    rows = [(k + 1, split_line(line, separator)) for k, line in enumerate(lines) if line.strip()]
+    if separator == ',' or find_decimal((c for _, row in rows for c in row), separator) != ',':
+        return rows
+    return [(line, [plain_number(cell, ',') if is_number(cell) else cell for cell in row])
+            for line, row in rows]
+
+
+def read_numbers(path: CsvPath, columns: Sequence[str]) -> FloatArray:
+    """Read a CSV file of numbers without a header; # begins a comment line.
+
+    Parameters
+    ----------
+    path : path_like
+    columns : sequence of str
+        Names of the columns, for error messages.
+
+    Returns
+    -------
+    (n, len(columns)) array
+
+    Raises
+    ------
+    RecordingError
+        If the file is invalid. The message names file, row and column.
+    """
+    rows = [(line, row) for line, row in csv_lines(path) if not row[0].startswith('#')]
+    if not rows:
+        raise RecordingError(f'{path} has no rows')
+    for line, row in rows:
+        if len(row) != len(columns):
+            raise RecordingError(f'{path}: row {line}: expected {len(columns)} columns, got '
+                                 f'{len(row)}')
+    return np.array([[number(path, line, name, text, True)
+                      for name, text in zip(columns, row, strict=True)] for line, row in rows])
 
 
 def number(path: CsvPath, line: int, column: str, text: str, finite: bool) -> float:

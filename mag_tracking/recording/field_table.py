@@ -1,206 +1,354 @@
-"""Import of CSV tables of magnetometer readings with user-defined columns and units."""
+"""Import of tables of magnetometer readings with any usual layout, columns and units."""
 
-import csv
+import math
 import re
-from collections.abc import Sequence
+from array import array
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.files import checked_path
 from mag_tracking.messages.schema import magnetic_field_dicts
 from mag_tracking.messages.types import MAGNETIC_FIELD
+from mag_tracking.quantities import quantity
+from mag_tracking.recording.table_columns import IGNORED, Columns, find_columns, sensor_name
+from mag_tracking.recording.table_layout import Table, read_table
+from mag_tracking.recording.table_order import MAX_STEPS, check_resolution, order_times
+from mag_tracking.recording.table_text import find_decimal, parse_number
+from mag_tracking.recording.table_times import check_range, read_times, span_text
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Readings
-from mag_tracking.units import LATEST_NS
+from mag_tracking.time_text import DAY_NS
+from mag_tracking.units import NS, time_unit
 
-FIELD_UNITS = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'gauss': 1e-4, 'mgauss': 1e-7}
-"""Tesla per unit."""
-TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
-"""Nanoseconds per unit."""
+SUFFIXES = ('.csv', '.tsv', '.txt')
+"""File name extensions of tables."""
+USUAL_FIELD_T = (1e-5, 2e-4)
+"""Range of the median magnitude of a field that is not influenced by magnets [T]."""
+MAX_RELATIVE_NS = 10 * 365 * DAY_NS
+"""Maximum span of times that are not since 1970 [ns]."""
+_DECIMALS = {'ms': 3, 'us': 6, 'ns': 9}
+"""Number of decimals of a second in a column of this unit."""
 
 _Path: TypeAlias = str | PathLike[str]
-_Axes: TypeAlias = dict[str, dict[str, str]]
-"""{sensor: {axis: column}}; the sensor is '' if a column contains the sensor names."""
 
 
-def parse_columns(texts: Sequence[str]) -> tuple[str, str | None, _Axes]:
-    """Parse the assignments of table columns.
+@dataclass(frozen=True)
+class TableOptions:
+    """Properties of a table that the user states. Empty properties are found from the table."""
+
+    columns: Sequence[str] = ()
+    """Assignments as for `parse_columns`."""
+    unit: str = ''
+    """Unit of the field, as for `units.field_scale`."""
+    time_unit: str = ''
+    """Unit of times that are numbers, as for `units.time_scale`."""
+    sensor: str = ''
+    """Name of the only sensor, if the table does not name it."""
+    sensors: Mapping[str, str] = field(default_factory=dict)
+    """Name of the sensor for each text in the sensor column; - discards its readings."""
+    separator: str = ''
+    decimal: str = ''
+    header: int | None = None
+    """Number of the header line; 0 without one."""
+    encoding: str = ''
+    date_order: str = ''
+    """dmy, mdy or ymd."""
+    rate: float | None = None
+    """Rate of the readings of a sensor [Hz], which replaces the times after the first."""
+    wrap: int = 0
+    """Number at which the time returns to 0."""
+    jumps: str = ''
+    """'split' or 'sort', if the time runs backwards or jumps ahead by years."""
+
+
+@dataclass(frozen=True)
+class FieldTable:
+    """Readings of a table."""
+
+    sessions: list[Readings]
+    """Readings between restarts of the clock, in chronological order."""
+    notes: list[str]
+    """What was found out about the layout, and numbers of ignored and unusable rows."""
+
+
+def read_field_table(path: _Path, options: TableOptions, with_times: bool = True) -> FieldTable:
+    """Read a table of readings.
 
     Parameters
     ----------
-    texts : sequence of str
-        `time=COLUMN`, and either `sensor=COLUMN` with `x=COLUMN` and so on (one row per reading),
-        or `NAME.x=COLUMN` and so on (one row for all sensors). Omit axes that were not measured.
+    path : path_like
+    options : TableOptions
+    with_times : bool, optional
+        Whether the times matter. If not, the timestamps count the rows.
 
     Returns
     -------
-    time : str
-        Column of the time.
-    sensor : str or None
-        Column of the sensor name. None if each sensor has its own columns.
-    axes : dict of str to dict of str to str
-        Column by sensor and axis. If `sensor` is a column, the only key is ''.
+    FieldTable
 
     Raises
     ------
     RecordingError
-        If an assignment is invalid, duplicated or missing.
+        If the table is ambiguous, or does not match the options. The message names the property,
+        and the option that states it.
+    SettingsError
+        If an option is not valid.
     """
-    found: dict[str, str] = {}
-    for text in texts:
-        key, equals, column = text.partition('=')
-        if not (equals and column) or key in found:
-            raise RecordingError(f'columns: {text!r} repeats a key' if key in found else
-                                 f'columns: expected KEY=COLUMN such as time=t, got {text!r}')
-        found[key] = column
-    time, sensor = found.pop('time', None), found.pop('sensor', None)
-    axes: _Axes = {}
-    for key, column in found.items():
-        name, _, axis = key.rpartition('.')
-        if axis not in ('x', 'y', 'z') or bool(name) == (sensor is not None):
-            raise RecordingError('columns: expected time, sensor, x, y, z (one row per reading) or '
-                                 'time, NAME.x, NAME.y, NAME.z (one row for all sensors); '
-                                 f'got {key!r}')
-        axes.setdefault(_sensor_name(name, 'columns') if name else '', {})[axis] = column
-    if time is None or not axes:
-        raise RecordingError('columns: time and at least one axis are required, such as time=t '
-                             'mag_1.x=bx mag_1.y=by mag_1.z=bz')
-    return time, sensor, axes
+    table = read_table(checked_path(path, RecordingError), options.separator, options.header,
+                       options.encoding)
+    columns = find_columns(table, options.columns, options.unit, options.sensor)
+    if not with_times:
+        columns, options = replace(columns, time=()), replace(options, rate=1.0)
+    decimal = _decimal(table, columns, options)
+    rows = _Rows(table, columns, decimal, options)
+    table.check_bad_rows(len(rows.lines))
+    if not rows.names:
+        raise RecordingError(f'{table.path} has no readings')
+    stamps, session, order, notes = _stamps(rows, decimal, options)
+    notes = [', '.join([*table.notes, *(['decimal comma'] if decimal == ',' else [])]),
+             *columns.notes, *(notes if with_times else [])]
+    table.check_bad_rows(len(order))
+    ignored = [quantity(n, kind) for kind, n in table.ignored.items()]
+    notes += [f'ignored: {", ".join(ignored)}'] if ignored else []
+    if table.bad:
+        line, fault = min(table.bad)
+        notes.append(f'warning: {quantity(len(table.bad), "unusable row")}, first row {line}: '
+                     f'{fault}')
+    return FieldTable(_sessions(rows, stamps, session, order), notes)
 
 
-def import_field_table(table: _Path, columns: Sequence[str], unit: str, out: _Path,
-                       time_unit: str = 's') -> tuple[Path, dict[str, int]]:
+class _Rows:
+    """Rows of a table whose numbers are valid; the others are added to `table.bad`."""
+
+    def __init__(self, table: Table, columns: Columns, decimal: str, options: TableOptions
+                 ) -> None:
+        self.table, self.columns = table, columns
+        self.lines: list[int] = []
+        self.texts: list[str] = []
+        """Text of the time."""
+        self.keys: list[int] = []
+        """Number of the sensor of each row; 0 if a row has all sensors."""
+        self.names: list[tuple[int, str]] = []
+        """Index of the row, and sensor, of each reading."""
+        self.fields = array('d')
+        """Three numbers of each reading [T]."""
+        key_of: dict[str, int] = {}
+        names = {name: value if value == IGNORED else sensor_name(value, '--sensors')
+                 for name, value in options.sensors.items()}
+        for line, cells in table.rows:
+            try:
+                sensor = '' if columns.sensor is None else sensor_name(
+                    cells[columns.sensor], self._column(columns.sensor), names)
+                if sensor != IGNORED:
+                    self._add(line, cells, sensor, key_of.setdefault(sensor, len(key_of)), decimal)
+            except (ValueError, RecordingError) as error:
+                table.bad.append((line, str(error)))
+        # A long table takes hundreds of megabytes.
+        table.rows.clear()
+
+    def _column(self, j: int) -> str:
+        """Name of a column, for messages."""
+        return self.table.header[j] if self.table.header else f'column {j + 1}'
+
+    def _add(self, line: int, cells: Sequence[str], sensor: str, key: int, decimal: str) -> None:
+        """Add a row; raises ValueError if a number is not valid."""
+        fields: dict[str, list[float]] = {}
+        for axis in self.columns.axes:
+            try:
+                value = parse_number(cells[axis.column], decimal)
+            except ValueError as error:
+                raise ValueError(f'{self._column(axis.column)} {error}') from None
+            fields.setdefault(sensor or axis.sensor, [math.nan] * 3)[axis.axis] = value * axis.scale
+        for name, vector in fields.items():
+            if not all(map(math.isnan, vector)):
+                self.names.append((len(self.lines), name))
+                self.fields.extend(vector)
+        self.lines.append(line)
+        self.keys.append(key)
+        self.texts.append(self._time_text([cells[j] for j in self.columns.time]))
+
+    def _time_text(self, parts: Sequence[str]) -> str:
+        """Join the cells of the time; a last column of ms, us or ns becomes decimals."""
+        if len(parts) < 2 or not parts[-1].isdecimal() or '.' in parts[-2]:
+            return ' '.join(parts)
+        name = self.table.header[self.columns.time[-1]] if self.table.header else ''
+        unit = time_unit(re.split('[^A-Za-z]', name)[-1]) or ''
+        if not self.table.header and len(parts) == 2 and len(parts[0]) == 10:
+            # Seconds since 1970 and nanoseconds, as `ros2 topic echo --csv` writes them.
+            unit = 'ns'
+        if len(parts[-1]) > _DECIMALS.get(unit, 0):
+            return ' '.join(parts)
+        return f'{" ".join(parts[:-1])}.{parts[-1].zfill(_DECIMALS[unit])}'
+
+
+def _decimal(table: Table, columns: Columns, options: TableOptions) -> str:
+    """Return the decimal mark of a table; raises RecordingError if it is ambiguous."""
+    if options.decimal not in ('', '.', ','):
+        raise RecordingError(f"--decimal: expected . or ',', got {options.decimal!r}")
+    used = {axis.column for axis in columns.axes} | set(columns.time)
+    decimal = options.decimal or find_decimal(
+        (cells[j] for _, cells in table.rows for j in used), table.separator)
+    if not decimal:
+        example = next(cells[j] for _, cells in table.rows for j in used if ',' in cells[j])
+        raise RecordingError(f"{table.path}: the decimal mark is ambiguous in {example!r}; give "
+                             "--decimal ',' or --decimal .")
+    return decimal
+
+
+def _stamps(rows: _Rows, decimal: str, options: TableOptions
+            ) -> tuple[list[int], list[int], list[int], list[str]]:
+    """Return (timestamps [ns], sessions, indices of the rows, notes) of all rows with a time."""
+    path, columns = rows.table.path, rows.columns
+    if options.rate is not None and not 1e-3 <= options.rate <= 1e6:
+        raise RecordingError(f'--rate: expected 0.001 to 1e6 Hz, got {options.rate:g}')
+    if not columns.time:
+        if options.rate is None:
+            raise RecordingError(
+                f'{path} has no column of the time; assign one with --columns time=..., or give '
+                'the rate of the readings with --rate HZ. For a calibration by rotation, the times '
+                'do not matter: mag-tracking tumble reads the table itself')
+        return (_at_rate(rows.keys, [0] * len(rows.keys), options.rate), [0] * len(rows.keys),
+                list(range(len(rows.keys))), [f'times from the rate, {options.rate:g} Hz'])
+    where = f'{path}: {columns.time_name}'
+    times = read_times(where, rows.texts, rows.keys, decimal, options.time_unit,
+                       columns.time_unit, options.date_order)
+    ordered = order_times(where, times, rows.texts, rows.keys, rows.lines, options.wrap,
+                          options.jumps)
+    for k, value in enumerate(times.values):
+        if value is None:
+            rows.table.bad.append((rows.lines[k], f'{columns.time_name}: {rows.texts[k][:30]!r} is '
+                                   'not a time'))
+    rows.table.bad += [(rows.lines[k], f'{columns.time_name}: {rows.texts[k][:30]!r} is far from '
+                        'the times before and after') for k in ordered.outliers]
+    rows.table.check_bad_rows(len(ordered.rows))
+    keys = [rows.keys[k] for k in ordered.rows]
+    stamps = times.stamps(ordered.values)
+    low, high = min(stamps, default=0), max(stamps, default=0)
+    if low < 0 and high - low < MAX_RELATIVE_NS:
+        # The origin of such times is a trigger or the overflow of a signed counter.
+        stamps = [stamp - low for stamp in stamps]
+        times.notes.append(f'times from {low / NS:.6g} s, shifted to 0')
+    for k, stamp in zip(ordered.rows, stamps, strict=True):
+        check_range(where, rows.lines[k], stamp)
+    if options.rate is None:
+        check_resolution(where, rows.texts, ordered.values, keys)
+    else:
+        stamps = _at_rate(keys, stamps, options.rate)
+    return stamps, ordered.session, ordered.rows, times.notes + ordered.notes
+
+
+def _at_rate(keys: Sequence[int], stamps: Sequence[int], rate: float) -> list[int]:
+    """Timestamps at a constant rate from the first timestamp of each sensor."""
+    first: dict[int, int] = {}
+    n: Counter[int] = Counter()
+    out = []
+    for key, stamp in zip(keys, stamps, strict=True):
+        out.append(first.setdefault(key, stamp) + round(n[key] * NS / rate))
+        n[key] += 1
+    return out
+
+
+def _sessions(rows: _Rows, stamps: Sequence[int], session: Sequence[int], order: Sequence[int]
+              ) -> list[Readings]:
+    """Divide the readings into sessions, each in chronological order."""
+    fields = np.frombuffer(rows.fields).reshape(-1, 3)
+    place = {k: (stamp, s) for k, stamp, s in zip(order, stamps, session, strict=True)}
+    out = []
+    for s in range(max(session, default=0) + 1):
+        chosen = [i for i, (k, _) in enumerate(rows.names) if k in place and place[k][1] == s]
+        if not chosen:
+            continue
+        times = [place[rows.names[i][0]][0] for i in chosen]
+        readings = Readings.by_name([rows.names[i][1] for i in chosen], times,
+                                    fields[chosen])
+        out.append(readings.part(np.argsort(times, kind='stable')))
+    return out
+
+
+def import_field_table(table: _Path, options: TableOptions, out: _Path
+                       ) -> tuple[list[Path], FieldTable]:
     """Import a table of readings as a recording.
 
     Parameters
     ----------
     table : path_like
-        CSV file with a header.
-    columns : sequence of str
-        Assignments as for `parse_columns`. An empty cell is a missing measurement.
-    unit : str
-        Unit of the field, a key of `FIELD_UNITS`.
+    options : TableOptions
     out : path_like
-        Folder for `<table>.mcap` and `metadata.yaml`.
-    time_unit : str, optional
-        Unit of the time, a key of `TIME_UNITS`.
+        Folder for `<table>.mcap` and `metadata.yaml`, or, if the clock restarts, for one folder
+        `session_1`, `session_2`, ... each.
 
     Returns
     -------
-    recording : Path
-        Recording with the readings on `/NAME/imu/mag`.
-    counts : dict of str to int
-        Number of readings by sensor. A row in which no axis was measured is not counted.
+    recordings : list of Path
+        Recordings with the readings on `/NAME/imu/mag`.
+    content : FieldTable
 
     Raises
     ------
     RecordingError
-        If a unit is unknown or the table does not match the columns.
+        As for `read_field_table`.
+    SettingsError
+        If an option is not valid.
     OutputError
         If `out` cannot be written.
     """
-    for name, value, units in (('unit', unit, FIELD_UNITS), ('time unit', time_unit, TIME_UNITS)):
-        if value not in units:
-            raise RecordingError(f'{name}: expected one of {", ".join(units)}, got {value!r}')
-    readings = _readings(Path(table), parse_columns(columns), FIELD_UNITS[unit],
-                         TIME_UNITS[time_unit])
-    recording = Path(out) / f'{Path(table).stem}.mcap'
-    counts = dict.fromkeys(readings.names, 0)
-    with RecordingWriter(recording) as writer:
-        for k, (name, content) in enumerate(magnetic_field_dicts(readings)):
-            writer.write(f'/{name}/imu/mag', MAGNETIC_FIELD, content, int(readings.stamp_ns[k]))
-            counts[name] += 1
-    return recording, counts
+    content = read_field_table(table, options)
+    recordings = []
+    for k, readings in enumerate(content.sessions):
+        folder = Path(out) / f'session_{k + 1}' if len(content.sessions) > 1 else Path(out)
+        recordings.append(folder / f'{Path(table).stem}.mcap')
+        with RecordingWriter(recordings[-1]) as writer:
+            for name, message, stamp in zip(readings.sensor_names(), (
+                    m for _, m in magnetic_field_dicts(readings)), readings.stamp_ns.tolist(),
+                    strict=True):
+                writer.write(f'/{name}/imu/mag', MAGNETIC_FIELD, message, stamp)
+    return recordings, content
 
 
-def _readings(table: Path, columns: tuple[str, str | None, _Axes], scale: float,
-              time_scale: int) -> Readings:
-    """Read the readings of a table in chronological order; raises RecordingError."""
-    time, sensor, axes = columns
-    names: list[str] = []
-    stamps: list[int] = []
-    fields: list[FloatArray] = []
-    column_names = [time, *([sensor] if sensor else []),
-                    *(c for a in axes.values() for c in a.values())]
-    for number, row in _rows(table, column_names):
-        stamp = _stamp(row[time], time_scale, f'{table}: row {number}: {time}')
-        for name, axis_columns in axes.items():
-            field = np.full(3, np.nan)
-            for axis, column in axis_columns.items():
-                field['xyz'.index(axis)] = scale * _number(
-                    row[column], f'{table}: row {number}: {column}')
-            if not np.isnan(field).all():
-                names.append(_sensor_name(row[sensor], f'{table}: row {number}: {sensor}')
-                             if sensor else name)
-                stamps.append(stamp)
-                fields.append(field)
-    if not names:
-        raise RecordingError(f'{table} has no readings')
-    order = np.argsort(stamps, kind='stable')
-    return Readings.by_name(names, stamps, np.array(fields)).part(order)
+def describe(readings: Readings) -> list[str]:
+    """Describe the readings of each sensor: number, rate, gaps and median field.
 
+    Parameters
+    ----------
+    readings : Readings
+        In chronological order.
 
-def _rows(table: Path, column_names: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
-    """Read [(line number, {column: cell})] from a CSV file; raises RecordingError."""
-    table = checked_path(table, RecordingError)
-    try:
-        with open(table, newline='', encoding='utf-8-sig') as stream:
-            reader = csv.DictReader(stream, skipinitialspace=True)
-            missing_columns = [c for c in column_names if c not in (reader.fieldnames or ())]
-            if missing_columns:
-                raise RecordingError(f'{table}: column {missing_columns[0]} is missing; the '
-                                     'columns are '
-                                     f'{", ".join(reader.fieldnames or ["none"])}')
-            rows = [(reader.line_num, row) for row in reader]
-    except OSError as error:
-        raise RecordingError(f'cannot read {table}: {error.strerror}') from error
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise RecordingError(f'{table} is not a CSV file: {error}') from error
-    for number, row in rows:
-        if any(row[c] is None for c in column_names):
-            raise RecordingError(f'{table}: row {number} has too few columns')
-        if None in row:
-            raise RecordingError(f'{table}: row {number} has too many columns; does it contain '
-                                 'decimal commas?')
-    return rows
-
-
-def _number(text: str, where: str) -> float:
-    """Convert a cell to a number, NaN if empty; raises RecordingError if invalid or infinite."""
-    if not text.strip():
-        return float('nan')
-    try:
-        value = float(text)
-    except ValueError:
-        raise RecordingError(f'{where}: expected a number, got {text!r}') from None
-    if np.isinf(value):
-        raise RecordingError(f'{where} is infinite')
-    return value
-
-
-def _stamp(text: str, scale: int, where: str) -> int:
-    """Convert a cell, in units of `scale` ns, to a time [ns]; raises RecordingError.
-
-    Integer cells are converted exactly.
+    Returns
+    -------
+    list of str
+        One line per sensor, and a warning if all fields have an unusual magnitude.
     """
-    text = text.strip()
-    is_integer = re.fullmatch(r'[+-]?[0-9]{1,20}', text)
-    value = int(text) * scale if is_integer else _number(text, where) * scale
-    if not 0 <= value <= LATEST_NS:
-        raise RecordingError(f'{where}: {text[:30] or "an empty cell"} is not a valid time since '
-                             '1970')
-    return round(value)
-
-
-def _sensor_name(text: str, where: str) -> str:
-    """Convert a string to a sensor name for topics (3 becomes `mag_3`); raises RecordingError."""
-    name = f'mag_{text.strip()}' if re.fullmatch('[0-9]+', text.strip()) else text.strip()
-    if not re.fullmatch('[A-Za-z_][A-Za-z0-9_]*', name):
-        raise RecordingError(f'{where}: {text!r} is not a valid sensor name: use only letters, '
-                             'digits and _, and do not begin with a digit')
-    return name
+    out, magnitudes = [], []
+    spans: dict[str, tuple[int, int]] = {}
+    begin = int(readings.stamp_ns.min())
+    for k, name in enumerate(readings.names):
+        own = readings.part(readings.sensor == k)
+        if not len(own):
+            continue
+        steps = np.diff(own.stamp_ns)
+        step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+        gaps = np.flatnonzero(steps > MAX_STEPS * step)
+        longest = gaps[np.argmax(steps[gaps])] if len(gaps) else 0
+        rate = f'{NS / step:.4g} Hz' if step else 'no rate'
+        gap_text = (f'{quantity(len(gaps), "gap")}, longest {span_text(steps[longest] / NS)} at '
+                    f'{(own.stamp_ns[longest] - begin) / NS:.6g} s' if len(gaps) else 'no gaps')
+        line = f'/{name}/imu/mag  {quantity(len(own), "reading")}, {rate}, {gap_text}'
+        if not np.isnan(own.field).all(axis=0).any():
+            magnitudes.append(float(np.nanmedian(np.linalg.norm(own.field, axis=1))))
+            line += f', median field {1e6 * magnitudes[-1]:.4g} uT'
+        out.append(line)
+        spans[name] = int(own.stamp_ns[0]), int(own.stamp_ns[-1])
+    last, first = max(spans, key=lambda n: spans[n][0]), min(spans, key=lambda n: spans[n][1])
+    if spans[last][0] > spans[first][1]:
+        out.append(f'warning: the readings of {last} begin after those of {first} have ended; the '
+                   'clocks of the sensors may differ')
+    if magnitudes and not any(USUAL_FIELD_T[0] <= m <= USUAL_FIELD_T[1] for m in magnitudes):
+        out.append(f'warning: the median field is {1e6 * magnitudes[0]:.4g} uT, but the Earth\'s '
+                   'field is 20 to 70 uT; check --unit (for raw counts, such as --unit 1090/G)')
+    return out

@@ -13,7 +13,7 @@ from mag_tracking.messages.schema import magnetic_field_dicts, pose_dict
 from mag_tracking.messages.types import MAGNETIC_FIELD, POSE
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import write_network
-from mag_tracking.recording.csv_file import number, read_csv
+from mag_tracking.recording.csv_file import number, read_csv, read_numbers
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Readings
 
@@ -61,7 +61,7 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
         If `out` cannot be written.
     """
     rows = _read_table(table)
-    backgrounds = _read_background(background)
+    backgrounds = read_numbers(background, ('Bx', 'By', 'Bz'))
     ids = np.unique(rows['id']).astype(int)
     if len(backgrounds) != len(ids):
         raise RecordingError(f'the tables have different numbers of sensors: {background} has '
@@ -110,18 +110,3 @@ def _read_table(path: _Path) -> dict[str, FloatArray]:
                              f'{MAX_TIME_S:g} s')
     return {'id': a[:, 0], 'timestamp': a[:, 1], 'field': a[:, 2:5], 'sensor': a[:, 5:8],
             'sensor_rotation': a[:, 8:11], 'magnet': a[:, 11:14], 'magnet_rotation': a[:, 14:17]}
-
-
-def _read_background(path: _Path) -> FloatArray:
-    """Read the background of each sensor, (n_sensors, 3) [µT]; raises RecordingError."""
-    try:
-        values = np.loadtxt(path, delimiter=',', ndmin=2)
-    except OSError as error:
-        raise RecordingError(f'cannot read {path}: {error}') from error
-    except ValueError as error:
-        raise RecordingError(f'{path}: {error}') from error
-    if not np.isfinite(values).all():
-        raise RecordingError(f'{path} contains values that are not finite')
-    if values.shape[1] != 3:
-        raise RecordingError(f'{path}: expected 3 columns, got {values.shape[1]}')
-    return values

@@ -4,7 +4,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
-from mag_tracking.recording.csv_file import CsvPath, Lines, csv_lines, number, read_csv
+from mag_tracking.recording.csv_file import CsvPath, Lines, number, read_csv, read_numbers
 
 _POSE_COLUMNS = ('mag_x0', 'mag_y0', 'mag_z0', 'mag_mx0', 'mag_my0', 'mag_mz0')
 
@@ -81,14 +81,7 @@ def read_sensor_positions(path: CsvPath) -> FloatArray:
     RecordingError
         If the file is invalid. The message names file, row and column.
     """
-    rows = [(line, row) for line, row in csv_lines(path) if not row[0].lstrip().startswith('#')]
-    if not rows:
-        raise RecordingError(f'{path} has no rows')
-    for line, row in rows:
-        if len(row) != 3:
-            raise RecordingError(f'{path}: row {line}: expected 3 columns, got {len(row)}')
-    return np.array([[number(path, line, name, text, True)
-                      for name, text in zip('xyz', row, strict=True)] for line, row in rows])
+    return read_numbers(path, ('x', 'y', 'z'))
 
 
 def _values(path: CsvPath, pose: tuple[str, ...]) -> tuple[Lines, FloatArray]:

@@ -74,10 +74,8 @@ def read_signatures(path: str | PathLike[str], is_labelled: bool = True) -> list
     """
     header, lines = read_csv(path)
     if LABEL not in header and is_labelled:
-        delimiter = next((c for c in ';\t' if c in header[0]), None)
-        hint = f'; the delimiter is {delimiter!r}, expected a comma' if delimiter else ''
         raise LabelsError(f'{path}: column {LABEL!r} is missing; the columns are '
-                          f'{", ".join(header)}{hint}')
+                          f'{", ".join(header)}')
     return _read_by_sample(path, header, lines) if TIME in header \
         else _read_by_row(path, header, lines)
 

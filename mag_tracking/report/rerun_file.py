@@ -1,5 +1,6 @@
 """Recordings for the Rerun viewer, which require the optional package rerun-sdk."""
 
+import sys
 from collections.abc import Mapping
 from importlib.util import find_spec
 from os import PathLike
@@ -36,7 +37,8 @@ def check_rerun() -> None:
     """
     if find_spec('rerun') is None:
         raise MissingDependencyError(
-            'Rerun recordings require rerun-sdk: run pip install rerun-sdk')
+            'Rerun recordings require the package rerun-sdk; install it with: '
+            f'{sys.executable} -m pip install rerun-sdk')
 
 
 def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, TrackLog],

@@ -15,6 +15,7 @@ from mag_tracking.drivers.device_clock import (
     NO_TICKS,
     OUT_OF_RANGE,
     RESET,
+    STANDING,
     STEP_BACK,
     STEP_FORWARD,
     ArrivalClock,
@@ -598,3 +599,22 @@ def test_the_arrival_clock_returns_the_arrival_time():
 def test_contradictory_settings_are_refused(changes, text):
     with pytest.raises(SettingsError, match=text):
         clock_of(**changes)
+
+
+@pytest.mark.parametrize('tick_s, ticks, advice', [
+    (1.0, lambda t: 1_790_000_000 + t // 10**9, 'decimals'),
+    (1e-6, lambda t: 1.79e9 + t / 1e9, 'tick_s: 1,'), (1e-6, lambda t: 0, 'tick_s')])
+def test_a_clock_that_hardly_advances_is_replaced_by_the_arrival(tick_s, ticks, advice):
+    clock = clock_of(tick_s=tick_s, wrap=0)
+    times = START + 20_000_000 * np.arange(500)
+    stamps = [clock.stamp(ticks(int(t) - START), int(t)) for t in times]
+    # The clock is recognised after max_delay_s, 5 s, or three whole seconds.
+    assert stamps[260:] == times[260:].tolist()
+    assert clock.counts[STANDING] >= 240 and set(clock.counts) <= {STANDING, NO_FIT}
+    assert advice in clock.examples[STANDING]
+
+
+def test_a_time_since_1970_beyond_the_counter_range_names_its_unit():
+    clock = clock_of()
+    assert clock.stamp(1_790_000_000_123, START) is None
+    assert clock.counts == {OUT_OF_RANGE: 1} and 'tick_s: 0.001' in clock.examples[OUT_OF_RANGE]

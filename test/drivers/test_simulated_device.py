@@ -1,8 +1,12 @@
 """Simulated device: fields, times, and the output of the command `listen`."""
 
 import dataclasses
+import io
 import math
 import re
+import socket
+import sys
+import threading
 
 import numpy as np
 import pytest
@@ -180,3 +184,29 @@ def test_listen_reports_silent_sensors_and_invalid_arguments(tmp_path, capsys):
     assert '--seconds: expected a number above 0, got 0' in capsys.readouterr().err
     assert cli.main(['listen', str(tmp_path / 'none.yaml')]) == 1
     assert 'No such file' in capsys.readouterr().err
+
+
+def test_listen_shows_a_rejected_line_and_writes_each_line_at_once(tmp_path, monkeypatch):
+    path = tmp_path / 'drivers.yaml'
+    path.write_text('board:\n  transport: udp\n  udp: {port: 5563}\n  framing: text\n'
+                    '  text: {fields: [x, y, z]}\n  unit: uT\n  sensor: mag_1\n')
+    # As redirected to a file, which Python writes in blocks.
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, 'stdout', io.TextIOWrapper(written))
+    stop = threading.Event()
+
+    def send():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+            while not stop.wait(0.05):
+                udp.sendto(b'14,1;-11,2;49,0', ('127.0.0.1', 5563))
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        assert cli.main(['listen', str(path), '--seconds', '1']) == 1
+        print('a line')
+        assert written.getvalue().endswith(b'a line\n')
+    finally:
+        stop.set()
+        thread.join()
+    assert b"'14,1;-11,2;49,0': set separator: ';'" in written.getvalue()

@@ -165,9 +165,9 @@ def test_lifecycle_transitions_start_and_stop_publishing(board):
 
     try:
         assert state() == State.PRIMARY_STATE_UNCONFIGURED
-        drivers.write_text(drivers.read_text().replace('unit: nT', 'unit: gauss'))
+        drivers.write_text(drivers.read_text().replace('unit: nT', 'unit: furlong'))
         assert not change(Transition.TRANSITION_CONFIGURE)
-        drivers.write_text(drivers.read_text().replace('unit: gauss', 'unit: nT'))
+        drivers.write_text(drivers.read_text().replace('unit: furlong', 'unit: nT'))
         assert change(Transition.TRANSITION_CONFIGURE)
         assert not spin_until(lambda: fields, 0.5)
         for _ in range(2):
@@ -182,7 +182,7 @@ def test_lifecycle_transitions_start_and_stop_publishing(board):
     finally:
         exit_codes, outputs = stop([process])
     assert exit_codes == [0], outputs
-    assert 'gauss' in outputs[0]
+    assert 'furlong' in outputs[0]
 
 
 def test_readings_are_published_in_batches(board):

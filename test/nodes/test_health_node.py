@@ -23,6 +23,7 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from support.bundled import NETWORK_FILE
 from support.node_processes import MAX_S, scaled, start, stop
 from support.samples import MagSample, one, sample_dict
+from support.spoilt_stamps import bursts, coarse, packets, regular
 
 STEP_NS = 10_000_000
 EARTH_FIELD = np.array([2e-6, 1.55e-5, -4.9e-5])
@@ -281,3 +282,23 @@ def test_past_faults_expire_after_two_windows(monkeypatch):
     assert 20.0 < min(times) < 35.0
     assert sensor_health.WINDOW_S < max(times) - min(times) <= 2.0 * sensor_health.WINDOW_S + 5.0
     assert reports[-1][1] == ['running', 'running']
+
+
+@pytest.mark.parametrize('modify, rate, text', [
+    (coarse(1.0), 100.0, 'whole seconds'), (packets(10), 100.0, '10 readings share'),
+    (bursts(10), 100.0, 'bursts of 10'), (lambda stamps: stamps, 1.0, '1 Hz is too slow')])
+def test_the_diagnostics_name_the_fault_of_the_timestamps_first(modify, rate, text):
+    """The status of a live sensor; its readings arrive at the true times."""
+    network, settings = read_network(NETWORK_FILE), settings_for('vehicle')
+    health, calibrate = HealthDiagnostics(network, settings), Calibrate(network, settings.calibrate)
+    rng, true = np.random.default_rng(0), regular(rate, 600)
+    for stamp, received in zip(modify(true).tolist(), true.tolist(), strict=True):
+        for name in network.names:
+            readings = one(MagSample(stamp, name, EARTH_FIELD + 1.2e-8 * rng.standard_normal(3)))
+            calibrate.feed(readings)
+            health.add(readings, received)
+    for status in health.statuses('calibration_node', calibrate):
+        assert status.level == DiagnosticStatus.ERROR and text in status.message
+        assert 'NTP' not in status.message and 'chrony' not in status.message
+        lost = next(v.value for v in status.values if v.key == 'lost')
+        assert lost == '0'

@@ -25,6 +25,16 @@ def test_a_pose_table_becomes_a_recording(tmp_path):
         '/mag_1/imu/mag', '/ground_truth/magnet/pose'}
 
 
+def test_semicolons_and_decimal_commas_give_the_same_recording(tmp_path):
+    fields = []
+    for change in (str, lambda text: text.replace(',', ';').replace('.', ',')):
+        recording, network, _ = import_tables(
+            tmp_path, change(HEADER + ROW.replace('10,', '10.25,')), change('# B\n1.5,2,3\n'))
+        fields.append([m.data for m in Recording(recording).messages()])
+        assert '1.5e-06' in network.read_text()
+    assert fields[0] == fields[1]
+
+
 @pytest.mark.parametrize('table, background, message', [
     ('', '1,2,3\n', 'poses.csv has no rows'), (HEADER, '1,2,3\n', 'poses.csv has no rows'),
     (HEADER.replace('Bz', 'Bw') + ROW, '1,2,3\n', 'column Bz is missing'),
@@ -35,8 +45,8 @@ def test_a_pose_table_becomes_a_recording(tmp_path):
     (HEADER + '1e30' + ROW[1:], '1,2,3\n', 'id contains values that are not integers up to'),
     (HEADER + ROW.replace('0.5', '-5'), '1,2,3\n', 'timestamp contains values outside'),
     (HEADER + ROW.replace('0.5', '1e300'), '1,2,3\n', 'timestamp contains values outside'),
-    (HEADER + ROW, '1,2,nan\n', 'values that are not finite'),
-    (HEADER + ROW, '1,2\n', 'background.csv: expected 3 columns, got 2'),
+    (HEADER + ROW, '1,2,nan\n', 'background.csv: row 1: Bz is not a finite number'),
+    (HEADER + ROW, '1,2\n', 'background.csv: row 1: expected 3 columns, got 2'),
     (HEADER + ROW, '1,2,3\n4,5,6\n', r'numbers of sensors: .*background.csv has 2, .* has 1$')])
 def test_an_invalid_pose_table_is_refused(tmp_path, table, background, message):
     with pytest.raises(RecordingError, match=message):

@@ -18,7 +18,6 @@ from mag_tracking.cli import main
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.self_described import field_decoder
 from mag_tracking.messages.types import MAGNETIC_FIELD
-from mag_tracking.recording.field_table import import_field_table
 from mag_tracking.recording.reader import Recording
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 
@@ -261,52 +260,3 @@ def test_a_table_of_readings_becomes_a_recording(source, expected, tmp_path, cap
     assert '/mag_1/imu/mag  1400' in capsys.readouterr().out
     result = mt.track(tmp_path / 'out', NETWORK_FILE, settings=QUICK)
     np.testing.assert_allclose(result.poses['position'], expected.poses['position'], rtol=1e-6)
-
-
-def test_a_row_may_contain_several_sensors(tmp_path):
-    table = tmp_path / 'wide.csv'
-    table.write_text('ms,a,b,c\n1,0.5,,2\n2,,,\n3,1.5,0.25,-2\n')
-    recording, counts = import_field_table(
-        table, ['time=ms', 'left.x=a', 'left.y=b', 'right.z=c'], 'gauss', tmp_path / 'o', 'ms')
-    assert counts == {'left': 2, 'right': 2}
-    found = [(m.topic, m.log_time_ns) for m in Recording(recording).messages()]
-    assert found == [('/left/imu/mag', 10**6), ('/right/imu/mag', 10**6),
-                     ('/left/imu/mag', 3 * 10**6), ('/right/imu/mag', 3 * 10**6)]
-
-
-@pytest.mark.parametrize('columns, unit, text, message', [
-    (['time=t', 'a.x=x'], 'tesla', 't,x\n1,2\n', 'unit: expected one of T, mT'),
-    (['time=t', 'a.x=x'], 'T', 't,y\n1,2\n', 'column x is missing; the columns are t, y'),
-    (['time=t', 'a.x=x'], 'T', 't,x\n1,b\n', "row 2: x: expected a number, got 'b'"),
-    (['time=t', 'a.x=x'], 'T', 't,x\n1,inf\n', 'row 2: x is infinite'),
-    (['time=t', 'a.x=x'], 'T', 't,x\n-1,2\n', 'row 2: t: -1 is not a valid time'),
-    (['time=t', 'a.x=x'], 'T', 't,x\n,2\n', 'row 2: t: an empty cell is not a valid time'),
-    (['time=t', 'a.x=x'], 'T', 't,x\n1\n', 'row 2 has too few columns'),
-    (['time=t', 'a.x=x'], 'T', 't,x\n0,1,5\n', 'row 2 has too many columns'),
-    (['time=t', 'a.x=x'], 'T', 't,x\n--5,1\n', "row 2: t: expected a number, got '--5'"),
-    (['time=t', 'a.x=x'], 'T', 't,x\n\u00b2,1\n', 'row 2: t: expected a number'),
-    (['time=t', 'a.x=x'], 'T', f't,x\n{"9" * 5000},1\n', 'is infinite|is not a valid time'),
-    (['time=t', 'sensor=s', 'x=x'], 'T', 't,s,x\n1,,2\n', "'' is not a valid sensor name"),
-    (['time=t', 'sensor=s', 'x=x'], 'T', 't,s,x\n1,a b,2\n', "'a b' is not a valid sensor name"),
-    (['time=t', 'a/b.x=x'], 'T', 't,x\n1,2\n', "'a/b' is not a valid sensor name"),
-    (['time=t', 'a.x=x'], 'T', 't,x\n1,\n', 'has no readings'),
-    (['time=t', 'x=x'], 'T', 't,x\n1,2\n', "got 'x'"),
-    (['time=t', 'sensor=s', 'a.x=x'], 'T', 't,x\n1,2\n', "got 'a.x'"),
-    (['a.x=x'], 'T', 't,x\n1,2\n', 'time and at least one axis'),
-    (['time=t', 'time=u', 'a.x=x'], 'T', 't,x\n1,2\n', 'repeats a key'),
-    (['time'], 'T', 't,x\n1,2\n', 'expected KEY=COLUMN such as time=t')])
-def test_an_invalid_table_is_refused(columns, unit, text, message, tmp_path):
-    table = tmp_path / 'a.csv'
-    table.write_text(text)
-    with pytest.raises(RecordingError, match=message):
-        import_field_table(table, columns, unit, tmp_path / 'o')
-
-
-def test_the_command_requires_columns_and_a_unit(tmp_path, capsys):
-    table = tmp_path / 'a.csv'
-    table.write_text('t,x\n1,2\n')
-    assert main(['import', str(table), '--out', str(tmp_path / 'o')]) == 1
-    assert 'give either --columns' in capsys.readouterr().err
-    assert main(['import', str(table), '--columns', 'time=t', 'a.x=x', '--out',
-                 str(tmp_path / 'o')]) == 1
-    assert '--unit is missing' in capsys.readouterr().err

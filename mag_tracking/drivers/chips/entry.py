@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from mag_tracking.drivers.chips.chip import ChipLocation
 from mag_tracking.drivers.chips.circuitpython import UNITS
-from mag_tracking.drivers.settings import FIELD_UNITS, scale_of
 from mag_tracking.errors import SettingsError
+from mag_tracking.units import field_scale
 
 ENTRY = re.compile(r'(?P<name>[^:]+):(?P<chip>[^:]+):0x(?P<address>[0-9a-fA-F]{2})'
                    r'(@0x(?P<multiplexer>[0-9a-fA-F]{2})\.(?P<channel>[0-7]))?(:(?P<unit>[^:]+))?')
@@ -104,7 +104,7 @@ def parse_sensor(entry: str, known: Collection[str]) -> Sensor:
     if unit is None:
         raise SettingsError(f'sensors: {name}: the unit of {chip} is not known; add it to the '
                             f'entry, as in {entry}:uT')
-    return Sensor(name, chip, location, scale_of(unit, FIELD_UNITS, f'sensors: {name}: unit'))
+    return Sensor(name, chip, location, field_scale(unit, f'sensors: {name}: unit'))
 
 
 def _parse_address(name: str, role: str, digits: str, lowest: int) -> int:

@@ -11,8 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
 from typing import Any, TypeAlias, TypeVar
 
-from mag_tracking.drivers.reading import Reading
+from mag_tracking.drivers.reading import DeviceDate, Reading
 from mag_tracking.errors import SettingsError
+from mag_tracking.time_text import FORMS, parse_time
 
 FIELD, ACCELERATION = ('x', 'y', 'z'), ('ax', 'ay', 'az')
 AXES = FIELD + ACCELERATION
@@ -29,7 +30,19 @@ _Choice = TypeVar('_Choice', bound=str)
 
 
 class Rejected(ValueError):
-    """Rejection of a line or frame. The message is the cause, such as 'with a wrong checksum'."""
+    """Rejection of a line or frame.
+
+    Parameters
+    ----------
+    cause : str
+        Such as 'with a wrong checksum'. It has no values of the line, because causes are counted.
+    remedy : str, optional
+        What to change, with values of the line.
+    """
+
+    def __init__(self, cause: str, remedy: str = '') -> None:
+        super().__init__(cause)
+        self.remedy = remedy
 
 
 class FieldLayout:
@@ -197,6 +210,79 @@ def ticks_value(value: float) -> float:
     if math.isnan(value):
         raise Rejected('without ticks')
     return value
+
+
+def text_number(text: str, decimal: str) -> float:
+    """Convert the text of a number, as in quotes, to float.
+
+    Parameters
+    ----------
+    text : str
+    decimal : str
+        Decimal mark, '.' or ','.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    ValueError
+        If `text` is not a decimal number, nan or inf.
+    """
+    text = text.strip()
+    if decimal == ',':
+        text = text.replace(',', '.')
+    if '_' in text or not text.isascii():
+        raise ValueError(text)
+    return float(text)
+
+
+def text_ticks(text: str, decimal: str) -> float:
+    """Convert the text of a device time: a number, or a date and time, or a time of day.
+
+    Parameters
+    ----------
+    text : str
+    decimal : str
+        Decimal mark of a number, '.' or ','.
+
+    Returns
+    -------
+    float, ticks, or DeviceDate
+
+    Raises
+    ------
+    Rejected
+        If it is neither a finite number nor a time.
+    """
+    try:
+        value = text_number(text, decimal)
+    except ValueError:
+        pass
+    else:
+        return ticks_value(value)
+    try:
+        return DeviceDate(parse_time(text)[0] // 1000)
+    except ValueError:
+        raise Rejected('with a time that is neither a number nor a date',
+                       f'accepted are numbers and {FORMS}') from None
+
+
+def decimal_remedy(text: str) -> str:
+    """Remedy for a text that is not a number.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    str
+    """
+    if ',' in text and re.fullmatch(r'[+-]?[0-9]*,[0-9]+', text.strip()):
+        return "the decimal mark is a comma: set decimal: ','"
+    return f'{text[:30]!r} is not a number; fields: - skips a value'
 
 
 def sequence_value(value: int) -> int:

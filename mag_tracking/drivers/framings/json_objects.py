@@ -1,6 +1,7 @@
 """Framing of JSON objects, one per line or one per message."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -12,8 +13,11 @@ from mag_tracking.drivers.framings.fields import (
     FieldLayout,
     Rejected,
     axis_value,
+    decimal_remedy,
     sensor_name,
     sequence_value,
+    text_number,
+    text_ticks,
     ticks_value,
 )
 from mag_tracking.drivers.framings.text import Lines
@@ -22,7 +26,16 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
 _Keys: TypeAlias = tuple[tuple[str, int | None], ...]
-_Converter: TypeAlias = Callable[[object, str], object]
+_Converter: TypeAlias = Callable[[object, str, str], object]
+"""Function of a value, its path and the decimal mark."""
+_LOOSE = re.compile(
+    r"""("(?:[^"\\]|\\.)*")|'((?:[^'"\\]|\\.)*)'|(?<![\w$-])([A-Za-z_$][\w$-]*)(?=\s*:)"""
+    r'|(?<![\w$-])(nan|None|True|False)(?![\w$-])')
+"""Strings, and what JavaScript and Python write otherwise than JSON: strings in single quotes, keys
+without quotes, other constants."""
+MAX_LOOSE = 1024
+"""Maximum length of an object that is not JSON."""
+_CONSTANTS = {'nan': 'NaN', 'None': 'null', 'True': 'true', 'False': 'false'}
 
 @dataclass(frozen=True)
 class JsonSettings:
@@ -40,6 +53,8 @@ class JsonSettings:
         'path of a list of the three values.')
     acceleration: tuple[str, ...] = param(
         (), 'Paths of the acceleration, in the same form as `field`.')
+    decimal: str = param(
+        '.', 'Decimal mark of numbers in quotes: . or a comma.', choices=('.', ','))
     end: str = param('\\n', 'Line terminator. A carriage return before it is removed.')
     max_length: int = param(
         4096, 'Maximum length of a line or message without its terminator.', 'bytes', (2, 1 << 20))
@@ -52,8 +67,9 @@ class JsonFraming:
     object that spans several lines is parsed only if the data are `final` and contain only this
     object; otherwise each line is parsed separately.
 
-    Source: RFC 8259. The parser also accepts NaN and Infinity, which RFC 8259 does not define,
-    because many libraries and devices write them. An infinite axis is rejected.
+    Source: RFC 8259. The parser also accepts what many libraries and devices write: NaN and
+    Infinity, keys without quotes or in single quotes, and numbers in quotes. The device time may be
+    a date and time. An infinite axis is rejected.
 
     Parameters
     ----------
@@ -69,6 +85,7 @@ class JsonFraming:
 
     def __init__(self, settings: JsonSettings) -> None:
         self._lines = Lines(settings.end, settings.max_length)
+        self._decimal = settings.decimal
         self._decode = json.JSONDecoder(object_pairs_hook=_object).decode
         self._lists: list[tuple[str, _Keys]] = []
         self._values: list[tuple[str, _Keys, _Converter]] = []
@@ -130,26 +147,46 @@ class JsonFraming:
     def _decode_document(self, line: bytes) -> Any:
         """Decode a JSON document; raises Rejected if it is not valid."""
         try:
-            return self._decode(line.decode())
+            text = line.decode()
+            try:
+                return self._decode(text)
+            except json.JSONDecodeError:
+                # The time for the substitution grows with the square of the length.
+                if len(text) > MAX_LOOSE:
+                    raise
+                return self._decode(_LOOSE.sub(_strict, text))
         except RecursionError:
             raise Rejected('that are nested too deeply') from None
         except Rejected:
             raise
-        except ValueError:
+        except ValueError as error:
             # This includes integers with more digits than Python converts.
-            raise Rejected('that are not JSON') from None
+            raise Rejected('that are not JSON', f'{error}; lines of numbers have the framing '
+                           'text'[:200]) from None
 
     def _read(self, line: bytes) -> list[Reading]:
         """Extract the reading of one object; raises Rejected if the object is not valid."""
         content = self._decode_document(line)
         if not isinstance(content, dict):
-            raise Rejected('that are not a JSON object')
+            raise Rejected('that are not a JSON object',
+                           'send objects such as {"x": 1.0, "y": 2.0, "z": 3.0}')
         for path, keys in self._lists:
             value = _lookup(content, path, keys)
             if not isinstance(value, list) or len(value) != 3:
-                raise Rejected(f'whose {path} is not a list of three values')
-        return self._layout.readings([convert(_lookup(content, path, keys), path)
+                raise Rejected(f'whose {path} is not a list of three values',
+                               'field needs the paths of x, y and z, or of a list of three values')
+        return self._layout.readings([convert(_lookup(content, path, keys), path, self._decimal)
                                       for path, keys, convert in self._values])
+
+
+def _strict(match: re.Match[str]) -> str:
+    """Replace a match of `_LOOSE` by JSON."""
+    string, quoted, key, constant = match.groups()
+    if string:
+        return string
+    if quoted is not None or key:
+        return f'"{quoted if key is None else key}"'
+    return _CONSTANTS[constant]
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -170,39 +207,55 @@ def _split_path(name: str, path: str) -> _Keys:
 
 def _lookup(value: Any, path: str, keys: _Keys) -> Any:
     """Value at a path; raises Rejected if the path is missing."""
+    content = value
     for key, index in keys:
         if isinstance(value, dict) and key in value:
             value = value[key]
         elif isinstance(value, list) and index is not None and index < len(value):
             value = value[index]
         else:
-            raise Rejected(f'without {path}')
+            raise Rejected(f'without {path}', f'the paths are {_paths(content)}'[:200])
     return value
 
 
-def _number(value: object, path: str) -> int | float:
-    """Return `value` if it is a number; raises Rejected otherwise, also for a bool."""
+def _paths(value: Any, prefix: str = '', depth: int = 3) -> list[str]:
+    """Paths of the values that are not objects, and of those at the maximum depth."""
+    if not isinstance(value, dict) or not value or not depth:
+        return [prefix]
+    return [path for key, inner in list(value.items())[:20]
+            for path in _paths(inner, f'{prefix}.{key}' if prefix else key, depth - 1)]
+
+
+def _number(value: object, path: str, decimal: str) -> int | float:
+    """Return `value` if it is a number, or the number in its quotes; raises Rejected otherwise,
+    also for a bool."""
+    if isinstance(value, str):
+        try:
+            return text_number(value, decimal)
+        except ValueError:
+            raise Rejected(f'whose {path} is not a number', decimal_remedy(value)) from None
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise Rejected(f'whose {path} is not a number')
+        raise Rejected(f'whose {path} is not a number', f'it is of the type {type(value).__name__}')
     return value
 
 
-def _axis(value: object, path: str) -> float:
+def _axis(value: object, path: str, decimal: str) -> float:
     """Convert an axis to float, null to NaN; raises Rejected for an infinite or other value."""
-    return float('nan') if value is None else axis_value(_number(value, path))
+    return float('nan') if value in (None, '') else axis_value(_number(value, path, decimal))
 
 
-def _ticks(value: object, path: str) -> float:
-    """Convert a device time; raises Rejected if it is not a finite number."""
-    return ticks_value(_number(value, path))
+def _ticks(value: object, path: str, decimal: str) -> float:
+    """Convert a device time; raises Rejected if it is neither a finite number nor a date."""
+    return text_ticks(value, decimal) if isinstance(value, str) else ticks_value(
+        _number(value, path, decimal))
 
 
-def _sequence(value: object, path: str) -> int:
+def _sequence(value: object, path: str, decimal: str) -> int:
     """Convert a sequence number, such as 12 or 12.0, to int.
 
     Raises Rejected if the value is not an integer of at most 64 bits.
     """
-    value = _number(value, path)
+    value = _number(value, path, decimal)
     if isinstance(value, float):
         if not value.is_integer():
             raise Rejected(f'whose {path} is not an integer')
@@ -210,7 +263,7 @@ def _sequence(value: object, path: str) -> int:
     return sequence_value(value)
 
 
-def _sensor(value: object, path: str) -> str:
+def _sensor(value: object, path: str, decimal: str) -> str:
     """Convert a name (string or integer) to str; raises Rejected if it is not a sensor name."""
     if isinstance(value, int) and not isinstance(value, bool):
         value = str(value)

@@ -1,5 +1,6 @@
 """Framing of text lines that contain separated values, with or without a checksum."""
 
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -13,10 +14,12 @@ from mag_tracking.drivers.framings.fields import (
     Rejected,
     axis_value,
     check_choice,
+    decimal_remedy,
     decode_escapes,
     ignore_value,
     sensor_name,
     sequence_value,
+    text_ticks,
     ticks_value,
 )
 from mag_tracking.drivers.reading import Parsed, Reading
@@ -27,6 +30,10 @@ from mag_tracking.settings import param
 _NUMBER = re.compile(rb'[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?').fullmatch
 _MISSING = re.compile(rb'(?:[+-]?nan)?', re.IGNORECASE).fullmatch
 _INFINITE = re.compile(rb'[+-]?inf(?:inity)?', re.IGNORECASE).fullmatch
+DATE = 'date'
+"""Field that is joined with the ticks."""
+MAX_SHOWN = 100
+"""Maximum length of a rejected line in a message [bytes]."""
 _INTEGER = re.compile(rb'[+-]?[0-9]{1,20}').fullmatch
 
 
@@ -36,12 +43,14 @@ class TextSettings:
 
     fields: tuple[str, ...] = param(
         (), 'Values of a line, in the order sent. Each is sensor, ticks, sequence, x, y, z, ax, '
-        'ay, az, or - to skip a value. x.A is an axis of sensor A, for lines with several sensors.')
+        'ay, az, or - to skip a value. x.A is an axis of sensor A, for lines with several sensors. '
+        'If date and time of day are two values, they are date and ticks.')
     each: tuple[str, ...] = param(
         (), 'Axes of one sensor, for lines with several identical sensors. They are repeated '
         '`count` times after `fields`.')
     count: int = param(0, 'Number of identical sensors described by `each`.', '', (0, 4096))
     separator: str = param(',', 'Separator between values; a blank stands for any white space.')
+    decimal: str = param('.', 'Decimal mark of the numbers: . or a comma.', choices=('.', ','))
     end: str = param('\\n', 'Line terminator. A carriage return before it is removed.')
     prefix: str = param('', 'Prefix of every line with readings; lines without it are rejected.')
     comment: str = param(
@@ -123,12 +132,16 @@ class Lines:
         """
         readings: list[Reading] = []
         rejected: Counter[str] = Counter()
+        examples: dict[str, str] = {}
         for line in lines:
             try:
                 readings += read(self._clean(line))
             except Rejected as cause:
                 rejected[f'lines {cause}'] += 1
-        return Parsed(tuple(readings), consumed, rejected)
+                if cause.remedy and f'lines {cause}' not in examples:
+                    shown = line[:MAX_SHOWN].decode(errors='backslashreplace')
+                    examples[f'lines {cause}'] = f'{shown!r}: {cause.remedy}'
+        return Parsed(tuple(readings), consumed, rejected, examples)
 
     def _clean(self, line: bytes) -> bytes:
         """Remove the carriage return; raises Rejected if a line is too long, empty or not UTF-8."""
@@ -148,7 +161,8 @@ class Lines:
 class TextFraming:
     """Extracts readings from lines of text, one frame per line. Implements `Framing`.
 
-    An axis is missing if it is `nan` or empty; all other numbers are decimal. A line that does not
+    An axis is missing if it is `nan` or empty; all other numbers are decimal, with or without
+    quotation marks. The device time may also be a date and time. A line that does not
     match the settings is rejected as a whole. Without a prefix or a checksum, part of a line may be
     mistaken for a complete line: '12.5,3,4' is also the end of '-12.5,3,4'. If the data end within
     a line and `final` is set, '1,2,3' may be the beginning of '1,2,34'.
@@ -169,13 +183,23 @@ class TextFraming:
 
     def __init__(self, settings: TextSettings) -> None:
         self._lines = Lines(settings.end, settings.max_length)
-        self._layout = FieldLayout(settings.fields, settings.each, settings.count)
+        fields = settings.fields
+        self._date: tuple[int, int] | None = None
+        if DATE in fields:
+            if 'ticks' not in fields:
+                raise SettingsError('fields: date needs ticks, the time of day')
+            self._date = fields.index(DATE), fields.index('ticks')
+        self._layout = FieldLayout([SKIP if name == DATE else name for name in fields],
+                                   settings.each, settings.count)
         self._prefix = decode_escapes('prefix', settings.prefix)
         self._comment = decode_escapes('comment', settings.comment)
         self._has_checksum = check_choice('checksum', settings.checksum, ('none', 'nmea')) == 'nmea'
         separator = decode_escapes('separator', settings.separator)
         self._separator = None if separator == b' ' else separator
-        self._converters = [_converter(q) for q in self._layout.quantities]
+        if settings.decimal == ',' and b',' in separator:
+            raise SettingsError('decimal: a comma cannot be both separator and decimal mark; set '
+                                'separator')
+        self._converters = [_converter(q, settings.decimal) for q in self._layout.quantities]
         self._check_settings(separator)
 
     def _check_settings(self, separator: bytes) -> None:
@@ -216,9 +240,22 @@ class TextFraming:
             line = _strip_checksum(line)
         values = line[len(self._prefix):].split(self._separator)
         if len(values) != len(self._converters):
-            raise Rejected('with an unexpected number of fields')
+            raise Rejected('with an unexpected number of fields', self._width_remedy(line, values))
+        if self._date is not None:
+            date, time = self._date
+            values[time] = values[date] + b' ' + values[time]
         return self._layout.readings(
             [convert(text) for convert, text in zip(self._converters, values, strict=True)])
+
+
+    def _width_remedy(self, line: bytes, values: list[bytes]) -> str:
+        """Explain a line with an unexpected number of values."""
+        n = len(self._converters)
+        for name, separator in (("';'", b';'), ("'\\t'", b'\t'), ("' '", None), ("','", b',')):
+            if len(line[len(self._prefix):].split(separator)) == n:
+                return f'set separator: {name}'
+        return (f'it has {len(values)} values, and fields lists {n}; list every value (- skips '
+                'one), or set the separator')
 
 
 def _strip_checksum(line: bytes) -> bytes:
@@ -231,34 +268,37 @@ def _strip_checksum(line: bytes) -> bytes:
     return line
 
 
-def _converter(quantity: str) -> Callable[[bytes], object]:
+def _converter(quantity: str, decimal: str) -> Callable[[bytes], object]:
     """Function that converts the bytes of a quantity to a value for `FieldLayout.readings`."""
     if quantity in AXES:
-        return _axis
+        return _axis if decimal == '.' else lambda text: _axis(text.replace(b',', b'.'))
     converters: dict[str, Callable[[bytes], object]] = {
-        'ticks': _ticks, 'sequence': _sequence, 'sensor': _sensor, SKIP: ignore_value}
+        'ticks': lambda text: _ticks(text, decimal), 'sequence': _sequence, 'sensor': _sensor,
+        SKIP: ignore_value}
     return converters[quantity]
 
 
 def _axis(text: bytes) -> float:
     """Parse an axis, NaN if missing; raises Rejected if it is not a finite number."""
-    text = text.strip(b' \t')
+    text = text.strip(b' \t"')
     if _NUMBER(text):
         return axis_value(text)
     if _MISSING(text):
         return float('nan')
-    raise Rejected('with an infinite number' if _INFINITE(text)
-                   else 'with a value that is not a number')
+    if _INFINITE(text):
+        raise Rejected('with an infinite number')
+    raise Rejected('with a value that is not a number', decimal_remedy(text.decode()))
 
 
-def _ticks(text: bytes) -> float:
-    """Parse a device time; raises Rejected if it is missing or not a finite number."""
-    return ticks_value(_axis(text))
+def _ticks(text: bytes, decimal: str) -> float:
+    """Parse a device time; raises Rejected if it is missing, or neither a number nor a date."""
+    text = text.strip(b' \t"')
+    return ticks_value(math.nan) if _MISSING(text) else text_ticks(text.decode(), decimal)
 
 
 def _sequence(text: bytes) -> int:
     """Parse a sequence number; raises Rejected if it is not an integer of at most 64 bits."""
-    text = text.strip(b' \t')
+    text = text.strip(b' \t"')
     if not _INTEGER(text):
         raise Rejected('with a sequence number that is not an integer')
     return sequence_value(int(text))
@@ -266,4 +306,4 @@ def _sequence(text: bytes) -> int:
 
 def _sensor(text: bytes) -> str:
     """Parse the name of a sensor; raises Rejected if it is not valid."""
-    return sensor_name(text.strip(b' \t').decode())
+    return sensor_name(text.strip(b' \t"').decode())

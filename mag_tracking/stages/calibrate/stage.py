@@ -6,10 +6,10 @@ from functools import partial
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, IntArray, Record
+from mag_tracking.arrays import FloatArray, Record, are_equal
 from mag_tracking.calibration import core
 from mag_tracking.calibration.agreement import FieldInconsistency
-from mag_tracking.calibration.background import RelearntBackground, RunningBackground
+from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.doubtful_times import (
     CONTRADICTS_EARTH_FIELD,
@@ -24,13 +24,17 @@ from mag_tracking.calibration.reading_faults import ReadingFaults
 from mag_tracking.calibration.screening import clear_spikes
 from mag_tracking.calibration.sensor_state import new_sensors
 from mag_tracking.errors import NetworkError
-from mag_tracking.inference.axes import are_valid_covariances
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.driver_faults import MAX_MARKED, DriverFaults
 from mag_tracking.stages.calibrate.field_comparison import FieldComparison
+from mag_tracking.stages.calibrate.output_buffer import OVERRULED as OVERRULED
 from mag_tracking.stages.calibrate.output_buffer import OutputBuffer
-from mag_tracking.stages.calibrate.rejections import REJECTIONS, Rejections
+from mag_tracking.stages.calibrate.rejections import (
+    REJECTIONS,
+    Rejections,
+    own_covariances,
+)
 from mag_tracking.stages.calibrate.restoration import (
     BackgroundRestoration,
     StoredBackground,
@@ -38,16 +42,13 @@ from mag_tracking.stages.calibrate.restoration import (
 )
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.health.diagnosis import Cause
-from mag_tracking.stages.health.timestamps import TimestampFault, TimestampMonitor
+from mag_tracking.stages.health.timestamps import TimestampMonitor
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NEVER, NS
 
 MAX_SYNCHRONOUS = 16
 """Maximum number of sensors whose blocks may end at the same time. In larger networks, the blocks
 are staggered, because evaluating all blocks at once would delay the readings."""
-
-OVERRULED = 'message covariances overruled by the measured noise'
-"""Key in the counts for message covariances that were replaced by the measured noise."""
 
 FAULTS_FOUND = 'faults of drivers found'
 """Key in the counts for the events after which `driver_faults` are others."""
@@ -81,6 +82,8 @@ class Calibrate:
         Number of rejected readings of each sensor by cause.
     driver_faults : DriverFaults
         Marks and repetitions, which are left out.
+    timestamps : TimestampMonitor
+        Faults of the timestamps, and rates.
     """
 
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
@@ -103,7 +106,7 @@ class Calibrate:
         self._background: dict[str, RunningBackground] = {}
         self._changes = SharedChanges()
         self._restoration = BackgroundRestoration(settings.max_resume_gap_s)
-        self._timestamps = TimestampMonitor(len(network))
+        self.timestamps = TimestampMonitor(network.names)
         self._comparison = FieldComparison(network, survey or SurveySettings())
         self.update_network(network)
 
@@ -131,8 +134,8 @@ class Calibrate:
                             for name in network.names}
         for i, name in enumerate(network.names):
             is_unchanged = previous is not None \
-                and _are_equal(previous.offset[i], network.offset[i]) \
-                and _are_equal(previous.correction[i], network.correction[i])
+                and are_equal(previous.offset[i], network.offset[i]) \
+                and are_equal(previous.correction[i], network.correction[i])
             shift = int(self._sensors[i]['clock_offset_ns'] - network.clock_offset_ns[i])
             if previous is not None and (not is_unchanged or shift):
                 self._restoration.forget(name)
@@ -191,8 +194,7 @@ class Calibrate:
         out = {DOUBTFUL_BACKGROUND: {n: b.doubtful_times for n, b in self._background.items()
                                      if b.doubtful_times},
                CONTRADICTS_EARTH_FIELD: self._comparison.doubtful_times(),
-               WRONG_TIMESTAMPS: {n: times for n, i in self._index.items()
-                                  if (times := self._timestamps.doubtful_times[i])}}
+               WRONG_TIMESTAMPS: self.timestamps.doubtful_times()}
         return {reason: by_sensor for reason, by_sensor in out.items() if by_sensor}
 
     def latest_doubt(self, sensor: str) -> tuple[int, int | None] | None:
@@ -209,46 +211,9 @@ class Calibrate:
         """
         times = [interval for by_sensor in (
             self._background[sensor].doubtful_times, self._comparison.times_of(sensor),
-            self._timestamps.doubtful_times[self._index[sensor]])
+            self.timestamps.doubtful_times().get(sensor, ()))
             for interval in by_sensor[-1:]]
         return max(times, key=lambda t: (t[1] is None, t[0]), default=None)
-
-    def relearnt(self) -> dict[str, tuple[RelearntBackground, ...]]:
-        """Latest changes of the background of each sensor that had any.
-
-        Returns
-        -------
-        dict of str to tuple of RelearntBackground
-        """
-        return {name: b.relearnt for name, b in self._background.items() if b.relearnt}
-
-    def timestamp_fault(self, sensor: str) -> TimestampFault | None:
-        """Return the worst regular error of the timestamps of a sensor so far.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        TimestampFault or None
-            None if the timestamps are regular.
-        """
-        return self._timestamps.worst_fault(self._index[sensor])
-
-    def lowest_rate(self, sensor: str) -> float:
-        """Return the lowest rate of a sensor so far, from its raw timestamps.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        float, Hz
-            Infinite if unknown.
-        """
-        return self._timestamps.lowest_rate(self._index[sensor])
 
     def field_inconsistencies(self) -> list[FieldInconsistency]:
         """Sensors whose background contradicts the Earth's field so much that tracks are wrong.
@@ -292,9 +257,9 @@ class Calibrate:
             are none.
         """
         rows = readings.rows(self._index)
-        validity, covariances = _own_covariances(readings)
+        validity, covariances = own_covariances(readings)
         stamps, fields = plain(readings.stamp_ns, np.int64), plain(readings.field)
-        self._timestamps.add(rows, stamps - self._network.clock_offset_ns[rows], fields)
+        self.timestamps.add(rows, stamps - self._network.clock_offset_ns[rows], fields)
         out, batch = self._new_output(len(readings)), self._batches[0]
         batch['next'] = 0
         while reason := core.calibrate_readings(
@@ -305,16 +270,14 @@ class Calibrate:
                 self.counts[f'rejected: unknown sensor {name}'] += 1
             else:
                 self._handle(reason, int(batch['row']), out)
-        return self._finish(out)
+        return out.finish(self.counts)
 
     def _new_output(self, n: int) -> OutputBuffer:
         """Reset the batch counters, and create a buffer for the output of `n` raw readings."""
         capacity = n + int(self._sensors['n_held'].sum())
         if self._settings.decimate_to_hz:
             capacity += sum(d.n_waiting for d in self._decimators.values())
-        for name in ('n_out', 'n_learning', 'n_partly_learning', 'n_overruled'):
-            self._batches[0][name] = 0
-        return OutputBuffer(self._network.names, capacity)
+        return OutputBuffer(self._network.names, capacity, self._batches[0])
 
     def _handle(self, reason: int, i: int, out: OutputBuffer) -> None:
         """Handle an event of sensor `i` that the compiled code has reported."""
@@ -386,16 +349,6 @@ class Calibrate:
             if self._background[name].ready:
                 self._comparison.update(i, self.background(name), int(s['first_ns']),
                                         int(s['last_ns']))
-
-    def _finish(self, out: OutputBuffer) -> list[Readings]:
-        """Count the calibrated readings of a batch and return them."""
-        batch = self._batches[0]
-        for key, name in (('calibrated', 'n_out'), ('held back while learning', 'n_learning'),
-                          ('axes held back while learning', 'n_partly_learning'),
-                          (OVERRULED, 'n_overruled')):
-            if batch[name]:
-                self.counts[key] += int(batch[name])
-        return out.readings(int(batch['n_out']))
 
     @property
     def n_held(self) -> int:
@@ -486,7 +439,7 @@ class Calibrate:
             self._calibrate_released(int(i), out)
         for s in self._sensors:
             clear_spikes(s)
-        return self._finish(out)
+        return out.finish(self.counts)
 
     def _reject(self, sensor: str, cause: tuple[Cause, str], n: int = 1) -> None:
         """Count `n` rejected readings of a sensor by cause and description."""
@@ -574,20 +527,3 @@ class Calibrate:
         dict of str to RunningBackground
         """
         return dict(self._background)
-
-
-def _own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
-    """Validity codes (NONE, VALID, INVALID) and covariances (n, 3, 3) [T²] of the readings.
-
-    If the readings have no covariances, all codes are NONE and the second array is empty.
-    """
-    if readings.covariance is None:
-        return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
-    C = plain(readings.covariance)
-    valid = np.where(are_valid_covariances(plain(readings.field), C), core.VALID, core.INVALID)
-    return np.where(readings.has_unknown_covariance(), core.NONE, valid), C
-
-
-def _are_equal(a: FloatArray | None, b: FloatArray | None) -> bool:
-    """Whether two arrays are equal; None equals only None."""
-    return a is b if a is None or b is None else np.array_equal(a, b)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.calibration.background import RelearntBackground
+from mag_tracking.calibration.background import RelearntBackground, RunningBackground
 from mag_tracking.event_records import SIGNATURE_SPAN, PassEvent
 from mag_tracking.inference.driving_direction import (
     MAX_CONFIDENCE,
@@ -65,17 +65,17 @@ class Events:
         self._sensors = [_SensorEvents(j, part, align, detect, rates, self.counts)
                          for j, part in enumerate(parts)]
 
-    def set_relearnt(self, relearnt: Mapping[str, Sequence[RelearntBackground]]) -> None:
+    def set_relearnt(self, backgrounds: Mapping[str, RunningBackground]) -> None:
         """Set the changes of the backgrounds, which are not the departure of a target.
 
         Parameters
         ----------
-        relearnt : mapping of str to sequence of RelearntBackground
-            Latest changes of each sensor. Without them, the event of a parked vehicle ends when
-            its field has become the background.
+        backgrounds : mapping of str to RunningBackground
+            Background of each sensor. Without them, the event of a parked vehicle ends when its
+            field has become the background.
         """
-        for name, changes in relearnt.items():
-            self._sensors[self._index[name]].relearnt = changes
+        for name, background in backgrounds.items():
+            self._sensors[self._index[name]].relearnt = background.relearnt
 
     def feed(self, readings: Readings) -> list[PassEvent]:
         """Add calibrated readings.

@@ -78,8 +78,8 @@ class Stays:
             start begins with the first reading.
         """
         end_ns = int(readings.stamp_ns[-1])
-        change = next((c for c in reversed(relearnt)
-                       if event.onset_ns < c.stamp_ns <= end_ns), None)
+        change = max((c for c in relearnt if event.onset_ns < c.stamp_ns <= end_ns),
+                     key=_size, default=None)
         if change is None or not event.ended:
             return [event]
         is_before = readings.stamp_ns < change.stamp_ns
@@ -91,7 +91,7 @@ class Stays:
                 return [_until(self._open.pop(k), event.onset_ns, True)]
         if change.has_departed or np.linalg.norm(level) < MIN_FIELD_STDS * noise:
             return [event]
-        if self._has_departed(change):
+        if change is relearnt[0] and self._has_departed(change):
             return [replace(event, onset_ns=self.first_ns, release_ns=event.onset_ns)]
         self._open.append(_Stay(event, level))
         if len(self._open) > MAX_OPEN:
@@ -102,8 +102,7 @@ class Stays:
         """Whether the previous background was further from the field without a vehicle."""
         before, after = (float(np.linalg.norm(np.nan_to_num(level - self._free_field)))
                          for level in (change.before, change.after))
-        size = float(np.linalg.norm(np.nan_to_num(change.after - change.before)))
-        return before - after > MIN_APPROACH * size
+        return before - after > MIN_APPROACH * _size(change)
 
     def flush(self, last_ns: int) -> list[PassEvent]:
         """Return the events of the vehicles that have not left, as not ended.
@@ -119,6 +118,11 @@ class Stays:
         """
         stays, self._open = self._open, []
         return [_until(stay, last_ns, False) for stay in stays]
+
+
+def _size(change: RelearntBackground) -> float:
+    """Magnitude of a change of the background [T]."""
+    return float(np.linalg.norm(np.nan_to_num(change.after - change.before)))
 
 
 def _until(stay: _Stay, release_ns: int, ended: bool) -> PassEvent:

@@ -13,15 +13,16 @@ from mag_tracking.calibration.reading_faults import NO_FAULTS, ReadingFaults
 from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
-from mag_tracking.quantities import occurrences
-from mag_tracking.stages.health.clocks import ClockSpan
-from mag_tracking.stages.health.diagnosis import Cause, Finding
-from mag_tracking.stages.health.timestamps import WINDOW as TIMESTAMP_WINDOW
-from mag_tracking.stages.health.timestamps import (
+from mag_tracking.calibration.timestamps import WINDOW as TIMESTAMP_WINDOW
+from mag_tracking.calibration.timestamps import (
     TimestampFault,
     latest_interval_s,
     timestamp_fault,
 )
+from mag_tracking.quantities import occurrences
+from mag_tracking.stages.health.clocks import ClockSpan
+from mag_tracking.stages.health.diagnosis import Cause, Finding
+from mag_tracking.stages.health.timestamps import timestamp_finding
 from mag_tracking.stages.health.window import median_field, quantiles, sample_noise_std
 from mag_tracking.units import NEVER, NS
 
@@ -392,7 +393,7 @@ class SensorHealth:
         c = self.counts
         median, low, high = self.delay_s
         if self._timestamp_fault is not None:
-            yield self._timestamp_fault.finding(name)
+            yield timestamp_finding(name, self._timestamp_fault)
         if c['duplicates'] > 0.001 * n:
             yield Finding(False, name, f'{c["duplicates"]} of {n} readings repeat the previous '
                           'timestamp', 'check whether the driver publishes readings twice, or '

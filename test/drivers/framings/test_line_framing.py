@@ -6,7 +6,7 @@ import pytest
 
 from mag_tracking.drivers.framings.json_objects import JsonFraming, JsonSettings
 from mag_tracking.drivers.framings.text import TextFraming, TextSettings
-from mag_tracking.drivers.reading import Reading
+from mag_tracking.drivers.reading import DeviceDate, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import replace
 
@@ -151,7 +151,7 @@ def test_an_object_with_every_quantity_is_parsed():
     (b'{"m": null}', 'whose m is not a list of three values'),
     (b'{"x": [1, 2, 3]}', 'without m'),
     (b'{"m": [1, 2, true]}', 'whose m.2 is not a number'),
-    (b'{"m": [1, 2, "3"]}', 'whose m.2 is not a number'),
+    (b'{"m": [1, 2, "3 nT"]}', 'whose m.2 is not a number'),
     (b'{"m": [1, 2, Infinity]}', 'with an infinite number'),
     (b'{"m": [1, 2, 1e999]}', 'with an infinite number'),
     (b'{"m": [1, 2, 1' + b'0' * 400 + b']}', 'with an infinite number'),
@@ -228,3 +228,64 @@ def test_an_object_of_several_lines_must_be_a_message_of_its_own():
 def test_invalid_json_settings_are_refused(changes, message):
     with pytest.raises(SettingsError, match=message):
         json_framing(**changes)
+
+
+# Values as loggers write them.
+
+@pytest.mark.parametrize('line, expected', [
+    (b'{"m":["1.0", " 2 ", "3e0"]}', (1.0, 2.0, 3.0)),
+    (b'{ t:"7", m:[1, 2, 3] }', (1.0, 2.0, 3.0)),
+    (b"{'m': [1.0, nan, 3], 'name': 'a \\\\ b', 'on': True, 'off': None}", (1.0, math.nan, 3.0)),
+    (b'{m: [1, 2, 3], "text": "it\'s k: 5, \\"x: 1"}', (1.0, 2.0, 3.0)),
+    (b'{"m":[1, null, ""]}', (1.0, math.nan, math.nan))])
+def test_objects_of_javascript_and_python_are_read(line, expected):
+    parsed = json_framing().parse(line + b'\n')
+    assert repr(parsed.readings) == repr((Reading('', expected),)) and not parsed.rejected
+
+
+@pytest.mark.parametrize('text, microseconds', [
+    ('03 May 2026 23:56:01.25', 1_777_852_561_250_000), ('2026-05-03T23:56:01Z', 1_777_852_561e6),
+    ('2026-05-04T01:56:01.000001+02:00', 1_777_852_561_000_001), ('00:00:01.5', 1_500_000)])
+def test_a_device_time_may_be_a_date(text, microseconds):
+    for framing, line in ((json_framing(ticks='t'), f'{{"t": "{text}", "m": [1, 2, 3]}}'),
+                          (text_framing(fields=('ticks', *XYZ)), f'"{text}",1,2,3')):
+        (reading,) = framing.parse(line.encode() + b'\n').readings
+        assert reading == READING._replace(ticks=microseconds)
+        assert isinstance(reading.ticks, DeviceDate)
+
+
+def test_date_and_time_of_day_may_be_two_values():
+    framing = text_framing(fields=('date', 'ticks', *XYZ), separator=' ')
+    (reading,) = framing.parse(b'2026-05-03  23:56:01.25 1 2 3\n').readings
+    assert reading == READING._replace(ticks=1_777_852_561_250_000)
+    assert framing.parse(b'2026-05-03 noon 1 2 3\n').rejected
+    with pytest.raises(SettingsError, match='date needs ticks'):
+        text_framing(fields=('date', *XYZ))
+
+
+def test_decimal_commas_are_read_as_stated():
+    line = b'1,5;2,0;-3,25e1\n'
+    parsed = text_framing(separator=';', decimal=',').parse(line)
+    assert parsed.readings == (Reading('', (1.5, 2.0, -32.5)),)
+    line = b'{"t": "7,5", "m": ["1,5", "2", 3.0]}\n'
+    parsed = json_framing(ticks='t', decimal=',').parse(line)
+    assert parsed.readings == (Reading('', (1.5, 2.0, 3.0), None, 7.5),)
+    with pytest.raises(SettingsError, match='separator'):
+        text_framing(decimal=',')
+
+
+@pytest.mark.parametrize('framing, line, remedy', [
+    (text_framing(separator=';'), '1,5;2;3', "decimal: ','"),
+    (text_framing(), '1;2;3', "separator: ';'"), (text_framing(), '1 2 3', "separator: ' '"),
+    (text_framing(), '7,1,2,3', 'it has 4 values'), (text_framing(), '1uT,2uT,3uT', "'1uT'"),
+    (text_framing(fields=('ticks', *XYZ)), 'noon,1,2,3', 'ISO 8601'),
+    (json_framing(), '{"mag": {"x": 1, "y": 2}}', "'mag.x', 'mag.y'"),
+    (json_framing(), '1,2,3', 'framing text'), (json_framing(), '[1, 2, 3]', '{"x":'),
+    (json_framing(), '{"m": ["1,5", 2, 3]}', "decimal: ','"),
+    (json_framing(), '{"m": [' + '{"a": ' * 400 + '1' + '}' * 400 + ', 2, 3]}', 'type dict')])
+def test_a_rejected_line_is_shown_with_a_remedy(framing, line, remedy):
+    parsed = framing.parse(line.encode() + b'\n' + line.encode() + b'\n')
+    ((cause, n),) = parsed.rejected.items()
+    assert n == 2 and set(parsed.examples) == {cause}
+    assert repr(line[:20])[1:-1] in parsed.examples[cause] and remedy in parsed.examples[cause]
+    assert len(parsed.examples[cause]) < 600

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from mag_tracking.calibration.doubtful_times import are_doubtful
+from mag_tracking.calibration.timestamps import MAX_ERROR_S, TimestampError, timestamp_fault
 from mag_tracking.stages.health.clocks import ClockSpan, clock_findings
 from mag_tracking.stages.health.diagnosis import Cause
 from mag_tracking.stages.health.sensor_health import SensorHealth
-from mag_tracking.stages.health.timestamps import MAX_ERROR_S, TimestampMonitor, timestamp_fault
+from mag_tracking.stages.health.timestamps import TimestampMonitor, timestamp_finding
 from mag_tracking.units import NEVER, NS
 from support.spoilt_stamps import (
     EPOCH_NS,
@@ -27,16 +28,16 @@ def fault_of(stamps):
 
 
 SPOILT = [
-    *((Cause.COARSE_STAMPS, rate, coarse(1.0)) for rate in (2.0, 8.0, 12.5, 50.0, 100.0)),
-    *((Cause.COARSE_STAMPS, rate, coarse(step)) for step, rate in (
+    *((TimestampError.COARSE, rate, coarse(1.0)) for rate in (2.0, 8.0, 12.5, 50.0, 100.0)),
+    *((TimestampError.COARSE, rate, coarse(step)) for step, rate in (
         (0.02, 100.0), (0.02, 200.0), (0.05, 8.0), (0.05, 50.0), (0.1, 8.0), (0.1, 12.5),
         (0.1, 100.0), (0.2, 25.0))),
-    *((Cause.PACKET_STAMPS, 100.0, packets(n)) for n in (2, 5, 10, 25)),
-    (Cause.PACKET_STAMPS, 120.0, packets(10, is_first=True)),
-    *((Cause.BURST_STAMPS, 100.0, bursts(n)) for n in (2, 5, 10, 25)),
-    (Cause.BURST_STAMPS, 50.0, bursts(4, 1e-3)),
-    (Cause.MILLISECOND_STAMPS, 100.0, nanoseconds_in(1e-3)),
-    (Cause.MILLISECOND_STAMPS, 100.0, nanoseconds_in(1e-6))]
+    *((TimestampError.PACKET, 100.0, packets(n)) for n in (2, 5, 10, 25)),
+    (TimestampError.PACKET, 120.0, packets(10, is_first=True)),
+    *((TimestampError.BURST, 100.0, bursts(n)) for n in (2, 5, 10, 25)),
+    (TimestampError.BURST, 50.0, bursts(4, 1e-3)),
+    (TimestampError.UNIT, 100.0, nanoseconds_in(1e-3)),
+    (TimestampError.UNIT, 100.0, nanoseconds_in(1e-6))]
 
 
 @pytest.mark.parametrize('cause, rate, modify', SPOILT)
@@ -45,12 +46,12 @@ def test_a_spoilt_timestamp_has_its_cause_rate_and_error(cause, rate, modify):
     true = regular(rate, n=300)
     stamps = modify(true)[:256]
     fault = fault_of(stamps)
-    assert fault.cause is cause
+    assert fault.error is cause
     assert fault.interval_s == pytest.approx(1.0 / rate, rel=0.05)
     spread_s = np.ptp(stamps - true[:256]) / NS
     # Half of a step is the error if the timestamps of a clock are not shared.
     assert 0.45 * spread_s < fault.error_s <= 1.1 * spread_s
-    assert fault.finding('mag_1').serious == (fault.error_s > MAX_ERROR_S)
+    assert timestamp_finding('mag_1', fault).serious == (fault.error_s > MAX_ERROR_S)
 
 
 @pytest.mark.parametrize('stamps', [
@@ -72,7 +73,7 @@ def test_readings_that_are_published_twice_share_no_timestamp():
 
 def test_timestamps_of_zero_are_named():
     fault = fault_of(np.zeros(100, dtype=np.int64))
-    assert fault.cause is Cause.ZERO_STAMPS and fault.finding('mag_1').serious
+    assert fault.error is TimestampError.ZERO and timestamp_finding('mag_1', fault).serious
 
 
 @pytest.mark.parametrize('size', [1, 7, 1000])
@@ -80,26 +81,29 @@ def test_the_readings_with_wrong_timestamps_are_doubtful(size):
     """Packets begin in the middle; the result does not depend on the batches."""
     true = regular(100.0, 2000)
     stamps = np.append(true[:1000], packets(10)(true)[1000:])
-    monitor, one = TimestampMonitor(2), TimestampMonitor(2)
+    names = 'mag_1', 'mag_2'
+    monitor, one = TimestampMonitor(names), TimestampMonitor(names)
     rows = np.ones(len(stamps), dtype=np.int64)
     for k in range(0, len(stamps), size):
         part = slice(k, k + size)
         monitor.add(rows[part], stamps[part], FIELDS[:2000][part])
     one.add(rows, stamps, FIELDS[:2000])
-    times = monitor.doubtful_times[1]
-    assert times == one.doubtful_times[1] and not monitor.doubtful_times[0]
+    assert monitor.doubtful_times() == one.doubtful_times()
+    times = monitor.doubtful_times()['mag_2']
+    assert 'mag_1' not in monitor.doubtful_times()
     assert not are_doubtful(times, int(true[500])) and are_doubtful(times, int(true[1500]))
-    assert monitor.worst_fault(1).cause is Cause.PACKET_STAMPS and monitor.worst_fault(0) is None
+    assert monitor.worst_fault('mag_2').error is TimestampError.PACKET
+    assert monitor.worst_fault('mag_1') is None
 
 
 def test_the_lowest_rate_is_remembered():
     fast = regular(100.0, 1000)
     slow = fast[-1] + np.arange(1, 65) * NS
-    monitor = TimestampMonitor(1)
+    monitor = TimestampMonitor(('mag_1',))
     stamps = np.concatenate([fast, slow, slow[-1] + regular(100.0, 1000) - EPOCH_NS])
     monitor.add(np.zeros(len(stamps), dtype=np.int64), stamps, FIELDS[:len(stamps)])
-    assert monitor.lowest_rate(0) == pytest.approx(1.0, rel=0.01)
-    assert monitor.worst_fault(0) is None
+    assert monitor.lowest_rate('mag_1') == pytest.approx(1.0, rel=0.01)
+    assert monitor.worst_fault('mag_1') is None
 
 
 def health_of(stamps, received=None):

@@ -1,0 +1,341 @@
+"""Columns of a table of readings: time, sensor and axes, named by the user or by the header."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from mag_tracking.errors import RecordingError
+from mag_tracking.recording.table_layout import Table
+from mag_tracking.settings import closest_name
+from mag_tracking.units import FIELD_UNITS, field_scale, field_unit, time_unit
+
+MAX_NAME = 200
+"""Length of a column name above which no unit is looked for."""
+_HEADER_HINT = '; if this is not the header, give --header with the number of its line'
+DEFAULT_SENSOR = 'mag_1'
+"""Name of the only sensor of a table that does not name it."""
+IGNORED = '-'
+"""Name assigned to a sensor whose readings are discarded."""
+_Assigned: TypeAlias = tuple[str, str | None, dict[str, dict[str, str]]]
+"""Column of the time ('' without one), column of the sensor, and {sensor: {axis: column}}."""
+_TIME_WORDS = frozenset('t time timestamp ts stamp datetime timestamps epoch elapsed unixtime '
+                        'millis micros nanos sec secs seconds ms us ns utc localtime'.split())
+_SENSOR_WORDS = frozenset('id sensor device node name board channel sensorid deviceid'.split())
+_FIELD_WORDS = frozenset('magnetic magnetometer magnetometers mag magn magneto field flux '
+                         'density b h m raw compass axis component data value sensor'.split())
+_OTHER_WORDS = frozenset(
+    'acc accel acceleration accelerometer linear gyro gyroscope gravity angular rate velocity '
+    'orientation quaternion position pos roll pitch yaw covariance rotation temperature true truth '
+    'gps offset scale bias'.split())
+_AXIS = re.compile(r'(?P<rest>.*?)(?P<prefix>magnetometer|magnetic|mag|field|compass|[bhm])?'
+                   r'(?P<axis>[xyz])(?P<number>[0-9]*)').fullmatch
+_UNIT_AT_END = re.compile(r'(.*\S)\s*[(\[](.*)[)\]]\s*|(.*[^\s_,/])\s*[\s_,/]+(\S+)').fullmatch
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Column of one axis of one sensor."""
+
+    sensor: str
+    """Name of the sensor; empty if a column contains the names."""
+    axis: int
+    column: int
+    scale: float
+    """Tesla per unit."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns of a table of readings."""
+
+    time: tuple[int, ...]
+    """Columns whose cells form the time, such as date and time of day."""
+    sensor: int | None
+    axes: tuple[Axis, ...]
+    time_name: str
+    time_unit: str
+    """Unit of the time in the header; empty if it states none."""
+    notes: tuple[str, ...]
+
+
+def parse_columns(texts: Sequence[str]) -> _Assigned:
+    """Parse the assignments of table columns.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        `time=COLUMN`, or `time=DATE+TIME` for two columns, and either `x=COLUMN` and so on (one row
+        per reading), with `sensor=COLUMN` if there are several sensors, or `NAME.x=COLUMN` and so
+        on (one row for all sensors). Omit axes that were not measured.
+
+    Returns
+    -------
+    time : str
+        Columns of the time, joined by +. Empty if there is none.
+    sensor : str or None
+        Column of the sensor name.
+    axes : dict of str to dict of str to str
+        Column by sensor and axis. The only key is '' if the axes name no sensor.
+
+    Raises
+    ------
+    RecordingError
+        If an assignment is invalid, duplicated or missing.
+    """
+    found: dict[str, str] = {}
+    for text in texts:
+        key, equals, column = text.partition('=')
+        if not (equals and column) or key in found:
+            raise RecordingError(f'columns: {text!r} repeats a key' if key in found else
+                                 f'columns: expected KEY=COLUMN such as time=t, got {text!r}')
+        found[key] = column
+    time, sensor = found.pop('time', ''), found.pop('sensor', None)
+    axes: dict[str, dict[str, str]] = {}
+    for key, column in found.items():
+        name, _, axis = key.rpartition('.')
+        if axis not in ('x', 'y', 'z') or name and sensor is not None:
+            raise RecordingError('columns: expected time, sensor, x, y, z (one row per reading) or '
+                                 'time, NAME.x, NAME.y, NAME.z (one row for all sensors); '
+                                 f'got {key!r}')
+        axes.setdefault(sensor_name(name, 'columns') if name else '', {})[axis] = column
+    if not axes or '' in axes and len(axes) > 1:
+        raise RecordingError('columns: at least one axis is required, and either all axes or none '
+                             'name a sensor, such as time=t mag_1.x=bx mag_1.y=by mag_1.z=bz')
+    return time, sensor, axes
+
+
+def sensor_name(text: str, where: str, names: Mapping[str, str] | None = None) -> str:
+    """Convert a text to the name of a sensor.
+
+    Parameters
+    ----------
+    text : str
+    where : str
+        Place of the text, for the error message.
+    names : dict of str to str, optional
+        Name of the sensor for each text; 3 becomes `mag_3` without an entry.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    RecordingError
+        If the text is not a valid name.
+    """
+    text = text.strip()
+    if names and text in names:
+        return names[text]
+    name = f'mag_{text}' if re.fullmatch('[0-9]+', text) else text
+    if not re.fullmatch('[A-Za-z_][A-Za-z0-9_]*', name):
+        raise RecordingError(f'{where}: {text!r} is not a valid sensor name, which has only '
+                             'letters, digits and _, and does not begin with a digit; assign one '
+                             f"with --sensors '{text or 'TEXT'}=mag_1'")
+    return name
+
+
+def find_columns(table: Table, assigned: Sequence[str], unit: str, sensor: str) -> Columns:
+    """Find the columns of a table.
+
+    Parameters
+    ----------
+    table : Table
+    assigned : sequence of str
+        Assignments as for `parse_columns`, of names or numbers (from 1) of columns. If empty, the
+        columns are found by their names.
+    unit : str
+        Unit of the field; if empty, that of the header.
+    sensor : str
+        Name of the only sensor, if the columns name none.
+
+    Returns
+    -------
+    Columns
+
+    Raises
+    ------
+    RecordingError
+        If a column is missing or ambiguous, or the unit is unknown.
+    SettingsError
+        If `unit` is not a unit.
+    """
+    time, sensor_column, axes = parse_columns(assigned) if assigned else _by_header(table)
+    notes = [] if assigned else [_assignment_note(time, sensor_column, axes)]
+    times = _time_columns(table, time)
+    scales = {} if not unit else {'': field_scale(unit, '--unit')}
+    found, units = [], set()
+    for name, columns in axes.items():
+        if not name and sensor_column is None:
+            name = sensor or DEFAULT_SENSOR
+            notes += [] if sensor else [f'sensor {name} (--sensor states another name)']
+        for axis, column in columns.items():
+            j = _index(table, column)
+            stated = _unit_of(table, j)
+            units.add(stated)
+            if not unit and not stated:
+                raise RecordingError(
+                    f'{table.path}: --unit is missing: column {column} states no unit of the '
+                    f'field; give {", ".join(FIELD_UNITS)}, or counts per unit such as 1090/G')
+            scale = scales[''] if unit else FIELD_UNITS[stated]
+            found.append(Axis(name, 'xyz'.index(axis), j, scale))
+    if unit and any(u and abs(FIELD_UNITS[u] / scales[''] - 1.0) > 1e-9 for u in units):
+        notes.append(f'warning: --unit {unit} differs from {" ".join(sorted(units - {""}))} in '
+                     'the header')
+    elif not unit:
+        notes.append(f'unit {" ".join(sorted(units))}')
+    names_column = None if sensor_column is None else _index(table, sensor_column)
+    return Columns(times, names_column, tuple(found), time,
+                   _time_unit_of(table, times[0]) if len(times) == 1 else '', tuple(notes))
+
+
+def _time_columns(table: Table, time: str) -> tuple[int, ...]:
+    """Indices of the columns of the time; a name may itself contain a plus sign."""
+    if not time:
+        return ()
+    if '+' in time and table.header and time in table.header:
+        return (_index(table, time),)
+    return tuple(_index(table, name) for name in time.split('+'))
+
+
+def _index(table: Table, column: str) -> int:
+    """Index of a column by its name, its name without unit, or its number (from 1)."""
+    header, column = table.header or [], column.strip().lstrip('#%/ ')
+    for names in (header, [name.lower() for name in header],
+                  [split_unit(name)[0].lower() for name in header]):
+        wanted = column if names is header else column.lower()
+        if names.count(wanted) == 1:
+            return names.index(wanted)
+        if names.count(wanted) > 1:
+            numbers = [str(k + 1) for k, name in enumerate(names) if name == wanted]
+            raise RecordingError(f'{table.path}: the columns {", ".join(numbers)} are all named '
+                                 f'{column}; give the number instead of the name')
+    n_columns = len(table.rows[0][1]) if table.rows else len(header)
+    if column.isdecimal() and 1 <= int(column) <= n_columns:
+        return int(column) - 1
+    if table.header is None:
+        raise RecordingError(f'{table.path} has no header line, so column {column} is missing; '
+                             f'give the numbers of its {n_columns} columns, such as time=1 '
+                             'sensor=2 x=3 y=4 z=5, or --header with the number of the header line')
+    similar = closest_name(column, header)
+    hint = f'; did you mean {similar}?' if similar else ''
+    raise RecordingError(f'{table.path}: column {column} is missing; the columns in line '
+                         f'{table.header_line} are {", ".join(header)}{hint or _HEADER_HINT}')
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Split the name of a column into name and unit.
+
+    Parameters
+    ----------
+    name : str
+        Such as 'Bx (µT)', 'Bx_uT' or 'time [ms]'.
+
+    Returns
+    -------
+    name : str
+    unit : str
+        Empty if there is none.
+    """
+    match = _UNIT_AT_END(name) if len(name) < MAX_NAME else None
+    if match and match[1]:
+        return match[1], match[2]
+    # A single letter without brackets is rather a part of the name.
+    if match and len(match[4]) > 1 and (field_unit(match[4]) or time_unit(match[4])):
+        return match[3], match[4]
+    return name, ''
+
+
+def _unit_of(table: Table, j: int) -> str:
+    """Unit of the field of a column in the header or the line of units; '' if none is stated."""
+    texts = [split_unit(table.header[j])[1]] if table.header else []
+    texts += table.units[j:j + 1]
+    return next((unit for text in texts if (unit := field_unit(text))), '')
+
+
+def _time_unit_of(table: Table, j: int) -> str:
+    """Unit of the time of a column in the header or the line of units; '' if none is stated."""
+    texts = [split_unit(table.header[j])[1], table.header[j]] if table.header else []
+    if table.header and table.header[j].strip() in ('s', 't', 'h', 'd', 'min'):
+        texts.pop()
+    texts += table.units[j:j + 1]
+    return next((unit for text in texts if (unit := time_unit(text))), '')
+
+
+def _by_header(table: Table) -> _Assigned:
+    """Find the columns by their names; raises RecordingError if they are not clear."""
+    if table.header is None:
+        n = len(table.rows[0][1])
+        raise RecordingError(f'{table.path} has no header line; give the numbers of its {n} '
+                             'columns with --columns, such as --columns time=1 sensor=2 x=3 y=4 '
+                             'z=5, or --header with the number of the header line')
+    times: list[str] = []
+    sensors: list[str] = []
+    axes: dict[str, dict[str, str]] = {}
+    names = [name for k, name in enumerate(table.header) if name]
+    for name in names:
+        base, unit = split_unit(name)
+        words = _words(base)
+        if set(words) & _OTHER_WORDS or unit and not field_unit(unit) and not time_unit(unit):
+            continue
+        if words[-1:] == ['date'] or set(words) & _TIME_WORDS and not field_unit(unit):
+            times.append(name)
+        elif axis := _axis_of(words):
+            if axes.setdefault(axis[0], {}).setdefault(axis[1], name) != name:
+                _refuse(table, f'both {axes[axis[0]][axis[1]]} and {name} may be the axis '
+                        f'{axis[1]}')
+        elif set(words) & _SENSOR_WORDS:
+            sensors.append(name)
+    if len(times) == 2 and any('date' in _words(t) for t in times):
+        times = ['+'.join(sorted(times, key=lambda t: 'date' not in _words(t)))]
+    if len(times) > 1 or len(sensors) > 1:
+        several = times if len(times) > 1 else sensors
+        _refuse(table, f'{" and ".join(several)} may be the '
+                f'{"time" if several is times else "sensor"}')
+    if not axes or '' in axes and len(axes) > 1 or sensors and '' not in axes:
+        _refuse(table, 'the axes of the field are not clear')
+    return times[0] if times else '', sensors[0] if sensors else None, axes
+
+
+def _refuse(table: Table, cause: str) -> None:
+    """Raise RecordingError because the names of the columns are not clear."""
+    raise RecordingError(f'{table.path}: {cause}; assign the columns with --columns, such as '
+                         '--columns time=t x=bx y=by z=bz; the columns are '
+                         f'{", ".join(table.header or ())}')
+
+
+def _words(name: str) -> list[str]:
+    """Words of a name in lower case, split at capitals and other characters."""
+    name = re.sub(r'([a-z0-9])([A-Z])', r'\1 \2', name)
+    return re.findall('[a-z0-9]+', name.lower())
+
+
+def _axis_of(words: Sequence[str]) -> tuple[str, str] | None:
+    """Return (sensor, axis) that the words of a name stand for; the sensor may be ''."""
+    # The axis may also come first: 'x1', 'X magnetic field'.
+    order = list(words) if not words or words[-1].isdecimal() or _AXIS(words[-1]) else [
+        *words[1:], words[0]]
+    number = order.pop() if order and order[-1].isdecimal() else ''
+    match = _AXIS(order[-1]) if order else None
+    if match is None:
+        return None
+    rest = [word for word in (*order[:-1], match['rest']) if word and word not in _FIELD_WORDS]
+    number = match['number'] or number
+    glued = re.fullmatch('(?:mag|magnetometer|sensor|s|m|b|imu)([0-9]+)', rest[0]) if len(
+        rest) == 1 else None
+    if glued and not number:
+        rest, number = [], glued[1]
+    if match['rest'] and not glued:
+        return None
+    name = '_'.join([*rest, *([number] if number else [])])
+    return (f'mag_{name}' if name[:1].isdecimal() else name), match['axis']
+
+
+def _assignment_note(time: str, sensor: str | None, axes: Mapping[str, Mapping[str, str]]) -> str:
+    """Describe columns that were found by their names."""
+    parts = [f'time={time}'] if time else []
+    parts += [f'sensor={sensor}'] if sensor else []
+    parts += [f'{name}.{axis}={column}' if name else f'{axis}={column}'
+              for name, columns in axes.items() for axis, column in columns.items()]
+    return f'columns {", ".join(parts[:8])}{", ..." if len(parts) > 8 else ""}'

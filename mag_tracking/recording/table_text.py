@@ -1,0 +1,277 @@
+"""Text of tables: encoding, separator and decimal mark."""
+
+import codecs
+import csv
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from os import PathLike
+
+from mag_tracking.errors import RecordingError
+from mag_tracking.files import checked_path
+
+SEPARATORS = {'\t': 'tab', ';': 'semicolon', '|': 'bar', ',': 'comma', ' ': 'spaces'}
+"""Names of the separators that are recognised. White space of any length is one separator."""
+COMMENTS = ('#', '%', '//')
+"""Beginnings of comment lines."""
+_MARKS = ((codecs.BOM_UTF8, 'utf-8-sig'), (codecs.BOM_UTF32_LE, 'utf-32'),
+          (codecs.BOM_UTF32_BE, 'utf-32'), (codecs.BOM_UTF16_LE, 'utf-16'),
+          (codecs.BOM_UTF16_BE, 'utf-16'))
+_OTHER_FILES = (
+    (b'PK\x03\x04', 'an Excel workbook or ZIP archive; export the sheet as CSV'),
+    (b'\xd0\xcf\x11\xe0', 'an Excel workbook; export the sheet as CSV'),
+    (b'PAR1', 'a Parquet file; write it as CSV, for example with pandas'),
+    (b'\x1f\x8b', 'compressed with gzip; unpack it first'),
+    (b'\x89MCAP', 'a recording, which needs no import'), (b'SQLite format', 'a database'),
+    (b'ULog', 'a flight log of PX4; convert it with ulog2csv first'),
+    (b'\x89HDF', 'an HDF5 or MATLAB file; write it as CSV first'),
+    (b'MATLAB', 'a MATLAB file; write it as CSV first'),
+    (b'\x93NUMPY', 'a NumPy file; write it with numpy.savetxt first'))
+_NUMBER = re.compile(r"[+-]?(?:[0-9][0-9.,'\u2019\u00a0\u202f]*|[.,][0-9]+)(?:[eE][+-]?[0-9]+)?"
+                     ).fullmatch
+_TIME = re.compile(r'[0-9](?=.*[-:/.].*)[0-9TZ:.,/+ apmAPMUTCG-]+|[0-9]{1,2}[ -][A-Za-z]{3,9}[ -].*'
+                   ).fullmatch
+_MISSING = frozenset(('', '-', '--', 'nan', '-nan', '+nan', 'na', 'n/a', '#n/a', 'null', 'none',
+                      'nat', '<na>'))
+_GROUPING = str.maketrans('', '', "'\u2019\u00a0\u202f ")
+_COMMA_DECIMALS = re.compile(
+    r'[+-]?(?:[0-9]*,(?:[0-9]{1,2}|[0-9]{4,})|0+,[0-9]+|[0-9]{4,},[0-9]+|[0-9.]+\.[0-9]{3},[0-9]+)'
+    r'(?:[eE][+-]?[0-9]+)?').fullmatch
+_POINT_DECIMALS = re.compile(
+    r'[+-]?(?:[0-9]*\.(?:[0-9]{1,2}|[0-9]{4,})|0+\.[0-9]+|[0-9]{4,}\.[0-9]+|[0-9,]+,[0-9]{3}\.'
+    r'[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?[0-9]{1,3}(?:,[0-9]{3}){2,}').fullmatch
+
+
+def read_text(path: str | PathLike[str], encoding: str = '') -> tuple[list[str], str]:
+    """Read the lines of a text file.
+
+    Parameters
+    ----------
+    path : path_like
+    encoding : str, optional
+        By default: a byte order mark, UTF-16 by its zero bytes, UTF-8, or else Windows-1252.
+
+    Returns
+    -------
+    lines : list of str
+        Lines without their ends; NUL characters are removed.
+    encoding : str
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read, or is not text.
+    """
+    path = checked_path(path, RecordingError)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f'cannot read {path}: {error.strerror}') from error
+    kind = next((kind for magic, kind in _OTHER_FILES if data.startswith(magic)), '')
+    if kind:
+        raise RecordingError(f'{path} is not a table of text but {kind}')
+    encoding = encoding or _encoding_of(data)
+    try:
+        text = data.decode(encoding)
+    except (LookupError, UnicodeError) as error:
+        raise RecordingError(f'{path}: the encoding is not {encoding}: {error}; give another '
+                             '--encoding') from error
+    control = sum(text.count(c) for c in map(chr, (*range(1, 9), *range(14, 27))))
+    if control > 0.01 * len(text):
+        raise RecordingError(f'{path} is not a table of text: it contains {control} control '
+                             'characters')
+    return text.replace('\0', '').replace('\r\n', '\n').replace('\r', '\n').split('\n'), encoding
+
+
+def _encoding_of(data: bytes) -> str:
+    """Find the encoding of a text."""
+    for mark, name in _MARKS:
+        if data.startswith(mark):
+            return name
+    begin = data[:4000]
+    for first, name in ((1, 'utf-16-le'), (0, 'utf-16-be')):
+        # The upper bytes of Latin characters are zero, the lower bytes are not.
+        if len(begin) > 3 and begin[first::2].count(0) > 0.9 * (len(begin) // 2) \
+                and begin[1 - first::2].count(0) < 0.1 * len(begin):
+            return name
+    for name in ('utf-8', 'cp1252'):
+        try:
+            data.decode(name)
+        except UnicodeDecodeError:
+            continue
+        return name
+    return 'latin-1'
+
+
+def split_line(line: str, separator: str) -> list[str]:
+    """Split a line into cells without surrounding white space.
+
+    Parameters
+    ----------
+    line : str
+    separator : str
+        A blank stands for white space of any length.
+
+    Returns
+    -------
+    list of str
+    """
+    if '"' in line:
+        try:
+            # The line may end within quotes, so strictness is left to the number of cells.
+            row = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+        except (csv.Error, StopIteration):
+            return [line]
+        return [cell.strip() for cell in row if cell or separator != ' ']
+    if separator == ' ':
+        return line.split()
+    return [cell.strip() for cell in line.split(separator)]
+
+
+def find_separator(lines: Sequence[str]) -> str | None:
+    """Find the separator that splits most lines into equal numbers of numbers and times.
+
+    Parameters
+    ----------
+    lines : sequence of str
+        Lines of a table, most of them rows.
+
+    Returns
+    -------
+    str or None
+        None if no separator splits the lines.
+    """
+    best: tuple[float, str | None] = (0.0, None)
+    for separator in SEPARATORS:
+        rows = [split_line(line, separator) for line in lines]
+        n, frequency = Counter(map(len, rows)).most_common(1)[0] if rows else (0, 0)
+        if n < 2:
+            continue
+        cells = [cell for row in rows if len(row) == n for cell in row]
+        score = frequency / len(rows) * sum(map(is_value, cells)) / len(cells)
+        if score > best[0] + 1e-9:
+            best = score, separator
+    return best[1]
+
+
+def is_value(cell: str) -> bool:
+    """Whether a cell is a number or a time, or missing.
+
+    Parameters
+    ----------
+    cell : str
+
+    Returns
+    -------
+    bool
+    """
+    return is_missing(cell) or bool(_NUMBER(cell) or _TIME(cell)) or cell.lower() in (
+        'inf', '-inf', 'infinity')
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell is a number with any decimal mark.
+
+    Parameters
+    ----------
+    cell : str
+
+    Returns
+    -------
+    bool
+    """
+    return bool(_NUMBER(cell))
+
+
+def is_missing(cell: str) -> bool:
+    """Whether a cell is empty or a usual mark of a missing value.
+
+    Parameters
+    ----------
+    cell : str
+
+    Returns
+    -------
+    bool
+    """
+    return cell.lower() in _MISSING
+
+
+def find_decimal(cells: Iterable[str], separator: str) -> str:
+    """Find the decimal mark of numbers.
+
+    Parameters
+    ----------
+    cells : iterable of str
+    separator : str
+        Separator of the table.
+
+    Returns
+    -------
+    str
+        '.' or ','. Empty if the numbers fit both, or contradict each other.
+    """
+    marked = {cell for cell in cells if (',' in cell or '.' in cell) and _NUMBER(cell)}
+    with_comma = any(',' in cell for cell in marked)
+    if not with_comma:
+        return '.'
+    comma = any(map(_COMMA_DECIMALS, marked))
+    point = any(map(_POINT_DECIMALS, marked))
+    if comma != point:
+        return ',' if comma else '.'
+    # 1,234 alone may be 1234 or 1.234. Spreadsheets write semicolons where the decimal mark is a
+    # comma.
+    return ',' if separator == ';' and not point and not any('.' in c for c in marked) else ''
+
+
+def parse_number(cell: str, decimal: str = '.') -> float:
+    """Convert a cell to a number.
+
+    Parameters
+    ----------
+    cell : str
+    decimal : str, optional
+        Decimal mark, '.' or ','.
+
+    Returns
+    -------
+    float
+        NaN if the value is missing.
+
+    Raises
+    ------
+    ValueError
+        If the cell is not a finite number. The message is a phrase such as "is 'b', not a number".
+    """
+    try:
+        # The most frequent case; float also accepts '1_000' and a word for infinity.
+        value = float(plain_number(cell, decimal))
+    except ValueError:
+        if is_missing(cell):
+            return math.nan
+        raise ValueError(f'is {cell[:40]!r}, not a number') from None
+    if math.isinf(value) or '_' in cell:
+        raise ValueError('is infinite' if math.isinf(value) else f'is {cell[:40]!r}, not a number')
+    return value
+
+
+def plain_number(cell: str, decimal: str) -> str:
+    """Write a number with a decimal point and without grouping.
+
+    Parameters
+    ----------
+    cell : str
+    decimal : str
+        Decimal mark, '.' or ','.
+
+    Returns
+    -------
+    str
+    """
+    if decimal == ',' and ('.' in cell or ',' in cell):
+        cell = cell.replace('.', '').replace(',', '.')
+    elif ',' in cell:
+        cell = cell.replace(',', '')
+    return cell if cell.isascii() and "'" not in cell and ' ' not in cell \
+        else cell.translate(_GROUPING)

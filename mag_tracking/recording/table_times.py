@@ -1,0 +1,264 @@
+"""Times of a table: exact conversion of numbers and dates to nanoseconds, with the unit found."""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from decimal import Context, Decimal, InvalidOperation
+from fractions import Fraction
+
+from mag_tracking.errors import RecordingError, SettingsError
+from mag_tracking.recording.table_text import is_missing, is_number, plain_number
+from mag_tracking.time_text import DATE_ORDERS, DAY_NS, FORMS, date_order, parse_time
+from mag_tracking.units import LATEST_NS, NS, TIME_UNITS, time_scale, time_unit, unit_since_1970
+
+PLAUSIBLE_STEP_S = (1e-4, 0.67)
+"""Range of intervals between readings that need no question about the unit of the time [s]."""
+_SUB = 10**15
+"""Resolution of numbers, as a fraction of the unit."""
+_EXACT = Context(prec=50)
+_DIGITS_OF_A_DATE = re.compile(
+    '(?:19|20)[0-9]{2}[01][0-9][0-3][0-9][0-2][0-9][0-5][0-9][0-5][0-9](?:[.]?[0-9]+)?').fullmatch
+"""yyyymmddhhmmss and decimals."""
+_EPOCHS = (
+    ('d', 36526, 58484, 25569 * DAY_NS, 'days since 1900 (spreadsheet)'),
+    ('d', 730486, 752444, 719529 * DAY_NS, 'days since the year 0 (MATLAB)'),
+    ('s', 3.03e9, 4.23e9, 2082844800 * NS, 's since 1904 (LabVIEW)'))
+"""Unit, range of values in this century, time to subtract [ns], and name of epochs before 1970."""
+_COUNTER_LIMITS = (2**15, 2**16, 2**20, 2**24, 2**31, 2**32)
+_CLOCK_LIMITS_S = (60, 3600, 86400, 7 * 86400)
+_TIME_OF_DAY = re.compile('[0-2][0-9][0-5][0-9][0-5][0-9](?:[.][0-9]+)?').fullmatch
+"""hhmmss and decimals, as in NMEA 0183."""
+
+
+@dataclass
+class Times:
+    """Times of the rows of a table, exact integers."""
+
+    values: list[int | None]
+    """Time in `scale` ns; None if the cell is not a time."""
+    scale: Fraction
+    """Nanoseconds per unit of `values`."""
+    offset_ns: int
+    """Time to subtract [ns]."""
+    unit: int
+    """Number of units of `values` per unit of the table."""
+    limits: tuple[int, ...]
+    """Values at which the time may restart at 0."""
+    notes: list[str]
+
+    def stamps(self, values: Iterable[int]) -> list[int]:
+        """Convert values to timestamps.
+
+        Parameters
+        ----------
+        values : iterable of int
+
+        Returns
+        -------
+        list of int, ns
+        """
+        numerator, denominator = self.scale.numerator, self.scale.denominator
+        half = denominator // 2
+        return [(v * numerator + half) // denominator - self.offset_ns for v in values]
+
+
+def step_of(values: Sequence[int | None], keys: Sequence[int]) -> int:
+    """Median interval between successive times of the same series; 0 if no time increases.
+
+    Parameters
+    ----------
+    values : sequence of int or None
+    keys : sequence of int
+        Series of each value.
+
+    Returns
+    -------
+    int
+    """
+    last: dict[int, int] = {}
+    steps = []
+    for value, key in zip(values, keys, strict=True):
+        if value is not None:
+            if key in last and value != last[key]:
+                steps.append(abs(value - last[key]))
+            last[key] = value
+    return sorted(steps)[len(steps) // 2] if steps else 0
+
+
+def read_times(where: str, texts: Sequence[str], keys: Sequence[int], decimal: str, unit: str,
+               header_unit: str, order: str) -> Times:
+    """Convert the times of a table.
+
+    Parameters
+    ----------
+    where : str
+        File and column, for error messages.
+    texts : sequence of str
+    keys : sequence of int
+        Series (sensor) of each time.
+    decimal : str
+        Decimal mark of numbers.
+    unit : str
+        Unit of numbers; if empty, that of the header, or else found from the values.
+    header_unit : str
+    order : str
+        Order of day, month and year; found by default.
+
+    Returns
+    -------
+    Times
+
+    Raises
+    ------
+    RecordingError
+        If the form or unit of the times is ambiguous. The message names the option that states it.
+    SettingsError
+        If `unit` or `order` is not valid.
+    """
+    if order and order not in DATE_ORDERS:
+        raise SettingsError(f'--date-order: expected one of {", ".join(DATE_ORDERS)}, got '
+                            f'{order!r}')
+    n_numbers = sum(is_number(t) for t in texts)
+    if n_numbers and all(_DIGITS_OF_A_DATE(t) or is_missing(t) for t in texts):
+        texts, n_numbers = [f'{t[:8]} {t[8:14]}.{t[14:].lstrip(".")}' for t in texts], 0
+    if n_numbers == len(texts) and all(map(_TIME_OF_DAY, texts)) and any(
+            40.0 < float(b) - float(a) < 42.0 or float(b) - float(a) < -235950.0
+            for a, b in zip(texts, texts[1:], strict=False)):
+        # As a number of seconds, the time would jump by 41 s after each minute.
+        n_numbers = 0
+    if 2 * n_numbers < sum(not is_missing(t) for t in texts):
+        return _read_dates(where, texts, order)
+    values = [_exact(t, decimal) for t in texts]
+    # Several readings may share a coarse time.
+    step = round(step_of(values, keys) * min(1.0, len(set(values)) * len(set(keys)) / len(values)))
+    scale, offset, notes = _unit_of(where, values, step, unit, header_unit)
+    limits = (*(n * _SUB for n in _COUNTER_LIMITS),
+              *(round(s * NS / scale) for s in _CLOCK_LIMITS_S))
+    return Times(values, scale, offset, _SUB, limits, notes)
+
+
+def _read_dates(where: str, texts: Sequence[str], order: str) -> Times:
+    """Convert dates or times of day."""
+    found = order or date_order(texts)
+    if found is None:
+        raise RecordingError(
+            f'{where}: the order of day, month and year is ambiguous in {texts[0]!r}; give '
+            '--date-order dmy, mdy or ymd')
+    values: list[int | None] = []
+    kinds = set()
+    fault = ''
+    for text in texts:
+        try:
+            time_ns, *kind = parse_time(text, found)
+        except ValueError as error:
+            values.append(None)
+            fault = fault or f'{text[:40]!r}: {error}'
+        else:
+            values.append(time_ns)
+            kinds.add(tuple(kind))
+    if not kinds or len({has_date for has_date, _ in kinds}) > 1:
+        raise RecordingError(f'{where}: {fault or "only some times have a date"}; accepted are '
+                             f'numbers (--time-unit) and {FORMS}')
+    has_date = any(has_date for has_date, _ in kinds)
+    has_zone = all(has_zone for _, has_zone in kinds)
+    note = 'date and time' if has_date else 'time of day'
+    note += ' in UTC' if has_zone else ' without time zone, taken as UTC' if has_date else ''
+    limits = () if has_date else (3600 * NS, DAY_NS // 2, DAY_NS)
+    return Times(values, Fraction(1), 0, NS, limits, [note])
+
+
+def _exact(text: str, decimal: str) -> int | None:
+    """Convert a number to units of 1 / `_SUB`, exactly; None if it is not a number."""
+    try:
+        number = Decimal(plain_number(text, decimal))
+        if not number.is_finite() or number.adjusted() > 30 or '_' in text:
+            return None
+        return int(number.scaleb(15, _EXACT).to_integral_value())
+    except InvalidOperation:
+        return None
+
+
+def _unit_of(where: str, values: Sequence[int | None], step: int, unit: str, header_unit: str
+             ) -> tuple[Fraction, int, list[str]]:
+    """Return (ns per unit of `values`, time to subtract [ns], notes about the unit)."""
+    numbers = [v / _SUB for v in values if v is not None]
+    low, high = (min(numbers), max(numbers)) if numbers else (0.0, 0.0)
+    stated = unit or header_unit
+    step_s = step / _SUB
+    known = (time_unit(stated) or stated) if stated else ''
+    epochs = list(_EPOCHS)
+    if (since := unit_since_1970(low)) and since == unit_since_1970(high):
+        epochs.append((since, low, high, 0, f'{since} since 1970'))
+    for name, first, last, offset, title in epochs:
+        seconds = step_s * TIME_UNITS[name] / NS
+        if first <= low <= high <= last and known in ('', name) and (
+                not step or 1e-4 <= seconds <= 100.0 or known):
+            return Fraction(TIME_UNITS[name], _SUB), offset, [f'time in {title}']
+    if stated:
+        scale = time_scale(stated, '--time-unit')
+        notes = [f'time in {stated}{"" if unit else " (header)"}']
+        others = _plausible(step_s, high - low)
+        if step and not 1e-4 <= step_s * float(scale) / NS <= 2.0 and others:
+            rate = _rates(step_s * float(scale) / NS, (high - low) * float(scale) / NS)
+            notes.append(f'warning: in {stated}, the times give {rate}; --time-unit may be wrong: '
+                         f'{others}')
+        return scale / _SUB, 0, notes
+    if not step or PLAUSIBLE_STEP_S[0] <= step_s <= PLAUSIBLE_STEP_S[1]:
+        return Fraction(NS, _SUB), 0, ['time in s']
+    others = _plausible(step_s, high - low)
+    raise RecordingError(
+        f'{where}: as seconds, the times give {_rates(step_s, high - low)}. If that is right, give '
+        f'--time-unit s; ' + (f'otherwise --time-unit with the unit: {others}' if others else
+                              f'otherwise --time-unit with one of {", ".join(TIME_UNITS)}'))
+
+
+def _plausible(step: float, span: float) -> str:
+    """List the units in which the interval of readings is plausible, with rate and span."""
+    return ', '.join(
+        f'{name} ({_rates(step * ns / NS, span * ns / NS)})' for name, ns in TIME_UNITS.items()
+        if PLAUSIBLE_STEP_S[0] <= step * ns / NS <= PLAUSIBLE_STEP_S[1])
+
+
+def _rates(step_s: float, span_s: float) -> str:
+    """Describe rate and span."""
+    return f'{1.0 / step_s if step_s else 0.0:.4g} Hz over {span_text(span_s)}'
+
+
+def span_text(span_s: float) -> str:
+    """Describe a duration.
+
+    Parameters
+    ----------
+    span_s : float, s
+
+    Returns
+    -------
+    str
+        Such as '14 s' or '3.9 h'.
+    """
+    for unit, length in (('years', 31557600.0), ('days', 86400.0), ('h', 3600.0), ('s', 1.0),
+                         ('ms', 1e-3), ('us', 1e-6)):
+        if span_s >= 1.5 * length or unit == 'us':
+            return f'{span_s / length:.4g} {unit}'
+    return ''
+
+
+def check_range(where: str, line: int, stamp_ns: int) -> None:
+    """Check that a time is in the range of ROS headers.
+
+    Parameters
+    ----------
+    where : str
+        File and column, for the message.
+    line : int
+        Row of the time.
+    stamp_ns : int, ns
+
+    Raises
+    ------
+    RecordingError
+        If it is not.
+    """
+    if not 0 <= stamp_ns <= LATEST_NS:
+        raise RecordingError(f'{where}: row {line}: {stamp_ns / NS:.6g} s is not a valid time '
+                             'since 1970; check --time-unit')
