@@ -12,6 +12,7 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.calibration.ellipsoid_refinement import BASIS, Quality, refine_ellipsoid
+from mag_tracking.calibration.missing_marks import are_marked, missing_marks
 from mag_tracking.calibration.quadric import POSSIBLE_CAUSES, fit_quadric
 from mag_tracking.calibration.saturation import saturated_readings, with_margin
 
@@ -184,6 +185,8 @@ def fit_ellipsoid(readings: FloatArray, field_magnitude: float | None = None) ->
     correction. The measure of coverage and the rejection criteria are additions of this package.
     """
     readings = _validated(readings, field_magnitude)
+    marks = missing_marks(readings)
+    readings = np.where(are_marked(readings, marks), np.nan, readings)
     present: BoolArray = ~np.any(np.isnan(readings), axis=1)
     is_saturated = with_margin(saturated_readings(readings)) & present[:, None]
     valid = readings[present & ~is_saturated.any(axis=1)]
@@ -193,7 +196,7 @@ def fit_ellipsoid(readings: FloatArray, field_magnitude: float | None = None) ->
         'n_readings': len(valid), 'n_missing': int((~present).sum()),
         'n_saturated': int(is_saturated.any(axis=1).sum()), 'n_outliers': int(glitches.sum()),
         'residual_before': _relative_spread(np.linalg.norm(readings[present], axis=1))}
-    notes = _notes_on_input(counts, is_saturated)
+    notes = _notes_on_input(counts, is_saturated, marks)
     reason = _insufficient_data(valid)
     if reason:
         return _rejected_fit(reason, counts, notes)
@@ -238,11 +241,14 @@ def _relative_spread(magnitudes: FloatArray) -> float:
     return float(magnitudes.std() / magnitudes.mean()) if magnitudes.any() else float('nan')
 
 
-def _notes_on_input(counts: _Counts, is_saturated: BoolArray) -> tuple[str, ...]:
+def _notes_on_input(counts: _Counts, is_saturated: BoolArray,
+                    marks: FloatArray) -> tuple[str, ...]:
     """Warnings about missing and saturated readings."""
     notes: tuple[str, ...] = ()
     if counts['n_missing']:
-        notes += (f'readings excluded because of a missing axis: {counts["n_missing"]}',)
+        values = ', '.join(f'{v:.6g}' for v in np.unique(marks[~np.isnan(marks)]))
+        notes += (f'readings excluded because of a missing axis: {counts["n_missing"]}'
+                  + (f' (marked by the value {values})' if values else ''),)
     if counts['n_saturated']:
         axes = ', '.join(name for name, is_cut in zip('xyz', np.any(is_saturated, axis=0),
                                                       strict=True) if is_cut)

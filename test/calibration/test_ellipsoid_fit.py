@@ -234,7 +234,7 @@ def test_outliers_are_bounded_and_counted(factor):
 def test_glitches_are_excluded_and_counted():
     y = readings(tumbling(2000))
     clean = fit_ellipsoid(y)
-    y[::100] = [[32767.0, -32768.0, 40.0]]
+    y[::100] = np.array([32767.0, -32768.0, 40.0]) * np.linspace(0.9, 1.0, 20)[:, None]
     fit = fit_ellipsoid(y)
     assert fit.converged and fit.n_outliers == 20 and fit.n_readings == 1980
     assert (np.abs(fit.offset - clean.offset) < clean.offset_std).all()
@@ -244,12 +244,22 @@ def test_glitches_are_excluded_and_counted():
 
 def test_missing_readings_are_excluded_and_counted():
     y = readings(tumbling(1000))
-    gaps = np.insert(y, range(0, 1000, 10), [np.nan, 1.0, 1.0], axis=0)
+    gaps = np.insert(y, range(0, 1000, 10), y[::10] * [np.nan, 1.0, 1.0], axis=0)
     fit, expected = fit_ellipsoid(gaps), fit_ellipsoid(y)
     assert fit.n_missing == 100 and fit.n_readings == 1000 and fit.converged
     assert fit.warnings == ('readings excluded because of a missing axis: 100',)
     np.testing.assert_array_equal(fit.offset, expected.offset)
     assert fit.residual == expected.residual and fit.residual_before == expected.residual_before
+
+
+def test_marks_for_missing_readings_are_excluded_and_named():
+    y = readings(tumbling(2000))
+    marked = y.copy()
+    marked[::50] = -32768.0
+    fit = fit_ellipsoid(marked)
+    expected = fit_ellipsoid(np.delete(y, slice(None, None, 50), axis=0))
+    assert fit.converged and fit.n_missing == 40 and '-32768' in fit.warnings[0]
+    np.testing.assert_array_equal(fit.offset, expected.offset)
 
 
 def test_saturated_readings_are_excluded_and_reported():

@@ -95,8 +95,7 @@ class SensorHealth:
         # Start of the current run of identical readings; number of readings after a stuck one.
         self._unchanged_since_ns: int | None = None
         self._n_since_stuck = WINDOW
-        # Length of the current run of identical readings; number of readings that repeated the
-        # previous reading; number of readings that changed; whether each axis has ever changed.
+        # Length of the current run; repeated and changed readings; axes that have ever changed.
         self._run_length, self._n_repeated, self._n_changed = 0, 0, 0
         self._has_changed = np.zeros(3, dtype=bool)
         self._steps: FloatArray = np.full(3, np.inf)
