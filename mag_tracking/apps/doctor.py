@@ -7,6 +7,7 @@ import numpy as np
 
 from mag_tracking.apps.doctor_covariances import covariance_findings
 from mag_tracking.apps.doctor_rejections import driver_findings, rejection_findings
+from mag_tracking.apps.host_stalls import HostStalls
 from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
@@ -226,7 +227,7 @@ class Doctor:
         self._clock_ns = dict(zip(network.names, network.clock_offset_ns.tolist(), strict=True))
         self._frozen_since_ns: dict[str, int] = {}
         self._missed = MissedTargets(network.names)
-        self._n_faults_found = 0
+        self._n_faults_found, self._stalls = 0, HostStalls()
 
     def feed(self, readings: Readings, received_ns: int | None = None) -> None:
         """Add raw readings.
@@ -238,12 +239,14 @@ class Doctor:
             Time of reception of the message; None if unknown.
         """
         names, stamps = readings.sensor_names(), readings.stamp_ns.tolist()
+        if received_ns is not None:
+            self._stalls.add(received_ns, names)
         self.calibrate.feed(readings)
         if self.calibrate.counts[FAULTS_FOUND] != self._n_faults_found:
             self._n_faults_found = self.calibrate.counts[FAULTS_FOUND]
             for name, health in self.sensors.items():
-                if health.faults != self.calibrate.faults_of(name):
-                    self.sensors[name] = SensorHealth(faults=self.calibrate.faults_of(name))
+                if health.faults != self.calibrate.driver_faults.of(name):
+                    self.sensors[name] = SensorHealth(faults=self.calibrate.driver_faults.of(name))
         for name, stamp, field in zip(names, stamps, readings.field, strict=True):
             self.sensors[name].add(stamp - self._clock_ns[name], field, received_ns)
         backgrounds = self.calibrate.backgrounds()
@@ -261,7 +264,7 @@ class Doctor:
         list of Finding
             Without ranking; see `stages.health.diagnosis.ranked`.
         """
-        found: list[Finding] = []
+        found = list(self._stalls.findings())
         for j, (name, health) in enumerate(self.sensors.items()):
             found += health.findings(name, self.network.noise_std[j],
                                      self._settings.calibrate.max_field)

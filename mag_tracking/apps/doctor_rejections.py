@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration.missing_marks import describe_marks
 from mag_tracking.quantities import quantity
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.diagnosis import Cause, Finding
@@ -42,7 +42,7 @@ def rejection_findings(name: str, calibrate: Calibrate) -> Iterator[Finding]:
     ------
     Finding
     """
-    for (cause, description), n in calibrate.rejections_of(name).items():
+    for (cause, description), n in calibrate.rejections.of(name).items():
         if cause in ADVICE:
             yield Finding(n > MIN_SERIOUS, name,
                           f'{quantity(n, "reading")} rejected: {description}', ADVICE[cause], cause)
@@ -61,25 +61,15 @@ def driver_findings(name: str, calibrate: Calibrate) -> Iterator[Finding]:
     ------
     Finding
     """
-    faults = calibrate.faults_of(name)
+    faults = calibrate.driver_faults.of(name)
     if len(faults.marks):
-        n = calibrate.n_marked(name)
+        n = calibrate.driver_faults.n_marked(name)
         yield Finding(False, name, f'{quantity(n, "reading has", "readings have")} the value '
-                      f'{" or ".join(map(_describe_mark, faults.marks))}: a mark for a missing '
-                      'reading', 'these values are left out; let the driver publish NaN, or no '
-                      'message, if it has no reading', Cause.NO_READING_MARK)
+                      f'{describe_marks(faults.marks)}: a mark for a missing reading', 'these '
+                      'values are left out; let the driver publish NaN, or no message, if it has '
+                      'no reading', Cause.NO_READING_MARK)
     if faults.repetition > 1.0:
         yield Finding(False, name, f'each reading is repeated {faults.repetition:.3g} times: the '
                       f'sensor measures at {faults.rate / faults.repetition:.3g} Hz, but is '
                       f'published at {faults.rate:.3g} Hz', 'the repetitions are left out; let the '
                       'driver publish each measurement once', Cause.REPEATED)
-
-
-def _describe_mark(mark: FloatArray) -> str:
-    """Format a mark, with the names of the axes unless it concerns all of them."""
-    axes = [f'{axis} = ' for axis in 'xyz']
-    values = [(axis, v) for axis, v in zip(axes, mark.tolist(), strict=True) if v == v]
-    if len(values) == 3 and len({v for _, v in values}) == 1:
-        values = [('', values[0][1])]
-    return ', '.join(axis + (f'{1e9 * v:.6g} nT' if abs(v) < 1.0 else f'{v:.6g} T')
-                     for axis, v in values)

@@ -123,7 +123,7 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
     # The field of a target that one sensor detects at the start may be part of the backgrounds of
     # all sensors.
     return Prescan({} if is_quiet else levels, steps,
-                   {name: recorder.faults_of(name) for name in network.names})
+                   {name: recorder.driver_faults.of(name) for name in network.names})
 
 
 def _beginning(batches: Iterator[Readings], network: SensorNetwork, settings: CalibrateSettings
@@ -134,7 +134,7 @@ def _beginning(batches: Iterator[Readings], network: SensorNetwork, settings: Ca
         stage.feed(readings)
         beginning.append(readings)
         n += len(readings)
-    return beginning, {name: stage.faults_of(name) for name in network.names}
+    return beginning, {name: stage.driver_faults.of(name) for name in network.names}
 
 
 def _level_of(recorder: BlockRecorder, departed_at: float | None,

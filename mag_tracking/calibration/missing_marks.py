@@ -78,6 +78,30 @@ def are_marked(fields: FloatArray, marks: FloatArray) -> BoolArray:
     return found
 
 
+def describe_marks(marks: FloatArray) -> str:
+    """Format marks, with the names of the axes unless a mark concerns all of them.
+
+    Parameters
+    ----------
+    marks : (k, 3) array, T
+
+    Returns
+    -------
+    str
+    """
+    return ' or '.join(map(_describe_mark, marks))
+
+
+def _describe_mark(mark: FloatArray) -> str:
+    """Format a mark (3,) [T]."""
+    values = [(f'{axis} = ', v) for axis, v in zip('xyz', mark.tolist(), strict=True)
+              if not np.isnan(v)]
+    if len(values) == 3 and len({v for _, v in values}) == 1:
+        values = [('', values[0][1])]
+    return ', '.join(axis + (f'{1e9 * v:.6g} nT' if abs(v) < 1.0 else f'{v:.6g} T')
+                     for axis, v in values)
+
+
 def _marks_of_axis(fields: FloatArray, axis: int) -> list[float]:
     """Marks of one axis."""
     fields = fields[~np.isnan(fields[:, axis])]
@@ -109,7 +133,7 @@ def _isolated_runs(values: FloatArray) -> tuple[FloatArray, FloatArray, IntArray
         np.abs(after - before), np.minimum(np.abs(before - before2), np.abs(before - before3)),
         np.minimum(np.abs(after - after2), np.abs(after - after3))])
     is_isolated = jump > MIN_ISOLATION * change
-    # The neighbours of the first and the last run are unknown.
+    # A neighbour of the first and of the last run is unknown.
     is_isolated[[0, -1]] = False
     lengths = np.diff(np.append(starts, len(values)))
     return values[starts][is_isolated], jump[is_isolated], lengths[is_isolated]
@@ -120,7 +144,11 @@ def _is_mark(fields: FloatArray, axis: int, value: float, jump: float, n_isolate
     values = fields[:, axis]
     is_value = values == value
     others = values[~is_value]
-    if len(others) < MIN_OTHERS or n_isolated < MIN_ISOLATED * np.count_nonzero(is_value):
+    n_inside = np.count_nonzero(is_value)
+    if is_value[-1] and not is_value.all():
+        # The last run may continue.
+        n_inside -= int(np.argmin(is_value[::-1]))
+    if len(others) < MIN_OTHERS or n_isolated < MIN_ISOLATED * n_inside:
         return False
     changes = np.abs(np.diff(np.clip(others, -LARGEST, LARGEST)))
     is_change = changes > 0.0

@@ -84,5 +84,4 @@ def reading_faults(fields: FloatArray) -> ReadingFaults:
     ReadingFaults
     """
     marks = missing_marks(fields)
-    readings = np.where(are_marked(fields, marks), np.nan, fields)
-    return ReadingFaults(marks, repetition_of(readings[~np.isnan(readings).all(axis=1)]))
+    return ReadingFaults(marks, repetition_of(np.where(are_marked(fields, marks), np.nan, fields)))

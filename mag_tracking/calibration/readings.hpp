@@ -167,13 +167,16 @@ inline Reason check(Sensor& s, const Limits& limits, int64_t stamp, const double
     if (s.n_window >= s.window_due) return WINDOW_COMPLETE;
     const int n_marked = remove_marks(s, in, raw);
     Reason reason = field_fault(limits, raw, own);
-    if (reason == NO_AXIS && n_marked) return MARKED;
+    if (reason == NO_AXIS && n_marked) {
+        ++s.n_marked;
+        return MARKED;
+    }
     if (reason != DONE) return reason;
     if (!remove_iron(s, raw, field)) return AXIS_MISSING;
     reason = timestamp_fault(s, limits, stamp);
     if (reason != DONE) return reason;
-    s.n_partly_marked += n_marked > 0;
     if (is_repeated(s, raw)) return REPEATED;
+    s.n_marked += n_marked > 0;
     return limits.reject_stuck && is_stuck(s, field) ? STUCK : DONE;
 }
 

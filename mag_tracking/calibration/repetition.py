@@ -6,7 +6,7 @@ readings at rest, but at random: the number of repetitions has a geometric distr
 
 import numpy as np
 
-from mag_tracking.arrays import BoolArray, FloatArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 
 MIN_REPETITION = 1.2
 """Minimum number of readings per measurement; timing jitter causes fewer repetitions."""
@@ -56,17 +56,19 @@ def repetition_of(fields: FloatArray) -> float:
     float
         1 if readings are not repeated regularly. An integer unless the rates are incommensurate.
     """
-    n = len(fields)
-    changed = changes_of(fields)[1:].astype(float)
-    n_changes = changed.sum()
-    if n_changes < MIN_LOG_ODDS or n_changes > len(changed) / MIN_REPETITION:
+    n, present = len(fields), np.flatnonzero(~np.isnan(fields).all(axis=1))
+    is_change = np.zeros(n, dtype=bool)
+    is_change[present] = changes_of(fields[present])
+    changes = np.flatnonzero(is_change[1:])
+    n_changes = len(changes)
+    if n_changes < MIN_LOG_ODDS or n_changes > len(present) / MIN_REPETITION:
         return 1.0
     size = OVERSAMPLING * 2 ** int(np.ceil(np.log2(n)))
-    resultant = np.abs(np.fft.rfft(changed, size)) / n_changes
+    resultant = np.abs(np.fft.rfft(is_change[1:].astype(float), size)) / n_changes
     frequency = np.arange(len(resultant)) / size
     # A rate above half the rate of publishing is aliased. Equal measurements only lower the number
     # of changes, so a source is at least as fast as the changes.
-    frequency = np.where(frequency < 0.95 * n_changes / len(changed), 1.0 - frequency, frequency)
+    frequency = np.where(frequency < 0.95 * n_changes / n, 1.0 - frequency, frequency)
     period = 1.0 / np.maximum(frequency, 1e-9)
     expected = np.sinc(1.0 / period)
     is_regular = (period >= MIN_REPETITION) & (period <= MAX_REPETITION) \
@@ -75,6 +77,17 @@ def repetition_of(fields: FloatArray) -> float:
         return 1.0
     # Multiples of the rate are regular as well: the slowest source decides.
     slowest = np.flatnonzero(is_regular & (period > 0.9 * period[is_regular].max()))
-    best = float(period[slowest[np.argmax(resultant[slowest])]])
+    bin_of_best = slowest[np.argmax(resultant[slowest])]
+    best = _refined(changes, float(frequency[bin_of_best]), 1.0 / size)
     nearest = round(best)
     return float(nearest) if abs(best - nearest) * n < 2.0 * best**2 / OVERSAMPLING else best
+
+
+def _refined(changes: IntArray, frequency: float, width: float) -> float:
+    """Period of the most regular frequency within `width` of a `frequency` [1/reading].
+
+    `changes` are the indices of the readings that changed.
+    """
+    frequencies = frequency + width * np.linspace(-1.0, 1.0, 65)
+    resultant = np.abs(np.exp(2j * np.pi * np.outer(frequencies, changes)).sum(axis=1))
+    return float(1.0 / frequencies[np.argmax(resultant)])

@@ -16,8 +16,8 @@ MAX_HELD = core.MAX_HELD
 
 N_WINDOW = core.N_WINDOW
 """Number of raw readings in which faults of the driver are searched."""
-FIRST_WINDOW = 128
-"""Number of raw readings after which the first search takes place; it doubles up to `N_WINDOW`."""
+FIRST_WINDOW = 64
+"""Number of raw readings between the searches in the first `N_WINDOW` readings of a sensor."""
 
 SENSOR = core.SENSOR
 """Data type of the state of one sensor, defined in `sensor.hpp`. Values are in [T] and [s], or in

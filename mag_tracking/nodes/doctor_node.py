@@ -1,5 +1,6 @@
 """Live input of `mag-tracking doctor`, received for a limited time."""
 
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -13,6 +14,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.apps.doctor import Doctor
+from mag_tracking.apps.host_stalls import load_findings
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import reading_of, readings_of
 from mag_tracking.messages.types import RAW_READINGS
@@ -82,7 +84,9 @@ class DoctorNode(Node):
             found += topic_findings(self, sensor, topic)
             if sensor not in self._batched_sensors and not self.count_publishers(topic):
                 found.append(no_message_finding(self, sensor, topic, self._topics))
-        return found
+        load, n_processors = os.getloadavg()[0], os.cpu_count() or 1
+        return [*load_findings(self.doctor.findings(), list(self._topics), load,
+                               n_processors), *found]
 
 
 @dataclass

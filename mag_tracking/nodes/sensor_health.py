@@ -1,6 +1,7 @@
 """Diagnostics of the health of each sensor over the last one to two minutes."""
 
 import math
+import os
 import time
 
 import numpy as np
@@ -10,6 +11,8 @@ from rclpy.node import Node
 
 from mag_tracking.apps.doctor import background_findings, network_findings, rate_findings
 from mag_tracking.apps.doctor_covariances import covariance_findings
+from mag_tracking.apps.doctor_rejections import driver_findings
+from mag_tracking.apps.host_stalls import TIME_CAUSES, HostStalls, load_findings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute
 from mag_tracking.nodes.flow import SILENCE_TIMEOUT_S
@@ -70,13 +73,12 @@ class HealthDiagnostics:
         # Earlier timestamps were corrected with the clock offsets of the previous network.
         self._buffer = ReadingBuffer(len(network), WINDOW // 2)
         self._previous_window: dict[str, SensorHealth | None] = dict.fromkeys(network.names)
-        self._current_window = self._new_window()
+        self._current_window = {name: SensorHealth() for name in network.names}
+        self._stalls, self._previous_stalls = HostStalls(), HostStalls()
+        # Findings of each sensor that an overloaded computer explains.
+        self._late_findings: dict[str, list[Finding]] = {}
         self._start_time = time.monotonic()
         self._window_end = self._start_time + WINDOW_S
-
-    def _new_window(self) -> dict[str, SensorHealth]:
-        """Create an empty `SensorHealth` for each sensor."""
-        return {name: SensorHealth() for name in self._network.names}
 
     def use_network(self, network: SensorNetwork) -> None:
         """Replace the network by another calibration of the same sensors; restart the windows.
@@ -97,6 +99,7 @@ class HealthDiagnostics:
             Time of arrival.
         """
         indices = readings.rows(self._index)
+        self._stalls.add(now_ns, readings.names)
         self._last_received[indices[indices >= 0]] = time.monotonic()
         # Readings of unknown sensors (index -1) get a wrong offset, but are not used.
         stamps, field, i = readings.stamp_ns - self._clock_ns[indices], plain(readings.field), 0
@@ -143,11 +146,18 @@ class HealthDiagnostics:
         calibrate : Calibrate
             Calibration stage.
         """
+        for name, health in self._current_window.items():
+            if health.faults != (faults := calibrate.driver_faults.of(name)):
+                # Earlier statistics include the faulty readings.
+                self._previous_window[name] = None
+                self._current_window[name] = SensorHealth(faults=faults)
         self._compare(calibrate)
         if time.monotonic() > self._window_end:
             self._window_end = time.monotonic() + WINDOW_S
             self._previous_window, self._current_window = \
-                {**self._current_window}, self._new_window()
+                {**self._current_window}, {name: SensorHealth(faults=health.faults)
+                                           for name, health in self._current_window.items()}
+            self._stalls, self._previous_stalls = HostStalls(), self._stalls
             self._relearnt_counts = [self._relearnt_counts[1], {
                 name: b.n_relearnt for name, b in calibrate.backgrounds().items()}]
 
@@ -190,6 +200,7 @@ class HealthDiagnostics:
             findings += background_findings(name, calibrate, self._frozen_since_ns.get(name),
                                             self._relearnt_counts[0][name])
         findings += covariance_findings(name, self._topics[name], calibrate)
+        findings += driver_findings(name, calibrate)
         in_windows: dict[Cause, Finding] = {}
         for health in (self._previous_window[name], self._current_window[name]):
             if health is not None and health.counts['readings']:
@@ -199,7 +210,14 @@ class HealthDiagnostics:
                     in_windows.setdefault(f.cause, f)
         findings += rate_findings(name, self._reported_window(name).rate, self._network,
                                   self._settings.track)
-        return ranked([*findings, *in_windows.values()])
+        findings += in_windows.values()
+        self._late_findings[name] = [f for f in findings if f.cause in TIME_CAUSES]
+        if not self._is_replayed and self._late_findings[name]:
+            late = [f for found in self._late_findings.values() for f in found]
+            findings += [*load_findings(late, self._network.names, os.getloadavg()[0],
+                                        os.cpu_count() or 1),
+                         *self._stalls.findings(), *self._previous_stalls.findings()]
+        return ranked(findings)
 
     def _silence_findings(self, name: str, silent_s: float) -> list[Finding]:
         """Return the fault of a silent sensor, if any; without readings, `silent_s` is NaN."""

@@ -36,5 +36,5 @@ def test_the_doctor_finds_no_error_in_a_clean_recording(simulator, seed):
         doctor.feed(readings.part(slice(k, k + 1000)))
     errors = [str(d) for d in ranked(doctor.findings()) if d.serious]
     assert not errors
-    assert not any(doctor.calibrate.faults_of(name) for name in network.names)
+    assert not any(doctor.calibrate.driver_faults.of(name) for name in network.names)
     assert not any(health.counts['saturated'] for health in doctor.sensors.values())

@@ -100,8 +100,9 @@ def test_a_saturated_segment_is_excluded_from_a_pass_and_reported():
     field = np.where((data.sensor == 0)[:, None], np.clip(data.field, -limit, limit), data.field)
     collector, passes = PassCollector(ROAD, settings_for('vehicle')), []
     for k in np.argsort(data.t, kind='stable'):
-        passes += collector.feed(one(MagSample(int(round(1e9 * (20.0 + data.t[k]))),
-                                               ROAD.names[data.sensor[k]], field[k] + 4e-5)))
+        j = data.sensor[k]
+        passes += collector.feed(one(MagSample(int(round(1e9 * (20.0 + data.t[k]))), ROAD.names[j],
+                                               field[k] + ROAD.R_sw[j] @ ROAD.earth_field)))
     passes += collector.flush()
     (clipped, notes), = passes
     assert any('mag_1' in n and 'saturated' in n and 'not used' in n for n in notes)

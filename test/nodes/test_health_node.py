@@ -172,7 +172,9 @@ def test_each_sensor_has_a_status(publish_until, statuses):
         assert publish_until(lambda: 'silent for' in status('mag_2').message, silent=('mag_2',))
         assert status('mag_2').level == DiagnosticStatus.ERROR
         assert status('mag_1').level != DiagnosticStatus.ERROR
-        assert publish_until(lambda: 'readings were lost' in status('mag_2').message)
+        # On a busy machine, an overload may be the cause, and the loss its consequence.
+        assert publish_until(lambda: 'readings were lost' in ' '.join(
+            [status('mag_2').message, *(v.value for v in status('mag_2').values)]))
     finally:
         exit_codes, outputs = stop([process])
     assert exit_codes == [0], outputs

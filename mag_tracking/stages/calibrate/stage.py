@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -21,15 +20,17 @@ from mag_tracking.calibration.doubtful_times import (
 )
 from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.level_change import SharedChanges
-from mag_tracking.calibration.reading_faults import ReadingFaults, reading_faults
+from mag_tracking.calibration.reading_faults import ReadingFaults
 from mag_tracking.calibration.screening import clear_spikes
-from mag_tracking.calibration.sensor_state import N_WINDOW, new_sensors
+from mag_tracking.calibration.sensor_state import new_sensors
 from mag_tracking.errors import NetworkError
 from mag_tracking.inference.axes import are_valid_covariances
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
+from mag_tracking.stages.calibrate.driver_faults import MAX_MARKED, DriverFaults
 from mag_tracking.stages.calibrate.field_comparison import FieldComparison
 from mag_tracking.stages.calibrate.output_buffer import OutputBuffer
+from mag_tracking.stages.calibrate.rejections import REJECTIONS, Rejections
 from mag_tracking.stages.calibrate.restoration import (
     BackgroundRestoration,
     StoredBackground,
@@ -49,21 +50,7 @@ OVERRULED = 'message covariances overruled by the measured noise'
 """Key in the counts for message covariances that were replaced by the measured noise."""
 
 FAULTS_FOUND = 'faults of drivers found'
-"""Key in the counts for the events after which `faults_of` returns other faults."""
-
-REJECTIONS = {
-    core.NO_AXIS: (Cause.NO_AXIS, 'no axis reported (all NaN)'),
-    core.INFINITE: (Cause.INFINITE, 'infinite value'),
-    core.BAD_COVARIANCE: (Cause.WRONG_COVARIANCE, 'covariance is not positive definite'),
-    core.AXIS_MISSING: (Cause.MISSING_AXIS, 'an axis that the correction needs is missing'),
-    core.TOO_FAR_AHEAD: (Cause.TOO_FAR_AHEAD, 'timestamp too far ahead'),
-    core.DUPLICATE: (Cause.DUPLICATE_STAMPS, 'duplicate timestamp'),
-    core.OUT_OF_ORDER: (Cause.BACKWARD_STAMPS, 'out of order'),
-    core.STUCK: (Cause.STUCK, 'stuck sensor (repeated reading)'),
-    core.MARKED: (Cause.NO_READING_MARK, 'mark for a missing reading'),
-    core.REPEATED: (Cause.REPEATED, 'repetition of the previous reading'),
-}
-"""Cause and description of the rejection for each reason code; `TOO_LARGE` depends on a setting."""
+"""Key in the counts for the events after which `driver_faults` are others."""
 
 
 class Calibrate:
@@ -90,6 +77,10 @@ class Calibrate:
     ----------
     counts : Counter of str
         Number of readings by outcome, and of events such as time jumps.
+    rejections : Rejections
+        Number of rejected readings of each sensor by cause.
+    driver_faults : DriverFaults
+        Marks and repetitions, which are left out.
     timestamps : TimestampMonitor
         Faults of the timestamps, and rates.
     """
@@ -98,12 +89,10 @@ class Calibrate:
                  background_type: type[RunningBackground] = RunningBackground,
                  survey: SurveySettings | None = None) -> None:
         self.counts: Counter[str] = Counter()
-        # Rate of the readings of each sensor [Hz] when a fault of its driver was found.
-        self._rates = dict.fromkeys(network.names, float('nan'))
-        self._rejections: dict[str, Counter[tuple[Cause, str]]] = {
-            name: Counter() for name in network.names}
+        self.rejections = Rejections(network.names)
         self._settings, self._sensors = settings, new_sensors(len(network))
         self._batches = np.zeros(1, core.BATCH)
+        self.driver_faults = DriverFaults(network.names, self._sensors)
         self._limits = np.array([(
             settings.max_field, settings.max_forward_jump_s * NS, settings.max_backward_jump_s * NS,
             settings.reject_stuck, settings.spike_std, settings.decimate_to_hz > 0.0,
@@ -246,10 +235,8 @@ class Calibrate:
         -------
         Counter of str
         """
-        rejections = self._rejections[sensor]
-        counts = {f'rejected: {description}': n for (_, description), n in rejections.items()}
-        return Counter(counts) + Counter(accepted=int(self._state_of(sensor)['accepted']),
-                                         rejected=rejections.total())
+        return self.rejections.counts_of(sensor) \
+            + Counter(accepted=int(self._state_of(sensor)['accepted']))
 
     def _state_of(self, sensor: str) -> Record:
         """State of a sensor: its element of the array that compiled code updates."""
@@ -315,65 +302,19 @@ class Calibrate:
         elif reason == core.PASSED:
             self._calibrate_released(i, out)
         elif reason != core.SPIKES:
-            self._reject(name, self._causes[reason])
+            self._reject(name, self._causes[reason] if reason in self._causes
+                         else self.driver_faults.rejection(name, reason))
 
     def _examine_window(self, i: int) -> None:
         """Search the latest raw readings of sensor `i` for faults of its driver."""
-        s, name = self._sensors[i], self._network.names[i]
-        known, found = self.faults_of(name), reading_faults(s['window'][:s['n_window']])
-        # The current reading is the first one after the window.
-        duration_s = (int(self._batches[0]['stamp_ns']) - int(s['window_begin_ns'])) / NS
-        if known.merged(found) != known:
-            self._set_faults(i, replace(known.merged(found), rate=(
-                int(s['n_window']) / duration_s if duration_s > 0.0 else float('nan'))))
-            if not s['is_examined']:
-                # The background has been learnt from faulty readings.
+        name, stamp_ns = self._network.names[i], int(self._batches[0]['stamp_ns'])
+        marked_fraction = self.driver_faults.examine(name, stamp_ns)
+        if marked_fraction >= 0.0:
+            self._reject_held(i, 'a fault of the driver was found')
+            self.counts[FAULTS_FOUND] += 1
+            if marked_fraction > MAX_MARKED:
+                # The background has been learnt from the marks.
                 self._background[name].forget()
-        if s['n_window'] < N_WINDOW:
-            s['window_due'] = 2 * s['window_due']
-        else:
-            s['n_window'], s['is_examined'] = 0, True
-
-    def _set_faults(self, i: int, faults: ReadingFaults) -> None:
-        """Leave out the marks and repetitions of sensor `i` from now on."""
-        s, self._rates[self._network.names[i]] = self._sensors[i], faults.rate
-        self.counts[FAULTS_FOUND] += 1
-        s['n_marks'], s['marks'][:len(faults.marks)] = len(faults.marks), faults.marks
-        s['repetition'] = faults.repetition
-        # The steps, repetitions and differences so far are those of the faults.
-        s['step'] = np.inf
-        s['n_same'] = s['n_changed'] = s['n_rest'] = 0
-        s['repeats'] = s['changes'] = s['run'] = 0
-        self._reject_held(i, 'a fault of the driver was found')
-
-    def faults_of(self, sensor: str) -> ReadingFaults:
-        """Faults of the driver of a sensor that have been found so far.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        ReadingFaults
-        """
-        s = self._state_of(sensor)
-        return ReadingFaults(s['marks'][:s['n_marks']].copy(), float(s['repetition']),
-                             self._rates[sensor])
-
-    def n_marked(self, sensor: str) -> int:
-        """Number of readings of a sensor with a mark for a missing reading on any axis.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        int
-        """
-        return int(self._state_of(sensor)['n_partly_marked']) \
-            + self._rejections[sensor][REJECTIONS[core.MARKED]]
 
     def _calibrate_released(self, i: int, out: OutputBuffer) -> None:
         """Calibrate the readings of sensor `i` that the spike filter has released."""
@@ -446,7 +387,8 @@ class Calibrate:
         """
         for name, found in faults.items():
             if found:
-                self._set_faults(self._index[name], found)
+                self.driver_faults.store(name, found)
+                self.counts[FAULTS_FOUND] += 1
         for name, step in steps.items():
             self._state_of(name)['step'] = step
         for name, quiet in levels.items():
@@ -514,20 +456,7 @@ class Calibrate:
         """Count `n` rejected readings of a sensor by cause and description."""
         if n:
             self.counts[f'rejected: {cause[1]}'] += n
-            self._rejections[sensor][cause] += n
-
-    def rejections_of(self, sensor: str) -> 'Counter[tuple[Cause, str]]':
-        """Number of rejected readings of a sensor, by cause and description.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        Counter of (Cause, str)
-        """
-        return self._rejections[sensor].copy()
+            self.rejections.add(sensor, cause, n)
 
     def forget(self, sensors: Collection[str] = ()) -> None:
         """Discard the backgrounds of sensors and learn them again.

@@ -9,16 +9,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration import timestamps
 from mag_tracking.calibration.reading_faults import NO_FAULTS, ReadingFaults
 from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
-from mag_tracking.calibration.timestamps import WINDOW as TIMESTAMP_WINDOW
-from mag_tracking.calibration.timestamps import (
-    TimestampFault,
-    latest_interval_s,
-    timestamp_fault,
-)
 from mag_tracking.quantities import occurrences
 from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.stages.health.diagnosis import Cause, Finding
@@ -87,13 +82,12 @@ class SensorHealth:
         self._field_stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._is_saturated: BoolArray = np.zeros(0, dtype=bool)
         self._interval_ns, self._jitter = float('nan'), float('inf')
-        self._timestamp_fault: TimestampFault | None = None
+        self._timestamp_fault: timestamps.TimestampFault | None = None
         self._noise: FloatArray = np.full(3, np.nan)
         # Results for the current window; cleared when readings are added.
         self._cache: dict[str, FloatArray] = {}
         self._delays: list[float] | None = None
-        # Timestamp of the first reading in the current run of identical readings; number of
-        # readings since the last stuck reading.
+        # Start of the current run of identical readings; number of readings after a stuck one.
         self._unchanged_since_ns: int | None = None
         self._n_since_stuck = WINDOW
         # Length of the current run of identical readings; number of readings that repeated the
@@ -155,20 +149,19 @@ class SensorHealth:
             return
         self._stamps = np.append(self._stamps, stamps)[-WINDOW:]
         self._received = np.append(self._received, received)[-WINDOW:]
-        self._raw_fields = np.append(self._raw_fields, fields, axis=0)[-TIMESTAMP_WINDOW:]
+        self._raw_fields = np.append(self._raw_fields, fields, axis=0)[-timestamps.WINDOW:]
         self._counts['readings'] += n
         self._check_timestamps(n)
         missing = np.isnan(fields)
         for axis, count in zip('xyz', missing.sum(axis=0).tolist(), strict=True):
             self._counts[axis] += count
         self._counts['without any axis'] += int(missing.all(axis=1).sum())
-        with_latest = np.append(self._latest, fields, axis=0)
-        self._latest = with_latest[-1:].copy()
-        kept = self.faults.without(with_latest)[-n:]
+        kept = self.faults.without(np.append(self._latest, fields, axis=0))[-n:]
+        self._latest = fields[-1:].copy()
         is_kept = ~np.isnan(kept).all(axis=1) | missing.all(axis=1)
+        self._field_stamps = np.append(self._field_stamps, stamps[is_kept])[-WINDOW:]
+        self._fields = np.append(self._fields, kept[is_kept], axis=0)[-WINDOW:]
         if is_kept.any():
-            self._field_stamps = np.append(self._field_stamps, stamps[is_kept])[-WINDOW:]
-            self._fields = np.append(self._fields, kept[is_kept], axis=0)[-WINDOW:]
             self._check_fields(int(is_kept.sum()))
 
     def _check_timestamps(self, n: int) -> None:
@@ -177,7 +170,7 @@ class SensorHealth:
         intervals = np.diff(self._stamps[-n - 1:])
         self._counts['duplicates'] += int((intervals == 0).sum())
         self._counts['backward timestamps'] += int((intervals < 0).sum())
-        fault = timestamp_fault(self._stamps[-TIMESTAMP_WINDOW:], self._raw_fields)
+        fault = timestamps.timestamp_fault(self._stamps[-timestamps.WINDOW:], self._raw_fields)
         if fault is not None:
             # The intervals of such timestamps show neither lost readings nor clock steps.
             self._timestamp_fault = fault.after(self._timestamp_fault)
@@ -197,7 +190,7 @@ class SensorHealth:
             self._largest_step_s = max(self._largest_step_s, *steps[is_step].tolist(), key=abs)
         if self._jitter < MAX_JITTER:
             # Intervals like the latest ones are those of another rate.
-            latest_ns = latest_interval_s(self._stamps) * NS
+            latest_ns = timestamps.latest_interval_s(self._stamps) * NS
             is_other_rate = (latest_ns > GAP_RATIO * self._interval_ns) \
                 & (np.abs(intervals - latest_ns) < 0.2 * latest_ns)
             gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) \
@@ -426,9 +419,9 @@ class SensorHealth:
             yield Finding(True, name, f'{c["without any axis"]} of {n} readings have no valid '
                           'axis', 'check the sensor and its driver', Cause.NO_AXIS)
         if dead := self.dead_axes:
-            yield Finding(True, name, ' and '.join(dead) + (
-                ' does not change' if len(dead) == 1 else ' do not change'),
-                'the axis is dead: check the sensor and its driver', Cause.DEAD_AXIS)
+            verb = 'does' if len(dead) == 1 else 'do'
+            yield Finding(True, name, f'{" and ".join(dead)} {verb} not change', 'the axis is '
+                          'dead: check the sensor and its driver', Cause.DEAD_AXIS)
         if missing := ', '.join(f'{axis} is missing in {c[axis]}' for axis in 'xyz'
                                 if 0.01 * n < c[axis] - c['without any axis']
                                 and c[axis] < 0.99 * n):

@@ -150,8 +150,8 @@ def test_valid_readings_need_python_once_per_block(monkeypatch):
     for b in parts:
         stage.feed(b)
     assert reasons.count(core.DONE) == len(parts)
-    # The first 128, 256 and 512 readings, and the next 512, are examined for faults of the driver.
-    assert len(reasons) - len(parts) <= len(samples) / 25 + 4 * len(network)
+    # The first 512 readings of a sensor are examined for faults of the driver in eight steps.
+    assert len(reasons) - len(parts) <= len(samples) / 25 + 9 * len(network)
 
 
 @pytest.mark.parametrize('seed', range(4))

@@ -1,0 +1,130 @@
+"""Faults of drivers, searched in the latest raw readings of each sensor."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mag_tracking.arrays import StructArray
+from mag_tracking.calibration import core
+from mag_tracking.calibration.missing_marks import are_marked, describe_marks
+from mag_tracking.calibration.reading_faults import ReadingFaults, reading_faults
+from mag_tracking.calibration.sensor_state import FIRST_WINDOW, N_WINDOW
+from mag_tracking.stages.health.diagnosis import Cause
+from mag_tracking.units import NS
+
+MAX_MARKED = 0.2
+"""Fraction of readings with a mark above which a background is learnt again when they are found."""
+
+
+class DriverFaults:
+    """Marks for missing readings, and repetitions, in the readings of several sensors.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of the sensors.
+    sensors : (n,) SENSOR array
+        State of the sensors. The compiled code leaves out the faults that are stored there.
+    """
+
+    def __init__(self, names: Sequence[str], sensors: StructArray) -> None:
+        self._states = dict(zip(names, sensors, strict=True))
+        # Rate of the readings of each sensor [Hz] when its faults were found.
+        self._rates = dict.fromkeys(names, float('nan'))
+
+    def of(self, sensor: str) -> ReadingFaults:
+        """Return the faults of a sensor that have been found so far.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        ReadingFaults
+        """
+        s = self._states[sensor]
+        return ReadingFaults(s['marks'][:s['n_marks']].copy(), float(s['repetition']),
+                             self._rates[sensor])
+
+    def n_marked(self, sensor: str) -> int:
+        """Number of readings of a sensor with a mark for a missing reading on any axis.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        int
+        """
+        return int(self._states[sensor]['n_marked'])
+
+    def store(self, sensor: str, faults: ReadingFaults) -> None:
+        """Leave out faults of a sensor from now on.
+
+        Parameters
+        ----------
+        sensor : str
+        faults : ReadingFaults
+        """
+        s, self._rates[sensor] = self._states[sensor], faults.rate
+        s['n_marks'], s['marks'][:len(faults.marks)] = len(faults.marks), faults.marks
+        s['repetition'] = faults.repetition
+        # The steps and repetitions so far are those of the faults.
+        s['step'] = np.inf
+        s['n_same'] = s['n_changed'] = s['n_rest'] = 0
+        s['repeats'] = s['changes'] = s['run'] = 0
+
+    def examine(self, sensor: str, stamp_ns: int) -> float:
+        """Search the latest raw readings of a sensor.
+
+        Parameters
+        ----------
+        sensor : str
+        stamp_ns : int, ns
+            Timestamp of the first reading after the window.
+
+        Returns
+        -------
+        float
+            Fraction of the readings in the window with a mark if a fault was found and stored; NaN
+            otherwise.
+        """
+        s, known = self._states[sensor], self.of(sensor)
+        n = int(s['n_window'])
+        faults = known.merged(reading_faults(s['window'][:n]))
+        if n < N_WINDOW:
+            s['window_due'] += FIRST_WINDOW
+        else:
+            s['n_window'] = 0
+        if faults == known:
+            return float('nan')
+        duration_s = (stamp_ns - int(s['window_begin_ns'])) / NS
+        rate = n / duration_s if duration_s > 0.0 else float('nan')
+        self.store(sensor, replace(faults, rate=rate))
+        return float(are_marked(s['window'][:n], faults.marks).any(axis=1).mean())
+
+    def rejection(self, sensor: str, reason: int) -> tuple[Cause, str]:
+        """Cause and description of the rejection of a reading of a sensor.
+
+        Parameters
+        ----------
+        sensor : str
+        reason : int
+            MARKED or REPEATED.
+
+        Returns
+        -------
+        cause : Cause
+        description : str
+            With the marks, or with the rates.
+        """
+        faults = self.of(sensor)
+        if reason == core.MARKED:
+            return (Cause.NO_READING_MARK,
+                    f'mark for a missing reading: {describe_marks(faults.marks)}')
+        return Cause.REPEATED, (
+            f'repetition: measured at {faults.rate / faults.repetition:.3g} Hz, published at '
+            f'{faults.rate:.3g} Hz')
