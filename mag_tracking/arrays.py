@@ -15,3 +15,17 @@ StructArray: TypeAlias = NDArray[np.void]
 """Structured array: one record per element."""
 Record: TypeAlias = Any
 """One element of a structured array."""
+
+
+def are_equal(a: FloatArray | None, b: FloatArray | None) -> bool:
+    """Whether two optional arrays are equal; None equals only None.
+
+    Parameters
+    ----------
+    a, b : array or None
+
+    Returns
+    -------
+    bool
+    """
+    return a is b if a is None or b is None else np.array_equal(a, b)

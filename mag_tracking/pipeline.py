@@ -69,7 +69,7 @@ TARGET_DEFAULTS: dict[str, dict[str, Any]] = {
         'track.magnet.speed_std': 0.5,
         'track.magnet.spin_std': 3.0,
         'track.magnet.acceleration': 0.5,
-        'track.magnet.angular_acceleration': 3.0,
+        'track.magnet.angular_acceleration': 1.5,
     },
     'bench': _MAGNET,
 }

@@ -8,7 +8,7 @@ from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
 from mag_tracking.settings import read_parameter_file, replace
-from mag_tracking.yaml_file import MAX_DEPTH, MAX_NODES, read_yaml
+from mag_tracking.yaml_file import MAX_BYTES, MAX_DEPTH, MAX_ENTRIES, MAX_NODES, read_yaml
 
 
 def nested_aliases(n, form='[{}]', width=9):
@@ -46,6 +46,9 @@ def test_aliases_that_expand_to_gigabytes_are_refused(tmp_path, read, key):
     ('a: 1\nb: &b {c: *b}', 'an alias contains itself (line 2)'),
     ('&a [[*a]]', 'an alias contains itself (line 1)'),
     ('a: &a {<<: *a}', 'an alias contains itself (line 1)'),
+    ('a:\n' + ''.join(f'  b{k}: 1\n' for k in range(MAX_ENTRIES + 1)),
+     f'more than {MAX_ENTRIES} entries in the mapping that begins in line 2'),
+    ('#' * (MAX_BYTES + 1), f'the maximum of a YAML file is {MAX_BYTES / 1e6:g} MB'),
     ('a: 0x' + 'f' * 9000, 'an integer of 36000 bits exceeds the maximum of')])
 def test_excessive_content_is_refused_with_its_line(tmp_path, text, message):
     path = tmp_path / 'a.yaml'

@@ -15,9 +15,9 @@ start; those marked *live* may change while a node runs.
 """
 MAGNET = """## Defaults for a magnet
 
-`target: magnet` (`--target magnet`) changes these defaults for a magnet in a hand that moves at up to
-0.5 m/s and turns
-at up to 3 rad/s. `target: bench` is for a magnet that is moved slowly or step by step.
+`target: magnet` (`--target magnet`) changes these defaults for a magnet in a hand that moves at
+up to 0.5 m/s and turns at up to 3 rad/s. `target: bench` is for a magnet that is moved slowly or
+step by step.
 
 | parameter | vehicle | magnet | bench |
 |---|---|---|---|"""

@@ -23,7 +23,6 @@ GAP_INTERVALS, MIN_GAP_S = 10.0, 1.0
 """A gap is longer than this number of median intervals, and than this time [s]."""
 _BINS_PER_OCTAVE = 16
 """Resolution of the histogram of intervals."""
-_N_BINS = 64 * _BINS_PER_OCTAVE
 _MAX_CLOCK_DIFFERENCE = 0.1
 """Relative difference of the durations of two clocks above which one of them is wrong."""
 _MIN_CLOCK_DIFFERENCE_S = 10.0
@@ -44,9 +43,9 @@ class Timing:
         self.n_messages = self.n_backward = self.n_unstamped = 0
         self._log: list[int] = []
         self._times: list[int] = []
-        self._longest = self._longest_begin = 0
-        self._counts = np.zeros(_N_BINS, dtype=np.int64)
-        self._sums = np.zeros(_N_BINS)
+        self._longest = self._longest_begin = self._n_steps = 0
+        # Histogram of the intervals: number and sum [ns] by logarithm.
+        self._bins: dict[int, tuple[int, int]] = {}
 
     def add(self, times_ns: IntArray, log_times_ns: IntArray) -> None:
         """Add messages in the order of the recording.
@@ -54,27 +53,35 @@ class Timing:
         Parameters
         ----------
         times_ns : (n,) int array, ns
-            Timestamps; log times of messages that have none. If all are 0, log times are used.
+            Timestamps. Zeros are omitted; if all are 0, log times are used.
         log_times_ns : (n,) int array, ns
         """
         if not len(times_ns):
             return
         self.n_messages += len(times_ns)
-        if not times_ns.any() and log_times_ns.any():
-            self.n_unstamped += len(times_ns)
+        is_missing = (times_ns == 0) & (log_times_ns != 0)
+        self.n_unstamped += int(is_missing.sum())
+        if is_missing.all():
             times_ns = log_times_ns
+        else:
+            times_ns, log_times_ns = times_ns[~is_missing], log_times_ns[~is_missing]
         steps = np.diff(np.concatenate((self._times[1:], times_ns)).astype(np.int64))
         for span, values in ((self._log, log_times_ns), (self._times, times_ns)):
             span[:] = [span[0] if span else int(values[0]), int(values[-1])]
+        self._n_steps += len(steps)
         self.n_backward += int(np.sum(steps < 0))
         if len(steps) and steps.max() > self._longest:
             self._longest = int(steps.max())
             # The end of the step is in this batch.
             self._longest_begin = int(times_ns[int(steps.argmax()) - len(steps)]) - self._longest
-        forward = steps[steps > 0]
-        bins = np.minimum((np.log2(forward) * _BINS_PER_OCTAVE).astype(np.int64), _N_BINS - 1)
-        self._counts += np.bincount(bins, minlength=_N_BINS)
-        self._sums += np.bincount(bins, forward, minlength=_N_BINS)
+        forward = np.sort(steps[steps > 0])
+        bins = (np.log2(forward) * _BINS_PER_OCTAVE).astype(np.int64)
+        numbers, first = np.unique(bins, return_index=True)
+        sums = np.add.reduceat(forward, first) if len(first) else forward
+        for k, n, total in zip(numbers.tolist(), np.diff([*first, len(bins)]).tolist(),
+                               sums.tolist(), strict=True):
+            earlier_n, earlier_total = self._bins.get(k, (0, 0))
+            self._bins[k] = earlier_n + n, earlier_total + total
 
     @property
     def span_s(self) -> float:
@@ -94,12 +101,13 @@ class Timing:
             _MIN_CLOCK_DIFFERENCE_S, _MAX_CLOCK_DIFFERENCE * min(abs(self.span_s),
                                                                  abs(self.log_span_s)))
 
-    def _n_regular_bins(self) -> int:
-        """Number of bins of intervals that are not gaps."""
-        cumulated = np.cumsum(self._counts)
-        median_bin = int(np.searchsorted(cumulated, (cumulated[-1] + 1) // 2))
+    def _longest_regular_bin(self) -> int:
+        """Largest bin of intervals that are not gaps."""
+        bins = sorted(self._bins)
+        cumulated = np.cumsum([self._bins[k][0] for k in bins])
+        median_bin = bins[int(np.searchsorted(cumulated, (cumulated[-1] + 1) // 2))] if bins else 0
         longest = max(GAP_INTERVALS * 2.0 ** (median_bin / _BINS_PER_OCTAVE), MIN_GAP_S * NS)
-        return int(np.log2(longest) * _BINS_PER_OCTAVE) + 1
+        return int(np.log2(longest) * _BINS_PER_OCTAVE)
 
     def describe(self) -> str:
         """Format rate, gaps and steps backward.
@@ -111,20 +119,19 @@ class Timing:
         """
         if self.n_messages < 2:
             return ''
-        n_bins = self._n_regular_bins()
-        n, total = int(self._counts[:n_bins].sum()), float(self._sums[:n_bins].sum())
+        longest_bin = self._longest_regular_bin()
+        n_gaps = sum(n for k, (n, _) in self._bins.items() if k > longest_bin)
+        total = sum(total for k, (_, total) in self._bins.items() if k <= longest_bin)
         # Messages with equal times belong to the same intervals.
-        n += self.n_messages - 1 - int(self._counts.sum()) - self.n_backward
+        n = self._n_steps - n_gaps - self.n_backward
         parts = [f'{n * NS / total:.4g} Hz'] if total else []
-        n_gaps = int(self._counts[n_bins:].sum())
         if n_gaps:
             parts.append(f'{quantity(n_gaps, "gap")}, the longest {self._longest / NS:.4g} s, '
                          f'{(self._longest_begin - self._times[0]) / NS:.4g} s after the start')
         if self.n_backward:
             parts.append(f'time steps backward {occurrences(self.n_backward)}')
         if self.n_unstamped:
-            parts.append(f'by log times, because header.stamp is 0 in '
-                         f'{quantity(self.n_unstamped, "message")}')
+            parts.append(f'header.stamp is 0 in {quantity(self.n_unstamped, "message")}')
         return ', '.join(parts)
 
 
@@ -207,7 +214,10 @@ def _batch_times(block: MessageBlock, topic: str, rows: IntArray, faults: 'Count
         except RecordingError:
             faults[fault_of(message)] += 1
             continue
-        for j in np.unique(readings.sensor).tolist():
-            stamps = readings.stamp_ns[readings.sensor == j]
+        order = np.argsort(readings.sensor, kind='stable')
+        numbers, first = np.unique(readings.sensor[order], return_index=True)
+        # Without readings, the split has one part and no number.
+        for j, stamps in zip(numbers.tolist(), np.split(readings.stamp_ns[order], first[1:]),
+                             strict=False):
             yield (Source(topic, readings.names[j]), stamps,
                    np.full(len(stamps), block.log_time_ns[k]))

@@ -14,6 +14,7 @@ from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.evidence import LOST
 from mag_tracking.stages.track.manager import NO_SCALE, NO_SCALE_FRAMES, UNCERTAIN_ORIENTATIONS
+from mag_tracking.stages.track.running_track import BELOW_SENSORS
 from mag_tracking.stages.track.smoothing import NOT_SMOOTHED
 from mag_tracking.units import NS
 
@@ -137,6 +138,10 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
         yield Note(WARNING, quantity(n_lost, 'track lost its target', 'tracks lost their target')
                    + ': check the orientations in the network file; other possible causes are '
                    'simultaneous targets, or a kind of target that the settings do not include')
+    if n := counts.get(BELOW_SENSORS, 0):
+        yield Note(WARNING, f'{quantity(n, "vehicle appears", "vehicles appear")} to pass below '
+                   'the sensors: two sensors are exchanged, or the sensors are mounted upside '
+                   'down; check topics, positions and orientations in the network file')
     for reason in bounds.REASONS:
         if n := counts.get(f'tracks ended: {reason}', 0):
             yield Note(WARNING, f'{quantity(n, "track")} ended: {reason}; {bounds.ADVICE}')

@@ -41,9 +41,11 @@ def _info(args: argparse.Namespace) -> int:
     _print_duration(recording, list(timings.values()))
     if not n_messages:
         print('  warning: the recording contains no messages')
+    by_topic: dict[str, dict[str, Timing]] = {}
+    for source, timing in timings.items():
+        by_topic.setdefault(source.topic, {})[source.sensor] = timing
     for topic in sorted(recording.types):
-        _print_topic(topic, recording, {source.sensor: timing for source, timing in timings.items()
-                                        if source.topic == topic})
+        _print_topic(topic, recording, by_topic.get(topic, {}))
     for cause, n in {**faults, **recording.losses}.items():
         print(f'  warning: {cause}: {n}')
     if args.network:

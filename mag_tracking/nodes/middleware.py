@@ -12,8 +12,9 @@ from rclpy.signals import SignalHandlerOptions
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import as_ros_parameters
 
-RCLError, UnknownROSArgsError = (rclpy_implementation.RCLError,
-                                 rclpy_implementation.UnknownROSArgsError)
+RCLError, RMWError, UnknownROSArgsError = (
+    rclpy_implementation.RCLError, rclpy_implementation.RMWError,
+    rclpy_implementation.UnknownROSArgsError)
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
 """Fast DDS profile for fast discovery, also of nodes that were killed and restarted."""

@@ -23,7 +23,7 @@ from mag_tracking.messages.frame import frame_of
 from mag_tracking.messages.markers import SENSOR_NAMESPACES
 from mag_tracking.messages.types import NETWORK_FRAME
 from mag_tracking.nodes.convert import smoothed_path_of, track_of
-from mag_tracking.nodes.middleware import init_ros
+from mag_tracking.nodes.middleware import RMWError, init_ros
 from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import LATCHED_QOS, RESULT_QOS, STREAM_QOS, make_executor, spin
 from mag_tracking.nodes.steady_timer import steady_timer
@@ -181,7 +181,7 @@ class PageNode(Node):
             try:
                 self._scene.add_frame(
                     frame_of(deserialize_message(data, NetworkFrame), self._layout))
-            except RecordingError as error:
+            except (RecordingError, RMWError) as error:
                 self._reject(NETWORK_FRAME, str(error))
         tracks = list(self._tracks)
         self._tracks.clear()

@@ -68,6 +68,10 @@ class BagFile:
         with open(path, 'rb') as stream:
             self._is_ros1 = stream.read(len(ROS1_MAGIC)) == ROS1_MAGIC
         self._lost_offsets: set[int] = set()
+        log = path.with_name(f'{path.name}-wal')
+        if not self._is_ros1 and log.is_file() and log.stat().st_size:
+            losses[f'write-ahead logs that are not read ({log.name}: run `sqlite3 {path.name} '
+                   '"PRAGMA wal_checkpoint(TRUNCATE)"`)'] = 1
         self.types: dict[str, str] = {}
         self.message_counts: Counter[str] = Counter()
         self.start_ns: int | None = None

@@ -9,4 +9,4 @@ from mcap.stream_reader import CRCValidationError
 
 DECODE_ERRORS: tuple[type[Exception], ...] = (
     McapError, CRCValidationError, ValueError, KeyError, EOFError, struct.error, zlib.error,
-    zstandard.ZstdError, RuntimeError, UnicodeDecodeError, MemoryError)
+    zstandard.ZstdError, RuntimeError, UnicodeDecodeError, MemoryError, OverflowError)

@@ -15,8 +15,11 @@ LARGEST_CHUNK_MB = 256.0
 """Largest size of a decompressed chunk, message or record that is read [MB]."""
 LARGEST_CHUNK_VARIABLE = 'MAG_TRACKING_LARGEST_CHUNK_MB'
 """Environment variable that replaces `LARGEST_CHUNK_MB`, in commands, nodes and workers."""
-_STEP = 4 << 20
-"""Number of bytes that are decompressed at once."""
+_STEP, _LARGE_STEP = 1 << 20, 4 << 20
+"""Numbers of bytes that are decompressed at once. The larger one is for decompressors that copy
+their remaining input at each step."""
+_MAX_WINDOW = 64 << 20
+"""Largest memory of previous output that a zstd frame may require, bytes."""
 _MAGIC = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
 
 
@@ -111,7 +114,7 @@ def expanded(compression: str, data: bytes, limit: int, is_cut: bool = False) ->
 
 def _zstd_pieces(data: bytes) -> Iterator[bytes]:
     """Decompress one frame piece by piece."""
-    with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+    with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as reader:
         while piece := reader.read(_STEP):
             yield piece
 
@@ -130,7 +133,7 @@ def _pieces(decompressor: 'bz2.BZ2Decompressor | lz4.frame.LZ4FrameDecompressor'
             data: bytes) -> Iterator[bytes]:
     """Decompress piece by piece; raises EOFError if the end is missing."""
     while not decompressor.eof:
-        piece = decompressor.decompress(data, max_length=_STEP)
+        piece = decompressor.decompress(data, max_length=_LARGE_STEP)
         if piece:
             yield piece
         elif not decompressor.eof:

@@ -54,7 +54,9 @@ _BINARY = (
 )
 _TEXT = (
     (re.compile(rb'^\s*Format\s+IAGA-2002', re.M | re.I), _Kind(
-        'an IAGA-2002 file of an observatory', _TO_CSV + '. The lines above the data end with |')),
+        'an IAGA-2002 file of an observatory', 'Remove the marks at the ends of its lines (`sed '
+        '"s/|$//" FILE > field.txt`), then run `mag-tracking import field.txt --unit nT --columns '
+        'time=DATE+TIME x=NAMEX y=NAMEY z=NAMEZ` with the names of its columns')),
     (re.compile(rb'^FMT\s*,', re.M), _Kind(
         'a text log of ArduPilot', 'No command reads it: extract its MAG lines as CSV, '
         + _IMPORT)),

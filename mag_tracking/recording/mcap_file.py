@@ -1,7 +1,7 @@
 """Reader of one MCAP file, which checks each chunk and skips damaged chunks."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -9,7 +9,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Schema, Statistics
+from mcap.records import Channel, ChunkIndex, Schema, Statistics
 from mcap.summary import Summary
 
 from mag_tracking.arrays import IntArray
@@ -107,10 +107,11 @@ class McapFile:
         for channel in summary.channels.values():
             self._channels.add(channel)
         statistics = summary.statistics
+        indexed = sorted(summary.chunk_indexes, key=lambda entry: entry.chunk_start_offset)
         # A summary may omit channels and schemas; they are then read from the chunks.
-        is_complete = len(self._channels.kinds) >= (statistics.channel_count if statistics else 1)
-        indexed = sorted(summary.chunk_indexes if is_complete else [],
-                         key=lambda entry: entry.chunk_start_offset)
+        if len(self._channels.kinds) < (statistics.channel_count if statistics else 1) \
+                or not _is_valid(indexed, file_size(stream)):
+            indexed = []
         position = len(MAGIC)
         for entry in indexed:
             begin = entry.chunk_start_offset
@@ -118,7 +119,7 @@ class McapFile:
             self._parts.append(_Part(Record(Opcode.CHUNK, begin, begin + entry.chunk_length),
                                      min(entry.message_start_time, LATEST_NS),
                                      min(entry.message_end_time, LATEST_NS)))
-            position = max(position, begin + entry.chunk_length + entry.message_index_length)
+            position = begin + entry.chunk_length + entry.message_index_length
         self._scan(stream, position, file_size(stream))
         self._set_counts(statistics, not indexed)
 
@@ -263,6 +264,13 @@ class McapFile:
             self._losses[description] += n
 
 
+def _is_valid(index: Sequence[ChunkIndex], size: int) -> bool:
+    """Whether the chunks of an index lie in a file of `size` bytes, one after the other."""
+    ends = [len(MAGIC), *(entry.chunk_start_offset + entry.chunk_length for entry in index)]
+    return ends[-1] <= size and all(
+        entry.chunk_start_offset >= end for entry, end in zip(index, ends, strict=False))
+
+
 def _reason(error: Exception) -> str:
     """Format why an intact chunk is not read; empty for a damaged chunk."""
     return f', {error}' if isinstance(error, RefusedDataError) else ''
@@ -279,19 +287,17 @@ class _Channels:
 
     def __init__(self) -> None:
         self._schemas: dict[int, Schema] = {0: Schema(id=0, data=b'', encoding='', name='')}
-        self._waiting: dict[int, Channel] = {}
+        self._waiting: dict[int, list[Channel]] = {}
         self.kinds: dict[int, ChannelKind] = {}
 
     def add(self, record: Schema | Channel) -> None:
         """Add a schema or a channel. A channel is defined when its schema is."""
         if isinstance(record, Schema):
             self._schemas[record.id] = record
-            channels = [c for c in self._waiting.values() if c.schema_id == record.id]
+            for channel in self._waiting.pop(record.id, ()):
+                self.add(channel)
+        elif record.schema_id in self._schemas:
+            self.kinds[record.id] = ChannelKind.of(
+                record.topic, record.message_encoding, self._schemas[record.schema_id])
         else:
-            self._waiting[record.id] = record
-            channels = [record]
-        for channel in channels:
-            if channel.schema_id in self._schemas:
-                self.kinds[channel.id] = ChannelKind.of(
-                    channel.topic, channel.message_encoding, self._schemas[channel.schema_id])
-                del self._waiting[channel.id]
+            self._waiting.setdefault(record.schema_id, []).append(record)

@@ -33,6 +33,8 @@ from mag_tracking.stages.health.clocks import ClockSpan
 TRUTH_PREFIX = 'ground_truth/'
 """Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
 never for tracking."""
+ZERO_STAMP = 'message with header.stamp 0'
+"""Beginning of the keys in `SampleReader.rejected` for messages without a time."""
 BATCH_SIZE = 256
 """Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
 few readings. The caller can stop only between batches."""
@@ -92,10 +94,10 @@ class SampleReader:
         self.clocks: dict[str, ClockSpan] = {}
         self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
         self._frames = FrameCheck(recording.path)
-        self._unstamped, self._shared = self._examine_topics(network)
+        self._unstamped, self._dated, self._shared = self._examine_topics(network)
 
-    def _examine_topics(self, network: SensorNetwork) -> tuple[frozenset[str], frozenset[str]]:
-        """Find the topics without timestamps and those of several sensors; check the types."""
+    def _examine_topics(self, network: SensorNetwork) -> tuple[frozenset[str], ...]:
+        """Find topics without timestamps, with dates, and of several sensors; check the types."""
         types = self._recording.types
         topics = [topic for topic in self._sensors if topic in types]
         for topic in topics:
@@ -103,7 +105,7 @@ class SampleReader:
                 raise RecordingError(f'{self._recording.path}: {topic} carries {types[topic]}, not '
                                      f'{MAGNETIC_FIELD} in tesla: convert the messages')
         if self._is_batched:
-            return frozenset(), frozenset()
+            return frozenset(), frozenset(), frozenset()
         found = examine_topics(self._recording, topics or [
             topic for topic, kind in types.items() if kind == MAGNETIC_FIELD])
         shared = found.shared(network.names)
@@ -111,7 +113,7 @@ class SampleReader:
             raise RecordingError(
                 f'{self._recording.path} has none of the network\'s topics '
                 f'({", ".join(self._sensors)}); {_candidates(types, found.frames)}')
-        return found.unstamped, shared
+        return found.unstamped, found.dated, shared
 
     def missing_topics(self) -> list[str]:
         """List the network's topics that are not in the recording.
@@ -154,17 +156,18 @@ class SampleReader:
                  and kind.topic not in self._shared}
         rows = np.flatnonzero(np.isin(block.channel, list(names)))
         fields = magnetic_fields(block.data, block.begin[rows], block.end[rows])
-        rows = rows[fields.is_decoded]
+        # Messages without a timestamp are decoded individually.
+        is_fast = fields.is_decoded & (fields.stamp_ns != 0)
+        rows = rows[is_fast]
         # The same sensor may have several channels.
         sensors = tuple(dict.fromkeys(names.values()))
         sensor_index = np.zeros(max(names, default=0) + 1, dtype=np.int64)
         sensor_index[list(names)] = [sensors.index(name) for name in names.values()]
-        self._check_frames(block, rows, fields.frame[fields.is_decoded])
+        self._check_frames(block, rows, fields.frame[is_fast])
         C = fields.covariance
         batch = Readings(
-            sensors, sensor_index[block.channel[rows]],
-            self._stamps(block, rows, fields.stamp_ns[fields.is_decoded]),
-            fields.field[fields.is_decoded], None if C is None else C[fields.is_decoded])
+            sensors, sensor_index[block.channel[rows]], fields.stamp_ns[is_fast],
+            fields.field[is_fast], None if C is None else C[is_fast])
         self._note_clocks(batch, block.log_time_ns[rows])
         other_messages = np.setdiff1d(np.arange(len(block)),
                                       np.append(rows, self._truth.add_block(block)))
@@ -185,20 +188,6 @@ class SampleReader:
         for i in np.flatnonzero(frames != expected[block.channel[rows]]):
             message = block.message(int(rows[i]))
             self._frames.check(message.topic, decode(message).header.frame_id, int(frames[i]))
-
-    def _stamps(self, block: MessageBlock, rows: IntArray, stamps_ns: IntArray) -> IntArray:
-        """Timestamps of the messages `rows` (k,) of a block; log times on unstamped topics."""
-        for number, kind in block.kinds.items() if self._unstamped else ():
-            if kind.topic in self._unstamped:
-                is_zero = (block.channel[rows] == number) & (stamps_ns == 0)
-                stamps_ns = np.where(is_zero, block.log_time_ns[rows], stamps_ns)
-                self._count_unstamped(kind.topic, int(is_zero.sum()))
-        return stamps_ns
-
-    def _count_unstamped(self, topic: str, n: int) -> None:
-        """Count messages whose log time is used."""
-        if n:
-            self.rejected[f'message with header.stamp 0 on {topic}, read with its log time'] += n
 
     def readings_as_received(self, progress: Progress | None = None
                              ) -> Iterator[tuple[Readings, int]]:
@@ -281,14 +270,19 @@ class SampleReader:
 
     def _single(self, content: MagneticField, sensor: str, message: RawMessage
                 ) -> Iterator[tuple[Readings, int]]:
-        """Convert a decoded message, unless its sensor is not in the network."""
-        reading = reading_of(content, sensor)
-        if message.topic in self._unstamped and reading.stamp_ns[0] == 0:
-            reading = replace(reading, stamp_ns=np.array([message.log_time_ns]))
-            self._count_unstamped(message.topic, 1)
-        self._note_clocks(reading, np.array([message.log_time_ns]))
-        reading = self._network_readings(reading)
+        """Convert a decoded message, unless its sensor is not in the network or its time is
+        missing."""
+        reading = self._network_readings(reading_of(content, sensor))
+        if not reading.stamp_ns.all():
+            cause = f'{ZERO_STAMP} on {message.topic}'
+            if message.topic in self._unstamped:
+                self.rejected[f'{cause}, read with its log time'] += 1
+                reading = replace(reading, stamp_ns=np.array([message.log_time_ns]))
+            elif message.topic in self._dated:
+                self.rejected[cause] += 1
+                return
         if len(reading):
+            self._note_clocks(reading, np.array([message.log_time_ns]))
             yield reading, message.log_time_ns
 
     def _note_clocks(self, readings: Readings, log_time_ns: IntArray) -> None:

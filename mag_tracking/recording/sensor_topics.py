@@ -12,11 +12,15 @@ from mag_tracking.messages.self_described import UNDECODABLE
 from mag_tracking.messages.types import decode
 from mag_tracking.recording.raw_message import RawMessage
 from mag_tracking.recording.reader import Recording
+from mag_tracking.units import NS
 
 N_FIRST_MESSAGES = 200
 """Number of messages by which the topics of a recording are checked before it is read."""
 MAX_FIRST_BLOCKS = 50
 """Number of blocks after which the check ends in any case."""
+MIN_DATE_S = 1e8
+"""Least timestamp that is a date, and not the time since the start of a simulation or a computer
+[s since 1970]."""
 N_FRAME_CHANGES = 3
 """Number of changes of frame_id after which a topic has several sensors. A driver that was
 restarted with another frame changes it once or twice."""
@@ -28,6 +32,9 @@ class TopicFindings(NamedTuple):
     unstamped: frozenset[str]
     """Topics whose first two messages have the timestamp 0. One such message may be the first of
     a simulation."""
+    dated: frozenset[str]
+    """Topics with timestamps since 1970, on which the timestamp 0 is missing. The timestamps of a
+    simulation begin at 0."""
     frames: dict[str, set[str]]
     """The frame_ids of the first messages of each topic."""
 
@@ -68,6 +75,7 @@ def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindin
     n_zero: Counter[str] = Counter()
     n_read: Counter[str] = Counter()
     faults: Counter[str] = Counter()
+    latest_ns: Counter[str] = Counter()
     frames: dict[str, set[str]] = {}
     for message in islice(_first_messages(recording, topics), N_FIRST_MESSAGES):
         try:
@@ -77,11 +85,14 @@ def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindin
             continue
         n_zero[message.topic] += stamp_ns(header.stamp) == 0 and n_read[message.topic] < 2
         n_read[message.topic] += 1
+        latest_ns[message.topic] = max(latest_ns[message.topic], stamp_ns(header.stamp))
         frames.setdefault(message.topic, set()).add(header.frame_id)
     if faults and not n_read:
         (cause, _), = faults.most_common(1)
         raise RecordingError(f'{recording.path}: no message of the sensors can be read: {cause}')
-    return TopicFindings(frozenset(topic for topic, n in n_zero.items() if n == 2), frames)
+    return TopicFindings(
+        frozenset(topic for topic, n in n_zero.items() if n == 2),
+        frozenset(topic for topic, ns in latest_ns.items() if ns > MIN_DATE_S * NS), frames)
 
 
 def _first_messages(recording: Recording, topics: Collection[str]) -> Iterator[RawMessage]:

@@ -70,7 +70,7 @@ class LiveScene:
         self._begin_ns: int | None = None
         self._end_ns = self._frame_ns = 0
         self._frames: OrderedDict[int, FieldFrame] = OrderedDict()
-        self._is_frame_new = False
+        self._n_new_frames = 0
         self._tracks: dict[int, LiveTrack] = {}
         # {track id: latest track with this id}
         self._latest_by_id: dict[int, LiveTrack] = {}
@@ -90,7 +90,7 @@ class LiveScene:
             self._frame_ns = frame.stamp_ns
             self._extend_time(frame.stamp_ns)
             self._frames[frame.stamp_ns] = frame
-            self._is_frame_new = True
+            self._n_new_frames = min(self._n_new_frames + 1, MAX_FRAMES)
             while len(self._frames) > MAX_FRAMES:
                 self._frames.popitem(last=False)
 
@@ -158,8 +158,9 @@ class LiveScene:
         with self._lock:
             begin_ns = self._begin_ns or 0
             tracks = [live.sent_entry(begin_ns) for live in self._tracks.values()]
+            frames = list(self._frames.values())[:self._n_sent_frames()]
             return [*self._scene_messages([t for t in tracks if t is not None]),
-                    self._health_message()]
+                    self._rows_message([], [], frames), self._health_message()]
 
     def updates(self) -> list[str]:
         """Return messages with all changes since the last call.
@@ -175,22 +176,31 @@ class LiveScene:
                 return self._scene_messages([])
             out = [self._health_message()] if self._is_health_new else []
             self._is_health_new = False
-            begin_ns, frame = self._begin_ns or 0, None
+            begin_ns = self._begin_ns or 0
             tracks = [live.unsent_entry(begin_ns) for live in self._tracks.values()
                       if live.has_unsent]
             smoothed = [live.smoothed for live in self._tracks.values() if live.is_smoothed_new]
             for live in self._tracks.values():
                 live.is_smoothed_new = False
-            if self._is_frame_new:
-                latest = next(reversed(self._frames.values()))
-                frame = {'t': (latest.stamp_ns - begin_ns) / NS,
-                         'field': packed(latest.field.ravel(), 'f4')}
-            if tracks or smoothed or frame:
-                out.append(json_text({
-                    'type': 'rows', 'tracks': tracks, 'smoothed': smoothed, 'frame': frame,
-                    'end': (self._end_ns - begin_ns) / NS, 'latest_ns': str(self._end_ns)}))
-            self._is_frame_new = False
+            frames = list(self._frames.values())[self._n_sent_frames():]
+            self._n_new_frames = 0
+            if tracks or smoothed or frames:
+                out.append(self._rows_message(tracks, smoothed, frames))
             return out
+
+    def _n_sent_frames(self) -> int:
+        """Number of stored frames that have been sent."""
+        return max(0, len(self._frames) - self._n_new_frames)
+
+    def _rows_message(self, tracks: list[dict[str, Any]], smoothed: list[dict[str, Any] | None],
+                      frames: list[FieldFrame]) -> str:
+        """JSON message with rows of tracks, smoothed paths, and frames."""
+        begin_ns = self._begin_ns or 0
+        return json_text({
+            'type': 'rows', 'tracks': tracks, 'smoothed': smoothed,
+            'frames': [{'t': (frame.stamp_ns - begin_ns) / NS,
+                        'field': packed(frame.field.ravel(), 'f4')} for frame in frames],
+            'end': (self._end_ns - begin_ns) / NS, 'latest_ns': str(self._end_ns)})
 
     def _scene_messages(self, tracks: list[dict[str, Any]]) -> list[str]:
         """List with the message that replaces the scene; empty if the network has no sensors."""

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from logging import getLogger
 from typing import Protocol
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
@@ -220,17 +220,14 @@ class PageServer:
 
     def _process_request(self, _: ServerConnection, request: Request) -> Response | None:
         """Return the response to an HTTP request, or None to accept a WebSocket connection."""
-        try:
-            address = urlsplit(request.path)
-            origins = [urlsplit(text).netloc for text in request.headers.get_all('Origin')]
-            hosts = request.headers.get_all('Host')
-        except ValueError:
-            return _response(HTTPStatus.BAD_REQUEST, b'Malformed address or origin.\n',
+        address, hosts = _parsed_address(request.path), request.headers.get_all('Host')
+        origins = [_parsed_address(text) for text in request.headers.get_all('Origin')]
+        if address is None or not address.path.startswith('/') or len(hosts) != 1 \
+                or len(origins) > 1 or not all(map(_is_origin, origins)):
+            return _response(HTTPStatus.BAD_REQUEST, b'Malformed address, Host or Origin.\n',
                              'text/plain')
-        if len(hosts) != 1 or len(origins) > 1:
-            return _response(HTTPStatus.BAD_REQUEST, b'Expected one Host and at most one Origin.\n',
-                             'text/plain')
-        refusal = self._refusal(hosts[0], origins, self._tokens_of(request, address.query))
+        refusal = self._refusal(hosts[0], [origin.netloc for origin in origins if origin],
+                                self._tokens_of(request, address.query))
         if refusal:
             return _response(HTTPStatus.FORBIDDEN, refusal.encode('utf-8'), 'text/plain')
         if address.path == STREAM:
@@ -321,6 +318,22 @@ def _host_name(host: str) -> str:
         return urlsplit(f'//{host}').hostname or ''
     except ValueError:
         return ''
+
+
+def _parsed_address(text: str) -> SplitResult | None:
+    """Parts of an address; None if it is malformed."""
+    try:
+        parts = urlsplit(text)
+        # The port is parsed on access.
+        _ = parts.port
+    except ValueError:
+        return None
+    return parts
+
+
+def _is_origin(parts: SplitResult | None) -> bool:
+    """Whether the value of an Origin header is an origin, or "null", which a page without has."""
+    return parts is not None and (bool(parts.scheme and parts.netloc) or parts.geturl() == 'null')
 
 
 def _buffered_bytes(viewer: ServerConnection) -> int:

@@ -91,3 +91,10 @@ def test_messages_without_a_timestamp_are_timed_by_their_log_times(tmp_path):
     (timing,) = time_topics(Recording(path))[0].values()
     text = timing.describe()
     assert text.startswith('50 Hz') and 'header.stamp is 0 in 400 messages' in text
+    # Messages without a timestamp among others do not disturb the times.
+    path = write(tmp_path / 'b' / 'b.mcap', np.where(np.arange(400) % 10 == 3, 0, t), t)
+    (timing,) = time_topics(Recording(path))[0].values()
+    text = timing.describe()
+    assert float(text.split(' Hz')[0]) == pytest.approx(45.0, rel=0.01)
+    assert 'header.stamp is 0 in 40 messages' in text
+    assert 'gap' not in text and not timing.clocks_disagree

@@ -154,6 +154,18 @@ def test_unknown_sensors_and_undecodable_messages_are_counted(tmp_path):
                                f'undecodable message on {BATCH_TOPIC}': 1}
 
 
+def test_many_unknown_sensors_are_counted_together(tmp_path):
+    rng = np.random.default_rng(2)
+    known = random_samples(3, False, rng, ('mag_1',))
+    others = [random_samples(1, False, rng, (f'x{k}',))[0] for k in range(300)]
+    reader = SampleReader(recording(tmp_path / 'a.mcap', [
+        (BATCH_TOPIC, FIELD_READINGS, readings_dict(batch(part)))
+        for part in (others[:100], others[100:] + known + others[:1])]), line_network(2))
+    assert identical(recorded(reader), known)
+    assert len(reader.rejected) < 30 and sum(reader.rejected.values()) == 301
+    assert reader.rejected['reading of x0, which is not in the network'] == 2
+
+
 def test_single_and_batch_topics_are_read(tmp_path):
     rng = np.random.default_rng(3)
     (one,) = random_samples(1, True, rng, ('mag_2',))

@@ -216,6 +216,8 @@ def test_invalid_calibrations_are_rejected(tmp_path, old, new, message):
     ('background: [1.0e-6', 'background: [0.2', 'background: .* is the value in microtesla'),
     ('[2.0e-6, 1.55e-5, -4.9e-5]', '[2.0e-3, 0.0, 0.0]', 'exceeds a millitesla'),
     ('position: [0, -4.5, 0]', 'position: [0, 2.0e+8, 0]', 'too far from the origin'),
+    ('position: [0, -4.5, 0]', 'position: [0, 1.0e+7, 0]',
+     'sensors a and b are 10,000 km apart; the maximum is 100 km'),
 ])
 def test_invalid_networks_are_rejected(tmp_path, old, new, message):
     assert old in VALID_FILE

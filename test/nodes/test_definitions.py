@@ -51,8 +51,8 @@ def test_own_types_have_a_definition_and_unknown_types_have_none(monkeypatch, tm
     assert definition_of('new_msgs/msg/Outer') is None
 
 
-@pytest.mark.parametrize('name', ['', 'foxglove.Log', 'no schema (json)', 'a/b', '/msg/X', 'a/b/c/d',
-                                  'sensor_msgs/msg/Imu (cbor)', 'odd_msgs/msg/Odd'])
+@pytest.mark.parametrize('name', ['', 'foxglove.Log', 'no schema (json)', 'a/b', '/msg/X',
+                                  'a/b/c/d', 'sensor_msgs/msg/Imu (cbor)', 'odd_msgs/msg/Odd'])
 def test_a_recorded_type_that_is_not_installed_has_no_class(name):
     assert message_class(name) is None
     assert message_class('sensor_msgs/msg/Imu').__name__ == 'Imu'

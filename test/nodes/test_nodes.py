@@ -188,6 +188,20 @@ def test_nodes_equal_offline_on_several_vehicles(tmp_path):
     assert max_difference <= 1e-9
 
 
+def test_nodes_flag_a_sensor_that_contradicts_the_earth_field(tmp_path, road_network):
+    """The network file states that a sensor is mounted upside down, which is wrong."""
+    R_ws = road_network.R_ws.copy()
+    R_ws[1] = np.diag([1.0, -1.0, -1.0])
+    network = dataclasses.replace(road_network, R_ws=R_ws)
+    write_network(network_file := tmp_path / 'network.yaml', network)
+    settings, recording = settings_for('vehicle', LONG_WAIT), vehicle_path('straight_car_right')
+    replay(Recording(recording), network, settings, tmp_path)
+    collector = collect_from_nodes(network_file, settings, recording, 6.0)
+    compare_with_offline(collector, tmp_path)
+    tracks = [t for m in collector.tracks for t in m.tracks]
+    assert tracks and all('contradicts_earth_field' in t.doubts for t in tracks)
+
+
 def test_nodes_equal_offline_at_the_defaults(tmp_path, road_network):
     """In real time, no message is later than the default `align.max_wait_s`, half a second."""
     settings, recording = settings_for('vehicle'), vehicle_path('straight_car_fast_left')

@@ -12,7 +12,7 @@ from array import array
 
 import numpy as np
 import pytest
-from mag_tracking_msgs.msg import SmoothedTrack, TrackArray
+from mag_tracking_msgs.msg import NetworkFrame, SmoothedTrack, TrackArray
 from visualization_msgs.msg import MarkerArray
 from websockets.sync.client import connect
 
@@ -150,17 +150,19 @@ MALFORMED_TRACKS = {
 def publish_malformed_messages(node, spin_until):
     """Publish the sensor markers, all malformed messages, and then a valid track."""
     def publish(cls, topic, message, qos):
-        publisher = node.create_publisher(cls, f'/tracker_node/{topic}', qos)
+        publisher = node.create_publisher(cls, topic, qos)
         assert spin_until(lambda: publisher.get_subscription_count())
         publisher.publish(message)
         return publisher
 
-    markers = sensor_markers(read_network(NETWORK_FILE))
-    publish(MarkerArray, 'sensor_markers', to_message(MarkerArray, markers), LATCHED_QOS)
-    publish(SmoothedTrack, 'smoothed', SmoothedTrack(track_id=1), RESULT_QOS)
-    publisher = publish(TrackArray, 'tracks', track_message(**MALFORMED_TRACKS['mounting_of_5']),
-                        RESULT_QOS)
-    for changes in MALFORMED_TRACKS.values():
+    markers = to_message(MarkerArray, sensor_markers(read_network(NETWORK_FILE)))
+    publish(MarkerArray, '/tracker_node/sensor_markers', markers, LATCHED_QOS)
+    publish(SmoothedTrack, '/tracker_node/smoothed', SmoothedTrack(track_id=1), RESULT_QOS)
+    # Serialised bytes that are no message.
+    publish(NetworkFrame, '/network_frame', b'\x00\x01\x00\x00' + b'\xff' * 300, RESULT_QOS)
+    first, *others = MALFORMED_TRACKS.values()
+    publisher = publish(TrackArray, '/tracker_node/tracks', track_message(**first), RESULT_QOS)
+    for changes in others:
         publisher.publish(track_message(**changes))
     publisher.publish(track_message())
 
@@ -171,9 +173,11 @@ def test_malformed_messages_are_named_on_the_page(ros):
     try:
         url = address(watch)
         publish_malformed_messages(*ros)
-        *_, last = messages_of(url, lambda m: f'tracks: {len(MALFORMED_TRACKS) + 1} invalid'
+        *_, last = messages_of(url, lambda m: f'tracks: {len(MALFORMED_TRACKS)} invalid'
                                in json.dumps(m))
-        assert any('smoothed: 1 invalid' in note['text'] for note in last['notes'])
+        notes = [note['text'] for note in last['notes']]
+        for topic in ('smoothed', 'network_frame'):
+            assert any(f'{topic}: 1 invalid' in text for text in notes)
         tracks = next(messages_of(url, lambda m: m['type'] == 'scene'))['scene']['tracks']
         assert len(tracks) == 1
     finally:

@@ -160,6 +160,17 @@ def test_messages_without_a_timestamp_are_read_with_their_log_time(tmp_path):
     assert_read(path, causes)
     path = write(tmp_path / 'b.mcap', 'json', ROS2, lambda t, n, b: in_json(0, n, b))
     assert_read(path, causes)
+    # Some messages have no timestamp.
+    path = write(tmp_path / 'd.mcap', 'cdr', ROS2, lambda t, n, b: cdr(t * (n != 'ab'), n, b)
+                 if t % 7 else cdr(0, n, b))
+    found = mt.read_recording(path, network())
+    n_zero = sum(t % 7 == 0 and n != 'ab' for t, n, _ in readings())
+    assert N // 4 == found.rejected.pop(
+        'message with header.stamp 0 on /ab/imu/mag, read with its log time')
+    assert sum(found.rejected.values()) == n_zero > 0
+    assert set(found.rejected) == {f'message with header.stamp 0 on /{n}/imu/mag'
+                                   for n in NAMES if n != 'ab'}
+    assert len(found.readings) == N - n_zero
     # The first message of a simulation has the timestamp 0.
     path = write(tmp_path / 'c.mcap', 'cdr', ROS2, lambda t, n, b: cdr(t - EPOCH_S * 10**9, n, b))
     found = mt.read_recording(path, network())

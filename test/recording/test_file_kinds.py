@@ -55,7 +55,7 @@ KINDS = {
     'decimal_comma': (b't;x\n0,1;2,5\n', 'table', 'mag-tracking import'),
     'utf16': ('t,x\n0.1,2.5\n'.encode('utf-16'), 'table', 'mag-tracking import'),
     'no_header': (b'0.1 2.5 3.5 4.5\n0.2 2.5 3.5 4.5\n', 'table', 'mag-tracking import'),
-    'iaga': (IAGA, 'IAGA-2002', 'CSV'),
+    'iaga': (IAGA, 'IAGA-2002', 'mag-tracking import'),
     'ulog': (b'ULog\x01\x12\x35\x01' + bytes(50), 'ULog', 'ulog2csv'),
     'dataflash': (b'\xa3\x95\x80\x80\x59FMT\0BBnNZ' + bytes(60), 'DataFlash', 'mavlogdump.py'),
     'dataflash_text': (b'FMT, 128, 89, FMT, BBnNZ, Type,Length\n', 'ArduPilot', 'MAG'),
@@ -150,3 +150,25 @@ def test_a_folder_without_a_recording_names_its_file(tmp_path):
     (tmp_path / 'field.csv').write_bytes(TABLE)
     with pytest.raises(RecordingError, match='no recording.*field.csv.*table'):
         Recording(tmp_path)
+
+
+def test_messages_in_a_write_ahead_log_are_not_lost_silently(tmp_path):
+    path = tmp_path / 'a.db3'
+    database = sqlite3.connect(path)
+    database.executescript('''
+        CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,
+                            serialization_format TEXT, offered_qos_profiles TEXT);
+        CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,
+                              data BLOB);
+        INSERT INTO topics VALUES(1, '/x', 'std_msgs/msg/String', 'cdr', '');
+        PRAGMA journal_mode = WAL;''')
+    with database:
+        database.execute("INSERT INTO messages VALUES(1, 1, 5, x'00010000')")
+    # As after a crash: the log exists, because the database is still open.
+    recording = Recording(path)
+    assert len(list(recording.messages())) == 0
+    (loss,) = recording.losses
+    assert 'a.db3-wal' in loss and 'wal_checkpoint' in loss
+    database.close()
+    recording = Recording(path)
+    assert len(list(recording.messages())) == 1 and not recording.losses

@@ -243,3 +243,21 @@ def test_a_damaged_summary_loses_no_message(written, tmp_path):
         damaged[position] ^= 0x10
         found, _ = read(damaged, tmp_path)
         assert found == expected
+
+
+@pytest.mark.parametrize('changes', [
+    {'chunk_start_offset': 2**64 - 1}, {'chunk_start_offset': 0}, {'chunk_length': 2**63},
+    {'message_index_length': 2**63}, {'message_index_length': 0}])
+def test_a_wrong_index_loses_no_message(changes, tmp_path):
+    """The entry of the second chunk is wrong, in a summary without a CRC."""
+    write_by_mcap(tmp_path / 'a.mcap')
+    data = (tmp_path / 'a.mcap').read_bytes()
+    summary = make_reader(io.BytesIO(data)).get_summary()
+    for name, value in changes.items():
+        setattr(summary.chunk_indexes[1], name, value)
+    end = data.index(serialised(DataEnd(0))[:9]) + 13
+    changed = data[:end] + serialised(
+        *summary.schemas.values(), *summary.channels.values(), summary.statistics,
+        *summary.chunk_indexes) + serialised(Footer(end, 0, 0)) + MAGIC
+    found, losses = read(changed, tmp_path)
+    assert found == sorted(samples()) and not losses

@@ -169,6 +169,13 @@ def test_repair_skips_and_reports_a_damaged_chunk(tmp_path):
     assert 0 < len(before) < 200
     assert repair(file, reports.append) == 1
     assert any('damaged chunks skipped: 1' in line for line in reports), reports
+    # The message indexes of the damaged chunk do not belong to the chunk before it.
+    with open(file, 'rb') as stream:
+        entries = make_reader(stream).get_summary().chunk_indexes
+    for entry in entries:
+        end = entry.chunk_start_offset + entry.chunk_length
+        assert all(end <= offset < end + entry.message_index_length
+                   for offset in entry.message_index_offsets.values())
     assert [k for _, k in by_rosbags(file)] == before
 
 

@@ -83,8 +83,8 @@ class Page:
                      or own.scheme == 'file' and url != self.url)] == []
 
     def assert_complete(self):
-        """Assert that each visible plot has content, and that its buttons cover none of it."""
-        empty, covered = self.value('''(() => {
+        """Assert that each plot has content of known types, and that no button covers it."""
+        empty, covered, unknown = self.value('''(() => {
             const shown = [...document.querySelectorAll('.js-plotly-plot')]
               .filter(plot => plot.checkVisibility());
             const name = plot => plot.id || plot.closest('.card').innerText;
@@ -96,9 +96,12 @@ class Page:
                 .map(name),
               shown.filter(plot => [...plot.querySelectorAll('.modebar-group')].some(group =>
                 [...plot.querySelectorAll(parts)].some(part => overlaps(
-                  group.getBoundingClientRect(), part.getBoundingClientRect())))).map(name)];
+                  group.getBoundingClientRect(), part.getBoundingClientRect())))).map(name),
+              // Plotly draws an unknown type of trace as another one.
+              shown.filter(plot => plot.data.some((d, i) => d.type !== plot._fullData[i].type))
+                .map(name)];
             })()''')
-        assert empty == [] and covered == []
+        assert empty == [] and covered == [] and unknown == []
 
     def move_slider(self, t):
         """Move the slider to time `t` [s] as a user does, and wait until the page is redrawn."""

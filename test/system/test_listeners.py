@@ -86,7 +86,6 @@ def listeners_of(arguments, environment, expected):
     ('watch', ['--port'], True, False),
     ('listen', [], False, True),
     ('run', [*NETWORK, '--drivers', 'drivers.yaml', '--web'], True, True),
-    ('run', [*NETWORK, '--recording', RECORDING, '--loop'], False, False),
     ('record', [*NETWORK, '--out', 'out'], False, False)])
 def test_a_command_that_waits_listens_only_as_requested(
         tmp_path, monkeypatch, environment, name, options, page, drivers):

@@ -115,6 +115,24 @@ def test_old_tracks_and_excess_poses_are_removed(scene, records):
     assert sum(len(json.loads(m).get('smoothed', ())) for m in rows) == len(late.tracks)
 
 
+def frame_times(messages):
+    return [f['t'] for m in map(json.loads, messages) for f in m.get('frames', ())]
+
+
+def test_each_frame_is_sent_once_and_a_new_viewer_gets_the_latest(scene, records):
+    frames = [r for r in records if isinstance(r, FieldFrame)][:40]
+    scene.add_frame(frames[0])
+    scene.updates()
+    times = frame_times(scene.updates())
+    for k in range(1, 40, 3):
+        feed(scene, frames[k:k + 3])
+        times += frame_times(scene.updates())
+    expected = [(f.stamp_ns - frames[0].stamp_ns) / NS for f in frames]
+    assert times == pytest.approx(expected)
+    scene.add_frame(replace(frames[-1], stamp_ns=frames[-1].stamp_ns + NS))
+    assert frame_times(scene.snapshot()) == pytest.approx(expected)
+
+
 def test_nan_values_give_valid_json(scene, records):
     feed(scene, [replace(r, moment=np.full(3, np.nan), nis=np.nan)
                  if not isinstance(r, FieldFrame) else r for r in records])

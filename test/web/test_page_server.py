@@ -220,6 +220,7 @@ def test_without_a_token_only_local_requests_are_served(server):
     with pytest.raises(InvalidStatus) as refused:
         connect(stream, origin='http://evil.example')
     assert refused.value.response.status_code == 403
+    assert status_of(server.url, Origin='null') == 403
     connect(stream, origin=server.url.rstrip('/')).close()
 
 
@@ -250,6 +251,8 @@ def response_to(server, path, headers):
     ('/', ['Host: 127.0.0.1', 'Origin: http://[']),
     ('/', ['Host: 127.0.0.1', 'Origin: http://127.0.0.1', 'Origin: http://evil.example']),
     ('/stream', ['Host: 127.0.0.1', 'Origin: http://[::1']),
+    ('/', ['Host: 127.0.0.1', 'Origin: garbage']),
+    ('/', ['Host: 127.0.0.1', 'Origin: http://127.0.0.1:port']), ('page', ['Host: 127.0.0.1']),
     ('//[', ['Host: 127.0.0.1']), ('http://[x/', ['Host: 127.0.0.1'])])
 def test_malformed_headers_and_addresses_are_bad_requests(server, caplog, path, headers):
     response = response_to(server, path, headers)

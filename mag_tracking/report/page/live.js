@@ -59,7 +59,7 @@ function addRows(message) {
     const track = scene.tracks.find(other => other.key === one.key);
     if (track) track.smoothed = one;
   }
-  if (message.frame) addFrame(scene.recent, message.frame);
+  for (const frame of message.frames) addFrame(scene.recent, frame);
   scene.end = Math.max(scene.end, message.end);
   scene.latestNs = message.latest_ns;
   scene.tracks = scene.tracks.filter(track => endOf(track) > scene.end - HISTORY_S);

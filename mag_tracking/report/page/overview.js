@@ -116,9 +116,7 @@ function showLegend(id, traces) {
   const named = traces.filter(trace => trace.name && trace.showlegend !== false);
   const first = named.filter((trace, i) => named.findIndex(o => o.name === trace.name) === i);
   at(id).replaceChildren(...first.map(trace => {
-    const entry = element('span');
-    // The markup characters of the names are escaped for Plotly.
-    entry.innerHTML = trace.name;
+    const entry = element('span', unescaped(trace.name));
     entry.prepend(sampleOf(trace));
     return entry;
   }));

@@ -1,8 +1,18 @@
 """Output buffer for the calibrated readings of one batch."""
 
+from collections import Counter
+
 import numpy as np
 
+from mag_tracking.arrays import Record
 from mag_tracking.records import Readings
+
+OVERRULED = 'message covariances overruled by the measured noise'
+"""Key in the counts for message covariances that were replaced by the measured noise."""
+
+COUNTED = {'held back while learning': 'n_learning',
+           'axes held back while learning': 'n_partly_learning', OVERRULED: 'n_overruled'}
+"""{key in the counts: counter of a batch}."""
 
 
 class OutputBuffer:
@@ -14,6 +24,8 @@ class OutputBuffer:
         Names of all sensors.
     capacity : int
         Maximum number of readings.
+    batch : Record
+        Counters of the batch that compiled code updates; reset.
 
     Attributes
     ----------
@@ -22,24 +34,30 @@ class OutputBuffer:
         covariances (capacity, 3, 3) T².
     """
 
-    def __init__(self, names: tuple[str, ...], capacity: int) -> None:
-        self._names = names
+    def __init__(self, names: tuple[str, ...], capacity: int, batch: Record) -> None:
+        self._names, self._batch = names, batch
+        for name in ('n_out', *COUNTED.values()):
+            batch[name] = 0
         self.arrays = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64),
                        np.empty((capacity, 3)), np.empty((capacity, 3, 3)))
 
-    def readings(self, n: int) -> list[Readings]:
-        """Return the first `n` readings.
+    def finish(self, counts: 'Counter[str]') -> list[Readings]:
+        """Count and return the readings that have been appended.
 
         Parameters
         ----------
-        n : int
-            Number of readings that have been appended.
+        counts : Counter of str
+            Updated in place.
 
         Returns
         -------
         list of Readings
-            One batch, or an empty list if `n` is 0.
+            One batch, or an empty list if no reading was appended.
         """
+        n = int(self._batch['n_out'])
+        for key, name in (('calibrated', 'n_out'), *COUNTED.items()):
+            if self._batch[name]:
+                counts[key] += int(self._batch[name])
         rows, stamps, fields, covariances = self.arrays
         return [Readings(self._names, rows[:n], stamps[:n], fields[:n], covariances[:n])] \
             if n else []

@@ -1,9 +1,14 @@
-"""Causes and numbers of the readings that the calibration rejects."""
+"""Causes and numbers of the readings that the calibration rejects; validity of covariances."""
 
 from collections import Counter
 from collections.abc import Iterable
 
+import numpy as np
+
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.calibration import core
+from mag_tracking.inference.axes import are_valid_covariances
+from mag_tracking.records import Readings, plain
 from mag_tracking.stages.health.diagnosis import Cause
 
 REJECTIONS = {
@@ -17,6 +22,27 @@ REJECTIONS = {
     core.STUCK: (Cause.STUCK, 'stuck sensor (repeated reading)'),
 }
 """Cause and description of the rejection for each reason code, except descriptions with a value."""
+
+
+def own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
+    """Covariances of readings, and whether they are valid.
+
+    Parameters
+    ----------
+    readings : Readings
+
+    Returns
+    -------
+    validity : (n,) int array
+        NONE, VALID or INVALID; all NONE if the readings have no covariances.
+    covariance : (n, 3, 3) array, T²
+        Empty if the readings have no covariances.
+    """
+    if readings.covariance is None:
+        return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
+    C = plain(readings.covariance)
+    valid = np.where(are_valid_covariances(plain(readings.field), C), core.VALID, core.INVALID)
+    return np.where(readings.has_unknown_covariance(), core.NONE, valid), C
 
 
 class Rejections:

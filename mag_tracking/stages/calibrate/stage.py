@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, IntArray, Record
+from mag_tracking.arrays import FloatArray, Record, are_equal
 from mag_tracking.calibration import core
 from mag_tracking.calibration.agreement import FieldInconsistency
 from mag_tracking.calibration.background import RunningBackground
@@ -24,13 +24,17 @@ from mag_tracking.calibration.reading_faults import ReadingFaults
 from mag_tracking.calibration.screening import clear_spikes
 from mag_tracking.calibration.sensor_state import new_sensors
 from mag_tracking.errors import NetworkError
-from mag_tracking.inference.axes import are_valid_covariances
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.driver_faults import MAX_MARKED, DriverFaults
 from mag_tracking.stages.calibrate.field_comparison import FieldComparison
+from mag_tracking.stages.calibrate.output_buffer import OVERRULED as OVERRULED
 from mag_tracking.stages.calibrate.output_buffer import OutputBuffer
-from mag_tracking.stages.calibrate.rejections import REJECTIONS, Rejections
+from mag_tracking.stages.calibrate.rejections import (
+    REJECTIONS,
+    Rejections,
+    own_covariances,
+)
 from mag_tracking.stages.calibrate.restoration import (
     BackgroundRestoration,
     StoredBackground,
@@ -45,9 +49,6 @@ from mag_tracking.units import NEVER, NS
 MAX_SYNCHRONOUS = 16
 """Maximum number of sensors whose blocks may end at the same time. In larger networks, the blocks
 are staggered, because evaluating all blocks at once would delay the readings."""
-
-OVERRULED = 'message covariances overruled by the measured noise'
-"""Key in the counts for message covariances that were replaced by the measured noise."""
 
 FAULTS_FOUND = 'faults of drivers found'
 """Key in the counts for the events after which `driver_faults` are others."""
@@ -133,8 +134,8 @@ class Calibrate:
                             for name in network.names}
         for i, name in enumerate(network.names):
             is_unchanged = previous is not None \
-                and _are_equal(previous.offset[i], network.offset[i]) \
-                and _are_equal(previous.correction[i], network.correction[i])
+                and are_equal(previous.offset[i], network.offset[i]) \
+                and are_equal(previous.correction[i], network.correction[i])
             shift = int(self._sensors[i]['clock_offset_ns'] - network.clock_offset_ns[i])
             if previous is not None and (not is_unchanged or shift):
                 self._restoration.forget(name)
@@ -256,7 +257,7 @@ class Calibrate:
             are none.
         """
         rows = readings.rows(self._index)
-        validity, covariances = _own_covariances(readings)
+        validity, covariances = own_covariances(readings)
         stamps, fields = plain(readings.stamp_ns, np.int64), plain(readings.field)
         self.timestamps.add(rows, stamps - self._network.clock_offset_ns[rows], fields)
         out, batch = self._new_output(len(readings)), self._batches[0]
@@ -269,16 +270,14 @@ class Calibrate:
                 self.counts[f'rejected: unknown sensor {name}'] += 1
             else:
                 self._handle(reason, int(batch['row']), out)
-        return self._finish(out)
+        return out.finish(self.counts)
 
     def _new_output(self, n: int) -> OutputBuffer:
         """Reset the batch counters, and create a buffer for the output of `n` raw readings."""
         capacity = n + int(self._sensors['n_held'].sum())
         if self._settings.decimate_to_hz:
             capacity += sum(d.n_waiting for d in self._decimators.values())
-        for name in ('n_out', 'n_learning', 'n_partly_learning', 'n_overruled'):
-            self._batches[0][name] = 0
-        return OutputBuffer(self._network.names, capacity)
+        return OutputBuffer(self._network.names, capacity, self._batches[0])
 
     def _handle(self, reason: int, i: int, out: OutputBuffer) -> None:
         """Handle an event of sensor `i` that the compiled code has reported."""
@@ -350,16 +349,6 @@ class Calibrate:
             if self._background[name].ready:
                 self._comparison.update(i, self.background(name), int(s['first_ns']),
                                         int(s['last_ns']))
-
-    def _finish(self, out: OutputBuffer) -> list[Readings]:
-        """Count the calibrated readings of a batch and return them."""
-        batch = self._batches[0]
-        for key, name in (('calibrated', 'n_out'), ('held back while learning', 'n_learning'),
-                          ('axes held back while learning', 'n_partly_learning'),
-                          (OVERRULED, 'n_overruled')):
-            if batch[name]:
-                self.counts[key] += int(batch[name])
-        return out.readings(int(batch['n_out']))
 
     @property
     def n_held(self) -> int:
@@ -450,7 +439,7 @@ class Calibrate:
             self._calibrate_released(int(i), out)
         for s in self._sensors:
             clear_spikes(s)
-        return self._finish(out)
+        return out.finish(self.counts)
 
     def _reject(self, sensor: str, cause: tuple[Cause, str], n: int = 1) -> None:
         """Count `n` rejected readings of a sensor by cause and description."""
@@ -538,20 +527,3 @@ class Calibrate:
         dict of str to RunningBackground
         """
         return dict(self._background)
-
-
-def _own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
-    """Validity codes (NONE, VALID, INVALID) and covariances (n, 3, 3) [T²] of the readings.
-
-    If the readings have no covariances, all codes are NONE and the second array is empty.
-    """
-    if readings.covariance is None:
-        return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
-    C = plain(readings.covariance)
-    valid = np.where(are_valid_covariances(plain(readings.field), C), core.VALID, core.INVALID)
-    return np.where(readings.has_unknown_covariance(), core.NONE, valid), C
-
-
-def _are_equal(a: FloatArray | None, b: FloatArray | None) -> bool:
-    """Whether two arrays are equal; None equals only None."""
-    return a is b if a is None or b is None else np.array_equal(a, b)

@@ -47,7 +47,8 @@ SENSED_LEVEL = 4.0
 noise by this number of standard deviations."""
 
 TRANSIENT_DOUBTS = (doubts.OVERFIT, doubts.DISTURBANCE_MODEL, doubts.INNOVATIONS, doubts.MISFIT,
-                    doubts.HEIGHT, doubts.OFF_THE_ROAD, doubts.NO_STEADY_PATH)
+                    doubts.HEIGHT, doubts.BELOW_SENSORS, doubts.OFF_THE_ROAD,
+                    doubts.NO_STEADY_PATH)
 """Doubts about the state of the filter in single frames. Smoothing resolves them only in part."""
 
 TRANSIENT_S = 0.1

@@ -114,12 +114,7 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
     std = np.sqrt(np.einsum('jii->ji', frame.covariance) + background_std**2
                   + (relative_std * magnitude[:, None]) ** 2)
     y = (frame.field / std)[is_present]
-    low, high = network.positions.min(axis=0), network.positions.max(axis=0)
-    extent = high - low + 2.0 * settings.start_margin
-    step = float((np.prod(extent) / settings.grid_points) ** (1.0 / 3.0))
-    axes = [np.arange(a - settings.start_margin + step / 2, b + settings.start_margin, step)
-            for a, b in zip(low, high, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
+    grid = _start_grid(settings, network)
     # The Jacobian with respect to the moment does not depend on the moment.
     dB_dm = dipole_jacobians(network.positions[None] - grid[:, None], np.zeros(3))[1]
     A = np.einsum('jik,gjkl->gjil', network.R_sw, dB_dm) / std[:, :, None]
@@ -136,6 +131,23 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
                                    background_std, own_covariance)
     bank.reweight(-0.5 * cost)
     return bank
+
+
+def _start_grid(settings: MagnetSettings, network: SensorNetwork) -> FloatArray:
+    """Grid (n, 3) [m] over the bounding box of the sensors with its margin.
+
+    A side that is shorter than the spacing of the grid has one point, in its middle. The other
+    sides then share the number of points.
+    """
+    low, high = network.positions.min(axis=0), network.positions.max(axis=0)
+    extent, step, is_long = high - low + 2.0 * settings.start_margin, 0.0, np.full(3, True)
+    while not step or (extent[is_long] < step).any():
+        is_long &= extent >= step
+        step = float((np.prod(extent[is_long]) / settings.grid_points) ** (1.0 / is_long.sum()))
+    axes = [np.arange(a - settings.start_margin + step / 2, b + settings.start_margin, step)
+            if long else np.array([(a + b) / 2])
+            for a, b, long in zip(low, high, is_long, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
 
 
 def _distinct_optima(settings: MagnetSettings, network: SensorNetwork, start: FloatArray,

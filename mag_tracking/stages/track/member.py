@@ -15,7 +15,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.cross_check import CrossCheck
 from mag_tracking.stages.track.disturbances import UnexplainedField
-from mag_tracking.stages.track.evidence import TrackEvidence
+from mag_tracking.stages.track.evidence import LOST, TrackEvidence
 from mag_tracking.stages.track.joint import JointExplanation
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.plausibility import Plausibility
@@ -104,7 +104,7 @@ class Member:
         self.is_lost = False
         self.early: list[TrackState] = []
         self.slot = 0
-        # Reason why the latest state is impossible and was not published; empty if it is possible.
+        # Reason to end because the latest state is impossible; empty if it is possible.
         self._impossible = ''
         self._position_std = np.inf
         self._unobserved_length = target.unobserved_length()
@@ -186,6 +186,9 @@ class Member:
         record = self._create_record(update, view)
         self._impossible = impossible_reason(record.velocity, record.moment, record.mounting)
         if self._impossible:
+            if update.bank_filter.is_implausible(view.bank, view.best, update.frame):
+                # The field contradicts the track, which is therefore lost, whatever its state.
+                self._impossible = LOST
             return []
         self.last = record
         self._position_std = float(np.sqrt(np.trace(view.bank.P[view.best, :2, :2])))
@@ -219,6 +222,19 @@ class Member:
             mounting=view.observation.angles(view.bank.x[best].copy()),
             mounting_covariance=view.observation.angle_covariances(view.bank.P[best])),
             update.settings)
+
+    @property
+    def passed_below(self) -> bool | None:
+        """Whether the target passed below the sensors; None if its height is uncertain.
+
+        The field of a dipole is the same at opposite points. If two sensors are exchanged, a
+        vehicle therefore fits well on the opposite side of the centre, below the sensors.
+        """
+        reasons = set() if self.last is None else \
+            set(self.last.doubts) - {doubts.HEIGHT, doubts.BELOW_SENSORS}
+        if self.last is None or self._target.starts_anywhere or reasons:
+            return None
+        return bool(self.last.position[2] < 0.0)
 
     def is_doubtful(self, settings: TrackSettings) -> bool:
         """Whether the whole track is currently doubtful.

@@ -73,6 +73,8 @@ class Plausibility:
         height_error = abs(float(x[2]) - settings.heights[kind])
         if height_error > -ndtri(P_HEIGHT / 2.0) * settings.height_stds[kind]:
             reasons.add(doubts.HEIGHT)
+        if x[2] < 0.0 < settings.heights[kind]:
+            reasons.add(doubts.BELOW_SENSORS)
         if self._was_off_road[bank.origin[best]] or _is_off_road(
                 x[None], settings, observation.positions, LANE_STDS_LATER)[0]:
             reasons.add(doubts.OFF_THE_ROAD)

@@ -42,6 +42,8 @@ UNDECIDED_S = 1.0
 DOUBTED_S = 3.0
 """[s] Duration of the doubt about the uncertain vehicles of an accepted explanation."""
 
+BELOW_SENSORS = 'vehicles that appear to pass below the sensors'
+
 TrackRecord = Track | SmoothedPose | Disturbance
 """Record that the tracker returns: pose, smoothed pose or disturbance."""
 
@@ -334,6 +336,9 @@ class RunningTrack:
         self.counts[f'tracks ended: {reason}'] += 1
         if member.last is None:
             return []
+        if member.passed_below:
+            self.counts[BELOW_SENSORS] += 1
+            member.evidence.flag(doubts.BELOW_SENSORS)
         best = self.bank.best()
         view = self._view(i, best)
         doubtful = member.evidence.ends_in_misfit or member.is_doubtful(self._settings)

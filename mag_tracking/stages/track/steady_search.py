@@ -147,7 +147,7 @@ class PathPrior:
         return (self.mean - relative) / self.std, J
 
     def starts(self, vehicle: VehicleSettings, network: SensorNetwork) -> FloatArray:
-        """Grid of start paths; their positions at time zero cover the arrival lines.
+        """Grid of start paths; their positions at time zero cover the arrival lines near sensors.
 
         Parameters
         ----------
@@ -165,12 +165,14 @@ class PathPrior:
         starts = []
         for heading in self.headings:
             along = np.array([np.cos(heading), np.sin(heading)])
-            half_length = float(np.abs((network.positions[:, :2] - self.centre) @ along).max())
-            x, y, v = (a.ravel() for a in np.meshgrid(
-                np.arange(-vehicle.max_start_distance - half_length, GRID_MARGIN + half_length,
-                          GRID_STEP),
-                offsets, speeds,
-                indexing='ij'))
+            sensors = (network.positions[:, :2] - self.centre) @ along
+            half_length = float(np.abs(sensors).max())
+            x = np.arange(-vehicle.max_start_distance - half_length, GRID_MARGIN + half_length,
+                          GRID_STEP)
+            # No sensor senses a vehicle in a wide gap between the sensors.
+            distance = np.abs(x[:, None] - sensors).min(axis=1)
+            x = x[distance <= vehicle.max_start_distance + GRID_MARGIN]
+            x, y, v = (a.ravel() for a in np.meshgrid(x, offsets, speeds, indexing='ij'))
             grid = np.tile(self.mean, (len(x), 1))
             grid[:, :2] = self.centre + x[:, None] * along \
                 + y[:, None] * [-along[1], along[0]]

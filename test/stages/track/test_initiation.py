@@ -1,6 +1,7 @@
 """Track initiation: states, covariances and weights of the first hypotheses."""
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -41,6 +42,25 @@ def test_the_hypothesis_on_the_side_that_fits_better_is_heavier():
     # standard deviations of half the field.
     gap = float(bank.log_w[above][0] - bank.log_w[below][0])
     assert gap == pytest.approx(0.5 * 4.0**2, rel=0.1)
+
+
+@pytest.mark.parametrize('spacing', [0.05, 1.0, 2e4])
+def test_a_magnet_starts_beside_a_line_of_sensors(spacing):
+    """The grid covers a long narrow box; its number of points does not grow with the length. The
+    direction from the line to the magnet is not observable."""
+    network = line_network(5, tilt=0.0)
+    network = dataclasses.replace(network, positions=spacing * np.arange(5)[:, None] * [1, 0, 0])
+    truth, m = network.positions[1] + [0.0, 0.08, 0.0], np.array([1.0, 0.5, 2.0])
+    field = dipole_field(network.positions - truth, m)
+    C = np.tile(1e-18 * np.eye(3), (5, 1, 1))
+    tracemalloc.start()
+    bank = start(FieldFrame(0, field, C, np.ones(5, dtype=int), np.zeros(5)), network)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200e6 and bank is not None
+    if spacing < 10.0:
+        x, y, z = bank.x[np.argmax(bank.log_w), :3]
+        np.testing.assert_allclose([x, np.hypot(y, z)], truth[:2], atol=0.03)
 
 
 def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):

@@ -10,6 +10,7 @@ from mag_tracking.stages.track.pass_samples import PassSamples
 from mag_tracking.stages.track.steady_search import N_DIPOLES, PathPrior, StartGrid, SteadySearch
 from mag_tracking.units import NS
 from support.busy_worlds import NETWORKS
+from support.networks import line_network
 
 NOISE = 6e-9
 VEHICLE = settings_for('vehicle').track.vehicle
@@ -43,6 +44,17 @@ def search_of(*paths, n_sensors=4, seed=0):
     prior = PathPrior.of(VEHICLE, network)
     return (SteadySearch(samples, prior, np.zeros(len(samples.y)), 2e-8 * samples.backgrounds),
             StartGrid(samples, prior, prior.starts(VEHICLE, network)))
+
+
+@pytest.mark.parametrize('gap_m', [300.0, 99e3])
+def test_starts_cover_the_neighbourhood_of_distant_sensors(gap_m):
+    """The number of starts does not grow with a gap between the sensors."""
+    network, compact = line_network(4, gap_m), line_network(4)
+    starts, compact_starts = (PathPrior.of(VEHICLE, n).starts(VEHICLE, n)
+                              for n in (network, compact))
+    assert len(compact_starts) < len(starts) < 4 * len(compact_starts)
+    distance = np.linalg.norm(starts[:, None, :2] - network.positions[:, :2], axis=2)
+    assert (distance.min(axis=0) < 4.0).all()
 
 
 def assert_near(path, truth, distance=0.5, speed=1.0):
