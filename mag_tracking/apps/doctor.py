@@ -14,7 +14,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
 from mag_tracking.quantities import occurrences
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.recording.sample_reader import ZERO_STAMP, SampleReader
 from mag_tracking.records import Readings
 from mag_tracking.stages.align.frame_period import frame_period_warning
 from mag_tracking.stages.calibrate.field_comparison import (
@@ -334,11 +334,15 @@ def recording_findings(recording: Recording, reader: SampleReader) -> list[Findi
     list of Finding
     """
     name, found = recording.path.name, []
+    without_time = {fault: n for fault, n in reader.rejected.items()
+                    if fault.startswith(ZERO_STAMP)}
     for counts, advice, cause in (
             (recording.losses, 'the recording is damaged; mag-tracking repair adds the missing '
              'index of a truncated file, but cannot restore lost data', Cause.DAMAGED_RECORDING),
-            (reader.rejected, 'the messages are damaged or incomplete, or their encoding or type '
-             'is not supported: check the driver and the program that recorded them',
+            (without_time, 'set the timestamps in the driver', Cause.ZERO_STAMPS),
+            (reader.rejected - Counter(without_time), 'the messages are damaged or incomplete, or '
+             'their encoding or type is not supported: check the driver and the program that '
+             'recorded them',
              Cause.UNDECODABLE)):
         if counts:
             found.append(Finding(cause is Cause.DAMAGED_RECORDING, name, ', '.join(

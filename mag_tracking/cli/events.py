@@ -30,7 +30,8 @@ _EVENTS_HELP = '''
 Detects the passes at each sensor and describes them without tracking: onset and release, peak,
 energy, time of the closest point of approach, direction (needs two horizontal axes), and the
 signature of the field. One sensor with one axis is sufficient. Distance and speed are not
-observable with a single sensor, so no value is in metres.
+observable with a single sensor, so no value is in metres. The stay of a parked vehicle is one
+event. Sensors that are too slow to show passes still show stays.
 
 With --out, writes events.csv and signatures.csv to DIR.
 

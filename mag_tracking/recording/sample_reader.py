@@ -33,6 +33,8 @@ from mag_tracking.stages.health.clocks import ClockSpan
 TRUTH_PREFIX = 'ground_truth/'
 """Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
 never for tracking."""
+ZERO_STAMP = 'message with header.stamp 0'
+"""Beginning of the keys in `SampleReader.rejected` for messages without a time."""
 BATCH_SIZE = 256
 """Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
 few readings. The caller can stop only between batches."""
@@ -272,7 +274,7 @@ class SampleReader:
         missing."""
         reading = self._network_readings(reading_of(content, sensor))
         if not reading.stamp_ns.all():
-            cause = f'message with header.stamp 0 on {message.topic}'
+            cause = f'{ZERO_STAMP} on {message.topic}'
             if message.topic in self._unstamped:
                 self.rejected[f'{cause}, read with its log time'] += 1
                 reading = replace(reading, stamp_ns=np.array([message.log_time_ns]))

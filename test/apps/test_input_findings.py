@@ -73,13 +73,15 @@ def test_every_program_names_the_cause_first(spoilt, tmp_path):
                count_traffic(Recording(path), NETWORK, SETTINGS).diagnoses,
                find_events(Recording(path), NETWORK, SETTINGS).diagnoses]
     for diagnoses in results:
-        assert diagnoses[0].serious and diagnoses[0].finding.cause is cause
+        # Timestamps of zero are replaced by the log time.
+        assert diagnoses[0].serious == (cause is not Cause.ZERO_STAMPS)
+        assert diagnoses[0].finding.cause is cause
         assert not any(d.finding.cause in (Cause.LOST, Cause.CLOCK_STEPPED, Cause.CLOCK_DIFFERS)
                        for d in diagnoses)
     assert all(health.counts['lost'] == 0 for health in doctor.sensors.values())
     summary = replay(Recording(path), NETWORK, SETTINGS, tmp_path / 'out').summary
     assert summary['diagnoses'][0]['cause'] == cause.value
-    for track in summary['tracks']:
+    for track in summary['tracks'] if cause is not Cause.ZERO_STAMPS else ():
         assert track['doubts'].get('wrong_timestamps') == track['poses']
-    if cause in (Cause.ZERO_STAMPS, Cause.RATE_TOO_LOW, Cause.MILLISECOND_STAMPS):
+    if cause in (Cause.RATE_TOO_LOW, Cause.MILLISECOND_STAMPS):
         assert not summary['tracks']

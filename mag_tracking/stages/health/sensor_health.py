@@ -9,16 +9,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration import timestamps
 from mag_tracking.calibration.reading_faults import NO_FAULTS, ReadingFaults
 from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import saturated_readings
 from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
-from mag_tracking.calibration.timestamps import WINDOW as TIMESTAMP_WINDOW
-from mag_tracking.calibration.timestamps import (
-    TimestampFault,
-    latest_interval_s,
-    timestamp_fault,
-)
 from mag_tracking.quantities import occurrences
 from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.stages.health.diagnosis import Cause, Finding
@@ -87,7 +82,7 @@ class SensorHealth:
         self._field_stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._is_saturated: BoolArray = np.zeros(0, dtype=bool)
         self._interval_ns, self._jitter = float('nan'), float('inf')
-        self._timestamp_fault: TimestampFault | None = None
+        self._timestamp_fault: timestamps.TimestampFault | None = None
         self._noise: FloatArray = np.full(3, np.nan)
         # Results for the current window; cleared when readings are added.
         self._cache: dict[str, FloatArray] = {}
@@ -153,7 +148,7 @@ class SensorHealth:
             return
         self._stamps = np.append(self._stamps, stamps)[-WINDOW:]
         self._received = np.append(self._received, received)[-WINDOW:]
-        self._raw_fields = np.append(self._raw_fields, fields, axis=0)[-TIMESTAMP_WINDOW:]
+        self._raw_fields = np.append(self._raw_fields, fields, axis=0)[-timestamps.WINDOW:]
         self._counts['readings'] += n
         self._check_timestamps(n)
         missing = np.isnan(fields)
@@ -174,7 +169,7 @@ class SensorHealth:
         intervals = np.diff(self._stamps[-n - 1:])
         self._counts['duplicates'] += int((intervals == 0).sum())
         self._counts['backward timestamps'] += int((intervals < 0).sum())
-        fault = timestamp_fault(self._stamps[-TIMESTAMP_WINDOW:], self._raw_fields)
+        fault = timestamps.timestamp_fault(self._stamps[-timestamps.WINDOW:], self._raw_fields)
         if fault is not None:
             # The intervals of such timestamps show neither lost readings nor clock steps.
             self._timestamp_fault = fault.after(self._timestamp_fault)
@@ -194,7 +189,7 @@ class SensorHealth:
             self._largest_step_s = max(self._largest_step_s, *steps[is_step].tolist(), key=abs)
         if self._jitter < MAX_JITTER:
             # Intervals like the latest ones are those of another rate.
-            latest_ns = latest_interval_s(self._stamps) * NS
+            latest_ns = timestamps.latest_interval_s(self._stamps) * NS
             is_other_rate = (latest_ns > GAP_RATIO * self._interval_ns) \
                 & (np.abs(intervals - latest_ns) < 0.2 * latest_ns)
             gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) \
