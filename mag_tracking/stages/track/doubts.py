@@ -59,8 +59,8 @@ MEANINGS = {
                  'their covariance',
     SENSORS_ROTATED: 'the track requires larger mounting errors than configured',
     HEIGHT: 'the height of the source is implausible for its kind of vehicle',
-    BELOW_SENSORS: 'this vehicle or the previous one appears to pass below the sensors: two '
-                   'sensors are exchanged, or the sensors are mounted upside down',
+    BELOW_SENSORS: 'the vehicle appears to pass below the sensors: two sensors are exchanged, or '
+                   'the sensors are mounted upside down',
     OFF_THE_ROAD: 'the target passes all sensors on one side, outside the lanes of '
                   'track.vehicle.lateral_offsets',
     FRAMES_TOO_LONG: 'the target moves too far within one frame',

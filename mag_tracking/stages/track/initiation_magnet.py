@@ -75,7 +75,7 @@ def is_lost_after(settings: MagnetSettings, network: SensorNetwork, dt: float) -
     """
     std = settings.acceleration * np.sqrt(dt**3 / 3.0)
     extent = np.ptp(network.positions, axis=0).max()
-    return bool(std > settings.start_margin + 0.5 * extent)
+    return bool(std > 2.0 * settings.start_margin + extent)
 
 
 def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldFrame,

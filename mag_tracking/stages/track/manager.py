@@ -19,7 +19,6 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.bank_size import sensors_at_start
 from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.disturbances import Disturbances
-from mag_tracking.stages.track.doubts import BELOW_SENSORS
 from mag_tracking.stages.track.low_rate import SampleRates
 from mag_tracking.stages.track.observation import MAX_ROTATION
 from mag_tracking.stages.track.running_track import RunningTrack, TrackRecord
@@ -87,8 +86,6 @@ class TrackManager:
         # limit; None if no target was lost in the current detection.
         self._restart_energy: float | None = None
         self._next_network: SensorNetwork | None = None
-        # Whether the latest vehicle of known height passed below the sensors.
-        self._passed_below = False
         self._disturbances = Disturbances(network.names)
         self._rates = SampleRates(network, settings)
         self._input_doubts: InputDoubts = {}
@@ -242,16 +239,11 @@ class TrackManager:
         out = [record for track in tracks for record in track.end(reason)]
         if stamp_ns is None:
             return out
-        return [*out, *self._evaluate_ended(tracks, stamp_ns), *self._disturbances.end(stamp_ns)]
+        return [*out, *self._add_unexplained(tracks, stamp_ns), *self._disturbances.end(stamp_ns)]
 
-    def _evaluate_ended(self, tracks: list[RunningTrack], stamp_ns: int) -> list[TrackRecord]:
-        """Evaluate ended tracks: start or extend a disturbance with their unexplained fields.
-
-        Return its records.
-        """
+    def _add_unexplained(self, tracks: list[RunningTrack], stamp_ns: int) -> list[TrackRecord]:
+        """Start or extend a disturbance with unexplained fields of `tracks`; return its records."""
         out: list[TrackRecord] = []
-        below = [m.passed_below for track in tracks for m in track.members if m.ended is not None]
-        self._passed_below = next((b for b in below if b is not None), self._passed_below)
         for found in (found for track in tracks for found in track.unexplained):
             self.counts[DISTURBANCE_TRACKS] += 1
             out += self._disturbances.begin(found, stamp_ns)
@@ -268,7 +260,7 @@ class TrackManager:
 
     def _delete_ended(self, stamp_ns: int) -> list[TrackRecord]:
         """Delete the ended tracks; return the records of disturbances that explain their fields."""
-        out = self._evaluate_ended([track for track in self._tracks if track.ended is not None],
+        out = self._add_unexplained([track for track in self._tracks if track.ended is not None],
                                     stamp_ns)
         # A track that restarts while the vehicle departs would be placed on the wrong line.
         if any(track.is_lost for track in self._tracks) and not self._target.starts_anywhere:
@@ -316,8 +308,6 @@ class TrackManager:
         self._next_id += 1
         self._tracks.append(track)
         track.flag_doubtful_sensors(self._doubtful_sensors(*recent, frame))
-        if self._passed_below:
-            track.flag_doubtful_sensors({BELOW_SENSORS: sensors.rows.tolist()})
         out = track.begin(
             frame, recent,
             approach_unobserved=is_in_tail or bool(recent) and _n_sensors(*recent) < 2)

@@ -224,17 +224,16 @@ class Member:
             update.settings)
 
     @property
-    def passed_below(self) -> bool | None:
-        """Whether the target passed below the sensors; None if its height is uncertain.
+    def passed_below(self) -> bool:
+        """Whether the target passed below the sensors, and everything else about it is plausible.
 
         The field of a dipole is the same at opposite points. If two sensors are exchanged, a
         vehicle therefore fits well on the opposite side of the centre, below the sensors.
         """
-        reasons = set() if self.last is None else \
-            set(self.last.doubts) - {doubts.HEIGHT, doubts.BELOW_SENSORS}
-        if self.last is None or self._target.starts_anywhere or reasons:
-            return None
-        return bool(self.last.position[2] < 0.0)
+        if self.last is None or self._target.starts_anywhere \
+                or set(self.last.doubts) - {doubts.HEIGHT, doubts.BELOW_SENSORS}:
+            return False
+        return bool(self.last.position[2] + np.sqrt(self.last.covariance[2, 2]) < 0.0)
 
     def is_doubtful(self, settings: TrackSettings) -> bool:
         """Whether the whole track is currently doubtful.
