@@ -12,7 +12,7 @@ from itertools import permutations, product
 from typing import TypeAlias
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from mag_tracking.arrays import FloatArray
 
@@ -216,7 +216,7 @@ def _probability(field: tuple[float, ...], orientation: tuple[float, ...],
     S = (bias_std**2 * np.eye(3) + tilt_effect @ tilt_effect.T)[np.ix_(is_reported, is_reported)]
     r = (y - B @ R_ws)[:, is_reported]
     energy = np.einsum('ni,ij,nj->n', r, np.linalg.inv(S), r) + (yaw / std[2])**2
-    return float(chi2.sf(energy.min(), np.count_nonzero(is_reported)))
+    return float(chdtrc(np.count_nonzero(is_reported), energy.min()))
 
 
 def _exact_explanations(s: _Sensor, suspects: Sequence[_Sensor]) -> list[tuple[str, float]]:

@@ -89,7 +89,6 @@ def test_invalid_intervals_are_reported(tmp_path, rows, error):
 
 @pytest.mark.parametrize(('text', 'message'), [
     ('a,x0,x1\n1,2,3\n', "column 'label' is missing; the columns are a, x0, x1\n"),
-    ('label;x0\ncar;1\n', "the delimiter is ';', expected a comma"),
     ('label,x,y\ncar,1,2\n', 'expected numbered columns of samples'),
     ('label,x0,x1,y0\ncar,1,2,3\n', 'the same number for each axis'),
     ('label,x0,x1,bx0,bx1\ncar,1,2,3,4\n', 'the columns x0, ... are not numbered consecutively'),

@@ -135,6 +135,8 @@ def test_glitches_and_saturation_are_distinguished(name):
     assert sum('end of the range' in f for f in found) == sum(
         'end of the range' in f for f in original)
     found = findings(name, clipped)
-    assert sum('end of the range' in f for f in found) == len(recorded(name).readings.names)
+    # No vehicle passes in the start of the road: only its noise is clipped.
+    assert sum('end of the range' in f for f in found) == (
+        0 if name == 'two_way_road_start' else len(recorded(name).readings.names))
     assert not any('are spikes' in f for f in found), found
     assert name in ROADS or outcome(name, glitches).direction_is_right

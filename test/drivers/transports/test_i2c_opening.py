@@ -29,7 +29,7 @@ from support.i2c_chips import Clock, FakeHmc5883l, FakeLis3mdl, FakeMmc5603
     (['A:lis3mdl:0x1c@0x78.1'], r'A: multiplexer 0x78 is outside'),
     (['A:my_driver.Sensor:0x1c'], 'A: the unit of my_driver.Sensor .* A:my_driver.Sensor:0x1c:uT'),
     (['A:my_driver.Sensor:0x1c@0x70.1'], 'A:my_driver.Sensor:0x1c@0x70.1:uT'),
-    (['A:my_driver.Sensor:0x1c:tesla'], "A: unit: 'tesla' is neither"),
+    (['A:my_driver.Sensor:0x1c:oersted'], "A: unit: 'oersted' is neither"),
     (['A:lis3mdl:0x1c:uT'], 'A: the unit of lis3mdl is known; remove :uT'),
     (['A:lis3mdl:0x1c', 'A:lis3mdl:0x1e'], 'A appears twice'),
     (['A:lis3mdl:0x1c', 'B:rm3100:0x1c'], 'A and B both answer at address 0x1c$'),

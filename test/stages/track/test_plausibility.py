@@ -37,7 +37,9 @@ def doubts_in_state(mounting=MOUNTING, dt=0.08, **of_state):
 
 @pytest.mark.parametrize('of_state, expected', [
     ({}, set()),
-    ({'z': 1.1}, set()), ({'z': 1.2}, {doubts.HEIGHT}), ({'z': -0.3}, {doubts.HEIGHT}),
+    ({'z': 1.1}, set()), ({'z': 1.2}, {doubts.HEIGHT}),
+    # Below the sensors, as after an exchange of two parallel sensors.
+    ({'z': -0.3}, {doubts.HEIGHT, doubts.BELOW_SENSORS}),
     # The squares of six angles of 1.2 standard deviations add up to 8.6; one correct mounting in
     # twenty exceeds 12.6.
     ({'angles_deg': 6.0}, set()), ({'angles_deg': 8.0}, {doubts.SENSORS_ROTATED}),
