@@ -12,6 +12,7 @@ from mag_tracking.report.page import ERROR, NOTE, Chart, Note, Page, Table, repo
 from mag_tracking.report.page_charts import axes, escape_markup
 from mag_tracking.report.palette import AXIS_COLOURS
 from mag_tracking.stages.health.diagnosis import Diagnosis
+from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S
 
 
 def write_report(doctor: Doctor, diagnoses: Sequence[Diagnosis], subject: str,
@@ -89,6 +90,6 @@ def _table(doctor: Doctor) -> Table:
             name, c['readings'], float(health.rate) if has_readings else None, c['lost'],
             c['duplicates'], c['spikes'],
             1e6 * float(np.sqrt(np.nansum(health.field**2))) if has_readings else None,
-            None if np.isnan(delay) else 1e3 * delay])
+            1e3 * delay if abs(delay) < MAX_LIVE_DELAY_S else None])
     return Table('Sensors', ['sensor', 'readings', 'rate [Hz]', 'lost', 'duplicates', 'spikes',
                              'field [µT]', 'delay [ms]'], rows)

@@ -8,7 +8,7 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.stages.calibrate.field_comparison import earth_field_findings
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.health.clocks import clock_findings
+from mag_tracking.stages.health.clocks import clock_findings, corrected
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.stages.health.timestamps import timestamp_finding
 from mag_tracking.stages.track.settings import TrackSettings
@@ -33,7 +33,8 @@ def input_findings(recording: Recording, reader: SampleReader, network: SensorNe
     list of Finding
     """
     missing = reader.missing_topics()
-    found = [*recording_findings(recording, reader), *clock_findings(reader.clocks)]
+    found = [*recording_findings(recording, reader), *clock_findings(
+        corrected(reader.clocks, network.names, network.clock_offset_ns.tolist()))]
     for name, topic in zip(network.names, network.absolute_topics, strict=True):
         if topic in missing:
             found.append(Finding(True, name, f'no messages on {topic}', 'check the topic in the '

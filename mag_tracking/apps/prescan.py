@@ -1,7 +1,7 @@
 """First pass over a recording, to find backgrounds if a target is present at the start."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 from mag_tracking.arrays import FloatArray
@@ -16,6 +16,7 @@ from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.units import NS
 
 LEARNING_TOLERANCE_S = 1.0
@@ -47,6 +48,8 @@ class Prescan:
     """{sensor: (3,) smallest change of each axis, T}."""
     faults: dict[str, ReadingFaults]
     """{sensor: faults of the driver}."""
+    clocks: dict[str, ClockSpan] = field(default_factory=dict)
+    """{sensor: timestamps and times of receipt}; empty if the times of receipt are unknown."""
 
     def segment_of(self, sensor: str) -> list[float] | None:
         """Return the interval in which the background level of a sensor was observed.
@@ -71,6 +74,7 @@ class Prescan:
         calibrate : Calibrate
         """
         calibrate.start_from(self.levels, self.steps, self.faults)
+        calibrate.compare_clocks(self.clocks)
 
 
 def prescan(batches: Iterable[Readings], network: SensorNetwork,
@@ -215,4 +219,5 @@ def prescan_of(recording: Recording, network: SensorNetwork, settings: Calibrate
         except ReadingStopped:
             return
 
-    return prescan(batches(), network, settings)
+    found = prescan(batches(), network, settings)
+    return replace(found, clocks=reader.clocks)

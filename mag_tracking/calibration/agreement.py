@@ -29,9 +29,12 @@ that explains the field this well is more probable than an offset that resembles
 GAIN_STDS = 2.0
 """Half of the stated interval of a gain, in standard deviations."""
 
-MIN_GAIN_ERROR, MIN_GAIN, MAX_GAIN = 0.1, 0.1, 10.0
-"""A gain is an explanation if it differs from 1 by more than the first value, and is between the
-other two."""
+MIN_GAIN_ERROR, MAX_AXIS_GAIN, MAX_GAIN = 0.1, 10.0, 2e4
+"""A gain is an explanation if it differs from 1 by more than the first value, and it or its inverse
+is below the second value for one axis, and below the third for all axes."""
+
+UNIT_TOLERANCE = 0.1
+"""A gain that differs from a power of ten by less than this may be due to a wrong unit."""
 
 MAX_HEADING_STDS = 5.0
 """Maximum tested heading error, in standard deviations."""
@@ -243,13 +246,16 @@ def _gain_explanations(s: _Sensor) -> tuple[str, ...]:
     relative_std = s.bias_std / np.sqrt(np.nansum(B**2))
     for sign, text in ((1.0, ''), (-1.0, 'x, y and z are flipped, with ')):
         if _is_wrong_gain(gain) and s.fits(sign * y / gain):
-            found.append(f'{text}{_gain_text(gain, relative_std)} (the direction agrees)')
+            power = round(np.log10(gain))
+            is_unit = power and abs(gain / 10.0**power - 1.0) < UNIT_TOLERANCE
+            found.append(f'{text}{_gain_text(gain, relative_std)} (the direction agrees'
+                         f'{"; a wrong unit?" if is_unit else ""})')
     for a, axis in enumerate(_AXES):
         # A field along the axis that is below the noise has no gain.
         if np.isnan(y[a]) or not abs(B[a]) > 2.0 * GAIN_STDS * s.bias_std:
             continue
         corrected = np.where(np.arange(3) == a, B, y)
-        if _is_wrong_gain(y[a] / B[a]) and s.fits(corrected):
+        if _is_wrong_gain(y[a] / B[a], MAX_AXIS_GAIN) and s.fits(corrected):
             found.append(f'{_gain_text(y[a] / B[a], s.bias_std / abs(B[a]))} of {axis} alone')
     return tuple(found)
 
@@ -261,9 +267,9 @@ def _orientation_explanation(s: _Sensor) -> tuple[str, ...]:
         if difference < MAX_HEADING_STDS * s.bias_std else ()
 
 
-def _is_wrong_gain(gain: float) -> bool:
+def _is_wrong_gain(gain: float, max_gain: float = MAX_GAIN) -> bool:
     """Whether a gain differs from 1, and is possible."""
-    return abs(gain - 1.0) > MIN_GAIN_ERROR and MIN_GAIN < gain < MAX_GAIN
+    return abs(gain - 1.0) > MIN_GAIN_ERROR and 1.0 / max_gain < gain < max_gain
 
 
 def _gain_text(gain: float, relative_std: float) -> str:

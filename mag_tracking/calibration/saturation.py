@@ -86,7 +86,7 @@ def saturated_readings(fields: FloatArray, max_run: float = MAX_RUN) -> BoolArra
     # A held reading is equal on all axes.
     is_new = changes_of(fields)
     for axis in range(3):
-        rows = np.flatnonzero(~np.isnan(fields[:, axis]) & is_new)
+        rows = np.flatnonzero(np.isfinite(fields[:, axis]) & is_new)
         for limit in _limits(fields[rows, axis], max_run):
             is_saturated[:, axis] |= fields[:, axis] == limit
     return is_saturated

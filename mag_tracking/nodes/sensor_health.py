@@ -172,6 +172,8 @@ class HealthDiagnostics:
             elif (last := calibrate.last_stamp_ns(name)) is not None:
                 self._frozen_since_ns.setdefault(name, last)
         health = {name: self._reported_window(name) for name in self._network.names}
+        calibrate.timestamps.compare_clocks({
+            name: clock for name, h in health.items() if (clock := h.clock) is not None})
         self._network_findings = {name: [] for name in self._network.names}
         for finding in network_findings(self._network, self._settings.survey, calibrate, health):
             if finding.subject in self._network_findings:

@@ -115,6 +115,8 @@ def read_field_table(path: _Path, options: TableOptions, with_times: bool = True
              *columns.notes, *(notes if with_times else [])]
     table.check_bad_rows(len(order))
     ignored = [quantity(n, kind) for kind, n in table.ignored.items()]
+    if rows.n_without_field:
+        ignored.append(quantity(rows.n_without_field, 'row') + ' without a field')
     notes += [f'ignored: {", ".join(ignored)}'] if ignored else []
     if table.bad:
         line, fault = min(table.bad)
@@ -138,6 +140,8 @@ class _Rows:
         """Index of the row, and sensor, of each reading."""
         self.fields = array('d')
         """Three numbers of each reading [T]."""
+        self.n_without_field = 0
+        """Rows without any number in the columns of the field."""
         key_of: dict[str, int] = {}
         names = {name: value if value == IGNORED else sensor_name(value, '--sensors')
                  for name, value in options.sensors.items()}
@@ -165,10 +169,11 @@ class _Rows:
             except ValueError as error:
                 raise ValueError(f'{self._column(axis.column)} {error}') from None
             fields.setdefault(sensor or axis.sensor, [math.nan] * 3)[axis.axis] = value * axis.scale
-        for name, vector in fields.items():
-            if not all(map(math.isnan, vector)):
-                self.names.append((len(self.lines), name))
-                self.fields.extend(vector)
+        present = {name: v for name, v in fields.items() if not all(map(math.isnan, v))}
+        self.n_without_field += not present
+        for name, vector in present.items():
+            self.names.append((len(self.lines), name))
+            self.fields.extend(vector)
         self.lines.append(line)
         self.keys.append(key)
         self.texts.append(self._time_text([cells[j] for j in self.columns.time]))
@@ -191,11 +196,10 @@ def _decimal(table: Table, columns: Columns, options: TableOptions) -> str:
     """Return the decimal mark of a table; raises RecordingError if it is ambiguous."""
     if options.decimal not in ('', '.', ','):
         raise RecordingError(f"--decimal: expected . or ',', got {options.decimal!r}")
-    used = {axis.column for axis in columns.axes} | set(columns.time)
     decimal = options.decimal or find_decimal(
-        (cells[j] for _, cells in table.rows for j in used), table.separator)
+        (cell for _, cells in table.rows for cell in cells), table.separator)
     if not decimal:
-        example = next(cells[j] for _, cells in table.rows for j in used if ',' in cells[j])
+        example = next(cell for _, cells in table.rows for cell in cells if ',' in cell)
         raise RecordingError(f"{table.path}: the decimal mark is ambiguous in {example!r}; give "
                              "--decimal ',' or --decimal .")
     return decimal

@@ -96,6 +96,29 @@ def describe_file(path: Path) -> str:
         'FILE', str(path))
 
 
+def binary_kind(path: Path) -> str:
+    """Describe a file that is not a text.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    str
+        Kind of the file, and the command or program that reads it; empty for a text, and for an
+        unknown format.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    """
+    kind = _kind_of(path)
+    return '' if kind in (_UNKNOWN, *(k for _, k in _TEXT)) else \
+        f'{kind.description}. {kind.advice}'.replace('FILE', str(path))
+
+
 def _kind_of(path: Path) -> _Kind:
     """Recognise a file by its first bytes."""
     with open(path, 'rb') as stream:

@@ -1,6 +1,7 @@
 """Columns of a table of readings: time, sensor and axes, named by the user or by the header."""
 
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -20,10 +21,13 @@ IGNORED = '-'
 _Assigned: TypeAlias = tuple[str, str | None, dict[str, dict[str, str]]]
 """Column of the time ('' without one), column of the sensor, and {sensor: {axis: column}}."""
 _TIME_WORDS = frozenset('t time timestamp ts stamp datetime timestamps epoch elapsed unixtime '
-                        'millis micros nanos sec secs seconds ms us ns utc localtime'.split())
+                        'millis micros nanos sec secs seconds ms us ns utc localtime '
+                        'zeit uhrzeit zeitstempel temps heure tiempo hora tempo ora'.split())
+_DATE_WORDS = frozenset('date datum fecha'.split())
 _SENSOR_WORDS = frozenset('id sensor device node name board channel sensorid deviceid'.split())
 _FIELD_WORDS = frozenset('magnetic magnetometer magnetometers mag magn magneto field flux '
-                         'density b h m raw compass axis component data value sensor'.split())
+                         'density b h m raw compass axis component data value sensor '
+                         'magnetfeld champ magnetique campo magnetico'.split())
 _OTHER_WORDS = frozenset(
     'acc accel acceleration accelerometer linear gyro gyroscope gravity angular rate velocity '
     'orientation quaternion position pos roll pitch yaw covariance rotation temperature true truth '
@@ -279,7 +283,7 @@ def _by_header(table: Table) -> _Assigned:
         words = _words(base)
         if set(words) & _OTHER_WORDS or unit and not field_unit(unit) and not time_unit(unit):
             continue
-        if words[-1:] == ['date'] or set(words) & _TIME_WORDS and not field_unit(unit):
+        if set(words[-1:]) & _DATE_WORDS or set(words) & _TIME_WORDS and not field_unit(unit):
             times.append(name)
         elif axis := _axis_of(words):
             if axes.setdefault(axis[0], {}).setdefault(axis[1], name) != name:
@@ -287,8 +291,8 @@ def _by_header(table: Table) -> _Assigned:
                         f'{axis[1]}')
         elif set(words) & _SENSOR_WORDS:
             sensors.append(name)
-    if len(times) == 2 and any('date' in _words(t) for t in times):
-        times = ['+'.join(sorted(times, key=lambda t: 'date' not in _words(t)))]
+    if len(times) == 2 and any(_DATE_WORDS & set(_words(t)) for t in times):
+        times = ['+'.join(sorted(times, key=lambda t: not _DATE_WORDS & set(_words(t))))]
     if len(times) > 1 or len(sensors) > 1:
         several = times if len(times) > 1 else sensors
         _refuse(table, f'{" and ".join(several)} may be the '
@@ -306,7 +310,8 @@ def _refuse(table: Table, cause: str) -> None:
 
 
 def _words(name: str) -> list[str]:
-    """Words of a name in lower case, split at capitals and other characters."""
+    """Words of a name in lower case without accents, split at capitals and other characters."""
+    name = ''.join(c for c in unicodedata.normalize('NFKD', name) if not unicodedata.combining(c))
     name = re.sub(r'([a-z0-9])([A-Z])', r'\1 \2', name)
     return re.findall('[a-z0-9]+', name.lower())
 

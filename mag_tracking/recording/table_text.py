@@ -10,6 +10,7 @@ from os import PathLike
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.files import checked_path
+from mag_tracking.recording.file_kind import binary_kind
 
 SEPARATORS = {'\t': 'tab', ';': 'semicolon', '|': 'bar', ',': 'comma', ' ': 'spaces'}
 """Names of the separators that are recognised. White space of any length is one separator."""
@@ -18,20 +19,12 @@ COMMENTS = ('#', '%', '//')
 _MARKS = ((codecs.BOM_UTF8, 'utf-8-sig'), (codecs.BOM_UTF32_LE, 'utf-32'),
           (codecs.BOM_UTF32_BE, 'utf-32'), (codecs.BOM_UTF16_LE, 'utf-16'),
           (codecs.BOM_UTF16_BE, 'utf-16'))
-_OTHER_FILES = (
-    (b'PK\x03\x04', 'an Excel workbook or ZIP archive; export the sheet as CSV'),
-    (b'\xd0\xcf\x11\xe0', 'an Excel workbook; export the sheet as CSV'),
-    (b'PAR1', 'a Parquet file; write it as CSV, for example with pandas'),
-    (b'\x1f\x8b', 'compressed with gzip; unpack it first'),
-    (b'\x89MCAP', 'a recording, which needs no import'), (b'SQLite format', 'a database'),
-    (b'ULog', 'a flight log of PX4; convert it with ulog2csv first'),
-    (b'\x89HDF', 'an HDF5 or MATLAB file; write it as CSV first'),
-    (b'MATLAB', 'a MATLAB file; write it as CSV first'),
-    (b'\x93NUMPY', 'a NumPy file; write it with numpy.savetxt first'))
+_RECORDINGS = (b'\x89MCAP', b'SQLite format', b'#ROSBAG')
 _NUMBER = re.compile(r"[+-]?(?:[0-9][0-9.,'\u2019\u00a0\u202f]*|[.,][0-9]+)(?:[eE][+-]?[0-9]+)?"
                      ).fullmatch
 _TIME = re.compile(r'[0-9](?=.*[-:/.].*)[0-9TZ:.,/+ apmAPMUTCG-]+|[0-9]{1,2}[ -][A-Za-z]{3,9}[ -].*'
                    ).fullmatch
+_DATE = re.compile(r'[0-9]{1,4}\.[0-9]{1,2}\.(?:[0-9]{2}){0,2}').fullmatch
 _MISSING = frozenset(('', '-', '--', 'nan', '-nan', '+nan', 'na', 'n/a', '#n/a', 'null', 'none',
                       'nat', '<na>'))
 _GROUPING = str.maketrans('', '', "'\u2019\u00a0\u202f ")
@@ -65,10 +58,11 @@ def read_text(path: str | PathLike[str], encoding: str = '') -> tuple[list[str],
     """
     path = checked_path(path, RecordingError)
     try:
-        data = path.read_bytes()
+        data, kind = path.read_bytes(), binary_kind(path)
     except OSError as error:
         raise RecordingError(f'cannot read {path}: {error.strerror}') from error
-    kind = next((kind for magic, kind in _OTHER_FILES if data.startswith(magic)), '')
+    if data.startswith(_RECORDINGS):
+        kind = 'a recording, which needs no import'
     if kind:
         raise RecordingError(f'{path} is not a table of text but {kind}')
     encoding = encoding or _encoding_of(data)
@@ -212,7 +206,8 @@ def find_decimal(cells: Iterable[str], separator: str) -> str:
     str
         '.' or ','. Empty if the numbers fit both, or contradict each other.
     """
-    marked = {cell for cell in cells if (',' in cell or '.' in cell) and _NUMBER(cell)}
+    marked = {cell for cell in cells if (',' in cell or '.' in cell) and _NUMBER(cell)
+              and not _DATE(cell)}
     with_comma = any(',' in cell for cell in marked)
     if not with_comma:
         return '.'

@@ -57,6 +57,11 @@ def comma(number):
     return f'{number:.4f}'.replace('.', ',')
 
 
+def thousandths(number):
+    """Format with a decimal comma and three digits, which might as well be thousands."""
+    return f'{number:.3f}'.replace('.', ',')
+
+
 LAYOUTS = {
     'commas': (text(cells()), {}),
     'tabs': (text(cells(), separator='\t'), {}),
@@ -81,6 +86,12 @@ LAYOUTS = {
         .encode('latin-1'), {'unit': '', 'columns': ()}),
     'line of units': (text([['ms', '', 'nT', 'nT', 'nT'], *cells(
         lambda t: f'{1000 * t:.1f}', lambda b: f'{1000 * b:.0f}')]), {'unit': ''}),
+    'German header': (text(cells(comma, thousandths), [
+        'Zeit (s)', 'id', *(f'Magnetfeld {a} (µT)' for a in 'xyz')], '\t'),
+        {'unit': '', 'columns': ()}),
+    'French header': (text(cells(comma, thousandths), [
+        'Temps (s)', 'id', *(f'Champ magnétique {a} (µT)' for a in 'xyz')], ';').encode('cp1252'),
+        {'unit': '', 'columns': ()}),
     'grouped digits': (text(cells(number=lambda b: f'"{1000 * b:,.1f}"')), {'unit': 'nT'}),
     'names': (text(cells(sensors=('vänster', '00:1A'))),
               {'sensors': {'vänster': 'mag_1', '00:1A': 'mag_2'}}),
@@ -122,6 +133,20 @@ TIMES = {
 def test_dates_and_times_of_day_are_read_across_midnight(form, tmp_path):
     content = text([[f'"{row[0]}"', *row[1:]] for row in cells(utc(form))])
     check(read(tmp_path, content, columns=COLUMNS, unit='uT'), TIMES[form])
+
+
+def test_decimal_commas_are_found_beside_dates_with_points(tmp_path):
+    rows = cells(utc('%d.%m.%Y;%H:%M:%S,%f'), thousandths)
+    content = text(rows, ['Date', 'Time', *HEADER[1:]], ';')
+    check(read(tmp_path, content, unit='uT'), EPOCH_S)
+
+
+def test_rows_without_a_field_are_counted(tmp_path):
+    content = text([[*row[:2], 'NaN', '', 'null'] if k % 50 == 7 else row
+                    for k, row in enumerate(cells())])
+    table = read(tmp_path, content, columns=COLUMNS, unit='uT')
+    assert sum(map(len, table.sessions)) == 2 * N - 10
+    assert any('10 rows' in note for note in table.notes)
 
 
 NUMBERS = {
@@ -266,7 +291,7 @@ def milliseconds(t):
     (text([[*row[:2], 'b', *row[3:]] if k % 5 == 0 else row for k, row in enumerate(cells())]), {},
      ["row 2: bx is 'b'", '100 of 500']),
     (text(cells(lambda t: f'{(t - 5) * 1e9:.4f}')), {'time_unit': 's'}, ['row 2', '-5e+09 s']),
-    (b'PK\x03\x04rest', {}, ['Excel']), (b'', {}, ['no rows']), (text([]), {}, ['no rows']),
+    (b'PK\x03\x04rest', {}, ['ZIP archive']), (b'', {}, ['no rows']), (text([]), {}, ['no rows']),
     (text(cells()), {'columns': ['time=t', 'sensor=id', 'a.x=bx']}, ["'a.x'"]),
     (text(cells()), {'columns': ['time=t', 'time=id', 'x=bx']}, ["'time=id'"])])
 def test_an_ambiguous_table_is_refused_with_the_property_and_the_option(

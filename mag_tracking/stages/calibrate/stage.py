@@ -41,6 +41,7 @@ from mag_tracking.stages.calibrate.restoration import (
     stored_background,
 )
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.stages.health.clocks import ClockSpan, corrected
 from mag_tracking.stages.health.diagnosis import Cause
 from mag_tracking.stages.health.timestamps import TimestampMonitor
 from mag_tracking.stages.survey.settings import SurveySettings
@@ -382,6 +383,17 @@ class Calibrate:
             self._state_of(name)['step'] = step
         for name, quiet in levels.items():
             self._background[name].start_from(quiet.level, quiet.covariance)
+
+    def compare_clocks(self, clocks: Mapping[str, ClockSpan]) -> None:
+        """Report sensors whose clocks differ from those of other sensors as doubtful.
+
+        Parameters
+        ----------
+        clocks : {sensor: ClockSpan}
+            Raw timestamps, and their times of receipt.
+        """
+        self.timestamps.compare_clocks(corrected(clocks, self._network.names,
+                                                 self._network.clock_offset_ns.tolist()))
 
     def resume(self, stored: Mapping[str, StoredBackground]) -> None:
         """Provide stored backgrounds, which are restored at the first reading of each sensor.

@@ -4,6 +4,10 @@ The calibration learns the field of a parked vehicle as the new background (`cal
 The calibrated field then steps to zero, and the event ends although the vehicle has not left. When
 it leaves, the calibrated field steps to the opposite of its field, and back to zero. Both events
 are joined to one.
+
+The detection of a weak field ends before this if the uncertainty of the background exceeds the
+field, and begins again. Such events are joined as well. If another vehicle takes the place, the
+opposite field lasts until then.
 """
 
 from collections.abc import Sequence
@@ -24,6 +28,10 @@ MIN_FIELD_STDS = 3.0
 """Minimum magnitude of this field, in standard deviations of the noise."""
 MAX_DIFFERENCE = 0.15
 """Maximum relative difference between the field of a departure and that of the arrival."""
+MIN_REMAINING = 0.5
+"""Minimum field at the end of an event, relative to its peak, for the vehicle to be present."""
+MAX_GAP_S, MAX_GAP_INTERVALS = 5.0, 3.0
+"""Maximum gap between events of one vehicle [s], to which intervals between readings are added."""
 MIN_APPROACH = 0.3
 """Minimum decrease of the distance to the field without a vehicle, relative to the change of the
 background, for a vehicle to have left."""
@@ -36,6 +44,16 @@ class _Stay(NamedTuple):
 
     arrival: PassEvent
     level: FloatArray
+
+
+class _Held(NamedTuple):
+    """End of an event at which the field of the vehicle remained."""
+
+    event: PassEvent | None
+    """None if the vehicle is one that has left, and whose event is complete."""
+    level: FloatArray
+    """(3,) [T]"""
+    release_ns: int
 
 
 class Stays:
@@ -57,6 +75,7 @@ class Stays:
         self._free_field = free_field
         self.first_ns = NEVER
         self._open: list[_Stay] = []
+        self._held: _Held | None = None
 
     def add(self, event: PassEvent, readings: Readings,
             relearnt: Sequence[RelearntBackground]) -> list[PassEvent]:
@@ -80,18 +99,69 @@ class Stays:
         end_ns = int(readings.stamp_ns[-1])
         change = max((c for c in relearnt if event.onset_ns < c.stamp_ns <= end_ns),
                      key=_size, default=None)
-        if change is None or not event.ended:
-            return [event]
-        is_before = readings.stamp_ns < change.stamp_ns
-        level: FloatArray = np.nan_to_num(readings.field[is_before][-N_READINGS:].mean(axis=0))
+        stamps = readings.stamp_ns
+        # A detection ends with the first quiet reading.
+        fields = readings.field[stamps > event.release_ns][:N_READINGS] if change is None \
+            else readings.field[stamps < change.stamp_ns][-N_READINGS:]
+        level: FloatArray = np.nan_to_num(
+            (fields if len(fields) else readings.field[-1:]).mean(axis=0))
         noise = float(np.nanmax(event.noise_std))
-        tolerance = MAX_DIFFERENCE * np.linalg.norm(level) + MIN_FIELD_STDS * noise
+        tolerance = MAX_DIFFERENCE * float(np.linalg.norm(level)) + MIN_FIELD_STDS * noise
+        held, self._held, out = self._held, None, []
+        if held is not None:
+            gap_ns = MAX_GAP_S * NS + MAX_GAP_INTERVALS * float(np.median(np.diff(stamps)))
+            if event.onset_ns - held.release_ns > gap_ns \
+                    or np.linalg.norm(held.level - level) > tolerance:
+                out += [held.event] if held.event is not None else []
+            elif held.event is not None:
+                event = replace(event, onset_ns=held.event.onset_ns,
+                                energy=held.event.energy + event.energy)
+            else:
+                self._held = held._replace(release_ns=event.release_ns)
+                return []
+        if not event.ended:
+            return [*out, event]
+        if change is None:
+            fields = readings.field[(event.onset_ns <= stamps) & (stamps <= event.release_ns)]
+            return out + self._unchanged(event, np.nan_to_num(fields), level, tolerance)
+        return out + self._changed(event, level, tolerance, noise, change, change is relearnt[0])
+
+    def _unchanged(self, event: PassEvent, fields: FloatArray, level: FloatArray,
+                   tolerance: float) -> list[PassEvent]:
+        """Events completed by an event during which the background did not change.
+
+        `fields` (n, 3) [T] are its readings, and `level` (3,) [T] is the field after its end.
+        """
+        remains = np.linalg.norm(level) > MIN_REMAINING * np.linalg.norm(np.nan_to_num(event.peak))
+        for k in reversed(range(len(self._open))):
+            stay = self._open[k]
+            is_opposite = np.linalg.norm(fields + stay.level, axis=1) <= max(
+                tolerance, MAX_DIFFERENCE * float(np.linalg.norm(stay.level)))
+            if np.mean(is_opposite) > MIN_REMAINING:
+                self._open.pop(k)
+                if remains:
+                    self._held = _Held(None, level, event.release_ns)
+                else:
+                    self._open.append(stay._replace(
+                        arrival=replace(event, onset_ns=event.release_ns)))
+                return [_until(stay, event.onset_ns, True)]
+        if remains:
+            self._held = _Held(event, level, event.release_ns)
+            return []
+        return [event]
+
+    def _changed(self, event: PassEvent, level: FloatArray, tolerance: float, noise: float,
+                 change: RelearntBackground, is_first: bool) -> list[PassEvent]:
+        """Events completed by an event before whose end the background changed.
+
+        `level` (3,) [T] is the field before the change.
+        """
         for k in reversed(range(len(self._open))):
             if np.linalg.norm(self._open[k].level + level) <= tolerance:
                 return [_until(self._open.pop(k), event.onset_ns, True)]
         if change.has_departed or np.linalg.norm(level) < MIN_FIELD_STDS * noise:
             return [event]
-        if change is relearnt[0] and self._has_departed(change):
+        if is_first and self._has_departed(change):
             return [replace(event, onset_ns=self.first_ns, release_ns=event.onset_ns)]
         self._open.append(_Stay(event, level))
         if len(self._open) > MAX_OPEN:
@@ -117,7 +187,9 @@ class Stays:
         list of PassEvent
         """
         stays, self._open = self._open, []
-        return [_until(stay, last_ns, False) for stay in stays]
+        held, self._held = self._held, None
+        return [*([held.event] if held is not None and held.event is not None else []),
+                *(_until(stay, last_ns, False) for stay in stays)]
 
 
 def _size(change: RelearntBackground) -> float:

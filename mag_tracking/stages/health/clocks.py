@@ -1,9 +1,7 @@
 """Findings about the clocks of the timestamps, compared with the times of receipt."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
-
-import numpy as np
 
 from mag_tracking.arrays import IntArray
 from mag_tracking.stages.health.diagnosis import Cause, Finding
@@ -13,10 +11,20 @@ MAX_CLOCK_DIFFERENCE_S = 60.0
 """[s] Difference from the clocks of other sensors above which a clock is reported."""
 MAX_BOOT_DIFFERENCE_S = 1.0
 """[s] The same for clocks that count from the start of their devices."""
+MAX_LATENCY_S = 0.25
+"""[s] Difference that does not change above which it is due to the clocks. Readings that are
+transmitted in packets have larger delays, but these vary."""
+MAX_CLOCK_ERROR_S = 0.1
+"""[s] The same if timestamps are later than their receipt, which no delay explains."""
+MIN_AHEAD_S = 0.02
+"""[s] Timestamps are later than their receipt by more than this."""
+MAX_CHANGE = 0.1
+"""Maximum relative change of a difference that does not change."""
 EARLIEST_DATE_S = 20.0 * 365.25 * 86400.0
 """[s] A clock that shows an earlier date (1990) than this counts from the start of its device."""
 MIN_SPAN_S = 0.2
-"""[s] Minimum time of receipt over which the unit of the timestamps is checked."""
+"""[s] Minimum time of receipt over which the unit of the timestamps, or the change of a difference,
+is known."""
 UNITS = ((1e3, 'milliseconds'), (1e6, 'microseconds'), (1e9, 'nanoseconds'))
 """Factor by which the timestamps advance too fast if their seconds have another unit."""
 MAX_RATIO_ERROR = 0.1
@@ -66,6 +74,44 @@ class ClockSpan(NamedTuple):
         return (self.last_received_ns - self.last_ns) / NS
 
     @property
+    def first_delay_s(self) -> float:
+        """Delay from the first timestamp to its receipt [s]."""
+        return (self.first_received_ns - self.first_ns) / NS
+
+    def corrected(self, offset_ns: int) -> 'ClockSpan':
+        """Subtract the offset of the clock from the timestamps.
+
+        Parameters
+        ----------
+        offset_ns : int, ns
+
+        Returns
+        -------
+        ClockSpan
+        """
+        return self._replace(first_ns=self.first_ns - offset_ns, last_ns=self.last_ns - offset_ns)
+
+    def ahead_s(self, reference: 'ClockSpan') -> tuple[float, bool]:
+        """Difference from another clock [s], and whether it is too large for delays.
+
+        Parameters
+        ----------
+        reference : ClockSpan
+
+        Returns
+        -------
+        tuple of (float, bool)
+            Positive if this clock is ahead.
+        """
+        ahead_s = reference.delay_s - self.delay_s
+        first_s = reference.first_delay_s - self.first_delay_s
+        if abs(first_s - ahead_s) > MAX_CHANGE * abs(ahead_s) \
+                or self.last_received_ns - self.first_received_ns < MIN_SPAN_S * NS:
+            return ahead_s, abs(ahead_s) > MAX_CLOCK_DIFFERENCE_S
+        is_ahead = min(self.delay_s, reference.delay_s) < -MIN_AHEAD_S
+        return ahead_s, abs(ahead_s) > (MAX_CLOCK_ERROR_S if is_ahead else MAX_LATENCY_S)
+
+    @property
     def is_since_boot(self) -> bool:
         """Whether the timestamps count from the start of the device."""
         return 0 < self.last_ns < EARLIEST_DATE_S * NS < self.last_received_ns
@@ -81,6 +127,44 @@ class ClockSpan(NamedTuple):
                      if abs(ratio / factor - 1.0) < MAX_RATIO_ERROR), None)
 
 
+def corrected(clocks: Mapping[str, ClockSpan], names: Sequence[str],
+              offsets_ns: Sequence[int]) -> dict[str, ClockSpan]:
+    """Correct the clocks of the sensors of a network.
+
+    Parameters
+    ----------
+    clocks : {sensor: ClockSpan}
+        Other sensors are omitted.
+    names : sequence of str
+        Sensors of the network.
+    offsets_ns : sequence of int, ns
+        Offset of the clock of each sensor.
+
+    Returns
+    -------
+    {sensor: ClockSpan}
+    """
+    return {name: clocks[name].corrected(ns) for name, ns in zip(names, offsets_ns, strict=True)
+            if name in clocks}
+
+
+def reference_of(clocks: Mapping[str, ClockSpan]) -> ClockSpan:
+    """Clock nearest to that of the host.
+
+    In a replay, all clocks differ from that of the host by about the same time.
+
+    Parameters
+    ----------
+    clocks : {sensor: ClockSpan}
+        At least one.
+
+    Returns
+    -------
+    ClockSpan
+    """
+    return min(clocks.values(), key=lambda clock: abs(clock.delay_s))
+
+
 def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
     """Report wrong units of timestamps, and clocks that differ from those of other sensors.
 
@@ -92,16 +176,15 @@ def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
     ------
     Finding
     """
-    # The clock nearest to the host clock is the reference. In a replay, all clocks differ from the
-    # host clock by about the same time.
-    reference_s = min((c.delay_s for c in clocks.values()), key=abs, default=np.nan)
+    reference = reference_of(clocks) if clocks else None
     for name, clock in clocks.items():
         if clock.unit is not None:
             yield Finding(True, name, f'the seconds of its timestamps are {clock.unit}',
                           'correct the unit of the timestamps in the driver',
                           Cause.MILLISECOND_STAMPS)
             continue
-        ahead_s = reference_s - clock.delay_s
+        assert reference is not None
+        ahead_s, differs = clock.ahead_s(reference)
         if clock.is_since_boot:
             differs = abs(ahead_s) > MAX_BOOT_DIFFERENCE_S
             yield Finding(
@@ -111,7 +194,7 @@ def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
                     if differs else ''),
                 'let the driver use the time of arrival, or add the time of the start',
                 Cause.BOOT_STAMPS)
-        elif abs(ahead_s) > MAX_CLOCK_DIFFERENCE_S:
+        elif differs:
             yield Finding(True, name, f'its timestamps differ by {ahead_s:+.4g} s from '
                           'the timestamps of other sensors', 'synchronise its clock (chrony, PTP); '
                           'knocks correct only offsets below survey.max_clock_offset_s',

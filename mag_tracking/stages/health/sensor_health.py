@@ -156,6 +156,7 @@ class SensorHealth:
             self._counts[axis] += count
         self._counts['without any axis'] += int(missing.all(axis=1).sum())
         kept = self.faults.without(np.append(self._latest, fields, axis=0))[-n:]
+        kept = np.where(np.isinf(kept), np.nan, kept)
         self._latest = fields[-1:].copy()
         is_kept = ~np.isnan(kept).all(axis=1) | missing.all(axis=1)
         self._field_stamps = np.append(self._field_stamps, stamps[is_kept])[-WINDOW:]
@@ -192,8 +193,7 @@ class SensorHealth:
             latest_ns = timestamps.latest_interval_s(self._stamps) * NS
             is_other_rate = (latest_ns > GAP_RATIO * self._interval_ns) \
                 & (np.abs(intervals - latest_ns) < 0.2 * latest_ns)
-            gaps = (intervals > GAP_RATIO * self._interval_ns) & (intervals < 3600 * NS) \
-                & ~is_step & ~is_other_rate
+            gaps = self._are_gaps(intervals) & (intervals < 3600 * NS) & ~is_step & ~is_other_rate
             self._counts['lost'] += int(np.sum(np.round(intervals[gaps] / self._interval_ns) - 1))
         forward = np.diff(self._stamps)
         forward = forward[forward > 0]
@@ -201,6 +201,17 @@ class SensorHealth:
             self._interval_ns = quantiles(forward, 0.5)[0]
             self._jitter = quantiles(np.abs(forward - self._interval_ns), 0.5)[0] \
                 / self._interval_ns
+
+    def _are_gaps(self, intervals: IntArray) -> BoolArray:
+        """Whether readings are missing in each of the latest intervals [ns], (n,).
+
+        The adjacent intervals compensate for a timestamp that is only late.
+        """
+        n, dt = len(intervals), self._interval_ns
+        nearby = np.concatenate([[dt], np.diff(self._stamps), [dt]])[-n - 2:]
+        spans = nearby[:-2] + intervals + nearby[2:]
+        are_gaps: BoolArray = (intervals > GAP_RATIO * dt) & (spans > (2.0 + GAP_RATIO) * dt)
+        return are_gaps
 
     def _check_fields(self, n: int) -> None:
         """Count the faults in the fields of the `n` latest readings."""

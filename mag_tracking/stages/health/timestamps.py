@@ -1,5 +1,7 @@
 """Examination of the timestamps of all sensors, and findings about their faults."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
@@ -12,6 +14,7 @@ from mag_tracking.calibration.timestamps import (
     latest_interval_s,
     timestamp_fault,
 )
+from mag_tracking.stages.health.clocks import ClockSpan, reference_of
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.stages.health.reading_buffer import ReadingBuffer
 
@@ -73,6 +76,7 @@ class TimestampMonitor:
         self._worst: dict[int, TimestampFault] = {}
         self._longest_s: FloatArray = np.zeros(n)
         self._doubtful_times: list[DoubtfulTimes] = [()] * n
+        self._differing: set[str] = set()
 
     def add(self, rows: IntArray, stamps: IntArray, fields: FloatArray) -> None:
         """Add readings.
@@ -109,6 +113,17 @@ class TimestampMonitor:
         return timestamp_fault(np.append(self._stamps[j], stamps)[-WINDOW:],
                                np.append(self._fields[j], fields, axis=0)[-WINDOW:])
 
+    def compare_clocks(self, clocks: Mapping[str, ClockSpan]) -> None:
+        """Mark all timestamps of sensors whose clocks differ from those of other sensors.
+
+        Parameters
+        ----------
+        clocks : {sensor: ClockSpan}
+            Latest clocks, which replace those of the previous call.
+        """
+        self._differing = {name for name, clock in clocks.items()
+                           if clock.ahead_s(reference_of(clocks))[1]}
+
     def doubtful_times(self) -> dict[str, DoubtfulTimes]:
         """Intervals in which timestamps were wrong by more than `MAX_ERROR_S`.
 
@@ -117,8 +132,9 @@ class TimestampMonitor:
         dict of str to DoubtfulTimes
             Of each sensor that has any.
         """
-        return {name: self._doubtful_times[j] for name, j in self._index.items()
-                if self._doubtful_times[j]}
+        out = {name: self._doubtful_times[j] for name, j in self._index.items()
+               if self._doubtful_times[j]}
+        return {**out, **dict.fromkeys(self._differing, ((0, None),))}
 
     def worst_fault(self, sensor: str) -> TimestampFault | None:
         """Return the fault of a sensor with the largest error so far.

@@ -48,7 +48,7 @@ MEANINGS = {
     CONTRADICTS_EARTH_FIELD: 'a sensor contradicts the Earth\'s field: its axes, its gain or its '
                              'orientation in the network file are wrong',
     WRONG_TIMESTAMPS: 'the timestamps of a sensor are wrong by more than 20 ms: they are coarse, '
-                      'or those of packets or bursts',
+                      'those of packets or bursts, or those of another clock',
     SENSORS_CONTRADICT: 'the sensors contradict each other, and no majority agrees',
     MISFIT: 'the field does not fit the best hypothesis',
     CONTRADICTION: 'the probability of the field given the best hypothesis is below 1e-5',

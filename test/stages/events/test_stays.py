@@ -83,3 +83,16 @@ def test_a_slow_sensor_shows_no_direction(rate):
     events = events_of(rate, 3600, (600, 1800, 1.0), (2400, 2460, 1.0))
     assert len(events) == 2
     assert all(e.left_to_right == 0.5 and np.isinf(e.closest_std) for e in events)
+
+
+def test_another_vehicle_takes_the_place():
+    events = events_of(0.1, 9000, (3600, 4800, 1.0), (4830, 6000, 1.0))
+    np.testing.assert_allclose([times_of(e) for e in events],
+                               [(3600, 4800), (4830, 6000)], atol=20.0)
+
+
+def test_a_field_below_the_uncertainty_of_the_background_is_one_stay():
+    """After 480 s the background may have drifted by more than a third of the field."""
+    events = events_of(1 / 30, 12 * 3600, (14400, 18000, 0.08), (28800, 29700, 0.08))
+    np.testing.assert_allclose([times_of(e) for e in events],
+                               [(14400, 18000), (28800, 29700)], atol=60.0)
