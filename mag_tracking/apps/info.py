@@ -41,8 +41,10 @@ class Timing:
 
     def __init__(self) -> None:
         self.n_messages = self.n_backward = self.n_unstamped = 0
+        # Earliest and latest log time and timestamp; latest message.
         self._log: list[int] = []
         self._times: list[int] = []
+        self._last: IntArray = np.zeros(0, dtype=np.int64)
         self._longest = self._longest_begin = self._n_steps = 0
         # Histogram of the intervals: number and sum [ns] by logarithm.
         self._bins: dict[int, tuple[int, int]] = {}
@@ -65,9 +67,10 @@ class Timing:
             times_ns = log_times_ns
         else:
             times_ns, log_times_ns = times_ns[~is_missing], log_times_ns[~is_missing]
-        steps = np.diff(np.concatenate((self._times[1:], times_ns)).astype(np.int64))
+        steps = np.diff(np.concatenate((self._last, times_ns)))
+        self._last = times_ns[-1:].copy()
         for span, values in ((self._log, log_times_ns), (self._times, times_ns)):
-            span[:] = [span[0] if span else int(values[0]), int(values[-1])]
+            span[:] = [min([*span[:1], int(values.min())]), max([*span[1:], int(values.max())])]
         self._n_steps += len(steps)
         self.n_backward += int(np.sum(steps < 0))
         if len(steps) and steps.max() > self._longest:
@@ -85,12 +88,12 @@ class Timing:
 
     @property
     def span_s(self) -> float:
-        """Time from the first to the last message [s]; 0 without messages."""
+        """Time from the earliest to the latest message [s]; 0 without messages."""
         return (self._times[-1] - self._times[0]) / NS if self._times else 0.0
 
     @property
     def log_span_s(self) -> float:
-        """Log time from the first to the last message [s]; 0 without messages."""
+        """Log time from the earliest to the latest message [s]; 0 without messages."""
         return (self._log[-1] - self._log[0]) / NS if self._log else 0.0
 
     @property

@@ -125,7 +125,7 @@ def test_iron_near_a_sensor_is_an_offset_or_unexplained(iron, misleads):
     assert ('not explained by' in str(d)) == misleads
 
 
-@pytest.mark.parametrize('gain', [0.3, 0.533, 0.7, 1.6, 3.0])
+@pytest.mark.parametrize('gain', [0.001, 0.01, 0.1, 0.3, 0.533, 0.7, 1.6, 3.0, 10.0])
 @pytest.mark.parametrize('seed', range(3))
 def test_a_wrong_gain_is_identified(gain, seed):
     fields = correct_fields(np.random.default_rng(seed))

@@ -25,8 +25,12 @@ EARLIEST_DATE_S = 20.0 * 365.25 * 86400.0
 MIN_SPAN_S = 0.2
 """[s] Minimum time of receipt over which the unit of the timestamps, or the change of a difference,
 is known."""
-UNITS = ((1e3, 'milliseconds'), (1e6, 'microseconds'), (1e9, 'nanoseconds'))
-"""Factor by which the timestamps advance too fast if their seconds have another unit."""
+UNITS = ((1e3, 'the seconds of its timestamps are milliseconds'),
+         (1e6, 'the seconds of its timestamps are microseconds'),
+         (1e9, 'the seconds of its timestamps are nanoseconds'),
+         (1e-3, 'the nanoseconds of its timestamps are microseconds'),
+         (1e-6, 'the nanoseconds of its timestamps are milliseconds'))
+"""Factor by which the timestamps advance too fast, and the reason."""
 MAX_RATIO_ERROR = 0.1
 """Maximum relative error of this factor."""
 
@@ -117,13 +121,13 @@ class ClockSpan(NamedTuple):
         return 0 < self.last_ns < EARLIEST_DATE_S * NS < self.last_received_ns
 
     @property
-    def unit(self) -> str | None:
-        """Unit of the seconds of the timestamps; None if they are seconds, or unknown."""
+    def wrong_unit(self) -> str | None:
+        """Description of a wrong unit of the timestamps; None if it is right, or unknown."""
         received_s = (self.last_received_ns - self.first_received_ns) / NS
         if received_s < MIN_SPAN_S:
             return None
         ratio = (self.last_ns - self.first_ns) / NS / received_s
-        return next((name for factor, name in UNITS
+        return next((text for factor, text in UNITS
                      if abs(ratio / factor - 1.0) < MAX_RATIO_ERROR), None)
 
 
@@ -178,8 +182,8 @@ def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
     """
     reference = reference_of(clocks) if clocks else None
     for name, clock in clocks.items():
-        if clock.unit is not None:
-            yield Finding(True, name, f'the seconds of its timestamps are {clock.unit}',
+        if clock.wrong_unit is not None:
+            yield Finding(True, name, clock.wrong_unit,
                           'correct the unit of the timestamps in the driver',
                           Cause.MILLISECOND_STAMPS)
             continue

@@ -128,6 +128,24 @@ def test_another_rate_is_no_loss():
     assert health.counts['lost'] < 0.01 * health.counts['readings']
 
 
+@pytest.mark.parametrize('lost', [0.0, 0.05])
+def test_jitter_is_no_loss(lost):
+    """The timestamps of a computer that is busy: in order, with a deviation of a fifth."""
+    rng = np.random.default_rng(3)
+    stamps = np.sort(regular(200.0, 3000) + rng.normal(0.0, 1e6, 3000).astype(np.int64))
+    stamps = stamps[rng.random(len(stamps)) >= lost]
+    assert health_of(stamps).counts['lost'] == pytest.approx(3000 * lost, abs=30)
+
+
+def test_infinite_readings_are_neither_spikes_nor_saturated():
+    fields = FIELDS[:1400].copy()
+    fields[::9] = np.inf
+    health = SensorHealth()
+    for stamp, field in zip(regular(100.0, 1400).tolist(), fields, strict=True):
+        health.add(stamp, field)
+    assert health.counts['spikes'] == health.counts['saturated'] == 0
+
+
 def test_identical_readings_of_a_slow_sensor_are_not_stuck():
     """At 0.1 Hz, two identical readings in a row last for ten seconds."""
     health, fields = SensorHealth(), 1e-8 * np.round(FIELDS[:400] / 1e-8)
@@ -158,6 +176,23 @@ def test_clocks_since_the_start_of_the_devices_are_compared(other_s, serious):
     found = findings_of(mag_1=span(12.0, 26.0), mag_2=span(other_s, other_s + 14.0))
     assert {f.cause for f in found.values()} == {Cause.BOOT_STAMPS}
     assert any(f.serious for f in found.values()) == serious
+
+
+@pytest.mark.parametrize('ahead_s, differs', [
+    (0.3, True), (0.15, True), (0.05, False), (-0.15, False), (-0.3, True), (3600.0, True)])
+def test_a_steady_difference_of_clocks_is_named(ahead_s, differs):
+    """A delay of 0.15 s is possible, but not a receipt before the measurement."""
+    found = findings_of(mag_1=span(EPOCH_NS / NS - 0.001, EPOCH_NS / NS + 13.999),
+                        mag_2=span(EPOCH_NS / NS + ahead_s, EPOCH_NS / NS + 14.0 + ahead_s))
+    assert [(f.subject, f.cause) for f in found.values()] == \
+        [('mag_2', Cause.CLOCK_DIFFERS)] * differs
+
+
+def test_a_delay_that_varies_is_no_difference_of_clocks():
+    """Readings of a packet arrive together."""
+    found = findings_of(mag_1=span(EPOCH_NS / NS, EPOCH_NS / NS + 14.0),
+                        mag_2=span(EPOCH_NS / NS - 5.0, EPOCH_NS / NS + 13.5))
+    assert not found
 
 
 def test_a_clock_without_a_time_of_receipt_is_unknown():
