@@ -117,9 +117,12 @@ def read_table(path: Path, separator: str = '', header: int | None = None,
              *(['line of units'] if units else [])]
     table = Table(path, names, units, 0 if header_line is None else header_line + 1, [], separator,
                   notes)
-    n_preamble = len(above) - (header_line is not None) - bool(units)
+    # Lines between header and rows are no preamble: a logger reports faults of its sensor there.
+    between = [k for k in above if header_line is not None and k > header_line]
+    n_preamble = len(above) - len(between) - (header_line is not None or bool(units))
     table.ignored.update({'preamble line': n_preamble} if n_preamble > 0 else {})
-    _read_rows(table, lines, [k for k in numbers if k >= first], n)
+    between = [k for k in between if _header_cells(lines[k], separator) != units]
+    _read_rows(table, lines, [*between, *(k for k in numbers if k >= first)], n)
     return table
 
 
@@ -157,6 +160,10 @@ def _header(lines: list[str], above: list[int], separator: str, n: int, header: 
                   ] if header is None else [k for k in above if k >= header - 1]
     if header == 0 or not candidates:
         return None, [], None
+    # Messages of the logger may follow the header.
+    last = max((k for k in candidates if len(_header_cells(lines[k], separator)) == n),
+               default=candidates[-1])
+    candidates = [k for k in candidates if k <= last]
     cells = _header_cells(lines[candidates[-1]], separator)
     if header is not None and len(candidates) == 1:
         return cells, [], candidates[0]

@@ -231,6 +231,16 @@ def test_unusable_rows_are_counted_with_the_first_of_them(tmp_path):
         assert fact in notes
 
 
+@pytest.mark.parametrize('units', [[], [['s', '', 'uT', 'uT', 'uT']]])
+def test_messages_between_header_and_rows_are_unusable_rows(units, tmp_path):
+    content = text([*units, ['ERROR: I2C timeout'], ['Waiting', 'retry 1'], *cells()])
+    table = read(tmp_path, content, unit='' if units else 'uT')
+    check(table)
+    notes = '; '.join(table.notes)
+    assert 'header in line 1' in notes and f'2 unusable rows, first row {2 + len(units)}' in notes
+    assert 'ignored' not in notes
+
+
 def test_readings_of_a_sensor_are_ignored_as_stated(tmp_path):
     table = read(tmp_path, text(cells()), columns=COLUMNS, unit='uT', sensors={'2': '-'})
     check(table, sensors=(0,))
