@@ -224,7 +224,9 @@ def _read_rows(table: Table, lines: list[str], numbers: list[int], n: int) -> No
         cells = split_line(line, table.separator)
         if len(cells) > n and not any(cells[n:]):
             del cells[n:]
-        if len(cells) == n and cells != header and cells != table.units:
+        if k == len(lines) - 1 and len(cells) == n and _is_cut(cells[-1], table.rows):
+            table.ignored['incomplete last row'] += 1
+        elif len(cells) == n and cells != header and cells != table.units:
             table.rows.append((k + 1, cells))
         elif header and cells[:len(header)] == header:
             table.ignored['repeated header line'] += 1
@@ -234,3 +236,14 @@ def _read_rows(table: Table, lines: list[str], numbers: list[int], n: int) -> No
             table.ignored['incomplete last row'] += 1
         else:
             table.bad.append((k + 1, f'{quantity(len(cells), "cell")}, expected {n}'))
+
+
+def _is_cut(cell: str, rows: Sequence[tuple[int, list[str]]]) -> bool:
+    """Whether the last cell of a file has fewer decimals than all other cells of its column."""
+    others = [cells[-1] for _, cells in rows if is_missing(cells[-1]) == is_missing(cell)]
+    return bool(rows) and _n_decimals(cell) < min(map(_n_decimals, others), default=1)
+
+
+def _n_decimals(cell: str) -> int:
+    """Number of characters after the first mark of a number, exponent included."""
+    return len(cell.replace(',', '.').partition('.')[2])

@@ -241,6 +241,19 @@ def test_messages_between_header_and_rows_are_unusable_rows(units, tmp_path):
     assert 'ignored' not in notes
 
 
+@pytest.mark.parametrize('number', [
+    lambda b: f'{b:.3f}', lambda b: f'{b:.4e}', lambda b: f'"{b:.3f}"'])
+def test_a_number_that_the_end_of_the_file_cuts_is_not_read(number, tmp_path):
+    content = text(cells(number=number))[:-1]
+    table = read(tmp_path, content, columns=COLUMNS, unit='uT')
+    check(table)
+    assert not any('ignored' in note for note in table.notes)
+    for n_cut in (2, 4, 6):
+        table = read(tmp_path, content[:-n_cut], columns=COLUMNS, unit='uT')
+        assert len(table.sessions[0]) == 2 * N - 1, content[-20:-n_cut]
+        assert 'ignored: 1 incomplete last row' in table.notes
+
+
 def test_readings_of_a_sensor_are_ignored_as_stated(tmp_path):
     table = read(tmp_path, text(cells()), columns=COLUMNS, unit='uT', sensors={'2': '-'})
     check(table, sensors=(0,))
