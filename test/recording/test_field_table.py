@@ -86,6 +86,8 @@ LAYOUTS = {
         .encode('latin-1'), {'unit': '', 'columns': ()}),
     'line of units': (text([['ms', '', 'nT', 'nT', 'nT'], *cells(
         lambda t: f'{1000 * t:.1f}', lambda b: f'{1000 * b:.0f}')]), {'unit': ''}),
+    'gamma': (text(cells(number=lambda b: f'{1000 * b:.0f}'), [
+        't', 'id', 'x (gamma)', 'y (Gammas)', 'z [\u03b3]']), {'unit': '', 'columns': ()}),
     'German header': (text(cells(comma, thousandths), [
         'Zeit (s)', 'id', *(f'Magnetfeld {a} (µT)' for a in 'xyz')], '\t'),
         {'unit': '', 'columns': ()}),
@@ -301,6 +303,8 @@ def milliseconds(t):
     (text(cells(comma, comma)), {}, ['5 cells', 'has 9', 'decimal commas']),
     (text(cells(lambda t: f'{t + 1:.3f}'.replace('.', ','), lambda b: f'{60 + b:.3f}'.replace(
         '.', ',')), separator='\t'), {}, ["'1,000'", '--decimal']),
+    (text(cells(), ['t', 'id', 'x (foo)', 'y (foo)', 'z (foo)']), {'unit': '', 'columns': ()},
+     ['the unit of x (foo) is not one of T, mT', '--unit', '--columns']),
     (text(cells(), None), {}, ['no header', 'time=1', '--header']),
     (text(cells(sensors=('left side', '2'))), {}, ['left side', '--sensors']),
     (text(cells()), {'unit': ''}, ['--unit', 'bx']),
