@@ -25,7 +25,8 @@ TIME_UNITS = {'s': NS, 'ms': 10**6, 'us': 10**3, 'ns': 1, 'min': 60 * NS, 'h': 3
 MAX_SCALE = 100.0
 """[T per count] A larger number is meant as counts per unit."""
 _FIELD_NAMES = {
-    'T': 't tesla teslas', 'mT': 'mt millitesla', 'uT': 'ut mut microtesla', 'nT': 'nt nanotesla',
+    'T': 't tesla teslas', 'mT': 'mt millitesla', 'uT': 'ut mut microtesla',
+    'nT': 'nt nanotesla gamma gammas \u03b3',
     'G': 'g ga gs gauss', 'mG': 'mg mga mgs mgauss milligauss'}
 _TIME_NAMES = {
     's': 's sec secs second seconds', 'ms': 'ms msec msecs milli millis millisecond milliseconds',

@@ -20,7 +20,10 @@ from mag_tracking.units import NS
 BATCH_SIZE = 4096
 """Number of messages that are decoded at once."""
 GAP_INTERVALS, MIN_GAP_S = 10.0, 1.0
-"""A gap is longer than this number of median intervals, and than this time [s]."""
+"""A gap is longer than this number of median intervals, and, if messages come in bursts, than this
+time [s]."""
+MAX_GAP_FRACTION = 0.01
+"""Fraction of intervals longer than `GAP_INTERVALS` above which messages come in bursts."""
 _BINS_PER_OCTAVE = 16
 """Resolution of the histogram of intervals."""
 _MAX_CLOCK_DIFFERENCE = 0.1
@@ -109,8 +112,11 @@ class Timing:
         bins = sorted(self._bins)
         cumulated = np.cumsum([self._bins[k][0] for k in bins])
         median_bin = bins[int(np.searchsorted(cumulated, (cumulated[-1] + 1) // 2))] if bins else 0
-        longest = max(GAP_INTERVALS * 2.0 ** (median_bin / _BINS_PER_OCTAVE), MIN_GAP_S * NS)
-        return int(np.log2(longest) * _BINS_PER_OCTAVE)
+        longest_bin = median_bin + int(np.log2(GAP_INTERVALS) * _BINS_PER_OCTAVE)
+        n_longer = sum(n for k, (n, _) in self._bins.items() if k > longest_bin)
+        if bins and n_longer > MAX_GAP_FRACTION * cumulated[-1]:
+            return max(longest_bin, int(np.log2(MIN_GAP_S * NS) * _BINS_PER_OCTAVE))
+        return longest_bin
 
     def describe(self) -> str:
         """Format rate, gaps and steps backward.
@@ -139,7 +145,7 @@ class Timing:
 
 
 def time_topics(recording: Recording, progress: Callable[[int], object] | None = None
-                ) -> tuple[dict[Source, Timing], 'Counter[str]']:
+                ) -> tuple[dict[Source, Timing], 'Counter[str]', 'Counter[str]']:
     """Compute the statistics of the times of all topics.
 
     Parameters
@@ -154,17 +160,22 @@ def time_topics(recording: Recording, progress: Callable[[int], object] | None =
         In order of appearance. Sensors that share a topic are separate.
     faults : Counter
         Number of readings that cannot be decoded, by cause.
+    counts : Counter
+        Number of messages that were read, by topic.
     """
     timings: dict[Source, Timing] = {}
     faults: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     for block in recording.blocks(progress=progress):
+        for channel, n in zip(*np.unique(block.channel, return_counts=True), strict=True):
+            counts[block.kinds[int(channel)].topic] += int(n)
         for first in range(0, len(block), BATCH_SIZE):
             for source, times, log_times in _times_of(
                     block.part(slice(first, first + BATCH_SIZE)), faults):
                 timings.setdefault(source, Timing()).add(times, log_times)
         # The bytes of this chunk are freed before the next chunk is read.
         del block
-    return timings, faults
+    return timings, faults, counts
 
 
 def _times_of(block: MessageBlock, faults: 'Counter[str]'

@@ -34,18 +34,17 @@ def _info(args: argparse.Namespace) -> int:
     recording = Recording(args.recording)
     with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
               disable=None) as bar:
-        timings, faults = time_topics(recording, bar.update)
-    n_messages = sum(recording.message_counts.values()) or sum(
-        timing.n_messages for timing in timings.values())
-    print(f'{recording.path}: {recording.size / 1e6:.2f} MB, {quantity(n_messages, "message")}')
+        timings, faults, counts = time_topics(recording, bar.update)
+    print(f'{recording.path}: {recording.size / 1e6:.2f} MB, '
+          f'{quantity(counts.total(), "message")}')
     _print_duration(recording, list(timings.values()))
-    if not n_messages:
+    if not counts:
         print('  warning: the recording contains no messages')
     by_topic: dict[str, dict[str, Timing]] = {}
     for source, timing in timings.items():
         by_topic.setdefault(source.topic, {})[source.sensor] = timing
     for topic in sorted(recording.types):
-        _print_topic(topic, recording, by_topic.get(topic, {}))
+        _print_topic(topic, recording.types[topic], counts[topic], by_topic.get(topic, {}))
     for cause, n in {**faults, **recording.losses}.items():
         print(f'  warning: {cause}: {n}')
     if args.network:
@@ -64,11 +63,10 @@ def _print_duration(recording: Recording, timings: Sequence[Timing]) -> None:
         print(f'  {(recording.end_ns - recording.start_ns) / 1e9:.2f} s')
 
 
-def _print_topic(topic: str, recording: Recording, timings: Mapping[str, Timing]) -> None:
-    """Print a topic with its rate and gaps, by sensor if there are several."""
-    n = recording.message_counts[topic] or sum(t.n_messages for t in timings.values())
+def _print_topic(topic: str, kind: str, n: int, timings: Mapping[str, Timing]) -> None:
+    """Print a topic of `n` messages with rate and gaps, by sensor if there are several."""
     rate = next(iter(timings.values())).describe() if len(timings) == 1 else ''
-    print(f'  {topic}  {recording.types[topic]}  {n}' + (f'  {rate}' if rate else ''))
+    print(f'  {topic}  {kind}  {n}' + (f'  {rate}' if rate else ''))
     if len(timings) > 1:
         for sensor, timing in timings.items():
             print(f'    {sensor or "no frame_id"}  {timing.n_messages}  {timing.describe()}')

@@ -10,8 +10,8 @@ _REPAIR_HELP = '''
 A recording that was interrupted (power failure, crash, full disk) has no index.
 `mag-tracking replay` can still read it; rosbag2 and other tools need the index.
 This command writes the index and a new metadata.yaml, and keeps the messages unchanged.
-The complete messages of a chunk that was cut are written as a new chunk. If nothing can be
-recovered, the exit status is 1.
+The complete messages of a chunk that was cut are written as a new chunk. Damaged chunks cannot be
+restored. If nothing can be recovered, the exit status is 1.
 
 example:
   mag-tracking repair night

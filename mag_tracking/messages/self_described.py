@@ -2,7 +2,7 @@
 
 Such messages are written by Foxglove's tools and by programs without ROS. A message is treated as
 a magnetic field if it has `magnetic_field` with x, y and z [T], and a time in `header.stamp`,
-`stamp` or `timestamp`.
+`stamp` or `timestamp`: seconds and nanoseconds, or one number since 1970.
 """
 
 import functools
@@ -16,6 +16,7 @@ from mcap.records import Schema
 
 from mag_tracking.messages.shapes import MessageDict
 from mag_tracking.messages.types import MAGNETIC_FIELD, encoder
+from mag_tracking.units import NS, TIME_UNITS, unit_since_1970
 
 _STAMPS = ('stamp', 'timestamp')
 _SECONDS = ('sec', 'secs', 'seconds')
@@ -132,11 +133,30 @@ def _field(message: Any) -> MessageDict:
     if len(covariance) not in (0, 9):
         raise ValueError(f'magnetic_field_covariance has {len(covariance)} elements; expected 9')
     return {
-        'header': {'stamp': {'sec': _time_part(stamp, _SECONDS, 2**31),
-                             'nanosec': _time_part(stamp, _NANOSECONDS, 10**9)},
+        'header': {'stamp': _time(stamp),
                    'frame_id': str(getattr(header, 'frame_id', ''))},
         'magnetic_field': {axis: _axis_value(field, axis) for axis in 'xyz'},
         'magnetic_field_covariance': covariance or [0.0] * 9}
+
+
+def _number(value: Any) -> Any:
+    """Convert text of digits, as which the JSON of protobuf writes 64-bit integers."""
+    return int(value) if isinstance(value, str) and value.isdecimal() else value
+
+
+def _time(stamp: Any) -> dict[str, int]:
+    """Convert a time to builtin_interfaces/Time; raises ValueError if it is not valid."""
+    stamp = _number(stamp)
+    if isinstance(stamp, str):
+        raise MissingPartError('sec in its time, which is text')
+    if isinstance(stamp, int | float):
+        unit = unit_since_1970(stamp)
+        if unit is None:
+            raise MissingPartError('sec in its time, which is a number not measured from 1970')
+        sec, nanosec = divmod(round(stamp * TIME_UNITS[unit]), NS)
+        return {'sec': sec, 'nanosec': nanosec}
+    return {'sec': _time_part(stamp, _SECONDS, 2**31),
+            'nanosec': _time_part(stamp, _NANOSECONDS, NS)}
 
 
 def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
@@ -145,7 +165,7 @@ def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
     Raises ValueError if there is no such field, or its value is not in [0, limit).
     """
     for name in names:
-        value = getattr(stamp, name, None)
+        value = _number(getattr(stamp, name, None))
         if isinstance(value, int) and not isinstance(value, bool):
             if not 0 <= value < limit:
                 raise ValueError(f'timestamp: {name} is out of range: {str(value)[:20]}')
@@ -161,5 +181,5 @@ def _axis_value(field: Any, axis: str) -> float:
     if value is None:
         return float('nan')
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f'magnetic_field.{axis} is not a number: {value!r}')
+        raise MissingPartError(f'a number in magnetic_field.{axis}')
     return float(value)

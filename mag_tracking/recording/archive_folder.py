@@ -26,7 +26,13 @@ from typing import Any
 from mag_tracking.errors import OutputError
 from mag_tracking.files import output_folder, replace_text
 from mag_tracking.recording.archive_tables import TABLES
-from mag_tracking.recording.parquet_table import VERSION, TableWriter, check_row, import_pyarrow
+from mag_tracking.recording.parquet_table import (
+    VERSION,
+    TableWriter,
+    check_row,
+    import_pyarrow,
+    is_complete,
+)
 from mag_tracking.units import NS
 
 MAX_STEM_BYTES = 100
@@ -109,6 +115,12 @@ class ArchiveFolder:
             self._check_head({'schema': VERSION, **head})
             for name in (_DONE, _WORK):
                 output_folder(self.path / name)
+            # One pass over all tables takes less time than a search for those of each recording.
+            self._damaged = {table.stem: table for table in self.path.glob('*/date=*/*.parquet')
+                             if not is_complete(table)}
+        except OSError as error:
+            self.close()
+            raise OutputError(f'cannot read {self.path}: {error.strerror}') from error
         except OutputError:
             self.close()
             raise
@@ -173,11 +185,14 @@ class ArchiveFolder:
         Raises
         ------
         OutputError
-            If the summary is damaged.
+            If the summary or a table is damaged.
         """
-        path = self.path / _DONE / f'{recording_key(recording)}.json'
+        name = recording_key(recording)
+        path = self.path / _DONE / f'{name}.json'
         if not path.exists():
             return None
+        if name in self._damaged:
+            raise OutputError(f'{self._damaged[name]} is damaged')
         summary = _read_summary(path)
         try:
             return summary if summary.get('state') == recording_state(recording) else None

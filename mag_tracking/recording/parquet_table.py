@@ -22,6 +22,9 @@ comparable."""
 MAX_BUFFERED_ROWS = 5000
 """Maximum number of rows that are buffered in memory."""
 
+_MAGIC = b'PAR1'
+"""First and last bytes of a file."""
+
 
 class Column(NamedTuple):
     """Description of a column of a table."""
@@ -123,6 +126,23 @@ def schema_of(columns: Iterable[Column]) -> 'pa.Schema':
              't': pa.timestamp('ns'), 'C': pa.list_(pa.float64(), 36)}
     return pa.schema([pa.field(c.name, kinds[c.kind], metadata={'unit': c.unit, 'is': c.meaning})
                       for c in columns], metadata={'mag_tracking.schema': str(VERSION)})
+
+
+def is_complete(path: Path) -> bool:
+    """Whether a file begins and ends as a Parquet file; its content is not read.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    bool
+    """
+    with open(path, 'rb') as stream:
+        begin = stream.read(len(_MAGIC))
+        stream.seek(max(0, path.stat().st_size - len(_MAGIC)))
+        return begin == stream.read() == _MAGIC and stream.tell() > 2 * len(_MAGIC)
 
 
 class TableWriter:

@@ -35,6 +35,7 @@ from mag_tracking.recording.bag_file import ROS1_MAGIC, SQLITE_MAGIC
 from mag_tracking.recording.decode_errors import DECODE_ERRORS
 from mag_tracking.recording.expansion import largest_chunk
 from mag_tracking.recording.file_kind import HEAD_SIZE, describe_file
+from mag_tracking.recording.mcap_file import McapFile
 from mag_tracking.recording.mcap_records import (
     MAGIC,
     MIN_BYTES_PER_MESSAGE,
@@ -283,7 +284,8 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     Raises
     ------
     RecordingError
-        If `path` does not contain a recording, or no message can be recovered.
+        If `path` does not contain a recording, or no message can be recovered: no message is
+        complete, or the files have an index and damaged chunks.
     OutputError
         If the recording cannot be written or is still being recorded.
     """
@@ -292,6 +294,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     if not files:
         raise RecordingError(f'{path} contains no .mcap file')
     n, summaries = 0, []
+    losses: Counter[str] = Counter()
     topics: dict[str, Topic] = {}
     # A crash at a split leaves an empty file.
     empty_files = [file for file in files if file.stat().st_size < len(MAGIC)]
@@ -302,6 +305,9 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     for file in [file for file in files if file not in empty_files]:
         try:
             lines = finish_file(file)
+            if not lines:
+                for _ in McapFile(file, losses).blocks():
+                    pass
         except OSError as error:
             raise OutputError(f'cannot repair {file}: {error.strerror}') from error
         n += bool(lines)
@@ -315,6 +321,10 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
             write_metadata(path, summaries, topics)
         except OSError as error:
             raise OutputError(f'cannot write {path}/metadata.yaml: {error.strerror}') from error
+    for loss, number in losses.items():
+        report(f'{loss}: {number}, which cannot be restored')
+    if losses and not n:
+        raise RecordingError(f'{path}: nothing recovered: damaged chunks cannot be restored')
     return n
 
 

@@ -277,11 +277,15 @@ def _by_header(table: Table) -> _Assigned:
     times: list[str] = []
     sensors: list[str] = []
     axes: dict[str, dict[str, str]] = {}
+    of_unknown_unit = ''
     names = [name for k, name in enumerate(table.header) if name]
     for name in names:
         base, unit = split_unit(name)
         words = _words(base)
-        if set(words) & _OTHER_WORDS or unit and not field_unit(unit) and not time_unit(unit):
+        if set(words) & _OTHER_WORDS:
+            continue
+        if unit and not field_unit(unit) and not time_unit(unit):
+            of_unknown_unit = of_unknown_unit or name * bool(_axis_of(words))
             continue
         if set(words[-1:]) & _DATE_WORDS or set(words) & _TIME_WORDS and not field_unit(unit):
             times.append(name)
@@ -298,7 +302,9 @@ def _by_header(table: Table) -> _Assigned:
         _refuse(table, f'{" and ".join(several)} may be the '
                 f'{"time" if several is times else "sensor"}')
     if not axes or '' in axes and len(axes) > 1 or sensors and '' not in axes:
-        _refuse(table, 'the axes of the field are not clear')
+        _refuse(table, f'the unit of {of_unknown_unit} is not one of {", ".join(FIELD_UNITS)}; '
+                'give --unit' if of_unknown_unit and not axes else
+                'the axes of the field are not clear')
     return times[0] if times else '', sensors[0] if sensors else None, axes
 
 

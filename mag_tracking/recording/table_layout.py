@@ -117,9 +117,12 @@ def read_table(path: Path, separator: str = '', header: int | None = None,
              *(['line of units'] if units else [])]
     table = Table(path, names, units, 0 if header_line is None else header_line + 1, [], separator,
                   notes)
-    n_preamble = len(above) - (header_line is not None) - bool(units)
+    # Lines between header and rows are no preamble: a logger reports faults of its sensor there.
+    between = [k for k in above if header_line is not None and k > header_line]
+    n_preamble = len(above) - len(between) - (header_line is not None or bool(units))
     table.ignored.update({'preamble line': n_preamble} if n_preamble > 0 else {})
-    _read_rows(table, lines, [k for k in numbers if k >= first], n)
+    between = [k for k in between if _header_cells(lines[k], separator) != units]
+    _read_rows(table, lines, [*between, *(k for k in numbers if k >= first)], n)
     return table
 
 
@@ -157,6 +160,10 @@ def _header(lines: list[str], above: list[int], separator: str, n: int, header: 
                   ] if header is None else [k for k in above if k >= header - 1]
     if header == 0 or not candidates:
         return None, [], None
+    # Messages of the logger may follow the header.
+    last = max((k for k in candidates if len(_header_cells(lines[k], separator)) == n),
+               default=candidates[-1])
+    candidates = [k for k in candidates if k <= last]
     cells = _header_cells(lines[candidates[-1]], separator)
     if header is not None and len(candidates) == 1:
         return cells, [], candidates[0]
@@ -217,7 +224,9 @@ def _read_rows(table: Table, lines: list[str], numbers: list[int], n: int) -> No
         cells = split_line(line, table.separator)
         if len(cells) > n and not any(cells[n:]):
             del cells[n:]
-        if len(cells) == n and cells != header and cells != table.units:
+        if k == len(lines) - 1 and len(cells) == n and _is_cut(cells[-1], table.rows):
+            table.ignored['incomplete last row'] += 1
+        elif len(cells) == n and cells != header and cells != table.units:
             table.rows.append((k + 1, cells))
         elif header and cells[:len(header)] == header:
             table.ignored['repeated header line'] += 1
@@ -227,3 +236,14 @@ def _read_rows(table: Table, lines: list[str], numbers: list[int], n: int) -> No
             table.ignored['incomplete last row'] += 1
         else:
             table.bad.append((k + 1, f'{quantity(len(cells), "cell")}, expected {n}'))
+
+
+def _is_cut(cell: str, rows: Sequence[tuple[int, list[str]]]) -> bool:
+    """Whether the last cell of a file has fewer decimals than all other cells of its column."""
+    others = [cells[-1] for _, cells in rows if is_missing(cells[-1]) == is_missing(cell)]
+    return bool(rows) and _n_decimals(cell) < min(map(_n_decimals, others), default=1)
+
+
+def _n_decimals(cell: str) -> int:
+    """Number of characters after the first mark of a number, exponent included."""
+    return len(cell.replace(',', '.').partition('.')[2])

@@ -367,6 +367,21 @@ def test_a_recording_with_a_damaged_summary_is_tracked_again(
 
 
 @pytest.mark.parametrize('damage', [
+    lambda data: b'', lambda data: b'garbage', lambda data: data[:-1], lambda data: b'PAR1'])
+def test_a_recording_with_a_damaged_table_is_tracked_again(
+        damage, tmp_path, complete_archive, recordings):
+    out, lines = tmp_path / 'out', []
+    shutil.copytree(complete_archive, out)
+    table = next(out.glob('poses/date=*/straight_small_left*.parquet'))
+    table.write_bytes(damage(table.read_bytes()))
+    run = archive([recordings / '*.mcap'], NETWORK_FILE, settings_for('vehicle', QUICK), out,
+                  report=lines.append)
+    assert [path.stem for path in run.done] == ['straight_small_left']
+    assert lines[0] == f'{table} is damaged; straight_small_left.mcap is tracked again'
+    assert same_tables(out, complete_archive)
+
+
+@pytest.mark.parametrize('damage', [
     lambda text: '', lambda text: '[' * 100_000, lambda text: text[:len(text) // 2],
     lambda text: '{}', lambda text: '[]',
     lambda text: text.replace('"size": ', '"size": null, "_": '),

@@ -1,7 +1,10 @@
 """Rates, gaps and clocks of a recording, as `mag-tracking info` prints them."""
 
+import io
+
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from mag_tracking.apps.info import Source, time_topics
 from mag_tracking.cli import main
@@ -36,10 +39,11 @@ def test_the_rate_does_not_depend_on_gaps_and_bursts(rate, tmp_path):
     # The jitter is 3 % of the interval; the recorder receives packets of ten messages.
     t += np.random.default_rng(0).integers(0, int(0.03 * S / rate), 600)
     packets = np.repeat(t[9::10], 10)
-    timings, faults = time_topics(Recording(write(tmp_path / 'a.mcap', t, packets)))
+    timings, faults, counts = time_topics(Recording(write(tmp_path / 'a.mcap', t, packets)))
     timing, = timings.values()
     text = timing.describe()
-    assert not faults and timing.n_messages == 600 and not timing.clocks_disagree
+    assert not faults and counts == {'/mag_1/imu/mag': 600}
+    assert timing.n_messages == 600 and not timing.clocks_disagree
     assert float(text.split(' Hz')[0]) == pytest.approx(rate, rel=0.002)
     gap_s = (t[400] - t[399]) / S
     assert f'1 gap, the longest {gap_s:.4g} s, {(t[399] - t[0]) / S:.4g} s after' in text
@@ -70,6 +74,21 @@ def test_wrong_log_times_do_not_become_the_duration(log_times, tmp_path, capsys)
     assert '1400  100 Hz' in out
 
 
+def test_a_damaged_chunk_is_a_gap(tmp_path, capsys):
+    path = write(tmp_path / 'a.mcap', uniform(30_000, 8000.0))
+    data = bytearray(path.read_bytes())
+    lost = make_reader(io.BytesIO(data)).get_summary().chunk_indexes[1]
+    lost_s = (lost.message_end_time - lost.message_start_time) / S
+    assert 0.84 < lost_s < 0.849
+    n_kept = 30_000 - round(lost_s * 8000) - 1
+    data[lost.chunk_start_offset + lost.chunk_length // 2] ^= 0xFF
+    path.write_bytes(data)
+    assert main(['info', str(path)]) == 0
+    out = capsys.readouterr().out
+    assert f'MB, {n_kept} messages' in out and 'warning: damaged segments' in out
+    assert f'{n_kept}  8000 Hz, 1 gap, the longest 0.84' in out
+
+
 def test_sensors_of_one_topic_are_separate(tmp_path, capsys):
     path = tmp_path / 'a.mcap'
     with RecordingWriter(path) as writer:
@@ -78,7 +97,7 @@ def test_sensors_of_one_topic_are_separate(tmp_path, capsys):
             (_, content), = magnetic_field_dicts(
                 Readings.single(name, EPOCH_NS + k * S // 30, np.full(3, 2e-5)), name)
             writer.write('/imu/mag', MAGNETIC_FIELD, content, EPOCH_NS + k * S // 30)
-    timings, _ = time_topics(Recording(path))
+    timings, *_ = time_topics(Recording(path))
     assert {source: t.n_messages for source, t in timings.items()} == {
         Source('/imu/mag', 'mag_1'): 200, Source('/imu/mag', 'mag_2'): 100}
     assert main(['info', str(path)]) == 0

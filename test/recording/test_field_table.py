@@ -86,6 +86,8 @@ LAYOUTS = {
         .encode('latin-1'), {'unit': '', 'columns': ()}),
     'line of units': (text([['ms', '', 'nT', 'nT', 'nT'], *cells(
         lambda t: f'{1000 * t:.1f}', lambda b: f'{1000 * b:.0f}')]), {'unit': ''}),
+    'gamma': (text(cells(number=lambda b: f'{1000 * b:.0f}'), [
+        't', 'id', 'x (gamma)', 'y (Gammas)', 'z [\u03b3]']), {'unit': '', 'columns': ()}),
     'German header': (text(cells(comma, thousandths), [
         'Zeit (s)', 'id', *(f'Magnetfeld {a} (µT)' for a in 'xyz')], '\t'),
         {'unit': '', 'columns': ()}),
@@ -231,6 +233,29 @@ def test_unusable_rows_are_counted_with_the_first_of_them(tmp_path):
         assert fact in notes
 
 
+@pytest.mark.parametrize('units', [[], [['s', '', 'uT', 'uT', 'uT']]])
+def test_messages_between_header_and_rows_are_unusable_rows(units, tmp_path):
+    content = text([*units, ['ERROR: I2C timeout'], ['Waiting', 'retry 1'], *cells()])
+    table = read(tmp_path, content, unit='' if units else 'uT')
+    check(table)
+    notes = '; '.join(table.notes)
+    assert 'header in line 1' in notes and f'2 unusable rows, first row {2 + len(units)}' in notes
+    assert 'ignored' not in notes
+
+
+@pytest.mark.parametrize('number', [
+    lambda b: f'{b:.3f}', lambda b: f'{b:.4e}', lambda b: f'"{b:.3f}"'])
+def test_a_number_that_the_end_of_the_file_cuts_is_not_read(number, tmp_path):
+    content = text(cells(number=number))[:-1]
+    table = read(tmp_path, content, columns=COLUMNS, unit='uT')
+    check(table)
+    assert not any('ignored' in note for note in table.notes)
+    for n_cut in (2, 4, 6):
+        table = read(tmp_path, content[:-n_cut], columns=COLUMNS, unit='uT')
+        assert len(table.sessions[0]) == 2 * N - 1, content[-20:-n_cut]
+        assert 'ignored: 1 incomplete last row' in table.notes
+
+
 def test_readings_of_a_sensor_are_ignored_as_stated(tmp_path):
     table = read(tmp_path, text(cells()), columns=COLUMNS, unit='uT', sensors={'2': '-'})
     check(table, sensors=(0,))
@@ -278,6 +303,8 @@ def milliseconds(t):
     (text(cells(comma, comma)), {}, ['5 cells', 'has 9', 'decimal commas']),
     (text(cells(lambda t: f'{t + 1:.3f}'.replace('.', ','), lambda b: f'{60 + b:.3f}'.replace(
         '.', ',')), separator='\t'), {}, ["'1,000'", '--decimal']),
+    (text(cells(), ['t', 'id', 'x (foo)', 'y (foo)', 'z (foo)']), {'unit': '', 'columns': ()},
+     ['the unit of x (foo) is not one of T, mT', '--unit', '--columns']),
     (text(cells(), None), {}, ['no header', 'time=1', '--header']),
     (text(cells(sensors=('left side', '2'))), {}, ['left side', '--sensors']),
     (text(cells()), {'unit': ''}, ['--unit', 'bx']),

@@ -157,6 +157,16 @@ def test_json_messages_of_a_magnetic_field_are_read(seconds, nanoseconds, source
     np.testing.assert_array_equal(found.poses, expected.poses)
 
 
+@pytest.mark.parametrize('stamp, tolerance_ns', [
+    ({'sec': '1790000000', 'nanosec': '250000001'}, 0), ('1790000000250000001', 0),
+    (1_790_000_000_250_000_001, 0), (1_790_000_000_250, 1), (1_790_000_000.250000001, 300)])
+def test_the_time_of_a_json_message_may_be_text_of_digits_or_a_number(stamp, tolerance_ns):
+    found = field_decoder('json', 'M', SCHEMA)(json.dumps({
+        'stamp': stamp, 'magnetic_field': {'x': 1e-5, 'y': None, 'z': 2}}).encode())
+    assert found['header']['stamp']['sec'] == 1_790_000_000
+    assert abs(found['header']['stamp']['nanosec'] - 250_000_001) <= tolerance_ns
+
+
 @pytest.mark.parametrize('change, cause', [
     (lambda m: m.pop('magnetic_field'), '^magnetic_field$'),
     (lambda m: m.pop('header'), 'header.stamp or timestamp'),
@@ -165,7 +175,9 @@ def test_json_messages_of_a_magnetic_field_are_read(seconds, nanoseconds, source
     (lambda m: m['header']['stamp'].update(sec=10**10), ' sec is out of range: 1'),
     (lambda m: m['header']['stamp'].update(nanosec=10**25), 'nanosec is out of range: 1'),
     (lambda m: m['magnetic_field'].pop('z'), r'magnetic_field\.z$'),
-    (lambda m: m['magnetic_field'].update(z='1'), "is not a number: '1'"),
+    (lambda m: m['header'].update(stamp='noon'), '^sec in its time, which is text$'),
+    (lambda m: m['header'].update(stamp=12.5), 'which is a number not measured from 1970'),
+    (lambda m: m['magnetic_field'].update(z='1'), r'^a number in magnetic_field\.z$'),
     (lambda m: m.update(magnetic_field_covariance=[1.0]), 'covariance'),
     (lambda m: m.update(magnetic_field=3.0), r'magnetic_field\.x$')])
 def test_invalid_json_messages_are_rejected(change, cause, tmp_path):

@@ -179,6 +179,20 @@ def test_repair_skips_and_reports_a_damaged_chunk(tmp_path):
     assert [k for _, k in by_rosbags(file)] == before
 
 
+def test_damaged_chunks_of_a_file_with_an_index_are_reported(tmp_path, capsys):
+    _, finished = unfinished_recording(tmp_path)
+    damaged, file = bytearray(finished), tmp_path / 'x' / 'x_0.mcap'
+    middle = make_reader(io.BytesIO(finished)).get_summary().chunk_indexes[2]
+    damaged[middle.chunk_start_offset + middle.chunk_length // 2] ^= 0xFF
+    file.parent.mkdir()
+    file.write_bytes(damaged)
+    assert main(['repair', str(file.parent)]) == 1
+    printed = capsys.readouterr()
+    assert 'damaged segments (x_0.mcap' in printed.out and 'cannot be restored' in printed.out
+    assert 'nothing recovered' in printed.err
+    assert file.read_bytes() == damaged and (file.parent / 'metadata.yaml').exists()
+
+
 def test_a_recording_in_progress_is_not_repaired(tmp_path):
     recorder, _ = started(tmp_path / 'a')
     recorder.write(TOPIC, field(0), 1)
