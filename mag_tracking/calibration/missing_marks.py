@@ -129,12 +129,14 @@ def _isolated_runs(values: FloatArray) -> tuple[FloatArray, FloatArray, IntArray
     before3, before2, before, run, after, after2, after3 = np.lib.stride_tricks.sliding_window_view(
         np.pad(np.clip(values[starts], -LARGEST, LARGEST), 3, 'edge'), 7).T
     jump = np.minimum(np.abs(run - before), np.abs(run - after))
+    change_after = np.minimum(np.abs(after - after2), np.abs(after - after3))
     change = np.maximum.reduce([
         np.abs(after - before), np.minimum(np.abs(before - before2), np.abs(before - before3)),
-        np.minimum(np.abs(after - after2), np.abs(after - after3))])
+        change_after])
+    # The reading before the first run is unknown; the last run may continue.
+    jump[0], change[0] = np.abs(run - after)[0], change_after[0]
     is_isolated = jump > MIN_ISOLATION * change
-    # A neighbour of the first and of the last run is unknown.
-    is_isolated[[0, -1]] = False
+    is_isolated[-1] = False
     lengths = np.diff(np.append(starts, len(values)))
     return values[starts][is_isolated], jump[is_isolated], lengths[is_isolated]
 
@@ -154,7 +156,9 @@ def _is_mark(fields: FloatArray, axis: int, value: float, jump: float, n_isolate
     is_change = changes > 0.0
     if is_change.any() and jump <= MIN_JUMP * np.median(changes[is_change]):
         return False
-    if value == 0.0 or np.mean(is_change) > 1.0 - MIN_COARSE:
+    # A first run that nothing was measured before may be a level that has changed.
+    is_left_again = n_isolated > int(np.argmin(is_value))
+    if value == 0.0 or is_left_again and np.mean(is_change) > 1.0 - MIN_COARSE:
         return True
     if len(others) < len(values) / 2:
         return False
