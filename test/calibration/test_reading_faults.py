@@ -94,6 +94,19 @@ def test_marks_of_a_sensor_that_rests_in_one_step_are_found(mark):
     np.testing.assert_array_equal(reading_faults(fields).marks, [[mark] * 3])
 
 
+def test_a_mark_of_two_axes_is_found_once():
+    fields = a_pass()
+    fields[::31, [0, 2]] = -3.75e-4, -4.18e-4
+    np.testing.assert_array_equal(reading_faults(fields).marks, [[-3.75e-4, np.nan, -4.18e-4]])
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_huge_values_that_are_equal_by_chance_on_one_axis_are_not_marks(seed):
+    fields = quantised(noise(N, seed), 1.25)
+    fields[7::50] *= 1e9
+    assert not len(reading_faults(fields).marks)
+
+
 def test_a_mark_of_zero_on_an_axis_without_a_field_belongs_to_the_others():
     fields = noise(N) - [EARTH[0], 0.0, 0.0]
     fields[::40] = 0.0
