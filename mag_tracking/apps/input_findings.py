@@ -41,7 +41,7 @@ def input_findings(recording: Recording, reader: SampleReader, network: SensorNe
                                  'network file', Cause.NO_MESSAGES))
         if (fault := calibrate.timestamps.worst_fault(name)) is not None:
             found.append(timestamp_finding(name, fault))
-        found += rate_findings(name, calibrate.timestamps.lowest_rate(name), network, settings)
+        found += rate_findings(name, calibrate.lowest_rate(name), network, settings)
         found += driver_findings(name, calibrate)
         found += rejection_findings(name, calibrate)
         found += background_findings(name, calibrate, None)
