@@ -221,8 +221,7 @@ class SensorHealth:
         self._steps = np.minimum(self._steps, smallest_steps(fields))
         # A comparison with NaN is false: while the noise is unknown, no spikes are counted.
         noise = np.maximum(self._noise, self._steps / np.sqrt(12.0))
-        spikes = [isolated_readings(values, SPIKE_STD * std)
-                  for values, std in zip(fields.T, noise.tolist(), strict=True)]
+        spikes = list(map(isolated_readings, fields.T, SPIKE_STD * noise))
         self._counts['spikes'] += len(np.unique(np.concatenate(spikes)))
         if self._n_since_stuck >= WINDOW:
             self._noise = self._cache['noise'] = sample_noise_std(self._fields)
