@@ -272,7 +272,7 @@ class Doctor:
             found += covariance_findings(name, self.network.absolute_topics[j], self.calibrate)
             found += driver_findings(name, self.calibrate)
             found += rejection_findings(name, self.calibrate)
-            found += rate_findings(name, self.calibrate.timestamps.lowest_rate(name), self.network,
+            found += rate_findings(name, self.calibrate.lowest_rate(name), self.network,
                                    self._settings.track)
         found += self._missed.findings()
         found += network_findings(self.network, self._settings.survey, self.calibrate,

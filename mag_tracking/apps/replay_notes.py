@@ -90,7 +90,7 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
     for name, s in summary['sensors'].items():
         if s['quiet_stretch_s'] is not None:
             begin, end = s['quiet_stretch_s']
-            yield Note(NOTE, f'a target is present at the start: the most frequent level of '
+            yield Note(NOTE, f'no quiet interval at the start: the most frequent level of '
                        f'{name}, from {begin:.1f} to {end:.1f} s, is used as its background')
 
 

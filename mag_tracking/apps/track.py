@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
+from mag_tracking.apps.doctor import recording_findings
+from mag_tracking.apps.input_findings import sensor_findings
 from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.apps.prescan import prescan, prescan_of
 from mag_tracking.apps.readings import (
@@ -16,6 +18,7 @@ from mag_tracking.apps.readings import (
     recorded_readings,
 )
 from mag_tracking.apps.replay import RunCollector, errors_against_truth
+from mag_tracking.apps.replay_notes import no_track_reason
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.errors import UnknownTrackError
 from mag_tracking.event_records import Disturbance
@@ -33,6 +36,7 @@ from mag_tracking.report.dataframes import (
 from mag_tracking.report.metrics import Truth, interpolate_truth
 from mag_tracking.report.result_arrays import detection_array, pose_array, smoothed_array
 from mag_tracking.report.track_log import TrackLog
+from mag_tracking.stages.health.diagnosis import Finding, ranked
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,7 +79,8 @@ class TrackingResult:
     missing_topics: tuple[str, ...]
     """Topics of the network that are not in the recording."""
     no_detection_reason: str | None
-    """Explanation, in one sentence, of why nothing was detected; None if a target was detected."""
+    """Explanation of why nothing was tracked: why nothing was detected, or else the first serious
+    fault of the input. None if a target was tracked, or the reason is unknown."""
     sensors_without_background: tuple[str, ...]
     """Sensors that were not used because their background was not learnt. To use them, record a
     quiet interval, or set `background` and `noise_std` in the network file."""
@@ -89,7 +94,8 @@ class TrackingResult:
                  *([quantity(len(self.disturbances), 'disturbance')] if self.disturbances else []),
                  *(f'no background of {name}' for name in self.sensors_without_background)]
         if self.no_detection_reason:
-            notes.append(f'nothing was detected: {self.no_detection_reason}')
+            notes.append(self.no_detection_reason if len(self.detections)
+                         else f'nothing was detected: {self.no_detection_reason}')
         numbers = (quantity(len(self.tracks), 'track'), quantity(len(self.poses), 'pose'),
                    quantity(len(self.smoothed), 'smoothed pose'),
                    quantity(int(self.detections['onset'].sum()), 'detection'))
@@ -311,20 +317,24 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
         source = RecordedReadings(source, {}, {}, {}, ())
     if isinstance(source, RecordedReadings):
         source = replace(source, readings=checked_readings(source.readings, network))
-        prescan(_batches(source.readings), network,
-                pipeline.settings.calibrate).apply(pipeline.calibrate)
+        scan = prescan(_batches(source.readings), network, pipeline.settings.calibrate)
+        scan.apply(pipeline.calibrate)
         for readings in _batches(source.readings):
             collector.add(pipeline.feed(readings))
-        recorded = source
+        recorded, damage = source, []
     else:
         recording = Recording(source)
         reader = SampleReader(recording, network)
-        prescan_of(recording, network, pipeline.settings.calibrate).apply(pipeline.calibrate)
+        scan = prescan_of(recording, network, pipeline.settings.calibrate)
+        scan.apply(pipeline.calibrate)
         for readings in reader.readings():
             collector.add(pipeline.feed(readings))
         recorded = recorded_readings(recording, reader, Readings.joined([]))
+        damage = recording_findings(recording, reader)
     collector.add(pipeline.flush())
-    return _tracking_result(pipeline, results, collector.logs, recorded)
+    found = [*damage, *sensor_findings(network, pipeline.calibrate, pipeline.settings.track,
+                                       recorded.missing_topics, scan.clocks)]
+    return _tracking_result(pipeline, results, collector.logs, recorded, found)
 
 
 def _batches(readings: Readings) -> Iterator[Readings]:
@@ -362,11 +372,17 @@ class _Results:
 
 
 def _tracking_result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
-                     recording: RecordedReadings) -> TrackingResult:
-    """Create a `TrackingResult`; the readings of `recording` are not used."""
+                     recording: RecordedReadings, found: list[Finding]) -> TrackingResult:
+    """Create a `TrackingResult`; the readings of `recording` are not used.
+
+    `found` are the findings about the input.
+    """
     rejections = dict(Counter(recording.rejected) + Counter(pipeline.rejections()))
     reason = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
                                  pipeline.detect, recording.missing_topics, rejections)
+    if reason is None and not tracks:
+        reason = next((str(d) for d in ranked(found) if d.serious),
+                      no_track_reason(pipeline.counts()['track']))
     return TrackingResult(
         pipeline.network, pipeline.settings, pose_array(results.poses),
         smoothed_array(results.smoothed), detection_array(results.detections), tracks,

@@ -46,16 +46,23 @@ def missing_marks(fields: FloatArray) -> FloatArray:
     """
     fields = np.where(np.isinf(fields), np.nan, fields)
     marks_of_axis = [_marks_of_axis(fields, axis) for axis in range(3)]
-    marks: dict[tuple[float, ...], None] = {}
+    if not any(marks_of_axis):
+        return np.zeros((0, 3))
+    changes = np.abs(np.diff(np.clip(fields, -LARGEST, LARGEST), axis=0, prepend=np.nan))
+    is_jump = changes > MIN_JUMP * np.array([_typical_change(values) for values in fields.T])
+    # By bytes, because NaN differs from NaN.
+    marks: dict[bytes, FloatArray] = {}
     for axis, of_axis in enumerate(marks_of_axis):
         for mark in of_axis:
-            rows, vector = fields[fields[:, axis] == mark], np.full(3, np.nan)
+            is_mark, vector = fields[:, axis] == mark, np.full(3, np.nan)
             for b in range(3):
                 # A background close to zero does not stand out from a mark of zero.
                 vector[b] = next((v for v in (mark, *marks_of_axis[b])
-                                  if np.mean(rows[:, b] == v) > MIN_TOGETHER), np.nan)
-            marks[tuple(vector)] = None
-    return np.array(list(marks)).reshape(-1, 3)
+                                  if np.mean(fields[is_mark, b] == v) > MIN_TOGETHER), np.nan)
+            # Where other axes jump to other values, an equal value is a coincidence.
+            if not (np.mean(is_jump[is_mark], axis=0) > MIN_ISOLATED)[np.isnan(vector)].any():
+                marks[vector.tobytes()] = vector
+    return np.array(list(marks.values())).reshape(-1, 3)
 
 
 def are_marked(fields: FloatArray, marks: FloatArray) -> BoolArray:
@@ -129,14 +136,22 @@ def _isolated_runs(values: FloatArray) -> tuple[FloatArray, FloatArray, IntArray
     before3, before2, before, run, after, after2, after3 = np.lib.stride_tricks.sliding_window_view(
         np.pad(np.clip(values[starts], -LARGEST, LARGEST), 3, 'edge'), 7).T
     jump = np.minimum(np.abs(run - before), np.abs(run - after))
+    change_after = np.minimum(np.abs(after - after2), np.abs(after - after3))
     change = np.maximum.reduce([
         np.abs(after - before), np.minimum(np.abs(before - before2), np.abs(before - before3)),
-        np.minimum(np.abs(after - after2), np.abs(after - after3))])
+        change_after])
+    # The reading before the first run is unknown; the last run may continue.
+    jump[0], change[0] = np.abs(run - after)[0], change_after[0]
     is_isolated = jump > MIN_ISOLATION * change
-    # A neighbour of the first and of the last run is unknown.
-    is_isolated[[0, -1]] = False
+    is_isolated[-1] = False
     lengths = np.diff(np.append(starts, len(values)))
     return values[starts][is_isolated], jump[is_isolated], lengths[is_isolated]
+
+
+def _typical_change(values: FloatArray) -> float:
+    """Median of the changes of an axis, without repetitions; 0 if there are none."""
+    changes = np.abs(np.diff(np.clip(values, -LARGEST, LARGEST)))
+    return float(np.median(changes[changes > 0.0])) if (changes > 0.0).any() else 0.0
 
 
 def _is_mark(fields: FloatArray, axis: int, value: float, jump: float, n_isolated: int) -> bool:
@@ -150,11 +165,11 @@ def _is_mark(fields: FloatArray, axis: int, value: float, jump: float, n_isolate
         n_inside -= int(np.argmin(is_value[::-1]))
     if len(others) < MIN_OTHERS or n_isolated < MIN_ISOLATED * n_inside:
         return False
-    changes = np.abs(np.diff(np.clip(others, -LARGEST, LARGEST)))
-    is_change = changes > 0.0
-    if is_change.any() and jump <= MIN_JUMP * np.median(changes[is_change]):
+    if jump <= MIN_JUMP * _typical_change(others):
         return False
-    if value == 0.0 or np.mean(is_change) > 1.0 - MIN_COARSE:
+    # A first run that nothing was measured before may be a level that has changed.
+    is_left_again = n_isolated > int(np.argmin(is_value))
+    if value == 0.0 or is_left_again and np.mean(others[1:] != others[:-1]) > 1.0 - MIN_COARSE:
         return True
     if len(others) < len(values) / 2:
         return False

@@ -39,13 +39,15 @@ MIN_ISOLATION = 10.0
 differences between and next to these neighbours."""
 
 
-def isolated_readings(values: FloatArray) -> IntArray:
+def isolated_readings(values: FloatArray, min_height: float = 0.0) -> IntArray:
     """Find single readings of one axis that differ from two neighbours that agree with each other.
 
     Parameters
     ----------
     values : (n,) array
-        Readings in chronological order, without NaN.
+        Readings in chronological order; NaN next to a reading excludes it.
+    min_height : float, optional
+        Minimum difference from both neighbours; NaN excludes all readings.
 
     Returns
     -------
@@ -59,9 +61,10 @@ def isolated_readings(values: FloatArray) -> IntArray:
     adjacent_change = np.maximum(np.abs(change[:-3]), np.abs(change[3:]))
     adjacent_change = np.maximum(adjacent_change, np.abs(change_before + change_after))
     height = np.minimum(np.abs(change_before), np.abs(change_after))
-    smallest_change = np.min(np.abs(change[change != 0.0]), initial=np.inf)
+    smallest_change = np.min(np.abs(change), where=np.abs(change) > 0.0, initial=np.inf)
     indices: IntArray = 2 + np.flatnonzero((np.sign(change_before) == -np.sign(change_after)) & (
-        height > MIN_ISOLATION * np.maximum(adjacent_change, smallest_change)))
+        height > MIN_ISOLATION * np.maximum(adjacent_change, smallest_change))
+        & (height > min_height))
     return indices
 
 

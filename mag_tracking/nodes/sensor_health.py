@@ -210,7 +210,8 @@ class HealthDiagnostics:
                                          self._settings.calibrate.max_field,
                                          not self._is_replayed):
                     in_windows.setdefault(f.cause, f)
-        findings += rate_findings(name, self._reported_window(name).rate, self._network,
+        reported = self._reported_window(name)
+        findings += rate_findings(name, reported.rate / reported.faults.repetition, self._network,
                                   self._settings.track)
         findings += in_windows.values()
         self._late_findings[name] = [f for f in findings if f.cause in TIME_CAUSES]

@@ -14,6 +14,9 @@ from support.spoilt_runs import recorded
 NETWORK = mt.read_network(NETWORK_FILE)
 QUIET = recorded('straight_car_right').readings
 QUIET = QUIET.part(QUIET.stamp_ns < QUIET.stamp_ns[0] + 5_000_000_000)
+CONFIGURED = dataclasses.replace(NETWORK, noise_std=(np.full(3, 1e-8),) * 2, background=tuple(
+    np.median(QUIET.field[np.array(QUIET.sensor_names()) == name], axis=0)
+    for name in NETWORK.names))
 
 
 def reason_of(*faults, network=NETWORK, readings=None, **settings):
@@ -45,6 +48,17 @@ def test_the_reason_names_the_cause(expected, arguments):
     assert re.search(expected, reason_of(**arguments)), reason_of(**arguments)
 
 
+def test_detections_without_a_track_are_explained_as_by_replay():
+    readings = recorded('straight_small_left').readings
+    slow = [np.flatnonzero(readings.sensor == j)[::50] for j in range(len(readings.names))]
+    result = mt.track(readings.part(np.sort(np.concatenate(slow))), CONFIGURED)
+    assert len(result.detections) and not result.tracks
+    assert result.no_detection_reason.startswith('mag_1: 2 Hz is too slow')
+    assert result.no_detection_reason in repr(result)
+    alone = mt.track(readings, NETWORK.part(np.array([0])))
+    assert alone.no_detection_reason.startswith('no track: the scale is not observable')
+
+
 def test_trusted_covariances_are_named_as_the_cause():
     reason = reason_of(spoiler.covariance(1e-2), calibrate__trust_covariances=True)
     assert 'calibrate.trust_covariances' in reason
@@ -59,10 +73,7 @@ def test_readings_in_a_wrong_unit_are_reported_as_too_large():
 
 def test_a_reason_is_given_if_the_scatter_is_unknown():
     """With configured backgrounds, a few readings suffice, but do not determine the scatter."""
-    configured = dataclasses.replace(NETWORK, noise_std=(np.full(3, 1e-8),) * 2, background=tuple(
-        np.median(QUIET.field[np.array(QUIET.sensor_names()) == name], axis=0)
-        for name in NETWORK.names))
-    assert 'times the threshold' in reason_of(network=configured, readings=QUIET.part(slice(0, 40)))
+    assert 'times the threshold' in reason_of(network=CONFIGURED, readings=QUIET.part(slice(0, 40)))
 
 
 def test_a_sensor_without_a_background_is_named():

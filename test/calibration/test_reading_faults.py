@@ -71,10 +71,40 @@ def test_marks_are_found_and_left_out(name, axes, rows):
 
 
 @pytest.mark.parametrize('mark', [0.0, 9.9999e-5])
+@pytest.mark.parametrize('axes', [[0, 1, 2], [2]], ids=['all', 'z'])
+def test_marks_at_the_start_are_found(mark, axes):
+    fields, expected = a_pass(), np.full(3, np.nan)
+    fields[:200, axes] = expected[axes] = mark
+    np.testing.assert_array_equal(reading_faults(fields).marks, [expected])
+
+
+@pytest.mark.parametrize('step', [0.0, 1.0, 10.0, 100.0])
+def test_a_level_that_is_left_at_once_is_not_a_mark(step):
+    """A vehicle departs between two readings, or a sensor was stuck."""
+    fields = quantised(noise(N) + np.where(np.arange(N) < 200, 2e-6, 0.0)[:, None], step)
+    assert not len(reading_faults(fields).marks)
+    fields[:200] = fields[0]
+    assert not len(reading_faults(fields).marks)
+
+
+@pytest.mark.parametrize('mark', [0.0, 9.9999e-5])
 def test_marks_of_a_sensor_that_rests_in_one_step_are_found(mark):
     fields = quantised(noise(N), 30.0)
     fields[5::25] = mark
     np.testing.assert_array_equal(reading_faults(fields).marks, [[mark] * 3])
+
+
+def test_a_mark_of_two_axes_is_found_once():
+    fields = a_pass()
+    fields[::31, [0, 2]] = -3.75e-4, -4.18e-4
+    np.testing.assert_array_equal(reading_faults(fields).marks, [[-3.75e-4, np.nan, -4.18e-4]])
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_huge_values_that_are_equal_by_chance_on_one_axis_are_not_marks(seed):
+    fields = quantised(noise(N, seed), 1.25)
+    fields[7::50] *= 1e9
+    assert not len(reading_faults(fields).marks)
 
 
 def test_a_mark_of_zero_on_an_axis_without_a_field_belongs_to_the_others():

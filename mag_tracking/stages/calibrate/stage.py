@@ -240,6 +240,20 @@ class Calibrate:
         return self.rejections.counts_of(sensor) \
             + Counter(accepted=int(self._state_of(sensor)['accepted']))
 
+    def lowest_rate(self, sensor: str) -> float:
+        """Lowest rate at which a sensor has measured so far.
+
+        Parameters
+        ----------
+        sensor : str
+
+        Returns
+        -------
+        float, Hz
+            Without repetitions; inf if unknown.
+        """
+        return self.timestamps.lowest_rate(sensor) / self.driver_faults.of(sensor).repetition
+
     def _state_of(self, sensor: str) -> Record:
         """State of a sensor: its element of the array that compiled code updates."""
         return self._sensors[self._index[sensor]]

@@ -12,7 +12,7 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration import timestamps
 from mag_tracking.calibration.reading_faults import NO_FAULTS, ReadingFaults
 from mag_tracking.calibration.resolution import smallest_steps
-from mag_tracking.calibration.saturation import saturated_readings
+from mag_tracking.calibration.saturation import isolated_readings, saturated_readings
 from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
 from mag_tracking.quantities import occurrences
 from mag_tracking.stages.health.clocks import ClockSpan
@@ -45,8 +45,8 @@ MIN_MOVED_STEPS = 10.0
 """A target that changes one axis by more than this number of quantisation steps is assumed to
 change every other axis by at least one step."""
 SPIKE_STD = 30.0
-"""Minimum difference of a spike from both neighbouring readings, in the same direction, in standard
-deviations of the noise."""
+"""Minimum difference of a spike from both neighbouring readings, in standard deviations of the
+noise; see `isolated_readings`."""
 
 
 class SensorHealth:
@@ -216,15 +216,13 @@ class SensorHealth:
     def _check_fields(self, n: int) -> None:
         """Count the faults in the fields of the `n` latest readings."""
         self._check_stuck(n)
-        # The two preceding readings are included, because the last one had no successor before.
-        fields = self._fields[-n - 2:]
-        before, after = np.diff(fields, axis=0)[:-1], -np.diff(fields, axis=0)[1:]
+        # A spike is found two readings later, with the two readings before it.
+        fields = self._fields[-n - 4:]
         self._steps = np.minimum(self._steps, smallest_steps(fields))
         # A comparison with NaN is false: while the noise is unknown, no spikes are counted.
         noise = np.maximum(self._noise, self._steps / np.sqrt(12.0))
-        is_spike = (np.minimum(np.abs(before), np.abs(after)) > SPIKE_STD * noise) \
-            & ((before > 0.0) == (after > 0.0))
-        self._counts['spikes'] += int(is_spike.any(axis=1).sum())
+        spikes = list(map(isolated_readings, fields.T, SPIKE_STD * noise))
+        self._counts['spikes'] += len(np.unique(np.concatenate(spikes)))
         if self._n_since_stuck >= WINDOW:
             self._noise = self._cache['noise'] = sample_noise_std(self._fields)
         # A limit is recognised only after the excursion.

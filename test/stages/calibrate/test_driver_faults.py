@@ -106,6 +106,17 @@ def test_the_doctor_names_the_fault_and_nothing_else(fault, cause, words, is_liv
         assert (health.noise_std < 4e-8).all()
 
 
+def test_the_rate_of_the_measurements_is_too_low_despite_the_repetitions():
+    readings = recorded(RECORDING).readings
+    rows = [np.flatnonzero(readings.sensor == j)[::5] for j in range(len(readings.names))]
+    readings, _ = repeated(10, (0, 1))(readings.part(np.sort(np.concatenate(rows))))
+    doctor = Doctor(NETWORK, SETTINGS)
+    doctor.feed(readings)
+    for diagnosis in ranked(doctor.findings()):
+        assert diagnosis.finding.cause is Cause.REPEATED
+        assert '2 Hz is too slow' in str(diagnosis)
+
+
 def test_the_number_of_marks_is_that_of_the_recording():
     readings, _ = marked(9.9999e-5, 40)(recorded(RECORDING).readings)
     pipeline = Pipeline(NETWORK, SETTINGS)

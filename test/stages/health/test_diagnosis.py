@@ -35,6 +35,13 @@ def test_a_chain_of_consequences_follows_the_first_cause():
         (Cause.NO_MESSAGES, [Cause.NO_DETECTION, Cause.NO_BACKGROUND])]
 
 
+def test_repetitions_explain_doubtful_backgrounds_only_if_they_make_a_sensor_too_slow():
+    doubtful, repeated = finding(Cause.DOUBTFUL_BACKGROUND), finding(Cause.REPEATED)
+    assert len(ranked([doubtful, repeated])) == 2
+    assert causes(ranked([doubtful, repeated, finding(Cause.RATE_TOO_LOW)])) == [
+        (Cause.REPEATED, [Cause.DOUBTFUL_BACKGROUND, Cause.RATE_TOO_LOW])]
+
+
 def test_an_overloaded_computer_explains_the_times_of_all_sensors():
     found = [finding(Cause.CLOCK_STEPPED, serious=True), finding(Cause.LOST, 'mag_2'),
              finding(Cause.DELAY_VARIES), finding(Cause.OVERLOADED, 'computer')]

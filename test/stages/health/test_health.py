@@ -165,6 +165,17 @@ def test_a_steep_slope_is_not_a_spike():
     assert examined(stamps, fields).counts['spikes'] == 0
 
 
+def test_a_fast_pass_near_the_sensor_has_no_spikes():
+    """The readings next to an isolated spike agree; near a peak, each reading differs."""
+    stamps, fields = readings()
+    for size in (1e-5, 1e-4, 1e-3):
+        t = (np.arange(3000) - 1500.3)[:, None] / 100.0
+        passing = fields + [size, -size, size] / (1.0 + (t / 0.1)**2)**1.5
+        assert examined(stamps, passing).counts['spikes'] == 0
+    fields[1500] += 1e-6
+    assert examined(stamps, fields).counts['spikes'] == 1
+
+
 def test_saturated_readings_are_counted_once():
     stamps, fields, _ = faulty('saturated')
     clipped = np.isin(fields[:, 1], [1.5e-5, 1.6e-5]).sum()
