@@ -128,8 +128,8 @@ void add_types(py::module_& m) {
     PYBIND11_NUMPY_DTYPE(
         Sensor, clock_offset_ns, offset, has_correction, correction, is_ready, centre, mean, slope,
         horizon, noise, noise_std, level_variance, first_ns, last_ns, unconfirmed_ns, is_restorable,
-        accepted, window, n_window, window_begin_ns, window_due, n_marks, marks, n_marked, repetition, latest,
-        last, run, repeats, changes, raw, rest_since_ns, n_rest, n_same, n_changed, step,
+        accepted, window, window_ns, n_window, window_due, n_marks, marks, n_marked, repetition,
+        latest, last, run, repeats, changes, raw, rest_since_ns, n_rest, n_same, n_changed, step,
         step_variance, n_averaged, stated_std, n_overruled, before_ns, before, n_steps, steps,
         n_held, n_released, held_ns, held_field, held_steps, held_own, held_covariance, length,
         phase, end, now, is_full, n, time, origin, count, sum, product);

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.calibration import core
 from mag_tracking.calibration.missing_marks import are_marked, missing_marks
-from mag_tracking.calibration.repetition import changes_of, repetition_of
+from mag_tracking.calibration.repetition import changes_of, repetition_of, with_lost_readings
 
 MAX_MARKS = core.MAX_MARKS
 """Maximum number of different marks of a sensor."""
@@ -71,17 +71,21 @@ NO_FAULTS = ReadingFaults(np.zeros((0, 3)), 1.0)
 """Readings of a sensor without these faults."""
 
 
-def reading_faults(fields: FloatArray) -> ReadingFaults:
+def reading_faults(fields: FloatArray, stamps: IntArray | None = None) -> ReadingFaults:
     """Find marks and repetitions.
 
     Parameters
     ----------
     fields : (n, 3) array, T
         Raw readings in chronological order; NaN for a missing axis.
+    stamps : (n,) int array, ns, optional
+        Timestamps, which show where readings were lost.
 
     Returns
     -------
     ReadingFaults
     """
     marks = missing_marks(fields)
-    return ReadingFaults(marks, repetition_of(np.where(are_marked(fields, marks), np.nan, fields)))
+    kept = np.where(are_marked(fields, marks), np.nan, fields)
+    return ReadingFaults(marks, repetition_of(
+        kept if stamps is None else with_lost_readings(kept, stamps)))

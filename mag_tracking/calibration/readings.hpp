@@ -87,7 +87,7 @@ inline int remove_marks(const Sensor& s, const double* in, double* raw) {
 // show how often the sensor measures.
 inline void note_raw(Sensor& s, int64_t stamp, const double* raw, bool is_duplicate) {
     if (is_duplicate || s.n_window >= N_WINDOW) return;
-    if (s.n_window == 0) s.window_begin_ns = stamp;
+    s.window_ns[s.n_window] = stamp;
     for (int a = 0; a < 3; ++a) s.window[s.n_window][a] = raw[a];
     ++s.n_window;
 }

@@ -17,6 +17,12 @@ MIN_LOG_ODDS = 24.0
 probability of exp(-24), at each of some thousand frequencies."""
 MIN_RESULTANT = 0.85
 """Minimum regularity of the changes, relative to a perfectly regular source."""
+MAX_JITTER = 0.2
+"""Maximum deviation of an interval from a multiple of the median interval, relative to it."""
+MIN_REGULAR = 0.9
+"""Minimum fraction of the intervals with less jitter, to know where readings were lost."""
+MAX_LOST = 2.0
+"""Maximum ratio of all readings, including lost ones, to the received readings."""
 OVERSAMPLING = 4
 """Oversampling of the frequencies at which the regularity is evaluated."""
 
@@ -37,6 +43,33 @@ def changes_of(fields: FloatArray) -> BoolArray:
     before, after = fields[:-1], fields[1:]
     equal = (after == before) | np.isnan(after) & np.isnan(before)
     return np.append(np.ones(min(1, len(fields)), dtype=bool), ~equal.all(axis=1))
+
+
+def with_lost_readings(fields: FloatArray, stamps: IntArray) -> FloatArray:
+    """Insert a missing reading wherever one was lost.
+
+    Parameters
+    ----------
+    fields : (n, 3) array
+        Readings in chronological order.
+    stamps : (n,) int array, ns
+        Timestamps.
+
+    Returns
+    -------
+    (m, 3) array
+        NaN for lost readings; unchanged if the timestamps are irregular, or most readings are lost.
+    """
+    intervals = np.diff(stamps) / max(1.0, float(np.median(np.diff(stamps)))) if len(stamps) > 1 \
+        else np.zeros(0)
+    steps = np.round(intervals)
+    if np.mean(np.abs(intervals - steps) > MAX_JITTER) > 1.0 - MIN_REGULAR or not len(steps) \
+            or steps.min() < 1.0 or steps.sum() > MAX_LOST * len(stamps):
+        return fields
+    index = np.append(0, np.cumsum(steps.astype(np.int64)))
+    out: FloatArray = np.full((int(index[-1]) + 1, 3), np.nan)
+    out[index] = fields
+    return out
 
 
 def repetition_of(fields: FloatArray) -> float:

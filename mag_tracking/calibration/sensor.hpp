@@ -35,7 +35,8 @@ struct Sensor {
     // for missing readings (NaN: any value of the axis), the number of readings with a mark
     // on any axis, and the number of readings per measurement.
     double window[N_WINDOW][3];
-    int64_t n_window, window_begin_ns, window_due, n_marks;
+    int64_t window_ns[N_WINDOW];
+    int64_t n_window, window_due, n_marks;
     double marks[MAX_MARKS][3];
     int64_t n_marked;
     double repetition, latest[3];

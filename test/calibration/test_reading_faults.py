@@ -41,6 +41,15 @@ def test_repetitions_by_rounding_are_random(n, step):
         assert not reading_faults(fields)
 
 
+@pytest.mark.parametrize('loss', [0.0, 0.05, 0.2])
+@pytest.mark.parametrize('jitter', [0.0, 0.05])
+def test_the_ratio_is_found_despite_lost_readings(loss, jitter):
+    rng = np.random.default_rng(int(100 * loss))
+    kept = rng.random(N) >= loss
+    stamps = (1e7 * (np.arange(N) + jitter * rng.standard_normal(N))).astype(np.int64)
+    assert reading_faults(held(4, 1.25)[kept], stamps[kept]).repetition == pytest.approx(4.0)
+
+
 def test_only_the_readings_that_changed_remain():
     fields = held(5, 0.0)
     kept = reading_faults(fields).without(fields)

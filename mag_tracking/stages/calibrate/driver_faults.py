@@ -9,6 +9,7 @@ from mag_tracking.arrays import StructArray
 from mag_tracking.calibration import core
 from mag_tracking.calibration.missing_marks import are_marked, describe_marks
 from mag_tracking.calibration.reading_faults import ReadingFaults, reading_faults
+from mag_tracking.calibration.repetition import with_lost_readings
 from mag_tracking.calibration.sensor_state import FIRST_WINDOW, N_WINDOW
 from mag_tracking.stages.health.diagnosis import Cause
 from mag_tracking.units import NS
@@ -94,15 +95,16 @@ class DriverFaults:
         """
         s, known = self._states[sensor], self.of(sensor)
         n = int(s['n_window'])
-        faults = known.merged(reading_faults(s['window'][:n]))
+        faults = known.merged(reading_faults(s['window'][:n], s['window_ns'][:n]))
         if n < N_WINDOW:
             s['window_due'] += FIRST_WINDOW
         else:
             s['n_window'] = 0
         if faults == known:
             return float('nan')
-        duration_s = (stamp_ns - int(s['window_begin_ns'])) / NS
-        rate = n / duration_s if duration_s > 0.0 else float('nan')
+        duration_s = (stamp_ns - int(s['window_ns'][0])) / NS
+        n_published = len(with_lost_readings(s['window'][:n], s['window_ns'][:n]))
+        rate = n_published / duration_s if duration_s > 0.0 else float('nan')
         self.store(sensor, replace(faults, rate=rate))
         return float(are_marked(s['window'][:n], faults.marks).any(axis=1).mean())
 
