@@ -3,6 +3,8 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from mag_tracking.arrays import IntArray
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.units import NS
@@ -32,7 +34,7 @@ UNITS = ((1e3, 'the seconds of its timestamps are milliseconds'),
          (1e-6, 'the nanoseconds of its timestamps are milliseconds'))
 """Factor by which the timestamps advance too fast, and the reason."""
 MAX_RATIO_ERROR = 0.1
-"""Maximum relative error of this factor."""
+"""Maximum relative error of this factor; of clocks that are compared, it is 1."""
 
 
 class ClockSpan(NamedTuple):
@@ -82,6 +84,13 @@ class ClockSpan(NamedTuple):
         """Delay from the first timestamp to its receipt [s]."""
         return (self.first_received_ns - self.first_ns) / NS
 
+    @property
+    def rate(self) -> float:
+        """Advance of the timestamps relative to the times of receipt; NaN if unknown."""
+        received_ns = self.last_received_ns - self.first_received_ns
+        return (self.last_ns - self.first_ns) / received_ns if received_ns > MIN_SPAN_S * NS \
+            else np.nan
+
     def corrected(self, offset_ns: int) -> 'ClockSpan':
         """Subtract the offset of the clock from the timestamps.
 
@@ -105,12 +114,14 @@ class ClockSpan(NamedTuple):
         Returns
         -------
         tuple of (float, bool)
-            Positive if this clock is ahead.
+            Positive if this clock is ahead. Clocks that do not advance like the time of receipt,
+            as those of a fast replay, cannot be compared.
         """
         ahead_s = reference.delay_s - self.delay_s
         first_s = reference.first_delay_s - self.first_delay_s
-        if abs(first_s - ahead_s) > MAX_CHANGE * abs(ahead_s) \
-                or self.last_received_ns - self.first_received_ns < MIN_SPAN_S * NS:
+        if max(abs(self.rate - 1.0), abs(reference.rate - 1.0)) > MAX_RATIO_ERROR:
+            return ahead_s, False
+        if np.isnan(self.rate) or abs(first_s - ahead_s) > MAX_CHANGE * abs(ahead_s):
             return ahead_s, abs(ahead_s) > MAX_CLOCK_DIFFERENCE_S
         is_ahead = min(self.delay_s, reference.delay_s) < -MIN_AHEAD_S
         return ahead_s, abs(ahead_s) > (MAX_CLOCK_ERROR_S if is_ahead else MAX_LATENCY_S)
@@ -123,12 +134,8 @@ class ClockSpan(NamedTuple):
     @property
     def wrong_unit(self) -> str | None:
         """Description of a wrong unit of the timestamps; None if it is right, or unknown."""
-        received_s = (self.last_received_ns - self.first_received_ns) / NS
-        if received_s < MIN_SPAN_S:
-            return None
-        ratio = (self.last_ns - self.first_ns) / NS / received_s
         return next((text for factor, text in UNITS
-                     if abs(ratio / factor - 1.0) < MAX_RATIO_ERROR), None)
+                     if abs(self.rate / factor - 1.0) < MAX_RATIO_ERROR), None)
 
 
 def corrected(clocks: Mapping[str, ClockSpan], names: Sequence[str],
