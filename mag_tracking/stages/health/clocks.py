@@ -119,9 +119,9 @@ class ClockSpan(NamedTuple):
         """
         ahead_s = reference.delay_s - self.delay_s
         first_s = reference.first_delay_s - self.first_delay_s
-        if max(abs(self.rate - 1.0), abs(reference.rate - 1.0)) > MAX_RATIO_ERROR:
+        if not all(abs(clock.rate - 1.0) <= MAX_RATIO_ERROR for clock in (self, reference)):
             return ahead_s, False
-        if np.isnan(self.rate) or abs(first_s - ahead_s) > MAX_CHANGE * abs(ahead_s):
+        if abs(first_s - ahead_s) > MAX_CHANGE * abs(ahead_s):
             return ahead_s, abs(ahead_s) > MAX_CLOCK_DIFFERENCE_S
         is_ahead = min(self.delay_s, reference.delay_s) < -MIN_AHEAD_S
         return ahead_s, abs(ahead_s) > (MAX_CLOCK_ERROR_S if is_ahead else MAX_LATENCY_S)
