@@ -49,7 +49,7 @@ def missing_marks(fields: FloatArray) -> FloatArray:
     if not any(marks_of_axis):
         return np.zeros((0, 3))
     changes = np.abs(np.diff(np.clip(fields, -LARGEST, LARGEST), axis=0, prepend=np.nan))
-    is_jump = changes > MIN_JUMP * np.array([_typical_change(values) for values in fields.T])
+    is_jump = changes > MIN_JUMP * np.array([typical_change(values) for values in fields.T])
     # By bytes, because NaN differs from NaN.
     marks: dict[bytes, FloatArray] = {}
     for axis, of_axis in enumerate(marks_of_axis):
@@ -148,8 +148,18 @@ def _isolated_runs(values: FloatArray) -> tuple[FloatArray, FloatArray, IntArray
     return values[starts][is_isolated], jump[is_isolated], lengths[is_isolated]
 
 
-def _typical_change(values: FloatArray) -> float:
-    """Median of the changes of an axis, without repetitions; 0 if there are none."""
+def typical_change(values: FloatArray) -> float:
+    """Median of the changes of an axis, without repetitions.
+
+    Parameters
+    ----------
+    values : (n,) array, T
+
+    Returns
+    -------
+    float, T
+        0 if there are no changes.
+    """
     changes = np.abs(np.diff(np.clip(values, -LARGEST, LARGEST)))
     return float(np.median(changes[changes > 0.0])) if (changes > 0.0).any() else 0.0
 
@@ -165,7 +175,7 @@ def _is_mark(fields: FloatArray, axis: int, value: float, jump: float, n_isolate
         n_inside -= int(np.argmin(is_value[::-1]))
     if len(others) < MIN_OTHERS or n_isolated < MIN_ISOLATED * n_inside:
         return False
-    if jump <= MIN_JUMP * _typical_change(others):
+    if jump <= MIN_JUMP * typical_change(others):
         return False
     # A first run that nothing was measured before may be a level that has changed.
     is_left_again = n_isolated > int(np.argmin(is_value))

@@ -5,9 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from mag_tracking.arrays import StructArray
+from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration import core
-from mag_tracking.calibration.missing_marks import are_marked, describe_marks
+from mag_tracking.calibration.missing_marks import (
+    MIN_JUMP,
+    are_marked,
+    describe_marks,
+    typical_change,
+)
 from mag_tracking.calibration.reading_faults import ReadingFaults, reading_faults
 from mag_tracking.calibration.repetition import with_lost_readings
 from mag_tracking.calibration.sensor_state import FIRST_WINDOW, N_WINDOW
@@ -16,6 +21,9 @@ from mag_tracking.units import NS
 
 MAX_MARKED = 0.2
 """Fraction of readings with a mark above which a background is learnt again when they are found."""
+MAX_SKIPPED = 3
+"""Maximum number of consecutive windows without a jump that are not searched, to save time. Only a
+repetition could be found there, which lasts."""
 
 
 class DriverFaults:
@@ -33,6 +41,9 @@ class DriverFaults:
         self._states = dict(zip(names, sensors, strict=True))
         # Rate of the readings of each sensor [Hz] when its faults were found.
         self._rates = dict.fromkeys(names, float('nan'))
+        # Change of an axis that is no jump to a mark (3,) [T], and number of windows skipped.
+        self._max_changes: dict[str, FloatArray] = {}
+        self._n_skipped = dict.fromkeys(names, 0)
 
     def of(self, sensor: str) -> ReadingFaults:
         """Return the faults of a sensor that have been found so far.
@@ -95,18 +106,34 @@ class DriverFaults:
         """
         s, known = self._states[sensor], self.of(sensor)
         n = int(s['n_window'])
+        if n == N_WINDOW and self._may_skip(sensor, s['window']):
+            s['n_window'] = 0
+            return float('nan')
         faults = known.merged(reading_faults(s['window'][:n], s['window_ns'][:n]))
         if n < N_WINDOW:
             s['window_due'] += FIRST_WINDOW
         else:
-            s['n_window'] = 0
+            s['n_window'] = self._n_skipped[sensor] = 0
         if faults == known:
+            if n == N_WINDOW and not known:
+                limits = MIN_JUMP * np.array([typical_change(values) for values in s['window'].T])
+                self._max_changes[sensor] = np.minimum(
+                    limits, self._max_changes.get(sensor, np.inf))
             return float('nan')
         duration_s = (stamp_ns - int(s['window_ns'][0])) / NS
         n_published = len(with_lost_readings(s['window'][:n], s['window_ns'][:n]))
         rate = n_published / duration_s if duration_s > 0.0 else float('nan')
         self.store(sensor, replace(faults, rate=rate))
         return float(are_marked(s['window'][:n], faults.marks).any(axis=1).mean())
+
+    def _may_skip(self, sensor: str, fields: FloatArray) -> bool:
+        """Whether a window (n, 3) [T] need not be searched; counts the windows skipped."""
+        max_changes = self._max_changes.get(sensor)
+        if max_changes is None or self._n_skipped[sensor] >= MAX_SKIPPED \
+                or (np.abs(np.diff(fields, axis=0)) > max_changes).any():
+            return False
+        self._n_skipped[sensor] += 1
+        return True
 
     def rejection(self, sensor: str, reason: int) -> tuple[Cause, str]:
         """Cause and description of the rejection of a reading of a sensor.

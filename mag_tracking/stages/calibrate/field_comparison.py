@@ -102,9 +102,9 @@ class FieldComparison:
             holds for the readings before it was learnt.
         """
         previous = self._levels[j]
-        if not self._survey.offset_std or np.array_equal(
-                np.isnan(level), np.isnan(previous)) and not np.nanmax(
-                    np.abs(level - previous), initial=0.0) > MIN_CHANGE:
+        if not self._survey.offset_std or (
+                (np.abs(level - previous) <= MIN_CHANGE)
+                | (np.isnan(level) & np.isnan(previous))).all():
             return
         self._levels[j] = level
         try:

@@ -107,6 +107,8 @@ class SampleRates:
         self._last_ns: IntArray = np.full(n, NEVER, dtype=np.int64)
         self._intervals_s: FloatArray = np.zeros((n, N_INTERVALS))
         self._next = np.zeros(n, dtype=np.int64)
+        # Whether all stored intervals of all sensors are short; latest frame with all sensors.
+        self._are_short, self._complete_ns = False, NEVER
 
     def add(self, frame: FieldFrame, first: int = 0) -> None:
         """Update the rates with a frame.
@@ -117,6 +119,13 @@ class SampleRates:
         first : int, optional
             Index of the first sensor of the frame in the network.
         """
+        is_complete = len(frame.n_samples) == len(self._last_ns) and bool(frame.n_samples.all())
+        interval_ns, self._complete_ns = frame.stamp_ns - self._complete_ns, \
+            frame.stamp_ns if is_complete else NEVER
+        if self._are_short and is_complete and 0 < interval_ns <= self._max_interval_s * NS:
+            # Another short interval of each sensor changes nothing.
+            self._last_ns[:] = frame.stamp_ns
+            return
         measuring = np.flatnonzero(frame.n_samples)
         rows = measuring + first
         interval_s = (frame.stamp_ns - self._last_ns[rows]) / NS / frame.n_samples[measuring]
@@ -125,6 +134,8 @@ class SampleRates:
         rows, interval_s = rows[is_known], interval_s[is_known]
         self._intervals_s[rows, self._next[rows] % N_INTERVALS] = interval_s
         self._next[rows] += 1
+        self._are_short = bool((self._next >= N_INTERVALS).all()
+                               and (self._intervals_s <= self._max_interval_s).all())
 
     def are_slow(self) -> BoolArray:
         """Whether most of the latest intervals of each sensor are too long.
