@@ -58,8 +58,7 @@ def sensor_findings(network: SensorNetwork, calibrate: Calibrate, settings: Trac
     -------
     list of Finding
     """
-    found = list(clock_findings(
-        corrected(clocks, network.names, network.clock_offset_ns.tolist())))
+    found = list(clock_findings(corrected(clocks, network)))
     for name, topic in zip(network.names, network.absolute_topics, strict=True):
         if topic in missing_topics:
             found.append(Finding(True, name, f'no messages on {topic}', 'check the topic in the '

@@ -406,8 +406,7 @@ class Calibrate:
         clocks : {sensor: ClockSpan}
             Raw timestamps, and their times of receipt.
         """
-        self.timestamps.compare_clocks(corrected(clocks, self._network.names,
-                                                 self._network.clock_offset_ns.tolist()))
+        self.timestamps.compare_clocks(corrected(clocks, self._network))
 
     def resume(self, stored: Mapping[str, StoredBackground]) -> None:
         """Provide stored backgrounds, which are restored at the first reading of each sensor.

@@ -30,6 +30,8 @@ MAX_DIFFERENCE = 0.15
 """Maximum relative difference between the field of a departure and that of the arrival."""
 MIN_REMAINING = 0.5
 """Minimum field at the end of an event, relative to its peak, for the vehicle to be present."""
+MIN_OPPOSITE = 0.5
+"""Minimum fraction of the readings of an event with the opposite field of a departed vehicle."""
 MAX_GAP_S, MAX_GAP_INTERVALS = 5.0, 3.0
 """Maximum gap between events of one vehicle [s], to which intervals between readings are added."""
 MIN_APPROACH = 0.3
@@ -109,7 +111,8 @@ class Stays:
         tolerance = MAX_DIFFERENCE * float(np.linalg.norm(level)) + MIN_FIELD_STDS * noise
         held, self._held, out = self._held, None, []
         if held is not None:
-            gap_ns = MAX_GAP_S * NS + MAX_GAP_INTERVALS * float(np.median(np.diff(stamps)))
+            interval_ns = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+            gap_ns = MAX_GAP_S * NS + MAX_GAP_INTERVALS * interval_ns
             if event.onset_ns - held.release_ns > gap_ns \
                     or np.linalg.norm(held.level - level) > tolerance:
                 out += [held.event] if held.event is not None else []
@@ -137,7 +140,7 @@ class Stays:
             stay = self._open[k]
             is_opposite = np.linalg.norm(fields + stay.level, axis=1) <= max(
                 tolerance, MAX_DIFFERENCE * float(np.linalg.norm(stay.level)))
-            if np.mean(is_opposite) > MIN_REMAINING:
+            if np.mean(is_opposite) > MIN_OPPOSITE:
                 self._open.pop(k)
                 if remains:
                     self._held = _Held(None, level, event.release_ns)

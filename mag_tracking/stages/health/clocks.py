@@ -1,11 +1,12 @@
 """Findings about the clocks of the timestamps, compared with the times of receipt."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from mag_tracking.arrays import IntArray
+from mag_tracking.network import SensorNetwork
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.units import NS
 
@@ -138,42 +139,40 @@ class ClockSpan(NamedTuple):
                      if abs(self.rate / factor - 1.0) < MAX_RATIO_ERROR), None)
 
 
-def corrected(clocks: Mapping[str, ClockSpan], names: Sequence[str],
-              offsets_ns: Sequence[int]) -> dict[str, ClockSpan]:
+def corrected(clocks: Mapping[str, ClockSpan], network: SensorNetwork) -> dict[str, ClockSpan]:
     """Correct the clocks of the sensors of a network.
 
     Parameters
     ----------
     clocks : {sensor: ClockSpan}
         Other sensors are omitted.
-    names : sequence of str
-        Sensors of the network.
-    offsets_ns : sequence of int, ns
-        Offset of the clock of each sensor.
+    network : SensorNetwork
 
     Returns
     -------
     {sensor: ClockSpan}
     """
-    return {name: clocks[name].corrected(ns) for name, ns in zip(names, offsets_ns, strict=True)
-            if name in clocks}
+    return {name: clocks[name].corrected(offset_ns) for name, offset_ns in zip(
+        network.names, network.clock_offset_ns.tolist(), strict=True) if name in clocks}
 
 
-def reference_of(clocks: Mapping[str, ClockSpan]) -> ClockSpan:
-    """Clock nearest to that of the host.
+def clock_differences(clocks: Mapping[str, ClockSpan]) -> dict[str, tuple[float, bool]]:
+    """Compare clocks with the one nearest to the clock of the host.
 
     In a replay, all clocks differ from that of the host by about the same time.
 
     Parameters
     ----------
     clocks : {sensor: ClockSpan}
-        At least one.
 
     Returns
     -------
-    ClockSpan
+    {sensor: (float, bool)}
+        See `ClockSpan.ahead_s`.
     """
-    return min(clocks.values(), key=lambda clock: abs(clock.delay_s))
+    reference = min(clocks.values(), key=lambda clock: abs(clock.delay_s), default=None)
+    return {} if reference is None else {
+        name: clock.ahead_s(reference) for name, clock in clocks.items()}
 
 
 def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
@@ -187,15 +186,13 @@ def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
     ------
     Finding
     """
-    reference = reference_of(clocks) if clocks else None
-    for name, clock in clocks.items():
+    for name, (ahead_s, differs) in clock_differences(clocks).items():
+        clock = clocks[name]
         if clock.wrong_unit is not None:
             yield Finding(True, name, clock.wrong_unit,
                           'correct the unit of the timestamps in the driver',
                           Cause.MILLISECOND_STAMPS)
             continue
-        assert reference is not None
-        ahead_s, differs = clock.ahead_s(reference)
         if clock.is_since_boot:
             differs = abs(ahead_s) > MAX_BOOT_DIFFERENCE_S
             yield Finding(

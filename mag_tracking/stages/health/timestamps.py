@@ -14,7 +14,7 @@ from mag_tracking.calibration.timestamps import (
     latest_interval_s,
     timestamp_fault,
 )
-from mag_tracking.stages.health.clocks import ClockSpan, reference_of
+from mag_tracking.stages.health.clocks import ClockSpan, clock_differences
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.stages.health.reading_buffer import ReadingBuffer
 
@@ -121,8 +121,8 @@ class TimestampMonitor:
         clocks : {sensor: ClockSpan}
             Latest clocks, which replace those of the previous call.
         """
-        self._differing = {name for name, clock in clocks.items()
-                           if clock.ahead_s(reference_of(clocks))[1]}
+        self._differing = {
+            name for name, (_, differs) in clock_differences(clocks).items() if differs}
 
     def doubtful_times(self) -> dict[str, DoubtfulTimes]:
         """Intervals in which timestamps were wrong by more than `MAX_ERROR_S`.

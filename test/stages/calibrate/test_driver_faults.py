@@ -8,9 +8,12 @@ import pytest
 import mag_tracking as mt
 from mag_tracking.apps.doctor import Doctor
 from mag_tracking.apps.prescan import prescan
+from mag_tracking.calibration.sensor_state import N_WINDOW
 from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.records import Track
+from mag_tracking.records import Readings, Track
+from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.diagnosis import Cause, ranked
+from mag_tracking.units import NS
 from support.bundled import NETWORK_FILE
 from support.spoilt_runs import recorded
 
@@ -125,3 +128,15 @@ def test_the_number_of_marks_is_that_of_the_recording():
     for j, name in enumerate(NETWORK.names):
         assert pipeline.calibrate.driver_faults.n_marked(name) == (readings.sensor == j).sum() // 40
     assert any('99999 nT' in cause for cause in pipeline.rejections())
+
+
+@pytest.mark.parametrize('window', range(4, 9))
+def test_marks_are_found_in_every_later_window(window):
+    """Windows without a jump are not searched."""
+    rng, n = np.random.default_rng(0), 10 * N_WINDOW
+    field = 1e-6 * np.array([2.0, 15.5, -49.0]) + rng.normal(0.0, 2e-8, (n, 3))
+    field[window * N_WINDOW + 100:window * N_WINDOW + 300:20] = 9.9999e-5
+    stamps = 1_790_000_000 * NS + 10_000_000 * np.arange(n)
+    calibrate = Calibrate(NETWORK, SETTINGS.calibrate)
+    calibrate.feed(Readings(('mag_1',), np.zeros(n, dtype=np.int64), stamps, field))
+    assert calibrate.driver_faults.of('mag_1').marks.tolist() == [[9.9999e-5] * 3]
