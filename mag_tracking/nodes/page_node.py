@@ -131,9 +131,11 @@ class PageNode(Node):
             return
         if (layout.names, layout.frame) != (self._layout.names, self._layout.frame) \
                 or not np.array_equal(layout.positions, self._layout.positions):
+            if len(self._layout):
+                # Tracks of the first network can arrive before its sensors.
+                self._frames.clear()
+                self._tracks.clear()
             self._layout = layout
-            self._frames.clear()
-            self._tracks.clear()
             self._scene.subtitle = f'{quantity(len(layout), "sensor")}, frame {layout.frame}'
             self._scene.use_network(layout)
 

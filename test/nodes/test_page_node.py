@@ -13,6 +13,7 @@ from array import array
 import numpy as np
 import pytest
 from mag_tracking_msgs.msg import NetworkFrame, SmoothedTrack, TrackArray
+from rclpy.duration import Duration
 from visualization_msgs.msg import MarkerArray
 from websockets.sync.client import connect
 
@@ -148,15 +149,16 @@ MALFORMED_TRACKS = {
 
 
 def publish_malformed_messages(node, spin_until):
-    """Publish the sensor markers, all malformed messages, and then a valid track."""
+    """Publish all malformed messages, a valid track, and then the sensor markers.
+
+    The middleware keeps no order between topics, so tracks can precede the sensors.
+    """
     def publish(cls, topic, message, qos):
         publisher = node.create_publisher(cls, topic, qos)
         assert spin_until(lambda: publisher.get_subscription_count())
         publisher.publish(message)
         return publisher
 
-    markers = to_message(MarkerArray, sensor_markers(read_network(NETWORK_FILE)))
-    publish(MarkerArray, '/tracker_node/sensor_markers', markers, LATCHED_QOS)
     publish(SmoothedTrack, '/tracker_node/smoothed', SmoothedTrack(track_id=1), RESULT_QOS)
     # Serialised bytes that are no message.
     publish(NetworkFrame, '/network_frame', b'\x00\x01\x00\x00' + b'\xff' * 300, RESULT_QOS)
@@ -165,6 +167,9 @@ def publish_malformed_messages(node, spin_until):
     for changes in others:
         publisher.publish(track_message(**changes))
     publisher.publish(track_message())
+    assert publisher.wait_for_all_acked(Duration(seconds=MAX_S))
+    markers = to_message(MarkerArray, sensor_markers(read_network(NETWORK_FILE)))
+    publish(MarkerArray, '/tracker_node/sensor_markers', markers, LATCHED_QOS)
 
 
 def test_malformed_messages_are_named_on_the_page(ros):
