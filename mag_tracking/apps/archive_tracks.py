@@ -12,13 +12,13 @@ from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.apps.archive_segments import FrameChunk
 from mag_tracking.apps.pass_fitter import fitted_vehicles
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
-from mag_tracking.apps.replay import RunCollector
-from mag_tracking.event_records import Disturbance
+from mag_tracking.apps.replay import TrackHistory
+from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.recording.archive_folder import common_columns
 from mag_tracking.recording.archive_tables import TABLES
 from mag_tracking.recording.fit_folder import pass_rows
 from mag_tracking.recording.parquet_table import TableWriter
-from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
+from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.settings import TrackSettings
@@ -27,7 +27,7 @@ SEGMENT_TABLES = ('tracks', 'poses', 'smoothed', 'passes')
 """Tables that are filled from the segments."""
 
 
-class SegmentTables:
+class SegmentTables(RecordReceiver):
     """Writes the tracks and passes of a segment to tables; a context manager.
 
     Parameters
@@ -53,7 +53,7 @@ class SegmentTables:
         self._files = ExitStack()
         self._tables = {name: self._files.enter_context(TableWriter(paths[name], TABLES[name]))
                         for name in SEGMENT_TABLES}
-        self._collector = RunCollector(self)
+        self._history = TrackHistory()
         self.n_tracks = self.n_passes = 0
 
     def __enter__(self) -> 'SegmentTables':
@@ -75,8 +75,9 @@ class SegmentTables:
                 tracker.set_input_doubts(doubts)
             records = tracker.feed(frame)
             self._tracks.add(records)
-            self._collector.add([frame, *records])
-        for log in [log for log in self._collector.logs.values() if log.ended]:
+            for receiver in (self, self._history):
+                receiver.receive([frame, *records])
+        for log in [log for log in self._history.logs.values() if log.ended]:
             self._add_track_row(log)
         for numbered_pass in chunk.passes:
             self._add_pass(*numbered_pass)
@@ -88,33 +89,11 @@ class SegmentTables:
         ----------
         tracker : TrackManager
         """
-        self._collector.add(tracker.flush())
-        for log in list(self._collector.logs.values()):
+        records = tracker.flush()
+        for receiver in (self, self._history):
+            receiver.receive(records)
+        for log in list(self._history.logs.values()):
             self._add_track_row(log)
-
-    def add_frame(self, frame: FieldFrame) -> None:
-        """Ignore a frame, because frames have no table.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-        """
-
-    def add_detection(self, detection: Detection) -> None:
-        """Ignore a detection, because detections have no table.
-
-        Parameters
-        ----------
-        detection : Detection
-        """
-
-    def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Ignore a disturbance, because disturbances have no table.
-
-        Parameters
-        ----------
-        disturbance : Disturbance
-        """
 
     def add_track(self, track: Track) -> None:
         """Write the row of a pose; the closing record of a track has no row.
@@ -149,8 +128,8 @@ class SegmentTables:
 
     def _add_track_row(self, log: TrackLog) -> None:
         """Write the row of a track that has ended, and discard the history of the track."""
-        del self._collector.logs[log.id]
-        smoothed = self._collector.smoothed.pop(log.id, None)
+        del self._history.logs[log.id]
+        smoothed = self._history.smoothed.pop(log.id, None)
         self.n_tracks += 1
         self._tables['tracks'].add(
             common_columns(self._recording, log.stamp_ns[0]) | {'track_id': log.id}

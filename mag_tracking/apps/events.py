@@ -8,20 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.apps.input_findings import input_findings
-from mag_tracking.apps.prescan import prescan_of
-from mag_tracking.apps.readings import network_of
+from mag_tracking.apps.readings import network_of, source_of
 from mag_tracking.event_records import PassEvent
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Settings, settings_for
+from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
-from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.record_receiver import RecordReceiver
+from mag_tracking.recording.interruptible import Progress
+from mag_tracking.records import Readings
+from mag_tracking.run import RunReport, Source, Step, run
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.events.stage import Events
-from mag_tracking.stages.health.diagnosis import Diagnosis, ranked
-from mag_tracking.stages.stage import rejected
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +27,8 @@ class EventsResult:
 
     events: tuple[PassEvent, ...]
     """Events in the order in which they ended."""
-    rejections: dict[str, int]
-    """Readings that were not used: {cause: number}."""
-    sensors_without_background: tuple[str, ...]
-    """Sensors whose background was not learnt."""
-    missing_topics: tuple[str, ...]
-    """Topics of the network that are not in the recording."""
-    diagnoses: tuple[Diagnosis, ...]
-    """Diagnoses of the recording and the sensors."""
+    report: RunReport
+    """What was lost, rejected or missing, and why."""
 
     def counts(self) -> dict[str, int]:
         """Count the events of each sensor.
@@ -78,54 +69,40 @@ def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLi
     SettingsError
         If a setting is invalid.
     """
-    return find_events(Recording(recording), network_of(network), settings_for('vehicle', settings))
+    network = network_of(network)
+    return find_events(source_of(recording, network), network, settings_for('vehicle', settings))
 
 
-def find_events(recording: Recording, network: SensorNetwork, settings: Settings,
-                progress: Callable[[int], object] | None = None,
+def find_events(source: Source, network: SensorNetwork, settings: Settings,
+                progress: Progress | None = None,
                 stopped: Callable[[], bool] | None = None) -> EventsResult:
-    """Describe the passes in an open recording.
+    """Describe the passes in a source."""
+    pipeline = Pipeline(network, settings, 'calibrate')
+    sink = _EventSink(pipeline)
+    report = run(source, pipeline, [sink], progress, stopped)
+    return EventsResult(tuple(_with_timestamp_error(event, pipeline.calibrate)
+                              for event in sink.events), report)
 
-    Parameters
-    ----------
-    recording : Recording
-    network : SensorNetwork
-    settings : Settings
-    progress : function, optional
-        Called with the number of bytes read since the last call.
-    stopped : function, optional
-        Called after every batch of readings; reading ends when it returns true.
 
-    Returns
-    -------
-    EventsResult
+class _EventSink(RecordReceiver):
+    """Collects the events in calibrated readings."""
 
-    Raises
-    ------
-    RecordingError
-        If the recording has none of the network's topics.
-    """
-    reader = SampleReader(recording, network)
-    calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
-    stage = Events(network, settings.align, settings.detect, settings.track)
-    prescan_of(recording, network, settings.calibrate, stopped).apply(calibrate)
-    pass_events: list[PassEvent] = []
-    try:
-        for readings in until_stopped(reader.readings, progress, stopped):
-            for calibrated in calibrate.feed(readings):
-                stage.set_relearnt(calibrate.backgrounds())
-                pass_events += stage.feed(calibrated)
-    except ReadingStopped:
-        pass
-    for calibrated in calibrate.flush():
-        pass_events += stage.feed(calibrated)
-    pass_events += stage.flush()
-    pass_events = [_with_timestamp_error(event, calibrate) for event in pass_events]
-    return EventsResult(tuple(pass_events),
-                        dict(reader.rejected + Counter(rejected(calibrate.counts))),
-                        tuple(calibrate.unready()), tuple(reader.missing_topics()),
-                        tuple(ranked(input_findings(recording, reader, network, calibrate,
-                                                    settings.track))))
+    def __init__(self, pipeline: Pipeline) -> None:
+        settings = pipeline.settings
+        self._calibrate = pipeline.calibrate
+        self._stage = Events(pipeline.network, settings.align, settings.detect, settings.track)
+        self.events: list[PassEvent] = []
+
+    def add(self, step: Step) -> None:
+        """Find the events in the calibrated readings of a step."""
+        self.receive(step.records)
+        if step.is_last:
+            self.events += self._stage.flush()
+
+    def add_calibrated(self, readings: Readings) -> None:
+        """Find the events in calibrated readings."""
+        self._stage.set_relearnt(self._calibrate.backgrounds())
+        self.events += self._stage.feed(readings)
 
 
 def _with_timestamp_error(event: PassEvent, calibrate: Calibrate) -> PassEvent:

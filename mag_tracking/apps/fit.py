@@ -1,6 +1,6 @@
 """Offline fits of the passes in a recording."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from typing import TYPE_CHECKING, Any
@@ -8,17 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
-from mag_tracking.apps.prescan import prescan_of
-from mag_tracking.apps.readings import network_of
+from mag_tracking.apps.readings import network_of, source_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Settings, settings_for
+from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.fit_folder import FIT_COLUMNS, pass_rows
-from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.recording.interruptible import Progress
 from mag_tracking.report.dataframes import STATE_UNITS, dataframe
-from mag_tracking.stages.calibrate.field_comparison import earth_field_findings
+from mag_tracking.run import RunReport, Source, run
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,79 +33,14 @@ FIT_UNITS = {
 """Units of the columns of `fits.csv`: {column: unit}."""
 
 
-class RecordingFit:
-    """Fits every pass in a recording.
-
-    Parameters
-    ----------
-    recording : Recording
-    network : SensorNetwork
-    settings : Settings
-        Settings of calibration, alignment, detection and tracking.
-    orders : sequence of int
-        Numbers of dipoles to try.
-    cpa_range : (range, std), m, optional
-        Range at the closest point of approach, only for a network of one sensor; see
-        `analysis.pass_fit.fit_pass`.
-
-    Raises
-    ------
-    RecordingError
-        If the recording has none of the network's topics.
-    """
-
-    def __init__(self, recording: Recording, network: SensorNetwork, settings: Settings,
-                 orders: Sequence[int], cpa_range: tuple[float, float] | None = None) -> None:
-        self._fitter = PassFitter(recording.path.resolve().stem, network, settings, orders,
-                                  cpa_range)
-        self._recording = recording
-        self._reader = SampleReader(recording, network)
-        self._network, self._settings = network, settings.calibrate
-
-    def passes(self, progress: Callable[[int], object] | None = None,
-               stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """Read the recording, fit each pass, and yield the results.
-
-        Parameters
-        ----------
-        progress : function, optional
-            Called with the number of bytes read since the last call.
-        stopped : function, optional
-            Called after every batch of readings and every fit; iteration ends when it returns
-            true.
-
-        Yields
-        ------
-        FittedPass
-        """
-        prescan_of(self._recording, self._network, self._settings,
-                   stopped).apply(self._fitter.collector.calibrate)
-        for readings in self._reader.readings(progress):
-            if stopped is not None and stopped():
-                return
-            yield from self._fitter.feed(readings, stopped)
-        yield from self._fitter.flush(stopped)
-
-    def warnings(self) -> list[str]:
-        """Describe missing topics, backgrounds and detections, and faulty or rejected readings.
-
-        Returns
-        -------
-        list of str
-            One line per warning.
-        """
-        collector = self._fitter.collector
-        lines = [f'no messages on {topic}' for topic in self._reader.missing_topics()]
-        lines += [f'no background was learnt for {name}: its quiet intervals are too short; '
-                  'set background and noise_std in the network file'
-                  for name in collector.sensors_without_background()]
-        lines += [str(f) for f in earth_field_findings(
-            collector.calibrate.field_inconsistencies())]
-        reason = collector.no_detection_reason(self._reader.missing_topics())
-        lines += [f'nothing was detected: {reason}'] if reason else []
-        for counts in (self._reader.rejected, collector.rejected, self._recording.losses):
-            lines += [f'{cause}: {n}' for cause, n in counts.items()]
-        return lines
+def fit_source(source: Source, network: SensorNetwork, settings: Settings, orders: Sequence[int],
+               cpa_range: tuple[float, float] | None, report: Callable[[FittedPass], object],
+               progress: Progress | None = None, stopped: Callable[[], bool] | None = None
+               ) -> RunReport:
+    """Fit every pass in a source, and pass each result to `report`."""
+    pipeline = Pipeline(network, settings, 'track')
+    fitter = PassFitter(source.stem, pipeline, orders, cpa_range, report, stopped)
+    return run(source, pipeline, [fitter], progress, stopped)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,12 +49,13 @@ class FitResult:
 
     passes: tuple[FittedPass, ...]
     """One entry per pass and vehicle."""
-    warnings: tuple[str, ...]
-    """Warnings about missing topics, backgrounds or detections, and lost or rejected readings."""
+    report: RunReport
+    """What was lost, rejected or missing, and why."""
 
     def __repr__(self) -> str:
+        notes = self.report.warnings()
         return (f'FitResult({quantity(len(self.passes), "pass", "passes")}'
-                + (f'; warnings: {"; ".join(self.warnings)}' if self.warnings else '') + ')')
+                + (f'; {"; ".join(notes)}' if notes else '') + ')')
 
     def to_dataframe(self) -> 'pd.DataFrame':
         """Convert the fits to a table.
@@ -179,10 +113,10 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
     network = network_of(network)
     check_orders('orders', orders)
     check_cpa_range('cpa_range', cpa_range, network)
-    job = RecordingFit(Recording(recording), network, settings_for('vehicle', settings), orders,
-                       cpa_range)
-    passes = tuple(job.passes())
-    return FitResult(passes, tuple(job.warnings()))
+    passes: list[FittedPass] = []
+    report = fit_source(source_of(recording, network), network, settings_for('vehicle', settings),
+                        orders, cpa_range, passes.append)
+    return FitResult(tuple(passes), report)
 
 
 def check_orders(name: str, orders: Sequence[int]) -> None:

@@ -17,10 +17,8 @@ from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.detection_theory import energy_threshold
-from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Settings
-from mag_tracking.records import FieldFrame, Readings
-from mag_tracking.stages.track.manager import TrackManager
+from mag_tracking.pipeline import Pipeline
+from mag_tracking.run import Step
 
 MAX_TRAILER_DISTANCE = 8.0
 """Maximum distance between a car and its trailer [m]."""
@@ -91,72 +89,28 @@ class FittedPass:
 
 
 class PassFitter:
-    """Fits every pass in a stream of readings.
+    """Sink that fits every pass as a row of dipoles, for each number of dipoles in `orders`.
 
-    A tracker runs in parallel and determines the number of vehicles in each pass.
-
-    Parameters
-    ----------
-    recording : str
-        Name of the recording.
-    network : SensorNetwork
-    settings : Settings
-    orders : sequence of int
-        Numbers of dipoles to try.
-    cpa_range : (range, std), m, optional
-        Range at the closest point of approach, only for a network of one sensor.
-
-    Attributes
-    ----------
-    collector : PassCollector
-        Extracts the passes.
+    The tracks determine the number of vehicles in each pass. Each result is passed to `report`.
+    `cpa_range` is (range, std) at the closest point of approach [m], only for a single sensor.
     """
 
-    def __init__(self, recording: str, network: SensorNetwork, settings: Settings,
-                 orders: Sequence[int], cpa_range: tuple[float, float] | None = None) -> None:
-        self._recording = recording
-        self.collector = PassCollector(network, settings, self._track)
-        self._tracker = TrackManager(network, settings.track)
-        self._tracks, self._ground = PassTracks(settings.track), ground_prior(settings.track)
+    def __init__(self, recording: str, pipeline: Pipeline, orders: Sequence[int],
+                 cpa_range: tuple[float, float] | None, report: Callable[[FittedPass], object],
+                 stopped: Callable[[], bool] | None = None) -> None:
+        self._recording, self._collector = recording, PassCollector(pipeline)
+        track = pipeline.settings.track
+        self._tracks, self._ground = PassTracks(track), ground_prior(track)
         self._orders, self._cpa_range = tuple(orders), cpa_range
-        self._n_passes = 0
+        self._report, self._stopped, self._n_passes = report, stopped, 0
 
-    def feed(self, readings: Readings,
-             stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """Add raw readings and fit the passes that they complete.
-
-        Parameters
-        ----------
-        readings : Readings
-        stopped : function, optional
-            Fitting ends when it returns true.
-
-        Returns
-        -------
-        iterator of FittedPass
-            The passes are fitted during the iteration.
-        """
-        return self._fit_passes(self.collector.feed(readings), stopped)
-
-    def flush(self, stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """End the stream and fit the pass that was still in progress.
-
-        Parameters
-        ----------
-        stopped : function, optional
-            Fitting ends when it returns true.
-
-        Returns
-        -------
-        iterator of FittedPass
-            The passes are fitted during the iteration.
-        """
-        return self._fit_passes(self.collector.flush(), stopped)
-
-    def _track(self, frame: FieldFrame) -> None:
-        """Track the targets in a frame."""
-        self._tracker.set_input_doubts(self.collector.calibrate.input_doubts())
-        self._tracks.add(self._tracker.feed(frame))
+    def add(self, step: Step) -> None:
+        """Fit the passes that end with a step; fitting ends when `stopped` returns true."""
+        if not step.is_last:
+            # A vehicle that still approaches at the end of the source does not belong to a pass.
+            self._tracks.add(step.records)
+        for fitted_pass in self._fit_passes(self._collector.passes(step), self._stopped):
+            self._report(fitted_pass)
 
     def _fit_passes(self, passes: Iterable[tuple[PassData, tuple[str, ...]]],
                     stopped: Callable[[], bool] | None) -> Iterator[FittedPass]:

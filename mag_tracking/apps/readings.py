@@ -17,6 +17,7 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings
 from mag_tracking.report.metrics import Truth
+from mag_tracking.run import ArraySource, RecordingSource, Source
 from mag_tracking.units import LATEST_NS, NS
 
 MAX_DELAY_S = 10.0
@@ -110,6 +111,18 @@ def recorded_readings(recording: Recording, reader: SampleReader,
     """
     return RecordedReadings(readings, reader.truth_arrays(), dict(reader.rejected),
                             dict(recording.losses), tuple(reader.missing_topics()))
+
+
+def source_of(source: Readings | RecordedReadings | str | PathLike[str],
+              network: SensorNetwork) -> Source:
+    """Source for `run`: a recording, which need not fit into memory, or readings."""
+    if isinstance(source, Readings):
+        check_order(source)
+        source = RecordedReadings(source, {}, {}, {}, ())
+    if isinstance(source, RecordedReadings):
+        return ArraySource(checked_readings(source.readings, network), rejected=source.rejected,
+                           lost=source.lost, topics=source.missing_topics)
+    return RecordingSource(Recording(source), network)
 
 
 def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: ArrayLike,

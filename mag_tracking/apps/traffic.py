@@ -1,7 +1,7 @@
 """Traffic in a recording: passages of vehicles across counting lines, and summaries."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -14,20 +14,16 @@ from mag_tracking.analysis.correlated_motion import (
     correlated_motion,
 )
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.apps.no_detection import no_detection_reason
-from mag_tracking.apps.prescan import prescan_of
-from mag_tracking.apps.readings import network_of
-from mag_tracking.apps.replay_notes import no_track_reason, replay_findings
+from mag_tracking.apps.readings import network_of, source_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import TrafficSummary, VehiclePassage
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Output, Pipeline, Settings, settings_for
+from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
-from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.record_receiver import RecordReceiver
+from mag_tracking.recording.interruptible import Progress
 from mag_tracking.records import FieldFrame, Track
-from mag_tracking.stages.health.diagnosis import Diagnosis, ranked
+from mag_tracking.run import RunReport, Source, run
 from mag_tracking.units import NS
 
 RETENTION_S = 300.0
@@ -61,20 +57,9 @@ class TrafficResult:
     """Counted vehicles in chronological order."""
     summaries: tuple[TrafficSummary, ...]
     """One summary per line and interval."""
-    counts: dict[str, int]
-    """{event: number}, for events such as passages, or tracks that crossed no line."""
-    rejections: dict[str, int]
-    """Readings that were not used: {cause: number}."""
-    missing_topics: tuple[str, ...]
-    """Topics of the network that are not in the recording."""
-    sensors_without_background: tuple[str, ...]
-    """Sensors whose background was not learnt."""
-    no_detection_reason: str | None
-    """Explanation, in one sentence, of why nothing was detected; None if a target was detected."""
-    no_track_reason: str | None
-    """Explanation if nothing was tracked because only one sensor measured the target, else None."""
-    diagnoses: tuple[Diagnosis, ...]
-    """Diagnoses of the recording, the sensors and the stages."""
+    report: RunReport
+    """What was lost, rejected or missing, and why; `report.counts['traffic']` counts passages,
+    tracks that crossed no line, and other events."""
 
     def __repr__(self) -> str:
         lines = dict(Counter(v.passage.line for v in self.vehicles))
@@ -107,60 +92,24 @@ def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathL
     SettingsError
         If a setting is invalid, or the target is not a vehicle.
     """
-    return count_traffic(Recording(recording), network_of(network),
-                         settings_for('vehicle', settings))
+    network = network_of(network)
+    return count_traffic(source_of(recording, network), network, settings_for('vehicle', settings))
 
 
-def count_traffic(recording: Recording, network: SensorNetwork, settings: Settings,
-                  progress: Callable[[int], object] | None = None,
+def count_traffic(source: Source, network: SensorNetwork, settings: Settings,
+                  progress: Progress | None = None,
                   stopped: Callable[[], bool] | None = None) -> TrafficResult:
-    """Count the vehicles in an open recording.
-
-    Parameters
-    ----------
-    recording : Recording
-    network : SensorNetwork
-    settings : Settings
-    progress : function, optional
-        Called with the number of bytes read since the last call.
-    stopped : function, optional
-        Called after every batch of readings; reading ends when it returns true.
-
-    Returns
-    -------
-    TrafficResult
-
-    Raises
-    ------
-    RecordingError
-        If the recording has none of the network's topics.
-    SettingsError
-        If the target is not a vehicle.
-    """
+    """Count the vehicles in a source; raises SettingsError if the target is not a vehicle."""
     if settings.track.target != 'vehicle':
         raise SettingsError('traffic counts only vehicles; set the target to vehicle instead of '
                             f'{settings.track.target}')
-    pipeline = Pipeline(network, settings)
-    reader = SampleReader(recording, network)
-    prescan_of(recording, network, settings.calibrate, stopped).apply(pipeline.calibrate)
-    collector = _TrafficCollector(network)
-    try:
-        for readings in until_stopped(reader.readings, progress, stopped):
-            collector.add(pipeline.feed(readings))
-    except ReadingStopped:
-        pass
-    collector.add(pipeline.flush())
-    rejections = dict(reader.rejected + Counter(pipeline.rejections()))
-    reason = no_detection_reason(network, settings, pipeline.calibrate, pipeline.detect,
-                                 reader.missing_topics(), rejections)
-    return TrafficResult(settings.traffic.class_names, tuple(collector.vehicles),
-                         tuple(collector.summaries), dict(pipeline.traffic.counts), rejections,
-                         tuple(reader.missing_topics()), tuple(pipeline.calibrate.unready()),
-                         reason, no_track_reason(pipeline.counts()['track']),
-                         tuple(ranked(replay_findings(recording, reader, pipeline, reason))))
+    sink = _TrafficSink(network)
+    report = run(source, Pipeline(network, settings), [sink], progress, stopped)
+    return TrafficResult(settings.traffic.class_names, tuple(sink.vehicles), tuple(sink.summaries),
+                         report)
 
 
-class _TrafficCollector:
+class _TrafficSink(RecordReceiver):
     """Collects passages and summaries; stores the frames of tracks to compute the delays."""
 
     def __init__(self, network: SensorNetwork) -> None:
@@ -171,19 +120,24 @@ class _TrafficCollector:
         self.vehicles: list[CountedVehicle] = []
         self.summaries: list[TrafficSummary] = []
 
-    def add(self, records: Iterable[Output]) -> None:
-        """Add the outputs of a batch of readings."""
-        for record in records:
-            if isinstance(record, FieldFrame):
-                self._drop_old(record.stamp_ns)
-                self._frame = record
-            elif isinstance(record, Track) and not record.ended:
-                assert self._frame is not None, 'a pose without a frame'
-                self._frames.setdefault(record.id, []).append(self._frame)
-            elif isinstance(record, VehiclePassage):
-                self.vehicles.append(CountedVehicle(record, self._delay_motion(record.track_id)))
-            elif isinstance(record, TrafficSummary):
-                self.summaries.append(record)
+    def add_frame(self, frame: FieldFrame) -> None:
+        """Store the frame of the following poses."""
+        self._drop_old(frame.stamp_ns)
+        self._frame = frame
+
+    def add_track(self, track: Track) -> None:
+        """Store the latest frame for a track."""
+        if not track.ended:
+            assert self._frame is not None, 'a pose without a frame'
+            self._frames.setdefault(track.id, []).append(self._frame)
+
+    def add_passage(self, passage: VehiclePassage) -> None:
+        """Add a passage with the velocity from the delays."""
+        self.vehicles.append(CountedVehicle(passage, self._delay_motion(passage.track_id)))
+
+    def add_traffic(self, summary: TrafficSummary) -> None:
+        """Add a summary."""
+        self.summaries.append(summary)
 
     def _drop_old(self, now_ns: int) -> None:
         """Drop frames of tracks that ended before a time jump, or more than `RETENTION_S` ago."""

@@ -14,6 +14,7 @@ from mag_tracking.errors import OutputError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.files import new_text_file, output_folder
 from mag_tracking.network import SensorNetwork
+from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.recording import core
 from mag_tracking.recording.track_recording import TrackRecording
 from mag_tracking.recording.writer import check_no_other_recording
@@ -60,7 +61,7 @@ def figure_name(kind: str, track_id: int) -> str:
     return f'{kind}_track_{track_id}.png'
 
 
-class ResultFolder:
+class ResultFolder(RecordReceiver):
     """Writes the tables and the recording of one run; a context manager.
 
     Rows are written immediately, so that an interrupted run does not lose them.
@@ -128,26 +129,28 @@ class ResultFolder:
         finally:
             self._recording.close()
 
-    def add_detection(self, d: Detection) -> None:
+    def add_detection(self, detection: Detection) -> None:
         """Write a row for the onset or the release of a target.
 
         Parameters
         ----------
-        d : Detection
+        detection : Detection
         """
+        d = detection
         self._detections.writerow([
             d.stamp_ns, d.id, 'onset' if d.onset else 'release', repr(d.statistic),
             d.degrees_of_freedom, repr(d.threshold), repr(d.false_alarm_probability),
             d.strongest_sensor])
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Write the fields of a frame to the recording, not to a table.
+        """Write the fields of a frame with a target to the recording, not to a table.
 
         Parameters
         ----------
         frame : FieldFrame
         """
-        self._recording.add_frame(frame)
+        if frame.target_present:
+            self._recording.add_frame(frame)
 
     def add_track(self, track: Track) -> None:
         """Write a track record to the recording; write one row for its pose and one per hypothesis.
@@ -182,13 +185,14 @@ class ResultFolder:
         self._hypotheses.write(''.join(
             f'{row_prefix}{names[pair]},{row}\r\n' for pair, row in zip(pairs, rows, strict=True)))
 
-    def add_disturbance(self, d: Disturbance) -> None:
+    def add_disturbance(self, disturbance: Disturbance) -> None:
         """Write a disturbance to the recording and the table, at its detection and at its end.
 
         Parameters
         ----------
-        d : Disturbance
+        disturbance : Disturbance
         """
+        d = disturbance
         self._recording.add_disturbance(d)
         self._disturbances.writerow([
             d.stamp_ns, d.id, int(d.ended), d.begin_ns, repr(d.largest), ' '.join(d.sensors),

@@ -1,7 +1,7 @@
 """First pass over a recording, to find backgrounds if a target is present at the start."""
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from itertools import chain
 
 from mag_tracking.arrays import FloatArray
@@ -10,9 +10,6 @@ from mag_tracking.calibration.quiet_level import BlockRecorder
 from mag_tracking.calibration.reading_faults import ReadingFaults
 from mag_tracking.calibration.sensor_state import N_WINDOW
 from mag_tracking.network import SensorNetwork
-from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
-from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
@@ -187,37 +184,3 @@ def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: MostFrequent
         return False
     # Without relearning, a level remains the background even if another level lasts.
     return not settings.relearn_s or recorder.is_known_level(learnt[1], level)
-
-
-def prescan_of(recording: Recording, network: SensorNetwork, settings: CalibrateSettings,
-               stopped: Callable[[], bool] | None = None) -> Prescan:
-    """Find the backgrounds of sensors if a target is present at the start of a recording.
-
-    Parameters
-    ----------
-    recording : Recording
-    network : SensorNetwork
-    settings : CalibrateSettings
-    stopped : function, optional
-        Called after every batch of readings; reading ends when it returns true.
-
-    Returns
-    -------
-    Prescan
-
-    Raises
-    ------
-    RecordingError
-        If the recording has none of the network's topics.
-    """
-    # A separate Recording is used, because losses are counted whenever a recording is read.
-    reader = SampleReader(Recording(recording.path), network)
-
-    def batches() -> Iterator[Readings]:
-        try:
-            yield from until_stopped(reader.readings, None, stopped)
-        except ReadingStopped:
-            return
-
-    found = prescan(batches(), network, settings)
-    return replace(found, clocks=reader.clocks)
