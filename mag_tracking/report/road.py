@@ -25,7 +25,7 @@ BEYOND_M = 100.0
 
 @dataclass(frozen=True)
 class Road:
-    """Outline of a road with side roads. Empty if no vehicle has passed."""
+    """Outline of a road with side roads; empty if no vehicle has passed."""
 
     areas: Sequence[FloatArray] = ()
     """Polygons, each (n, 2) m, world frame."""

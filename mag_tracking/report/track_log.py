@@ -16,7 +16,7 @@ Arrival: TypeAlias = tuple[float, FloatArray, FloatArray]
 
 @dataclass
 class SmoothedLog:
-    """History of one smoothed track. Each list has one element per pose, as in `SmoothedPose`."""
+    """History of one smoothed track; lists have one element per pose, as in `SmoothedPose`."""
 
     id: int
     stamp_ns: list[int] = field(default_factory=list)

@@ -69,7 +69,7 @@ class ClockStepFilter:
 
     @property
     def is_calm(self) -> bool:
-        """Whether no clock step is suspected. Samples that do not jump then bypass the filter."""
+        """Whether no clock step is suspected: samples that do not jump then bypass the filter."""
         if not self._held and not self._ahead_since:
             return True
         # The entry of a sensor without held samples expires when a newer timestamp is accepted.

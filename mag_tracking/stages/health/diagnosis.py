@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 class Cause(enum.Enum):
-    """Kind of a fault. The value names it in `summary.json`."""
+    """Kind of a fault; the value names it in `summary.json`."""
 
     # The computer, the recording and the topics.
     OVERLOADED = 'overloaded computer'
