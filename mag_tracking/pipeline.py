@@ -79,24 +79,10 @@ and 3 rad/s), or a magnet that is moved step by step on a bench."""
 
 
 def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Settings:
-    """Settings for a type of target.
+    """Settings for a target, a key of `TARGET_DEFAULTS`, with changes by dotted name.
 
-    Parameters
-    ----------
-    target : str
-        Key of `TARGET_DEFAULTS`.
-    changes : mapping of str to setting, optional
-        Values by dotted name that override the defaults of the target. A value of `track.target`
-        must not differ from that of the target.
-
-    Returns
-    -------
-    Settings
-
-    Raises
-    ------
-    SettingsError
-        If `target` is unknown or contradicts `changes`, or if a change is invalid.
+    Raises SettingsError if `target` is unknown, if a change is invalid, or if the change of
+    `track.target` differs from the target.
     """
     if target not in TARGET_DEFAULTS:
         raise SettingsError(f'target: expected {" or ".join(TARGET_DEFAULTS)}, got {target!r}')

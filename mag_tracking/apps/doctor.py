@@ -39,20 +39,8 @@ field by about fifty times as much."""
 
 
 def level_of(calibrate: Calibrate, name: str, health: SensorHealth) -> FloatArray:
-    """Return the field that a sensor measures while no target is present.
-
-    Parameters
-    ----------
-    calibrate : Calibrate
-    name : str
-        Sensor.
-    health : SensorHealth
-
-    Returns
-    -------
-    (3,) array, T, sensor frame
-        Background if it was learnt from readings, otherwise the median of the latest readings.
-    """
+    """Field (3,), T, sensor frame, that a sensor measures without a target: the background if it
+    was learnt from readings, otherwise the median of the latest readings."""
     background = calibrate.backgrounds()[name]
     if background.measured and calibrate.last_stamp_ns(name) is not None:
         return calibrate.background(name)
@@ -61,19 +49,7 @@ def level_of(calibrate: Calibrate, name: str, health: SensorHealth) -> FloatArra
 
 def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: Calibrate,
                      sensors: Mapping[str, SensorHealth]) -> list[Finding]:
-    """Diagnose faults that are visible only by comparing sensors.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    survey : SurveySettings
-    calibrate : Calibrate
-    sensors : {name: SensorHealth}
-
-    Returns
-    -------
-    list of Finding
-    """
+    """Diagnose faults that are visible only by comparing sensors."""
     clocks = {name: health.clock for name, health in sensors.items()}
     findings = list(clock_findings({name: c for name, c in clocks.items() if c is not None}))
     levels = np.array([level_of(calibrate, name, sensors[name]) for name in network.names])
@@ -88,29 +64,13 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
 
 
 class MissedTargets:
-    """Counts targets that other sensors detect while the readings of a sensor stay constant.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Names of the sensors.
-    """
+    """Counts targets that other sensors detect while the readings of a sensor stay constant."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self._missed: dict[str, Counter[str]] = {name: Counter() for name in names}
 
     def add_target(self, name: str, begin_ns: int, sensors: Mapping[str, SensorHealth]) -> None:
-        """Add a target that one sensor detected and that has passed.
-
-        Parameters
-        ----------
-        name : str
-            Sensor that detected the target.
-        begin_ns : int, ns
-            Time at which the detection began.
-        sensors : {name: SensorHealth}
-            Health of all sensors.
-        """
+        """Add a target that has passed and that sensor `name` detected from `begin_ns` on."""
         for other, health in sensors.items():
             since_ns = health.unchanged_since_ns
             if since_ns is not None and since_ns < begin_ns:
@@ -119,12 +79,7 @@ class MissedTargets:
                 self._missed[other].clear()
 
     def findings(self) -> Iterator[Finding]:
-        """Report each sensor that missed several consecutive targets.
-
-        Yields
-        ------
-        Finding
-        """
+        """Report each sensor that missed several consecutive targets."""
         for name, missed in self._missed.items():
             for other, n in missed.most_common(1):
                 if n >= MIN_MISSED_TARGETS:
@@ -177,13 +132,7 @@ class Doctor:
                 self._missed.add_target(name, begin_ns, self.sensors)
 
     def findings(self) -> list[Finding]:
-        """Return the findings from all readings so far.
-
-        Returns
-        -------
-        list of Finding
-            Without ranking; see `stages.health.diagnosis.ranked`.
-        """
+        """Findings from all readings so far, without ranking (`stages.health.diagnosis.ranked`)."""
         found = list(self._stalls.findings())
         for j, (name, health) in enumerate(self.sensors.items()):
             found += health.findings(name, self.network.noise_std[j],

@@ -120,38 +120,14 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
 
 
 def check_orders(name: str, orders: Sequence[int]) -> None:
-    """Check that the numbers of dipoles are distinct and from 1 to 8.
-
-    Parameters
-    ----------
-    name : str
-        Name of the argument in the message.
-    orders : sequence of int
-
-    Raises
-    ------
-    SettingsError
-        If a number is repeated or out of range, or `orders` is empty.
-    """
+    """Raise SettingsError unless the numbers of dipoles are distinct and from 1 to 8."""
     if not len(orders) or min(orders) < 1 or max(orders) > 8 or len(set(orders)) < len(orders):
         raise SettingsError(f'{name}: expected different numbers from 1 to 8, got {list(orders)}')
 
 
 def check_cpa_range(name: str, cpa_range: Sequence[float] | None, network: SensorNetwork) -> None:
-    """Check the range at the closest point of approach, which requires a single sensor.
-
-    Parameters
-    ----------
-    name : str
-        Name of the argument in the message.
-    cpa_range : (range, std), m, or None
-    network : SensorNetwork
-
-    Raises
-    ------
-    SettingsError
-        If `cpa_range` is not a pair of positive values, or the network has several sensors.
-    """
+    """Raise SettingsError unless (range, std) [m] are positive and the network has a single
+    sensor."""
     if cpa_range is None:
         return
     if len(network) > 1:

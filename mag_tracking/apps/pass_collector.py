@@ -135,8 +135,8 @@ def _common_covariance(covariances: FloatArray) -> FloatArray:
     """Replace the covariances (n, 3, 3) of readings by the first one if they are similar.
 
     While the noise is being learnt, its estimate varies slightly although the noise is constant.
-    The covariances of a coarse sensor are not similar: they are much larger in a constant field
-    than in a changing field.
+    The covariances of a coarse sensor differ: they are much larger in a constant field than in a
+    changing one.
     """
     traces = np.nansum(np.einsum('kii->ki', covariances), axis=1)
     if traces.max() > 2.0 * traces.min():

@@ -134,31 +134,11 @@ def fitted_vehicles(recording: str, number: int, data: PassData, single_fits: Se
                     paths: FloatArray, ground: GroundPrior, orders: Sequence[int],
                     notes: tuple[str, ...],
                     stopped: Callable[[], bool] | None = None) -> list[FittedPass]:
-    """Fit the vehicles in a pass, jointly if there are several.
+    """Fit the vehicles in detection `number` (from 1), jointly if there are several.
 
-    Parameters
-    ----------
-    recording : str
-        Name of the recording.
-    number : int
-        Index of the detection in the recording, from 1.
-    data : PassData
-    single_fits : sequence of PassFit
-        Fits of the pass as a single vehicle.
-    paths : (K, 6) array, m and m/s, world frame
-        Position and velocity of each tracked vehicle when `data.t` is zero.
-    ground : GroundPrior
-    orders : sequence of int
-        Numbers of dipoles to try if there are several vehicles.
-    notes : tuple of str
-        Remarks on the pass for the user.
-    stopped : function, optional
-        Fitting ends when it returns true; the result is then invalid.
-
-    Returns
-    -------
-    list of FittedPass
-        One entry per vehicle.
+    `single_fits` are the fits as a single vehicle; `paths` (K, 6) [m, m/s, world frame] are the
+    positions and velocities of the tracked vehicles when `data.t` is zero; `orders` are the numbers
+    of dipoles for several vehicles. The result is invalid after `stopped` has returned true.
     """
     vehicles = fit_targets(data, single_fits, paths, ground, orders, stopped)
     if len(vehicles) == 1:

@@ -16,33 +16,13 @@ from mag_tracking.units import NS
 
 
 def diagnosis_entries(diagnoses: Iterable[Diagnosis]) -> list[dict[str, Any]]:
-    """Entries of diagnoses in `summary.json`.
-
-    Parameters
-    ----------
-    diagnoses : iterable of Diagnosis
-
-    Returns
-    -------
-    list of dict
-        Cause, whether it is serious, and the text.
-    """
+    """Entries of diagnoses in `summary.json`: cause, whether it is serious, and the text."""
     return [{'cause': d.finding.cause.value, 'serious': d.serious, 'text': str(d)}
             for d in diagnoses]
 
 
 def notes_of(summary: Mapping[str, Any]) -> list[Note]:
-    """Create the notes on a replay.
-
-    Parameters
-    ----------
-    summary : dict
-        Content of `summary.json`.
-
-    Returns
-    -------
-    list of Note
-    """
+    """Create the notes on a replay from the content of `summary.json`."""
     return [*_input_notes(summary), *_limit_notes(summary), *_truth_notes(summary),
             *(Note(NOTE, _describe_disturbance(d)) for d in summary['disturbances'])]
 

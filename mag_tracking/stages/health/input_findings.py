@@ -26,22 +26,9 @@ ZERO_STAMP = 'message with header.stamp 0'
 def sensor_findings(network: SensorNetwork, calibrate: Calibrate, settings: TrackSettings,
                     missing_topics: Sequence[str], clocks: Mapping[str, ClockSpan]
                     ) -> list[Finding]:
-    """Findings about the sensors, without ranking.
+    """Findings about the sensors, without ranking, after all readings.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-    calibrate : Calibrate
-        Calibration stage after all readings.
-    settings : TrackSettings
-    missing_topics : sequence of str
-        Topics of the network without messages.
-    clocks : {sensor: ClockSpan}
-        Raw timestamps, and their times of receipt; empty if unknown.
-
-    Returns
-    -------
-    list of Finding
+    `clocks` are the raw timestamps and times of receipt; empty if unknown.
     """
     found = list(clock_findings(corrected(clocks, network)))
     for name, topic in zip(network.names, network.absolute_topics, strict=True):
@@ -60,21 +47,9 @@ def sensor_findings(network: SensorNetwork, calibrate: Calibrate, settings: Trac
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
                         n_reported: int = 0) -> Iterator[Finding]:
-    """Diagnose the background of one sensor.
+    """Diagnose the background of a sensor, frozen since `frozen_since_ns` or not (None).
 
-    Parameters
-    ----------
-    name : str
-        Sensor.
-    calibrate : Calibrate
-    frozen_since_ns : int, ns, or None
-        Timestamp from which the background has been frozen; None if it is not frozen.
-    n_reported : int
-        Number of relearnt backgrounds that were reported earlier.
-
-    Yields
-    ------
-    Finding
+    `n_reported` is the number of relearnt backgrounds that were reported earlier.
     """
     background, last = calibrate.backgrounds()[name], calibrate.last_stamp_ns(name)
     if last is not None and not background.ready and background.stuck:
@@ -104,21 +79,7 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
 
 def rate_findings(name: str, rate: float, network: SensorNetwork,
                   settings: TrackSettings) -> Iterator[Finding]:
-    """Report a sensor that is too slow for tracks.
-
-    Parameters
-    ----------
-    name : str
-        Sensor.
-    rate : float, Hz
-        NaN or inf if unknown.
-    network : SensorNetwork
-    settings : TrackSettings
-
-    Yields
-    ------
-    Finding
-    """
+    """Report a sensor whose rate [Hz; NaN or inf if unknown] is too low for tracks."""
     fault = low_rate_fault(rate, network, settings)
     if fault is not None:
         yield Finding(True, name, fault, 'raise the rate of the sensor; for parked vehicles, use '
