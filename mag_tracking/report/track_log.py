@@ -42,7 +42,7 @@ class SmoothedLog:
 
 @dataclass
 class TrackLog:
-    """History of one track. Each list has one value per pose, of the `Track` or of its frame."""
+    """History of one track; lists have one value per pose, of the `Track` or of its frame."""
 
     id: int
     stamp_ns: list[int] = field(default_factory=list)
