@@ -1,24 +1,29 @@
 """Receiver of the records of a run, with one method for each type of record."""
 
-from collections.abc import Iterable
-from typing import Protocol
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 from mag_tracking.event_records import Disturbance, TrafficSummary, VehiclePassage
 from mag_tracking.records import Detection, FieldFrame, Readings, SmoothedPose, Track
 
 
-class _Records(Protocol):
-    """Object with records, such as `run.Step`."""
+class Step(NamedTuple):
+    """A batch of raw readings and what the pipeline made of it."""
 
-    @property
-    def records(self) -> Iterable[object]:
-        """Records in order of processing."""
+    readings: Readings
+    """Raw readings; empty at the end of the source."""
+    received_ns: int | None
+    """Time of receipt [ns]; None if unknown."""
+    records: Sequence[object]
+    """Records in order of processing."""
+    is_last: bool = False
+    """Whether the records follow from the end of the source; all frames precede them."""
 
 
 class RecordReceiver:
     """Sink that passes each record to the method for its type; subclasses override some."""
 
-    def add(self, step: _Records) -> None:
+    def add(self, step: Step) -> None:
         """Receive the records of a step."""
         self.receive(step.records)
 

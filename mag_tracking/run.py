@@ -3,11 +3,12 @@
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from mag_tracking.errors import OutputError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Output, Pipeline
+from mag_tracking.pipeline import Pipeline
+from mag_tracking.record_receiver import Step
 from mag_tracking.recording.interruptible import Progress, ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
@@ -31,8 +32,10 @@ class Source(Protocol):
     """Name for messages."""
     stem: str
     """Name for tables and files."""
-    rejected: Mapping[str, int]
-    """Messages without a usable reading so far: {cause: number}."""
+
+    @property
+    def rejected(self) -> Mapping[str, int]:
+        """Messages without a usable reading so far: {cause: number}."""
 
     @property
     def lost(self) -> Mapping[str, int]:
@@ -83,7 +86,11 @@ class RecordingSource:
         self.stem = recording.path.resolve().stem
         self._network, self._by_message = network, by_message
         self.reader = SampleReader(recording, network, truth)
-        self.rejected = self.reader.rejected
+
+    @property
+    def rejected(self) -> Mapping[str, int]:
+        """Messages without a usable reading so far: {cause: number}."""
+        return self.reader.rejected
 
     @property
     def lost(self) -> Mapping[str, int]:
@@ -137,19 +144,6 @@ class ArraySource:
         """Iterate over batches of at most `ARRAY_BATCH` readings."""
         for i in range(0, len(self.readings), ARRAY_BATCH):
             yield self.readings.part(slice(i, i + ARRAY_BATCH)), None
-
-
-class Step(NamedTuple):
-    """A batch of raw readings and what the pipeline made of it."""
-
-    readings: Readings
-    """Raw readings; empty at the end of the source."""
-    received_ns: int | None
-    """Time of receipt [ns]; None if unknown."""
-    records: Sequence[Output]
-    """Records in order of processing."""
-    is_last: bool = False
-    """Whether the records follow from the end of the source; all frames precede them."""
 
 
 class Sink(Protocol):

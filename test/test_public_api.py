@@ -130,8 +130,8 @@ def test_tracking_a_recording_equals_a_replay(result, vehicle_replays):
     pd.testing.assert_frame_equal(
         result.detections_dataframe(), read_csv(folder / 'detections.csv'), check_exact=True)
     assert len(result.poses) == len(result.smoothed) > 20 and result.smoothed['complete'].all()
-    assert result.counts == run.summary['counts']
-    assert result.rejections == run.summary['rejected']
+    assert result.report.counts == run.summary['counts']
+    assert result.report.rejected == run.summary['rejected']
     entry, = run.summary['tracks']
     assert result.tracks[1].summary() == {k: entry[k] for k in result.tracks[1].summary()}
     errors = result.errors()
@@ -211,8 +211,8 @@ def test_no_target_gives_empty_arrays(recorded, result, source):
         frame = getattr(found, f'{name}_dataframe')()
         assert len(frame) == 0
         assert list(frame.columns) == list(getattr(result, f'{name}_dataframe')().columns)
-    assert found.tracks == {} and found.rejections == {}
-    assert found.sensors_without_background == (() if source == 'noise' else ('mag_1', 'mag_2'))
+    assert found.tracks == {} and found.report.rejected == {}
+    assert found.report.sensors_without_background == (() if source == 'noise' else ('mag_1', 'mag_2'))
     assert ('no background of mag_1' in repr(found)) is (source == 'nothing')
     with pytest.raises(mt.UnknownTrackError, match='the result contains no tracks'):
         found.map_figure()
@@ -225,7 +225,7 @@ def test_rejected_readings_are_counted(recorded):
     names = np.array(r.names)[r.sensor].astype('U8')
     names[500:520] = 'mag_9'
     found = mt.track(mt.readings_from_arrays(names, r.stamp_ns, field), NETWORK_FILE)
-    assert sum(found.rejections.values()) == 30
+    assert sum(found.report.rejected.values()) == 30
     assert '20 unknown sensor' in repr(found) and 'not used' in repr(found)
 
 
@@ -233,7 +233,7 @@ def test_losses_of_a_damaged_recording_are_reported(tmp_path):
     damaged = tmp_path / 'damaged.mcap'
     content = vehicle_path(NAME).read_bytes()
     damaged.write_bytes(content[:len(content) // 2])
-    assert mt.track(damaged, NETWORK_FILE).lost and mt.read_recording(damaged, NETWORK_FILE).lost
+    assert mt.track(damaged, NETWORK_FILE).report.lost and mt.read_recording(damaged, NETWORK_FILE).lost
 
 
 FIELD, STAMPS = np.zeros((3, 3)), np.arange(3)
@@ -344,7 +344,7 @@ def test_a_track_has_a_map_a_weights_and_a_field_figure(result):
 def test_the_fit_dataframe_equals_the_table_of_the_command(tmp_path):
     found = mt.fit(vehicle_path(NAME), NETWORK_FILE, orders=[1, 3])
     fitted_pass, = found.passes
-    assert found.warnings == () and fitted_pass.chosen.n_dipoles == 3
+    assert not found.report.warnings() and fitted_pass.chosen.n_dipoles == 3
     frame = found.to_dataframe()
     assert tuple(frame.columns) == FIT_COLUMNS and len(frame) == 2
     assert frame.attrs['units']['sd_mx'] == 'A m^2' and frame.attrs['units']['cpa_time'] == 's'
@@ -360,7 +360,7 @@ def test_a_recording_without_a_pass_gives_an_empty_fit(tmp_path):
     content = vehicle_path(NAME).read_bytes()
     cut.write_bytes(content[:len(content) // 8])
     found = mt.fit(cut, NETWORK_FILE)
-    assert found.passes == () and found.warnings and 'warnings' in repr(found)
+    assert found.passes == () and found.report.warnings()[0] in repr(found)
     assert tuple(found.to_dataframe().columns) == FIT_COLUMNS and len(found.to_dataframe()) == 0
 
 

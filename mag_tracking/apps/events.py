@@ -13,10 +13,10 @@ from mag_tracking.event_records import PassEvent
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.record_receiver import RecordReceiver
+from mag_tracking.record_receiver import RecordReceiver, Step
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.records import Readings
-from mag_tracking.run import RunReport, Source, Step, run
+from mag_tracking.run import RunReport, Source, run
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.events.stage import Events
 

@@ -9,8 +9,8 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.doubtful_times import DOUBTFUL_BACKGROUND, are_doubtful
 from mag_tracking.calibration.saturation import saturated_readings, with_margin
 from mag_tracking.pipeline import Pipeline
+from mag_tracking.record_receiver import Step
 from mag_tracking.records import Detection, FieldFrame, Readings
-from mag_tracking.run import Step
 from mag_tracking.stages.track.doubts import MEANINGS
 from mag_tracking.units import NS
 

@@ -18,7 +18,7 @@ from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.pipeline import Pipeline
-from mag_tracking.run import Step
+from mag_tracking.record_receiver import Step
 
 MAX_TRAILER_DISTANCE = 8.0
 """Maximum distance between a car and its trailer [m]."""

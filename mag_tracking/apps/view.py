@@ -8,12 +8,12 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings
-from mag_tracking.record_receiver import RecordReceiver
+from mag_tracking.record_receiver import RecordReceiver, Step
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.reader import Recording
 from mag_tracking.records import FieldFrame, Readings, SmoothedPose, Track
 from mag_tracking.report.page import NOTE, WARNING, Note, Table
-from mag_tracking.run import RecordingSource, Source, Step, run
+from mag_tracking.run import RecordingSource, Source, run
 from mag_tracking.units import NS
 from mag_tracking.web.live_scene import LiveScene
 

@@ -6,7 +6,6 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from mag_tracking.apps.events import EventsResult, find_events
 from mag_tracking.cli.options import (
@@ -14,6 +13,7 @@ from mag_tracking.cli.options import (
     add_command,
     add_recorded_network,
     print_diagnoses,
+    progress_bar,
     recorded_network,
 )
 from mag_tracking.cli.tracking_options import add_settings, settings_of
@@ -23,6 +23,7 @@ from mag_tracking.interrupts import recorded_signals
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.event_tables import write_events
 from mag_tracking.recording.reader import Recording
+from mag_tracking.run import RecordingSource
 from mag_tracking.stages.events.stage import MAX_DURATION_S
 from mag_tracking.units import NS
 
@@ -55,13 +56,11 @@ def _events(args: argparse.Namespace) -> int:
     """Run `mag-tracking events`."""
     network = recorded_network(args)
     settings = settings_of(args, network)
-    recording = Recording(args.recording)
-    if args.out is not None and recording.lies_in(args.out):
+    source = RecordingSource(Recording(args.recording), network)
+    if args.out is not None and source.recording.lies_in(args.out):
         raise OutputError(f'--out: {args.out} is the folder of the recording; choose another one')
-    with recorded_signals(signal.SIGINT) as signals, \
-            tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
-                 disable=None) as bar:
-        result = find_events(recording, network, settings, bar.update, lambda: bool(signals))
+    with recorded_signals(signal.SIGINT) as signals, progress_bar(source) as bar:
+        result = find_events(source, network, settings, bar.update, lambda: bool(signals))
     _print(result, network.names)
     if args.out is not None:
         write_events(args.out, result.events)
@@ -74,7 +73,7 @@ def _events(args: argparse.Namespace) -> int:
 
 def _print(result: EventsResult, names: tuple[str, ...]) -> None:
     """Print the diagnoses, one line per event, and the number of events of each sensor."""
-    print_diagnoses(result.diagnoses)
+    print_diagnoses(result.report.diagnoses)
     for event in result.events:
         print(line_of(event))
     counts = result.counts()

@@ -4,14 +4,14 @@ import argparse
 import signal
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.analysis.correlated_motion import contradicts_delays
 from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, Bearing, PassFit
-from mag_tracking.apps.fit import RecordingFit, check_cpa_range, check_orders
+from mag_tracking.apps.fit import check_cpa_range, check_orders, fit_source
 from mag_tracking.apps.pass_fitter import FittedPass
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import (
@@ -19,6 +19,8 @@ from mag_tracking.cli.options import (
     add_command,
     add_recorded_network,
     distinct_names,
+    print_diagnoses,
+    progress_bar,
     recorded_network,
 )
 from mag_tracking.errors import OutputError, SettingsError
@@ -31,6 +33,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.fit_folder import FitFolder
 from mag_tracking.recording.reader import Recording
+from mag_tracking.run import RecordingSource
 from mag_tracking.settings import read_parameter_file
 
 P_WARNING = 1e-3
@@ -91,27 +94,26 @@ def _fit(args: argparse.Namespace) -> int:
     settings = settings_for('vehicle', read_parameter_file(args.params) if args.params else {})
     _check(args, network)
     # All recordings are opened before a file is written.
-    recordings = [Recording(path) for path in args.recordings]
-    if any(recording.lies_in(args.out) for recording in recordings):
+    sources = [RecordingSource(Recording(path), network) for path in args.recordings]
+    if any(source.recording.lies_in(args.out) for source in sources):
         raise OutputError(f'--out: {args.out} is the folder of a recording; choose another one')
-    jobs = [RecordingFit(r, network, settings, args.orders, args.cpa_range) for r in recordings]
     passes: list[FittedPass] = []
     warnings: list[str] = []
     with recorded_signals(signal.SIGINT) as signals, FitFolder(args.out) as folder:
-        for path, recording, job in zip(args.recordings, recordings, jobs, strict=True):
-            with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
-                      disable=None) as bar:
-                for fitted_pass in job.passes(bar.update, lambda: bool(signals)):
+        for source in sources:
+            with progress_bar(source) as bar:
+                def report(fitted_pass: FittedPass, bar: 'tqdm[NoReturn]' = bar) -> None:
                     folder.add(fitted_pass)
                     passes.append(fitted_pass)
                     bar.clear()
                     _print_pass(fitted_pass)
                     if not args.no_figures:
                         _draw(fitted_pass, args.out)
-            lines = [f'{path.name}: {line}' for line in job.warnings()]
-            warnings += lines
-            for line in lines:
-                print(f'  warning: {line}')
+
+                run_report = fit_source(source, network, settings, args.orders, args.cpa_range,
+                                        report, bar.update, lambda: bool(signals))
+            print_diagnoses(run_report.diagnoses)
+            warnings += [f'{source.name}: {line}' for line in run_report.warnings()]
             if signals:
                 break
         iron = _iron(passes, network) if args.same_vehicle else None

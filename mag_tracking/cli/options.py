@@ -5,7 +5,9 @@ import dataclasses
 import datetime
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, NoReturn, TypeAlias
+
+from tqdm import tqdm
 
 from mag_tracking.cli.commands import COMMANDS
 from mag_tracking.errors import OutputError, SettingsError
@@ -13,6 +15,10 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.network.topics import checked_namespace
 from mag_tracking.stages.health.diagnosis import Diagnosis
+
+if TYPE_CHECKING:
+    # Not every command loads the stages.
+    from mag_tracking.run import RecordingSource
 
 # Quoted because the class is not generic at run time.
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
@@ -120,6 +126,12 @@ def check_outputs(args: argparse.Namespace) -> None:
     if args.figure is not None and args.figure.suffix.lower() not in FIGURE_SUFFIXES:
         raise SettingsError(f'--figure: expected a file name ending in '
                             f'{", ".join(FIGURE_SUFFIXES)}; got {args.figure.name}')
+
+
+def progress_bar(source: 'RecordingSource') -> 'tqdm[NoReturn]':
+    """Progress bar of the bytes of a recording, shown only in a terminal."""
+    return tqdm(total=source.recording.size, unit='B', unit_scale=True, desc=source.name,
+                disable=None)
 
 
 def print_diagnoses(diagnoses: Iterable[Diagnosis]) -> None:

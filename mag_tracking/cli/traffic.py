@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from mag_tracking.apps.fleet import Fleet, earth_field_strength, pass_of
 from mag_tracking.apps.traffic import CountedVehicle, TrafficResult, count_traffic
@@ -20,6 +19,7 @@ from mag_tracking.cli.options import (
     check_writable,
     distinct_names,
     print_diagnoses,
+    progress_bar,
     recorded_network,
 )
 from mag_tracking.cli.tracking_options import add_settings, settings_of
@@ -32,7 +32,6 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.fleet_file import FleetPass, read_fleet, write_fleet
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.traffic_tables import (
     DIRECTIONS,
     passage_row,
@@ -40,6 +39,7 @@ from mag_tracking.recording.traffic_tables import (
     tables_of,
     write_traffic,
 )
+from mag_tracking.run import RecordingSource
 from mag_tracking.units import NS
 
 _TRAFFIC_HELP = '''
@@ -82,17 +82,16 @@ def _traffic(args: argparse.Namespace) -> int:
     network = recorded_network(args)
     settings = settings_of(args, network)
     names = distinct_names(args.recordings)
-    recordings = _recordings(args, network)
+    sources = _sources(args, network)
     tables: dict[str, list[dict[str, Any]]] = {'passages': [], 'intervals': []}
     fleet = _fleet(args, network)
     enrolled: list[FleetPass] = []
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
-        for name, recording in zip(names, recordings, strict=True):
+        for name, source in zip(names, sources, strict=True):
             if signals:
                 break
-            with tqdm(total=recording.size, unit='B', unit_scale=True, desc=recording.path.name,
-                      disable=None) as bar:
-                result = count_traffic(recording, network, settings, bar.update,
+            with progress_bar(source) as bar:
+                result = count_traffic(source, network, settings, bar.update,
                                        lambda: bool(signals))
             if args.enrol is not None and not signals:
                 enrolled.append(pass_of(name, [v.passage for v in result.vehicles]))
@@ -117,17 +116,15 @@ def _traffic(args: argparse.Namespace) -> int:
     return 0
 
 
-def _recordings(args: argparse.Namespace, network: SensorNetwork) -> list[Recording]:
+def _sources(args: argparse.Namespace, network: SensorNetwork) -> list[RecordingSource]:
     """Open all recordings; check their topics and the output folder before the run begins."""
-    recordings = [Recording(path) for path in args.recordings]
-    for recording in recordings:
-        SampleReader(recording, network)
-        if args.out is not None and recording.lies_in(args.out):
+    sources = [RecordingSource(Recording(path), network) for path in args.recordings]
+    if args.out is not None:
+        if any(source.recording.lies_in(args.out) for source in sources):
             raise OutputError(f'--out: {args.out} is the folder of a recording; choose another '
                               'one')
-    if args.out is not None:
         output_folder(args.out)
-    return recordings
+    return sources
 
 
 def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
@@ -171,7 +168,7 @@ def _delay(vehicle: CountedVehicle) -> dict[str, Any]:
 def _print(name: str, result: TrafficResult,
            identifications: Sequence[Identification | None]) -> None:
     """Print the diagnoses of a recording, one line per vehicle, the counts, and warnings."""
-    print_diagnoses(result.diagnoses)
+    print_diagnoses(result.report.diagnoses)
     for vehicle, identification in zip(result.vehicles, identifications, strict=True):
         identity = '' if identification is None else f', vehicle {identification.name}'
         print(f'{line_of(vehicle)}{identity}')
@@ -182,11 +179,12 @@ def _print(name: str, result: TrafficResult,
         print(f'  {line}, {direction}, {vehicle_class}: {n}')
     n_ambiguous = sum(v.passage.ambiguous for v in result.vehicles)
     warnings = {**({'ambiguous passages': n_ambiguous} if n_ambiguous else {}),
-                **{cause: n for cause, n in result.counts.items() if n and cause != 'passages'}}
+                **{cause: n for cause, n in result.report.counts['traffic'].items()
+                  if n and cause != 'passages'}}
     for cause, n in warnings.items():
         print(f'  warning: {cause}: {n}')
-    if result.no_track_reason:
-        print(f'  {result.no_track_reason}')
+    if result.report.no_track_reason:
+        print(f'  {result.report.no_track_reason}')
 
 
 def line_of(vehicle: CountedVehicle) -> str:

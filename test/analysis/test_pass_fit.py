@@ -13,13 +13,11 @@ from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.analysis.pass_data import separable_problem
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
-from mag_tracking.apps.fit import RecordingFit
+from mag_tracking.apps.fit import fit
 from mag_tracking.inference.iron import hard_and_soft_iron
 from mag_tracking.inference.least_squares import refine, score_sum_covariance
 from mag_tracking.physics.dipole import MU0, dipole_field
 from mag_tracking.physics.passes import RowPass
-from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.reader import Recording
 from support.bundled import VEHICLES, vehicle_path
 from support.passes import (
     EARTH,
@@ -353,11 +351,9 @@ def recorded_passes(road_network):
     """Fit the bundled vehicle recordings: {name: FittedPass}."""
     out = {}
     for name in VEHICLES:
-        job = RecordingFit(Recording(vehicle_path(name)), road_network, settings_for('vehicle'),
-                           (1, 2, 3, 4))
-        passes = list(job.passes())
-        assert len(passes) == 1 and not job.warnings(), name
-        out[name] = passes[0]
+        found = fit(vehicle_path(name), road_network)
+        assert len(found.passes) == 1 and not found.report.warnings(), name
+        out[name] = found.passes[0]
     return out
 
 

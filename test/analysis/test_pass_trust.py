@@ -14,10 +14,8 @@ from mag_tracking.analysis.pass_trust import (
     residual_elsewhere,
     trusted_quantities,
 )
-from mag_tracking.apps.fit import RecordingFit
-from mag_tracking.pipeline import settings_for
+from mag_tracking.apps.fit import fit
 from mag_tracking.recording.fit_folder import fit_row
-from mag_tracking.recording.reader import Recording
 from support.bundled import VEHICLES, vehicle_path
 from support.close_pairs import estimates_of, pass_of, readings_of
 from support.passes import NOISE, ROAD, measured, random_path, superposed
@@ -170,7 +168,5 @@ def test_each_quantity_is_trusted_according_to_its_own_std():
 
 @pytest.mark.parametrize('name', [n for n in VEHICLES if 'turns' in n])
 def test_no_fit_of_a_turn_is_trusted(name, road_network):
-    job = RecordingFit(Recording(vehicle_path(name)), road_network, settings_for('vehicle'),
-                       (1, 2, 3, 4))
-    (fitted_pass,) = job.passes()
+    (fitted_pass,) = fit(vehicle_path(name), road_network).passes
     assert fitted_pass.chosen is None and fitted_pass.reported is None

@@ -5,7 +5,7 @@ import pytest
 
 from mag_tracking.apps.doctor import Doctor
 from mag_tracking.apps.host_stalls import load_findings
-from mag_tracking.pipeline import settings_for
+from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.stages.health.diagnosis import Cause, Finding, ranked
 from support.networks import line_network
 from support.samples import MagSample, one
@@ -21,7 +21,7 @@ def diagnoses(received, sensors=2, seconds=30.0, rate=100.0, n_kept=None):
     `n_kept` is the number of messages that a queue holds while the computer does not read it.
     """
     network = line_network(sensors)
-    doctor, rng = Doctor(network, settings_for('vehicle')), np.random.default_rng(0)
+    doctor, rng = Doctor(Pipeline(network, settings_for('vehicle'), 'calibrate')), np.random.default_rng(0)
     messages = []
     for j, name in enumerate(network.names):
         t = np.arange(int(seconds * rate)) / rate + 0.0031 * j

@@ -7,6 +7,7 @@ import pytest
 
 import mag_tracking as mt
 from mag_tracking.cli import main
+from mag_tracking.stages.health.diagnosis import Cause
 from support import spoiler
 from support.bundled import NETWORK_FILE, vehicle_path
 from support.spoilt_runs import recorded
@@ -22,7 +23,7 @@ CONFIGURED = dataclasses.replace(NETWORK, noise_std=(np.full(3, 1e-8),) * 2, bac
 def reason_of(*faults, network=NETWORK, readings=None, **settings):
     readings = recorded('straight_small_left').readings if readings is None else readings
     return mt.track(spoiler.apply(readings, *faults), network, settings={
-        name.replace('__', '.'): value for name, value in settings.items()}).no_detection_reason
+        name.replace('__', '.'): value for name, value in settings.items()}).report.no_detection_reason
 
 
 def test_no_reason_is_given_after_a_detection():
@@ -53,10 +54,11 @@ def test_detections_without_a_track_are_explained_as_by_replay():
     slow = [np.flatnonzero(readings.sensor == j)[::50] for j in range(len(readings.names))]
     result = mt.track(readings.part(np.sort(np.concatenate(slow))), CONFIGURED)
     assert len(result.detections) and not result.tracks
-    assert result.no_detection_reason.startswith('mag_1: 2 Hz is too slow')
-    assert result.no_detection_reason in repr(result)
+    first, *_ = result.report.diagnoses
+    assert first.serious and first.finding.cause is Cause.RATE_TOO_LOW
+    assert str(first) in repr(result)
     alone = mt.track(readings, NETWORK.part(np.array([0])))
-    assert alone.no_detection_reason.startswith('no track: the scale is not observable')
+    assert alone.report.no_track_reason.startswith('no track: the scale is not observable')
 
 
 def test_trusted_covariances_are_named_as_the_cause():

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.apps.pass_fitter import PassFitter
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.pipeline import settings_for
 from support.busy_fits import assigned_fits, fits_of_recording, fits_of_world
 from support.busy_worlds import busy
+from support.live_runs import fits_of
 from support.passes import ROAD
 from support.random_passes import SIMULATORS
 from support.track_records import NS, track_pose
@@ -39,8 +39,7 @@ def test_two_vehicles_are_fitted_together(scenario, simulator):
 
 def test_a_stopped_run_returns_no_fits():
     world = busy('meeting', 2, 'clouds', 3, n=1)
-    fitter = PassFitter('x', world.network, settings_for('vehicle'), (1, 2))
-    assert [*fitter.feed(world.readings, lambda: True), *fitter.flush(lambda: True)] == []
+    assert fits_of(world.network, world.readings, (1, 2), stopped=lambda: True) == []
 
 
 @pytest.mark.study

@@ -54,8 +54,8 @@ def test_summaries_cover_all_vehicles_and_the_whole_recording():
     result = road()
     assert sum(c.count for s in result.summaries for c in s.counts) == 30
     assert sum(s.observed_s for s in result.summaries) == pytest.approx(360.0, abs=5.0)
-    assert len(result.summaries) == 7 and result.counts['passages'] == 30
-    assert result.no_detection_reason is None and '30 vehicles' in repr(result)
+    assert len(result.summaries) == 7 and result.report.counts['traffic']['passages'] == 30
+    assert result.report.no_detection_reason is None and '30 vehicles' in repr(result)
 
 
 def test_speeds_of_track_and_delay_agree_along_a_road():
@@ -150,5 +150,5 @@ def test_invalid_input_is_reported_before_the_run(tmp_path, capsys):
 def test_lines_without_crossings_count_no_vehicles():
     result = mt.traffic(vehicle_path('straight_car_right'), NETWORK_FILE, {
         **QUICK, 'traffic.line_offsets': (500.0,)})
-    assert result.vehicles == () and result.counts['tracks that crossed no line'] == 1
+    assert result.vehicles == () and result.report.counts['traffic']['tracks that crossed no line'] == 1
     assert 'no line was crossed' in repr(result)

@@ -14,7 +14,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from bench.figures import Figures
-from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.replay import replay
 from mag_tracking.network.file import read_network
 from mag_tracking.physics.dipole import MU0, dipole_field
@@ -22,6 +21,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from support.bundled import NETWORK_FILE, vehicle_path
+from support.live_runs import passes_of
 from support.samples import one, recorded
 
 NAME = 'junction_left_turns_to_rear'
@@ -81,9 +81,7 @@ def magnetic_centre(network, row):
     Returns (centre (3,) [m] in the body frame, half length [m], moments [A m²], normalised cost).
     """
     reader = SampleReader(Recording(vehicle_path(NAME)), network)
-    collector = PassCollector(network, settings_for('vehicle'))
-    passes = [p for s in recorded(reader) for p in collector.feed(one(s))] + collector.flush()
-    (data, _), = passes
+    (data, _), = passes_of(network, map(one, recorded(reader)))
     body_position, R = true_motion(data, next(iter(replay_recording(network, {}).truth.values())))
     y = np.einsum('nij,nj->ni', network.R_ws[data.sensor], data.field).ravel() / NOISE
     field_strength = network.earth_field / MU0

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mag_tracking.apps.prescan import prescan
 from mag_tracking.records import Readings
 from mag_tracking.settings import replace
+from mag_tracking.stages.calibrate.prescan import prescan
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from support.calibration_runs import EARTH, SIGMA

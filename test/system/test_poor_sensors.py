@@ -32,7 +32,7 @@ def test_placeholder_covariances_change_nothing(name):
         np.testing.assert_array_equal(result.poses['position'], original.poses['position'])
         found = [f for f in findings(name, spoiler.covariance(variance)) if 'state a noise' in f]
         assert len(found) == 2, found
-        overruled = result.counts['calibrate'].get(
+        overruled = result.report.counts['calibrate'].get(
             'message covariances overruled by the measured noise', 0)
         assert overruled > 0
 

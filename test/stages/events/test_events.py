@@ -174,7 +174,7 @@ def test_a_single_sensor_tracks_only_with_a_prior_and_its_poses_are_ambiguous():
     readings = spoiler.only_sensor('mag_1')(recorded('straight_car_right').readings)
     result = mt.track(readings, single)
     assert not len(result.poses)
-    assert result.counts['track'][
+    assert result.report.counts['track'][
         'detections not tracked (scale not observable with one sensor)'] > 0
     result = mt.track(readings, single, settings={'track.single_sensor_prior': True})
     assert len(result.poses) and result.poses['ambiguous'].all()
@@ -185,7 +185,7 @@ def test_a_network_with_a_single_active_sensor_tracks_only_with_a_prior():
     readings = spoiler.only_sensor('mag_2')(recorded('straight_car_right').readings)
     result = mt.track(readings, NETWORK)
     assert len(result.detections) and not len(result.poses)
-    assert result.counts['track'][NO_SCALE_FRAMES] > 10
+    assert result.report.counts['track'][NO_SCALE_FRAMES] > 10
     result = mt.track(readings, NETWORK, settings={'track.single_sensor_prior': True})
     assert len(result.poses) and result.poses['ambiguous'].all()
 
@@ -197,7 +197,7 @@ def test_a_track_that_begins_when_a_sensor_returns_is_ambiguous():
     begin_ns = mt.track(readings, NETWORK, settings=LINEARISED_ONCE).poses['stamp_ns'][0]
     assert begin_ns < readings.stamp_ns[silent].max(), 'no track begins during the dropout'
     result = mt.track(readings.part(~silent), NETWORK, settings=LINEARISED_ONCE)
-    assert result.counts['track'][NO_SCALE_FRAMES] > 0
+    assert result.report.counts['track'][NO_SCALE_FRAMES] > 0
     assert len(result.poses) and result.poses['ambiguous'].all()
     assert result.poses['stamp_ns'][0] > readings.stamp_ns[silent].max() - 0.1 * NS
 

@@ -9,9 +9,10 @@ from mag_tracking.apps.doctor import Doctor, examine
 from mag_tracking.cli import main
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.file import read_network
-from mag_tracking.pipeline import settings_for
+from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.run import RecordingSource
 from mag_tracking.stages.health.diagnosis import ranked
 from mag_tracking.stages.health.reading_buffer import ReadingBuffer
 from mag_tracking.stages.health.sensor_health import WINDOW, SensorHealth
@@ -207,7 +208,7 @@ def test_a_sensor_without_readings_is_reported():
 def doctor_findings(change=lambda k, field: field, seconds=10.0, **settings):
     """Diagnoses of `Doctor` for three sensors; `change` modifies the fields of the second one."""
     network = line_network(3)
-    doctor = Doctor(network, settings_for('vehicle', settings))
+    doctor = Doctor(Pipeline(network, settings_for('vehicle', settings), 'calibrate'))
     rng = np.random.default_rng(5)
     for k in range(int(seconds * 50)):
         for j, name in enumerate(network.names):
@@ -241,7 +242,7 @@ def test_the_doctor_compares_sensors_with_the_earth_field():
 def test_a_background_in_the_file_does_not_hide_a_flipped_axis():
     network = line_network(3)
     backgrounds = tuple(network.R_sw[j] @ network.earth_field for j in range(3))
-    doctor = Doctor(replace(network, background=backgrounds), settings_for('vehicle'))
+    doctor = Doctor(Pipeline(replace(network, background=backgrounds), settings_for('vehicle'), 'calibrate'))
     rng = np.random.default_rng(6)
     for k in range(600):
         for j, name in enumerate(network.names):
@@ -257,7 +258,7 @@ def test_without_an_earth_field_sensors_are_compared_with_each_other():
     for n, message in ((3, "mag_2: differs from the Earth's field by"),
                        (2, 'network: sensors were not compared')):
         network = replace(line_network(n), earth_field=None)
-        doctor = Doctor(network, settings_for('vehicle'))
+        doctor = Doctor(Pipeline(network, settings_for('vehicle'), 'calibrate'))
         rng = np.random.default_rng(7)
         for k in range(400):
             for j, name in enumerate(network.names):
@@ -271,7 +272,7 @@ def test_without_an_earth_field_sensors_are_compared_with_each_other():
 def test_clocks_far_apart_are_reported_and_the_age_of_a_replay_is_not():
     for offset_ns, n in ((120 * NS, 1), (0, 0)):
         network = line_network(2)
-        doctor = Doctor(network, settings_for('vehicle'))
+        doctor = Doctor(Pipeline(network, settings_for('vehicle'), 'calibrate'))
         rng = np.random.default_rng(8)
         for k in range(400):
             received = 10**18 + k * 20_000_000
@@ -299,7 +300,8 @@ def test_the_doctor_reports_frozen_relearnt_and_missing_backgrounds():
 
 @pytest.mark.parametrize('name', VEHICLES)
 def test_the_doctor_finds_no_faults_in_the_bundled_recordings(name, road_network):
-    doctor, lost = examine(Recording(vehicle_path(name)), road_network, settings_for('vehicle'))
+    doctor, lost = examine(RecordingSource(Recording(vehicle_path(name)), road_network, by_message=True),
+                           road_network, settings_for('vehicle'))
     findings = [str(d) for d in ranked(doctor.findings())]
     assert not lost and not findings
 
