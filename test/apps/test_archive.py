@@ -27,6 +27,8 @@ from mag_tracking.stages.track.doubts import CLOCKS_APART
 from support.archives import command, rows, same_tables, wait_for
 from support.bundled import DATA, NETWORK_FILE, QUICK
 
+pytestmark = pytest.mark.timeout(900)
+
 NETWORK = read_network(NETWORK_FILE)
 ROAD = DATA / 'two_way_road' / 'two_way_road.mcap'
 
@@ -182,7 +184,7 @@ def test_ctrl_c_ends_the_command_with_a_hint_to_continue(tmp_path, recordings):
     wait_for(lambda: list(out.glob('unfinished/*/.*.cut')))
     # A terminal sends Ctrl-C to the whole process group.
     os.killpg(process.pid, signal.SIGINT)
-    text, errors = process.communicate(timeout=60)
+    text, errors = process.communicate()
     assert process.returncode == 130 and 'run the same command to continue' in text, errors
     assert 'Traceback' not in errors
 
