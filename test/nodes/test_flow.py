@@ -67,9 +67,8 @@ def test_a_silent_input_is_reported_until_it_returns(clock):
     clock[0] += module.FIRST_MESSAGE_TIMEOUT_S
     overdue = status_of(flow, sender_exists=False)
     assert overdue.level == DiagnosticStatus.WARN
-    assert overdue.message == 'no message received on /a: no publisher found; start the ' \
-        'driver or the preceding node'
-    assert status_of(flow).message == 'no message received on /a'
+    assert '/a: no publisher' in overdue.message
+    assert status_of(flow).message.endswith(' /a')
     flow.add(0, 0, clock[0])
     clock[0] += module.SILENCE_TIMEOUT_S
     assert status_of(flow).message == 'running'
@@ -77,11 +76,10 @@ def test_a_silent_input_is_reported_until_it_returns(clock):
     silent = status_of(flow)
     # A sender that exists may have nothing to publish, so the level is not ERROR.
     assert silent.level == DiagnosticStatus.WARN
-    assert silent.message == 'no message from a_node for 3 s'
+    assert 'a_node for 3 s' in silent.message
     no_sender = status_of(flow, sender_exists=False)
     assert no_sender.level == DiagnosticStatus.ERROR
-    assert no_sender.message == silent.message + ', and its topics have no publisher: ' \
-        'check that it is running'
+    assert 'no publisher' in no_sender.message and 'no publisher' not in silent.message
     flow.add(0, 0, clock[0])
     assert status_of(flow).message == 'running'
 
@@ -136,14 +134,14 @@ def test_a_subscriber_that_disappears_is_reported():
     def status(*names):
         return monitor.status('me', set(names), lambda name: {
             '/other': {'its type'}, '/second': {'its type', 'more'}}.get(name, set()))
-    assert status('/rviz').message == 'no tracker node has subscribed to /network_frame yet'
+    assert '/network_frame' in status('/rviz').message
     assert status('/rviz', '/other').message == 'running'
     disappeared = status('/rviz')
     assert disappeared.level == DiagnosticStatus.ERROR and disappeared.name == 'me: to tracker'
-    assert disappeared.message == '/other has disappeared: check that it is running'
+    assert disappeared.message.startswith('/other ')
     assert status('/other').level == DiagnosticStatus.OK
     assert status('/other', '/second').message == 'running'
-    assert status().message == '/other, /second have disappeared: check that they are running'
+    assert status().message.startswith('/other, /second ')
     # A tracker with another name may replace the first; other subscribers may disappear.
     assert status('/second').level == DiagnosticStatus.OK
     assert status('/second', '/rviz').message == status('/second').message == 'running'
