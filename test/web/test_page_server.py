@@ -175,7 +175,7 @@ def test_an_error_of_the_scene_is_reported_and_does_not_stop_the_server(caplog):
         assert messages[-1]['text'] == 'ValueError: broken'
         messages_until(server.url, lambda m: m['type'] == 'fault')
         assert server.is_serving
-    assert len([r for r in caplog.records if 'error in the live page' in r.message]) == 1
+    assert len([r for r in caplog.records if 'live page' in r.message]) == 1
     assert not server.is_serving
 
 
@@ -194,12 +194,12 @@ def test_a_looped_bag_starts_a_new_scene(scene, server, records):
 
 
 def test_an_unusable_address_is_reported(scene, server):
-    with pytest.raises(DeviceError, match=f'port {server.port}: Address already in use'):
+    with pytest.raises(DeviceError, match=f'port {server.port}: '):
         PageServer(scene, port=server.port)
     for port in (-1, 70000):
-        with pytest.raises(DeviceError, match='cannot be served'):
+        with pytest.raises(DeviceError, match=str(port)):
             PageServer(scene, port=port)
-    with pytest.raises(DeviceError, match='cannot be served'):
+    with pytest.raises(DeviceError, match='no.such.host.invalid'):
         PageServer(scene, host='no.such.host.invalid', port=0)
 
 
