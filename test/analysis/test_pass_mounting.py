@@ -148,7 +148,7 @@ def test_covariance_of_overconfident_tracks_is_inflated():
 def test_a_track_of_another_network_is_rejected():
     t = simulated_tracks(2)
     t.tracks[1].mounting = t.tracks[1].mounting[:2]
-    with pytest.raises(ValueError, match='track 2 has mounting angles of 2 sensors, expected 3'):
+    with pytest.raises(ValueError, match='track 2 .* 2 sensors, expected 3'):
         fuse_mounting(NETWORK, PRIOR, t.tracks)
 
 

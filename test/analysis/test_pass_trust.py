@@ -89,7 +89,7 @@ def test_a_single_fit_of_two_vehicles_is_not_trusted():
     both = superposed(measured(ROAD, first_path, m1, rng),
                       measured(ROAD, second_path, m2, rng, noise=1e-15))
     fit = fit_pass(both, 3)
-    assert 'not one target' in fit.reason and fit.trusted == ()
+    assert 'one target' in fit.reason and fit.trusted == ()
 
 
 def test_a_near_vehicle_is_not_rejected_for_its_residuals():

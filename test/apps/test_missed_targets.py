@@ -44,9 +44,9 @@ def test_a_stuck_sensor_misses_targets_of_other_sensors(last_amplitude, stuck_fr
     if missed is None:
         assert found == []
     else:
-        assert len(found) == 1 and found[0].startswith('mag_3: its readings did not change while')
+        assert len(found) == 1 and found[0].startswith('mag_3: ')
         assert f' detected {missed} targets' in found[0]
 
 
 def test_quiet_sensors_miss_no_targets():
-    assert not any('did not change' in f for f in findings_of(2e-6, np.inf, n_targets=0))
+    assert not any('not change' in f for f in findings_of(2e-6, np.inf, n_targets=0))

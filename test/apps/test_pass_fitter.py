@@ -31,7 +31,7 @@ def test_two_vehicles_are_fitted_together(scenario, simulator):
     matches = assigned_fits(passes, [(world.t, position) for position in world.positions])
     assert sorted(match.vehicle for match in matches) == [0, 1]
     for match in matches:
-        assert '2 vehicles were fitted together' in match.fitted_pass.notes[-1]
+        assert '2 vehicles' in match.fitted_pass.notes[-1]
         # Three standard deviations are allowed, because a driver may brake.
         found, std = match.fitted_pass.chosen.speed
         assert abs(found - match.speed) < max(0.1 * match.speed, 3.0 * std)

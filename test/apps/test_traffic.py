@@ -18,6 +18,7 @@ from mag_tracking.recording.traffic_tables import tables_of
 from mag_tracking.recording.writer import RecordingWriter
 from support.bundled import DATA, NETWORK_FILE, QUICK, vehicle_path
 from support.busy_recordings import correctly_counted, network_of_recording
+from support.counters import count_of
 from support.samples import field_dict
 
 ROAD = DATA / 'two_way_road'
@@ -104,10 +105,10 @@ def test_invalid_input_is_reported(tmp_path, capsys):
         mt.traffic(recording, NETWORK_FILE, {'track.target': 'magnet'})
     arguments = ['traffic', str(recording), '--network', str(NETWORK_FILE)]
     assert main([*arguments, '--target', 'magnet']) == 1
-    assert 'traffic counts only vehicles' in capsys.readouterr().err
+    assert 'only vehicles' in capsys.readouterr().err
     assert main(['traffic', str(tmp_path / 'none.mcap'), '--network', str(NETWORK_FILE)]) == 1
     assert main(['traffic', str(recording), *arguments[1:]]) == 1
-    assert 'several recordings are named' in capsys.readouterr().err
+    assert 'several recordings' in capsys.readouterr().err
 
 
 def test_tables_without_rows_have_their_columns(tmp_path, capsys):
@@ -119,7 +120,7 @@ def test_tables_without_rows_have_their_columns(tmp_path, capsys):
         assert main(['traffic', recording, '--network', network, '--out', str(tmp_path)]) == 0
         printed = capsys.readouterr().out
         assert re.search(rf': {n} vehicles?\n', printed)
-        assert ('the scale is not observable with a single sensor' in printed) == (n == 0)
+        assert ('single sensor' in printed) == (n == 0)
         csv_rows, rows = (read(tmp_path / f'passages.{kind}') for read, kind in (
             (pd.read_csv, 'csv'), (pd.read_parquet, 'parquet')))
         assert list(csv_rows.columns) == list(rows.columns) and len(rows) == n
@@ -150,5 +151,6 @@ def test_invalid_input_is_reported_before_the_run(tmp_path, capsys):
 def test_lines_without_crossings_count_no_vehicles():
     result = mt.traffic(vehicle_path('straight_car_right'), NETWORK_FILE, {
         **QUICK, 'traffic.line_offsets': (500.0,)})
-    assert result.vehicles == () and result.report.counts['traffic']['tracks that crossed no line'] == 1
-    assert 'no line was crossed' in repr(result)
+    assert result.vehicles == ()
+    assert count_of(result.report.counts['traffic'], 'no line') == 1
+    assert 'no line' in repr(result)

