@@ -22,25 +22,22 @@ Scalar: TypeAlias = bool | int | float | str
 Value: TypeAlias = Scalar | tuple[Scalar, ...]
 """Type of the value of a setting."""
 
-REPLACED_SETTINGS = {'track.vehicle.soft_iron': 'track.vehicle.induced_share',
-                     'track.vehicle.soft_iron_std': 'track.vehicle.induced_share_std'}
-"""Former settings, and the current settings that replace them in another unit."""
+USER, EXPERT = 'user', 'expert'
+"""Levels: settings that describe the site, the targets and the wanted results; and settings of the
+methods, which rarely change."""
 
-RENAMED_SETTINGS = {
-    'stated_std_deg': 'nominal_std_deg',
-    'jump_ahead_s': 'max_forward_jump_s', 'jump_back_s': 'max_backward_jump_s',
-    'resume_s': 'max_resume_gap_s', 'ahead_s': 'max_clock_jump_s', 'most_pending': 'max_buffered',
-    'most_sensors': 'max_sensors', 'most_together': 'max_joint_targets',
-    'most_hypotheses': 'max_hypotheses', 'most_at_start': 'max_initial_hypotheses',
-    'relinearise_most': 'relinearise_max_hypotheses', 'smooth_longest_s': 'max_smoothing_s',
-    'explained_ratio': 'min_bayes_factor', 'second_opinion': 'cross_check',
-    'farthest': 'max_start_distance', 'reach': 'start_margin',
-    'longest_clock_offset_s': 'max_clock_offset_s', 'most_accelerations': 'max_accelerations',
-    'longest_retry_s': 'max_retry_s', 'gather_s': 'batch_s', 'silent_s': 'silence_timeout_s',
-    'shortest_delay_s': 'min_delay_s', 'longest_delay_s': 'max_delay_s',
-    'least_step_s': 'min_step_s', 'most_drift_ppm': 'max_drift_ppm', 'longest': 'max_length',
-    'longest_message': 'max_message', 'most_failures': 'max_failures', 'in_turn': 'sequential'}
-"""Former names of settings, and their current names within the same group."""
+FORMER_SETTINGS: dict[str, str] = dict.fromkeys((
+    'calibrate.look_ahead_s', 'calibrate.memory_s', 'calibrate.guard_s', 'calibrate.block_s',
+    'calibrate.freeze_std', 'calibrate.max_forward_jump_s', 'calibrate.max_backward_jump_s',
+    'align.max_backward_jump_s', 'detect.release_probability', 'track.prune_ratio',
+    'track.max_initial_hypotheses', 'track.relinearise_interval_s',
+    'track.relinearise_max_hypotheses', 'track.vehicle.lateral_std', 'track.vehicle.along_std',
+    'track.vehicle.max_start_distance', 'track.vehicle.speed_std',
+    'track.vehicle.cross_speed_std', 'track.vehicle.climb_std', 'track.vehicle.turn_share',
+    'track.magnet.start_margin', 'track.magnet.grid_points', 'track.magnet.starts',
+    'track.magnet.near_field_length', 'survey.compass_bias_std', 'survey.accelerometer_bias',
+    'survey.max_clock_offset_s', 'survey.max_accelerations'), '')
+"""{former setting: its current name, or empty if it is a constant}."""
 
 _Class: TypeAlias = type[object]
 _Default = TypeVar('_Default')
@@ -48,7 +45,8 @@ _Settings = TypeVar('_Settings', bound='DataclassInstance')
 
 
 def param(default: _Default, doc: str, unit: str = '', range: tuple[float, float] | None = None,
-          live: bool = False, length: int | None = None, choices: tuple[str, ...] = ()) -> _Default:
+          live: bool = False, length: int | None = None, choices: tuple[str, ...] = (),
+          level: str = EXPERT) -> _Default:
     """Declare one setting of a frozen dataclass.
 
     Parameters
@@ -65,6 +63,8 @@ def param(default: _Default, doc: str, unit: str = '', range: tuple[float, float
         Required length of a tuple. None allows any length except zero.
     choices : tuple of str, optional
         Permitted values of a string.
+    level : str, optional
+        USER or EXPERT.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def param(default: _Default, doc: str, unit: str = '', range: tuple[float, float
     """
     return dataclasses.field(default=default, metadata={
         'doc': doc, 'unit': unit, 'range': range, 'live': live, 'length': length,
-        'choices': choices})
+        'choices': choices, 'level': level})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +99,8 @@ class Parameter:
     """Required length of a tuple, or None."""
     choices: tuple[str, ...]
     """Permitted values of a string. Empty if any string is allowed."""
+    level: str
+    """USER or EXPERT."""
 
 
 def _types_of_hint(hint: Any) -> tuple[_Class, _Class | None]:
@@ -252,17 +254,15 @@ def _unknown_message(name: str, value: object, names: Iterable[str]) -> str:
 
 
 def _suggestion(name: str, names: Iterable[str]) -> str:
-    """Suggestion for an unknown setting: its replacement, its new name or the closest known name.
+    """Suggestion for an unknown setting: its current name or the closest known name.
 
     Empty if there is no suggestion.
     """
     names = list(names)
-    group, dot, leaf = name.rpartition('.')
-    if name in REPLACED_SETTINGS:
-        return f'; it was replaced by {REPLACED_SETTINGS[name]}, which has another unit'
-    renamed = f'{group}{dot}{RENAMED_SETTINGS.get(leaf)}'
-    if renamed in names:
-        return f'; it was renamed to {renamed}'
+    group, _, leaf = name.rpartition('.')
+    if name in FORMER_SETTINGS:
+        current = FORMER_SETTINGS[name]
+        return f'; it is now {current}' if current else '; it is now a constant'
     if group in names:
         return f'; {group} is a single setting'
     if group and not any(k.startswith(f'{group}.') for k in names):

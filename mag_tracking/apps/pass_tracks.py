@@ -10,6 +10,7 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import propagated_path
 from mag_tracking.records import Track
+from mag_tracking.stages.track.initiation_vehicle import CLIMB_STD
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
@@ -124,4 +125,4 @@ def ground_prior(settings: TrackSettings) -> GroundPrior:
     vehicle = settings.vehicle
     height, std = np.array(vehicle.heights), np.array(vehicle.height_stds)
     height_std = float(np.sqrt(height.var() + np.square(std).mean()))
-    return GroundPrior((float(height.mean()), height_std), vehicle.climb_std)
+    return GroundPrior((float(height.mean()), height_std), CLIMB_STD)

@@ -15,7 +15,7 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.stages.align.frame_period import frame_period
-from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
+from mag_tracking.stages.track.initiation_vehicle import CLIMB_STD, VehicleSettings
 from mag_tracking.stages.track.settings import TrackSettings
 
 NOISE_STD = 1.2e-8
@@ -209,7 +209,7 @@ def _target(track: TrackSettings, target: str | None, moment: float | None,
                             f'{kind!r}')
     k = vehicle.kinds.index(kind)
     return PlannedTarget(vehicle.moments[k], vehicle.heights[k] if height is None else height,
-                         speed, vehicle.height_stds[k], vehicle.climb_std)
+                         speed, vehicle.height_stds[k], CLIMB_STD)
 
 
 def _lanes(vehicle: VehicleSettings, heading: Sequence[float] | None,

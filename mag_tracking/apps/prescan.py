@@ -19,6 +19,10 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.units import NS
 
+LOOK_AHEAD_S = 300.0
+"""[s] Duration, from the start of the recording, that is searched for the most frequent level of a
+sensor that is not quiet at the start."""
+
 LEARNING_TOLERANCE_S = 1.0
 """Excess over the nominal learning time above which a target is considered present [s]."""
 
@@ -84,19 +88,17 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
     Parameters
     ----------
     batches : iterable of Readings
-        Raw readings from the start of the recording; consumed up to `look_ahead_s`.
+        Raw readings from the start of the recording; consumed up to `LOOK_AHEAD_S`.
     network : SensorNetwork
     settings : CalibrateSettings
 
     Returns
     -------
     Prescan
-        Only the faults if the network file contains all backgrounds; empty if `look_ahead_s` is 0.
+        Only the faults if the network file contains all backgrounds.
     """
     without_background = [name for name, level in zip(network.names, network.background,
                                                       strict=True) if level is None]
-    if not settings.look_ahead_s:
-        return Prescan({}, {}, {})
     batches = iter(batches)
     beginning, faults = _beginning(batches, network, settings)
     if not without_background:
@@ -110,7 +112,7 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
         recorder.feed(readings)
         _learn(learner, readings, first_ns, learnt)
         start_ns = min(first_ns.values(), default=0)
-        if len(readings) and int(readings.stamp_ns[-1]) - start_ns > settings.look_ahead_s * NS:
+        if len(readings) and int(readings.stamp_ns[-1]) - start_ns > LOOK_AHEAD_S * NS:
             break
     levels, steps, is_quiet = {}, {}, True
     for name, background in recorder.backgrounds().items():

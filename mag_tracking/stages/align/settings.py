@@ -25,9 +25,6 @@ class AlignSettings:
         0.5, 'Maximum forward jump of the timestamps of one sensor. The samples after a '
         'larger jump are held back until the other sensors follow; otherwise they are rejected '
         'because of a clock step. 0 disables the check.', 's', (0.0, 3600.0))
-    max_backward_jump_s: float = param(
-        1.0, 'Maximum backward jump of a timestamp. A larger jump is treated as a restart (a '
-        'looped recording).', 's', (0.0, 3600.0))
     max_buffered: int = param(
         10000, 'Maximum number of buffered samples per sensor. If it is exceeded, the oldest '
         'samples are rejected.', '', (2, 10_000_000))

@@ -15,9 +15,6 @@ class DetectSettings:
     onset_frames: int = param(
         3, 'Number of consecutive frames above the threshold that start a detection.', '',
         (1, 1000))
-    release_probability: float = param(
-        1e-2, 'Probability that noise exceeds the release threshold. A frame below that threshold '
-        'is quiet.', '', (1e-12, 0.5))
     hold_s: float = param(
         1.0, 'Duration for which all frames have to be quiet before a detection ends.',
         's', (0.0, 3600.0))

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.errors import SettingsError
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.network import SensorNetwork
@@ -17,6 +16,10 @@ from mag_tracking.records import Detection, FieldFrame
 from mag_tracking.stages.detect.resting_axes import RestingAxes
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.units import NS
+
+RELEASE_PROBABILITY = 1e-2
+"""Probability that noise exceeds the release threshold, unless that of the detection is larger. A
+frame below that threshold is quiet."""
 
 RECOVERY_S = 5.0
 """[s] Approximate time in which the calibration learns the background again after a target."""
@@ -37,22 +40,12 @@ class Detect:
     max_consecutive_above : int
         Largest number of consecutive frames above the threshold.
 
-    Raises
-    ------
-    SettingsError
-        If the release probability is below the false alarm probability.
-
     References
     ----------
     [T10]_ eq. (5.14)-(5.19).
     """
 
     def __init__(self, network: SensorNetwork, settings: DetectSettings) -> None:
-        if settings.release_probability < settings.false_alarm_probability:
-            raise SettingsError(
-                f'detect.release_probability: {settings.release_probability:g} is below '
-                f'false_alarm_probability ({settings.false_alarm_probability:g}); the release '
-                'threshold must not exceed the detection threshold')
         self.counts: Counter[str] = Counter()
         self._names = network.names
         self._settings = settings
@@ -175,7 +168,7 @@ class Detect:
             self.max_consecutive_above = max(self.max_consecutive_above, self._n_above)
         else:
             self._n_above = 0
-        if statistic > self.threshold(s.release_probability, n):
+        if statistic > self.threshold(max(RELEASE_PROBABILITY, s.false_alarm_probability), n):
             self._last_active_ns = stamp_ns
         if not self._present and self._n_above >= s.onset_frames:
             self._present, self._last_active_ns = True, stamp_ns

@@ -19,6 +19,21 @@ from mag_tracking.settings import param
 REFERENCE_FIELD = 5e-5
 """Field for which `VehicleSettings.induced_share` is defined [T]."""
 
+LATERAL_STD = 1.5
+"""[m] Standard deviation of the lateral distance from a starting line."""
+ALONG_STD = 3.0
+"""[m] Standard deviation of the starting distance along the line."""
+MAX_START_DISTANCE = 30.0
+"""[m] Maximum starting distance from the outermost sensor."""
+SPEED_STD = 0.3
+"""Standard deviation of each initial speed, relative to the speed."""
+CROSS_SPEED_STD = 0.1
+"""Standard deviation of the velocity across the heading, relative to the initial speed."""
+CLIMB_STD = 0.1
+"""[m/s] Standard deviation of the vertical velocity."""
+TURN_SHARE = 0.5
+"""Fraction of vehicles that turn near the sensors."""
+
 START_TURN_RATIO = 0.5
 """Initial standard deviation of the turn rate, relative to the standard deviation of a turning
 vehicle. The ratio is below 1, because vehicles arrive along straight lines."""
@@ -37,20 +52,7 @@ class VehicleSettings:
     lateral_offsets: tuple[float, ...] = param(
         (-4.0, 0.0, 4.0), 'Lateral offsets of the starting lines from each arrival line. Positive '
         'offsets are to the left of the heading.', 'm', (-1000.0, 1000.0))
-    lateral_std: float = param(1.5, 'Standard deviation of the lateral distance from a starting '
-                               'line.', 'm', (1e-3, 1000.0))
-    along_std: float = param(3.0, 'Standard deviation of the starting distance along the line.',
-                             'm', (1e-3, 1000.0))
-    max_start_distance: float = param(
-        30.0, 'Maximum starting distance from the outermost sensor.', 'm', (0.1, 10000.0))
     speeds: tuple[float, ...] = param((5.0, 10.0, 20.0), 'Initial speeds.', 'm/s', (0.01, 200.0))
-    speed_std: float = param(0.3, 'Standard deviation of each initial speed, as a fraction of the '
-                             'speed.', '', (1e-3, 10.0))
-    cross_speed_std: float = param(
-        0.1, 'Standard deviation of the velocity across the heading, relative to the initial '
-        'speed.', '', (1e-3, 10.0))
-    climb_std: float = param(0.1, 'Standard deviation of the vertical velocity.', 'm/s',
-                             (1e-9, 100.0))
     dipoles: int = param(
         5, 'Number of dipoles in the row that models a vehicle with a length. Three are '
         'sufficient for cars; a truck that passes close by is then tracked less accurately.', '',
@@ -102,8 +104,6 @@ class VehicleSettings:
         'hypothesis has a turning counterpart. 0 disables turning hypotheses, which halves the '
         'number of hypotheses.', 'm/s^2', (0.0, 100.0))
     turn_time: float = param(1.5, 'Correlation time of the turn rate.', 's', (0.01, 1000.0))
-    turn_share: float = param(
-        0.5, 'Fraction of vehicles that turn near the sensors.', '', (1e-6, 0.999999))
     climb_acceleration: float = param(
         0.1, 'Root spectral density of the vertical acceleration.', 'm/s^1.5', (0.0, 1000.0))
     moment_drift: float = param(
@@ -250,7 +250,7 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
             kinds += [kind] * len(states[-1])
     bank = FilterBank.from_targets(np.vstack(states), np.vstack(covariances), np.array(labels),
                                    len(network), background_std, own_covariance, np.array(kinds))
-    return _add_turning_hypotheses(bank, vehicle_model(settings, network), settings.turn_share)
+    return _add_turning_hypotheses(bank, vehicle_model(settings, network), TURN_SHARE)
 
 
 def _add_turning_hypotheses(bank: FilterBank, model: RowVehicle, fraction: float) -> FilterBank:
@@ -291,7 +291,7 @@ def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
     last position of the line, next to the outermost sensor.
     """
     along = (network.positions - network.centre) @ R[:, 0]
-    distance = np.linspace(settings.max_start_distance, 0.0, 160) - along.min()
+    distance = np.linspace(MAX_START_DISTANCE, 0.0, 160) - along.min()
     line = np.array([network.centre[0], network.centre[1], height])
     offsets = np.array(settings.lateral_offsets)
     points = line + offsets[:, None, None] * R[:, 1] - distance[:, None] * R[:, 0]
@@ -345,11 +345,10 @@ def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, spe
     soft_iron_std = settings.induced_share_std * _soft_iron_per_share(settings, kind)
     n_t = soft_index + 2 + min(d, 2) + int(settings.turn_acceleration > 0.0)
     P = np.zeros((n_t, n_t))
-    P[:3, :3] = R @ np.diag([settings.along_std**2, settings.lateral_std**2,
+    P[:3, :3] = R @ np.diag([ALONG_STD**2, LATERAL_STD**2,
                              settings.height_stds[kind]**2]) @ R.T
-    P[3:6, 3:6] = R @ np.diag([(settings.speed_std * speed) ** 2,
-                               (settings.cross_speed_std * speed) ** 2,
-                               settings.climb_std**2]) @ R.T
+    P[3:6, 3:6] = R @ np.diag([(SPEED_STD * speed) ** 2, (CROSS_SPEED_STD * speed) ** 2,
+                               CLIMB_STD**2]) @ R.T
     mean = np.full((d, d), 1.0 / d)
     among_dipoles = (moment_std**2 / d * mean
                      + settings.difference_stds[kind]**2 * (np.eye(d) - mean))

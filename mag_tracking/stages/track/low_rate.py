@@ -5,6 +5,7 @@ import numpy as np
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.initiation_vehicle import LATERAL_STD
 from mag_tracking.stages.track.plausibility import MAX_RELATIVE_MOVE
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NEVER, NS
@@ -42,7 +43,7 @@ def required_rate(network: SensorNetwork, settings: TrackSettings) -> float:
     `MAX_RELATIVE_MOVE` times its distance from the nearest sensor. The field of a pass at distance
     d and speed v has little content above the frequency v / (2 d), because its spectrum decreases
     like exp(-2 pi f d / v). The distance is that of the path between the outermost lanes that keeps
-    furthest from all sensors, and includes `lateral_std`: a lower rate is too low in every lane.
+    furthest from all sensors, and includes `LATERAL_STD`: a lower rate is too low in every lane.
 
     Parameters
     ----------
@@ -64,7 +65,7 @@ def required_rate(network: SensorNetwork, settings: TrackSettings) -> float:
     for heading in np.deg2rad(vehicle.arrival_headings_deg):
         lateral = np.cos(heading) * relative[:, 1] - np.sin(heading) * relative[:, 0]
         nearest = np.hypot(lateral - offsets[:, None], z).min(axis=1)
-        distances.append(np.hypot(nearest.max(), vehicle.lateral_std))
+        distances.append(np.hypot(nearest.max(), LATERAL_STD))
     return typical_speed(settings) / (MAX_RELATIVE_MOVE * float(np.median(distances)))
 
 

@@ -66,26 +66,14 @@ class TrackSettings:
     max_joint_targets: int = param(
         4, 'Maximum number of vehicles with overlapping fields that are tracked jointly. '
         'Each additional vehicle adds computing time. 1 disables joint tracking.', '', (1, 4))
-    prune_ratio: float = param(
-        1e-12, 'Weight, relative to the heaviest hypothesis, below which a hypothesis is dropped '
-        '(T10 Alg. 3).', '', (1e-300, 0.5), live=True)
     max_hypotheses: int = param(
         1200, 'Maximum number of hypotheses. The heaviest are retained.', '', (1, 100000),
         live=True)
-    max_initial_hypotheses: int = param(
-        1200, 'Maximum number of hypotheses in the frames before the detection, if larger than '
-        'max_hypotheses. These frames contain little information about the origin of a target, so '
-        'the correct hypothesis is often lost if few are kept.', '', (1, 100000), live=True)
     relinearise_window_s: float = param(
         2.0, 'Duration of the window over which the leading hypotheses of a running track are '
         'relinearised along their smoothed paths. It covers one to two times this duration, and at '
         'most 64 frames. 0 disables relinearisation, which reduces the computing time by a fifth.',
         's', (0.0, 60.0))
-    relinearise_interval_s: float = param(
-        0.15, 'Interval between relinearisations. Their cost grows with the number of sensors; at '
-        '100 frames per second, 0.5 is recommended.', 's', (0.0, 60.0))
-    relinearise_max_hypotheses: int = param(
-        20, 'Maximum number of hypotheses that are relinearised.', '', (1, 100000))
     cross_check: bool = param(
         True, 'Fit a path of steady acceleration and turn rate to the whole pass once a vehicle '
         'has passed, and about four times after that. The fit reveals clock offsets, clipped '

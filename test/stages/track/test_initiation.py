@@ -11,7 +11,14 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_magnet import start_magnet
-from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
+from mag_tracking.stages.track.initiation_vehicle import (
+    CROSS_SPEED_STD,
+    MAX_START_DISTANCE,
+    SPEED_STD,
+    TURN_SHARE,
+    start_vehicle,
+    vehicle_model,
+)
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
@@ -91,7 +98,7 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
     speed = np.hypot(*bank.x[:, 3:5].T)[turns]
     np.testing.assert_allclose(bank.P[turns, turn, turn],
                                (0.5 * vehicle.turn_acceleration / speed)**2)
-    assert np.exp(bank.log_w[turns]).sum() == pytest.approx(vehicle.turn_share)
+    assert np.exp(bank.log_w[turns]).sum() == pytest.approx(TURN_SHARE)
     assert len(set(bank.origin)) == len(bank)
     # The length and the differences between dipoles of a point have no variance.
     points = bank.P[bank.kind == 0]
@@ -107,7 +114,7 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
         # The standard deviations of the velocity match the settings, relative to the speed.
         ahead = np.array([np.cos(heading), np.sin(heading)])
         across = np.array([-ahead[1], ahead[0]])
-        for direction, share in ((ahead, vehicle.speed_std), (across, vehicle.cross_speed_std)):
+        for direction, share in ((ahead, SPEED_STD), (across, CROSS_SPEED_STD)):
             std = np.sqrt(direction @ bank.P[rows, 3:5, 3:5] @ direction)
             np.testing.assert_allclose(std, share * speed, rtol=1e-9)
 
@@ -148,9 +155,9 @@ def test_a_vehicle_starts_where_its_field_first_has_the_frame_energy(missing):
     assert reached.mean() > 0.5
     # A vehicle that never reaches the energy starts at the outermost sensor.
     np.testing.assert_allclose(before[~reached], 0.0, atol=1e-9)
-    starts_inside = reached & (before < vehicle.max_start_distance - 1e-9)
+    starts_inside = reached & (before < MAX_START_DISTANCE - 1e-9)
     assert starts_inside.mean() > 0.5
-    assert (energy(vehicle.max_start_distance / 159.0)[starts_inside] < required).all()
+    assert (energy(MAX_START_DISTANCE / 159.0)[starts_inside] < required).all()
 
 
 def test_the_start_covariance_includes_the_model_error():
