@@ -1,14 +1,15 @@
 """Settings: generated files, validation of values, and parameter files."""
 
+import dataclasses
 import importlib.util
 
 import pytest
 import yaml
 
 from mag_tracking.errors import SettingsError
+from mag_tracking.former_settings import FORMER_SETTINGS
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.settings import (
-    FORMER_SETTINGS,
     flatten,
     read_parameter_file,
     replace,
@@ -63,8 +64,16 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
     ({'track.vehicle.speeds': []}, 'at least one'),
     ({'track.vehicle.speeds': 5.0}, 'expected a list'),
     ({'track.vehicle.speeds': [5.0, 1e9]}, 'outside'),
-    ({'track.vehicle.kinds': ['small', 'c\ud800r', 'truck']},
-     r"track.vehicle.kinds: 'c\\ud800r' is not text: it contains an unpaired surrogate"),
+    ({'track.vehicle.kinds': {'names': ['small', 'c\ud800r', 'truck']}},
+     r"track.vehicle.kinds.names: 'c\\ud800r' is not text: it contains an unpaired surrogate"),
+    ({'track.vehicle.kinds': ['car']}, 'kinds is a group of settings, such as .*kinds.names'),
+    ({'track.vehicle.kinds.names': ['car', 'car']}, 'kinds.names: a name is duplicated'),
+    ({'track.vehicle.kinds.names': ['a.b']}, "kinds.names: 'a.b' is not a valid name"),
+    ({'track.vehicle.kinds.names': ['names']}, "kinds.names: 'names' is not a valid name"),
+    ({'track.vehicle.kinds.names': []}, 'kinds.names: expected at least one value'),
+    ({'track.vehicle.kinds.bus.height': 1.0}, 'bus is not in track.vehicle.kinds.names'),
+    ({'track.vehicle.kinds.car.hight': 1.0}, r'did you mean track.vehicle.kinds.car.height\?'),
+    ({'track.vehicle.heights': [1.0]}, 'it is now track.vehicle.kinds.car.height'),
     ({'track.vehicle.arrival_names': ['left', 'right', '\udcff']}, 'arrival_names: .* surrogate'),
 ])
 def test_errors_name_the_invalid_setting(changes, message):
@@ -77,6 +86,15 @@ def test_each_arrival_needs_a_heading(road_network):
     settings = settings_for('vehicle', {'track.vehicle.arrival_headings_deg': [0.0, 90.0]})
     with pytest.raises(SettingsError, match='arrival_headings_deg: expected 3 values'):
         Pipeline(road_network, settings)
+
+
+def test_rows_of_a_table_are_added_and_removed():
+    bus = {'length': 8.0, 'height': 1.2}
+    changed = replace(Settings(), {'track': {'vehicle': {'kinds': {
+        'names': ['bus', 'truck'], 'bus': bus, 'truck': {'moment': 2000.0}}}}}).track.vehicle.kinds
+    default = {kind.name: kind for kind in Settings().track.vehicle.kinds}
+    assert changed == (dataclasses.replace(default['car'], name='bus', **bus),
+                       dataclasses.replace(default['truck'], moment=2000.0))
 
 
 def test_the_targets_in_parameters_and_call_must_agree():
@@ -122,12 +140,10 @@ def test_the_default_file_is_plain_yaml_with_floats():
 
 
 @pytest.mark.parametrize('changes, message', [
-    ({'track.vehicle.lengths': [0.0, 3.0]}, r'lengths: expected 3 values \(one per kind\), got 2'),
     ({'track.vehicle.arrival_names': ['a']},
      r'arrival_headings_deg: expected 1 value \(one per arrival name\), got 3'),
-    ({'track.vehicle.kinds': ['car', 'car', 'truck']}, 'kinds: a name is duplicated'),
-    ({'track.vehicle.length_stds': [1.0, 1.0, 3.0]}, 'length_stds: 1 for small, which is a point'),
-    ({'track.vehicle.difference_stds': [9.0, 30.0, 120.0]}, 'difference_stds: 9 for small')])
+    ({'track.vehicle.kinds.small.length_std': 1.0}, 'small.length_std: 1 for a point'),
+    ({'track.vehicle.kinds.small.difference_std': 9.0}, 'small.difference_std: 9 for a point')])
 def test_related_lists_are_checked_against_each_other(road_network, changes, message):
     with pytest.raises(SettingsError, match=message):
         TrackManager(road_network, settings_for('vehicle', changes).track)

@@ -122,7 +122,6 @@ def ground_prior(settings: TrackSettings) -> GroundPrior:
     -------
     GroundPrior
     """
-    vehicle = settings.vehicle
-    height, std = np.array(vehicle.heights), np.array(vehicle.height_stds)
+    height, std = np.array([(k.height, k.height_std) for k in settings.vehicle.kinds]).T
     height_std = float(np.sqrt(height.var() + np.square(std).mean()))
     return GroundPrior((float(height.mean()), height_std), CLIMB_STD)

@@ -153,7 +153,7 @@ def count_traffic(recording: Recording, network: SensorNetwork, settings: Settin
     rejections = dict(reader.rejected + Counter(pipeline.rejections()))
     reason = no_detection_reason(network, settings, pipeline.calibrate, pipeline.detect,
                                  reader.missing_topics(), rejections)
-    return TrafficResult(settings.traffic.class_names, tuple(collector.vehicles),
+    return TrafficResult(tuple(c.name for c in settings.traffic.classes), tuple(collector.vehicles),
                          tuple(collector.summaries), dict(pipeline.traffic.counts), rejections,
                          tuple(reader.missing_topics()), tuple(pipeline.calibrate.unready()),
                          reason, no_track_reason(pipeline.counts()['track']),

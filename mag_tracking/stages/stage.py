@@ -8,8 +8,8 @@ In = TypeVar('In', contravariant=True)
 Out = TypeVar('Out')
 
 MAX_BACKWARD_JUMP_S = 1.0
-"""[s] Maximum backward jump of a timestamp. After a larger jump (a looped recording), everything that
-was learnt is discarded."""
+"""[s] Maximum backward jump of a timestamp. After a larger jump (a looped recording), all that was
+learnt is discarded."""
 
 
 class Stage(Protocol[In, Out]):

@@ -123,7 +123,9 @@ def test_magnets_are_not_vehicles():
 
 def test_the_ground_prior_combines_the_heights_of_all_kinds():
     settings = settings_for('vehicle', {
-        'track.vehicle.heights': [0.4, 0.4, 1.0], 'track.vehicle.height_stds': [0.3, 0.3, 0.3]})
+        f'track.vehicle.kinds.{kind}.{column}': value for kind, height in (
+            ('small', 0.4), ('car', 0.4), ('truck', 1.0))
+        for column, value in (('height', height), ('height_std', 0.3))})
     ground = ground_prior(settings.track)
     # Variance of the means plus mean of the variances.
     assert ground.height == pytest.approx((0.6, np.sqrt(0.08 + 0.09)))

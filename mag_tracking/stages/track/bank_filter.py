@@ -104,11 +104,11 @@ class BankFilter:
         """
         self._settings = settings
         is_vehicle = settings.target == 'vehicle'
-        self._near_field_lengths: FloatArray = np.atleast_1d(
-            settings.vehicle.near_field_lengths if is_vehicle
-            else NEAR_FIELD_LENGTH).astype(float)
+        self._near_field_lengths: FloatArray = np.array(
+            [kind.near_field_length for kind in settings.vehicle.kinds] if is_vehicle
+            else [NEAR_FIELD_LENGTH])
         self._is_long_kind: BoolArray = np.array(
-            settings.vehicle.lengths if is_vehicle else [0.0]) > MAX_CAR_ROW
+            [kind.length for kind in settings.vehicle.kinds] if is_vehicle else [0.0]) > MAX_CAR_ROW
 
     def move(self, bank: FilterBank, dt: float) -> None:
         """Predict a bank in place, without a measurement update.

@@ -60,7 +60,7 @@ def required_rate(network: SensorNetwork, settings: TrackSettings) -> float:
     vehicle = settings.vehicle
     offsets = np.linspace(min(vehicle.lateral_offsets), max(vehicle.lateral_offsets), N_PATHS)
     relative = network.positions - network.positions.mean(axis=0)
-    z = network.positions[:, 2] - min(vehicle.heights)
+    z = network.positions[:, 2] - min(kind.height for kind in vehicle.kinds)
     distances = []
     for heading in np.deg2rad(vehicle.arrival_headings_deg):
         lateral = np.cos(heading) * relative[:, 1] - np.sin(heading) * relative[:, 0]

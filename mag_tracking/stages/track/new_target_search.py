@@ -317,7 +317,7 @@ class NewTargetSearch:
             speed = np.hypot(*x[i * n + 3:i * n + 5])
             moment = np.linalg.norm(self._vehicles.hard_moments(x[i * n:]).sum(axis=0))
             if not self._search.prior.min_speed <= speed <= MAX_RATIO * max(settings.speeds) \
-                    or moment > MAX_RATIO * max(settings.moments):
+                    or moment > MAX_RATIO * max(kind.moment for kind in settings.kinds):
                 return False
         return True
 

@@ -70,10 +70,10 @@ class Plausibility:
         reasons = set()
         if _needs_rotated_sensors(observation, x, mounting_std):
             reasons.add(doubts.SENSORS_ROTATED)
-        height_error = abs(float(x[2]) - settings.heights[kind])
-        if height_error > -ndtri(P_HEIGHT / 2.0) * settings.height_stds[kind]:
+        height_error = abs(float(x[2]) - settings.kinds[kind].height)
+        if height_error > -ndtri(P_HEIGHT / 2.0) * settings.kinds[kind].height_std:
             reasons.add(doubts.HEIGHT)
-        if x[2] < 0.0 < settings.heights[kind]:
+        if x[2] < 0.0 < settings.kinds[kind].height:
             reasons.add(doubts.BELOW_SENSORS)
         if self._was_off_road[bank.origin[best]] or _is_off_road(
                 x[None], settings, observation.positions, LANE_STDS_LATER)[0]:

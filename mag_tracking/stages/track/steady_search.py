@@ -96,13 +96,15 @@ class PathPrior:
             m, s = np.array(means, dtype=float), np.array(stds, dtype=float)
             return float(m.mean()), max(float(np.sqrt(m.var() + np.square(s).mean())), MIN_STD)
 
-        height, height_std = spread(vehicle.heights, vehicle.height_stds)
+        kinds = vehicle.kinds
+        height, height_std = spread([k.height for k in kinds], [k.height_std for k in kinds])
         speeds = np.array(vehicle.speeds)
         speed, speed_std = spread(speeds, SPEED_STD * speeds)
-        length, length_std = spread(vehicle.lengths, vehicle.length_stds)
+        length, length_std = spread([k.length for k in kinds], [k.length_std for k in kinds])
         lateral_std = spread(vehicle.lateral_offsets, [LATERAL_STD])[1]
-        total = np.sqrt(np.square(vehicle.moments).mean() / 3.0)
-        difference = max(float(np.sqrt(np.square(vehicle.difference_stds).mean())), MIN_STD)
+        total = np.sqrt(np.square([k.moment for k in kinds]).mean() / 3.0)
+        difference = max(float(np.sqrt(np.square(
+            [k.difference_std for k in kinds]).mean())), MIN_STD)
         # The first combination is the mean of the row times the root of the number of dipoles.
         return cls(np.deg2rad(vehicle.arrival_headings_deg), network.centre[:2],
                    np.array([0.0, 0.0, height, speed, 0.0, 0.0, length]),

@@ -77,17 +77,18 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
                        np.full(2, 8), np.zeros(2))
     bank = start_vehicle(vehicle, road_network, frame, 2e-8, None)
     model = vehicle_model(vehicle, road_network)
+    moments, lengths = np.array([(k.moment, k.length) for k in vehicle.kinds])[bank.kind].T
     length, turn = (model.state_names.index(name) for name in 'Lw')
     m = model.dipoles(bank.x[:, :turn + 1]).m.sum(axis=1)
-    np.testing.assert_allclose(np.linalg.norm(m, axis=1), np.take(vehicle.moments, bank.kind),
+    np.testing.assert_allclose(np.linalg.norm(m, axis=1), moments,
                                rtol=1e-9)
-    np.testing.assert_array_equal(bank.x[:, length], np.take(vehicle.lengths, bank.kind))
+    np.testing.assert_array_equal(bank.x[:, length], lengths)
     # In 50 uT, the soft iron of each axis contributes the induced share of this moment.
     soft = [model.state_names.index(f'D{axis}') for axis in 'xyz']
-    share = bank.x[:, soft] * 5e-5 / MU0 / np.take(vehicle.moments, bank.kind)[:, None]
+    share = bank.x[:, soft] * 5e-5 / MU0 / moments[:, None]
     np.testing.assert_allclose(share, vehicle.induced_share, rtol=1e-12)
     share_covariance = (bank.P[:, soft][:, :, soft] * (5e-5 / MU0)**2
-                        / np.square(np.take(vehicle.moments, bank.kind))[:, None, None])
+                        / np.square(moments)[:, None, None])
     np.testing.assert_allclose(share_covariance / vehicle.induced_share_std**2 - 1.0,
                                np.tile(np.eye(3), (len(bank), 1, 1)), atol=1e-9)
     assert len(bank) == 3 * 3 * 14 * 3 * 3 * 2
