@@ -457,6 +457,7 @@ def to_yaml(settings: 'DataclassInstance', level: str = '', node: str = '/**') -
     str
     """
     lines = ['# Generated from the settings by `make config`; do not edit.',
+             *[f'# The {level} settings; the reference lists all.'] * bool(level),
              f'{node}:', '  ros__parameters:']
     previous_group = previous_row = ''
     chosen = (p for p in flatten(settings) if level in ('', p.level))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+import re
 
 import pytest
 import yaml
@@ -10,6 +11,8 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.former_settings import FORMER_SETTINGS
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.settings import (
+    EXPERT,
+    USER,
     flatten,
     read_parameter_file,
     replace,
@@ -134,9 +137,32 @@ def test_parameter_files_are_read_and_checked(tmp_path):
         read_parameter_file(tmp_path / 'nowhere.yaml')
 
 
-def test_the_default_file_is_plain_yaml_with_floats():
-    content = yaml.safe_load((ROOT / 'config/default.yaml').read_text())
-    assert content['/**']['ros__parameters']['track']['background_std'] == 2e-8
+def declared(settings, prefix=''):
+    """{name: level} of the settings, in which a table counts as one."""
+    out = {}
+    for f in dataclasses.fields(settings):
+        if f.metadata:
+            out[prefix + f.name] = f.metadata['level']
+        else:
+            out |= declared(getattr(settings, f.name), f'{prefix}{f.name}.')
+    return out
+
+
+def test_settings_are_few_and_the_guide_names_those_of_users():
+    levels = declared(Settings())
+    of_users = {name for name, level in levels.items() if level == USER}
+    assert len(of_users) <= 22 and len(levels) <= 75 and set(levels.values()) == {USER, EXPERT}
+    guide = (ROOT / 'docs/guides/settings.md').read_text(encoding='utf-8')
+    assert set(re.findall(r'`((?:\w+\.)+\w+)`', guide)) - {'config/default.yaml'} == of_users
+
+
+def test_the_default_file_is_plain_yaml_with_the_settings_of_users():
+    content = yaml.safe_load((ROOT / 'config/default.yaml').read_text(encoding='utf-8'))
+    assert content['/**']['ros__parameters']['calibrate']['max_field'] == 1e-3
+    parameters = flatten(Settings())
+    assert read_parameter_file(ROOT / 'config/default.yaml') == {
+        p.name: list(p.value) if isinstance(p.value, tuple) else p.value
+        for p in parameters if p.level == USER}
 
 
 @pytest.mark.parametrize('changes, message', [

@@ -77,15 +77,16 @@ class VehicleSettings:
     """Motion, magnetism and arrival directions of vehicles."""
 
     arrival_names: tuple[str, ...] = param(
-        ('left', 'right', 'rear'), 'Names of the arrival directions.')
+        ('left', 'right', 'rear'), 'Names of the arrival directions.', level=USER)
     arrival_headings_deg: tuple[float, ...] = param(
         (0.0, 180.0, 90.0), 'Heading on arrival, one per arrival name, measured anticlockwise from '
         'x. The arrival lines pass through the centre of the network.',
-        'deg', (-360.0, 360.0))
+        'deg', (-360.0, 360.0), level=USER)
     lateral_offsets: tuple[float, ...] = param(
         (-4.0, 0.0, 4.0), 'Lateral offsets of the starting lines from each arrival line. Positive '
-        'offsets are to the left of the heading.', 'm', (-1000.0, 1000.0))
-    speeds: tuple[float, ...] = param((5.0, 10.0, 20.0), 'Initial speeds.', 'm/s', (0.01, 200.0))
+        'offsets are to the left of the heading.', 'm', (-1000.0, 1000.0), level=USER)
+    speeds: tuple[float, ...] = param((5.0, 10.0, 20.0), 'Initial speeds.', 'm/s', (0.01, 200.0),
+                                      level=USER)
     dipoles: int = param(
         5, 'Number of dipoles in the row that models a vehicle with a length. Three are '
         'sufficient for cars; a truck that passes close by is then tracked less accurately.', '',
