@@ -200,6 +200,22 @@ def test_a_magnet_track_estimates_mounting_angles():
     assert (tracks[0].mounting_std > np.deg2rad(0.1)).all()
 
 
+@pytest.mark.parametrize('name, is_spin', [
+    ('speed_std', False), ('acceleration', False), ('spin_std', True),
+    ('angular_acceleration', True)])
+def test_a_magnet_that_may_move_faster_has_a_less_certain_pose(name, is_spin):
+    network, frames, _ = magnet_frames(2)
+    variances = []
+    for value in (1e-4, 10.0):
+        settings = settings_for('bench', {f'track.magnet.{name}': value}).track
+        stage = TrackManager(network, settings)
+        track = [t for f in frames for t in stage.feed(f)][-1]
+        # The largest variance of the orientation is that of the unobservable roll.
+        variances.append(np.linalg.eigvalsh(track.orientation_covariance)[:2].sum() if is_spin
+                         else np.trace(track.covariance))
+    assert variances[1] > 1.01 * variances[0]
+
+
 def test_drifting_backgrounds_are_not_a_target(road_network):
     """The frames are flagged as containing a target, but only the backgrounds drift."""
     drift = 3e-8
