@@ -5,6 +5,7 @@ _CONSTANTS = {
                  'max_backward_jump_s',
     'align': 'max_backward_jump_s',
     'detect': 'release_probability',
+    'events': 'max_sensors',
     'track': 'prune_ratio max_initial_hypotheses relinearise_interval_s relinearise_max_hypotheses',
     'track.vehicle': 'lateral_std along_std max_start_distance speed_std cross_speed_std climb_std '
                      'turn_share',

@@ -51,7 +51,7 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
     ({'trak': {'x': 1}}, 'unknown setting trak.x; there is no group trak; did you mean track'),
     ({'trak': {'iteration': 1}}, r'there is no group trak; did you mean track.iterations\?'),
     ({'track.vehicel.x': 1}, r'no group track.vehicel; did you mean track.vehicle\?'),
-    ({'foo': {'x': 1}}, 'no group foo; the groups are calibrate, align, detect, events, track, '),
+    ({'foo': {'x': 1}}, 'no group foo; the groups are calibrate, align, detect, track, traffic'),
     ({'relearn_s': 3}, r'unknown setting relearn_s; did you mean calibrate.relearn_s\?'),
     ({'calibrate.relearn_s': {'x': 3}}, 'calibrate.relearn_s is a single setting'),
     ({'trak': {}}, r'unknown setting trak; did you mean track\?'),
