@@ -18,14 +18,5 @@ Record: TypeAlias = Any
 
 
 def are_equal(a: FloatArray | None, b: FloatArray | None) -> bool:
-    """Whether two optional arrays are equal; None equals only None.
-
-    Parameters
-    ----------
-    a, b : array or None
-
-    Returns
-    -------
-    bool
-    """
+    """Whether two optional arrays are equal; None equals only None."""
     return a is b if a is None or b is None else np.array_equal(a, b)

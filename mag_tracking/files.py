@@ -10,39 +10,15 @@ from mag_tracking.errors import MagTrackingError, OutputError
 
 
 def checked_path(path: str | PathLike[str], error: type[MagTrackingError]) -> Path:
-    """Validate a path and convert it to a `Path`.
-
-    Parameters
-    ----------
-    path : path_like
-    error : type of MagTrackingError
-        Exception to raise if the path contains a NUL character.
-
-    Returns
-    -------
-    Path
-    """
+    """Convert a path to a `Path`; raises `error` if it contains a NUL character."""
     if '\0' in fspath(path):
         raise error(f'{fspath(path)!r} is not a valid path: it contains a NUL character')
     return Path(path)
 
 
 def output_folder(path: str | PathLike[str]) -> Path:
-    """Create a folder for results if it does not exist.
-
-    Parameters
-    ----------
-    path : path_like
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be created.
-    """
+    """Create a folder for results if it does not exist; raises OutputError if it cannot be
+    created."""
     folder = checked_path(path, OutputError)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -52,71 +28,29 @@ def output_folder(path: str | PathLike[str]) -> Path:
 
 
 def new_text_file(path: str | PathLike[str], newline: str | None = None) -> TextIO:
-    """Create an empty UTF-8 file and open it for writing.
+    """Create an empty UTF-8 file and open it for writing; `newline` as for `open`.
 
     An existing file or link with this name is removed first; the target of a link is not modified.
-    Unpaired surrogates, for example from file names that are not UTF-8, are written
-    as escape sequences such as `\\udcff`.
-
-    Parameters
-    ----------
-    path : path_like
-    newline : str, optional
-        Newline translation, as for `open`.
-
-    Returns
-    -------
-    text stream
-
-    Raises
-    ------
-    OSError
-        If the file cannot be created.
-    OutputError
-        If the path is invalid.
+    Unpaired surrogates, for example from file names that are not UTF-8, are written as escape
+    sequences. Raises OSError if the file cannot be created, OutputError if the path is invalid.
     """
     return open(_unlinked_path(path), 'x', newline=newline, encoding='utf-8',
                 errors='backslashreplace')
 
 
 def new_binary_file(path: str | PathLike[str]) -> BinaryIO:
-    """Create an empty binary file and open it for writing.
+    """Create an empty binary file and open it for writing, with the errors of `new_text_file`.
 
     An existing file or link with this name is removed first; the target of a link is not modified.
-
-    Parameters
-    ----------
-    path : path_like
-
-    Returns
-    -------
-    binary stream
-
-    Raises
-    ------
-    OSError
-        If the file cannot be created.
-    OutputError
-        If the path is invalid.
     """
     return open(_unlinked_path(path), 'xb')
 
 
 def replace_text(path: str | PathLike[str], text: str) -> None:
-    """Write a UTF-8 file atomically.
+    """Write a UTF-8 file atomically; raises OutputError if it cannot be written.
 
     The text is written to a temporary file with a random name, which then replaces `path`. Links
     are not followed, neither at `path` nor at the temporary name.
-
-    Parameters
-    ----------
-    path : path_like
-    text : str
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
     """
     path = checked_path(path, OutputError)
     temporary = path.parent / f'.{path.name}.{secrets.token_hex(8)}.part'

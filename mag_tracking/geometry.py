@@ -7,21 +7,9 @@ from mag_tracking.arrays import FloatArray
 
 
 def rotation_from_quaternion(q: ArrayLike) -> FloatArray:
-    """Rotation matrices of unit quaternions.
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4).
 
-    Parameters
-    ----------
-    q : (..., 4) array
-        Unit quaternions xyzw; normalised before use.
-
-    Returns
-    -------
-    (..., 3, 3) array
-
-    Raises
-    ------
-    ValueError
-        If a norm differs from one by more than 1e-3.
+    Raises ValueError if a norm differs from one by more than 1e-3.
     """
     q = np.asarray(q, dtype=float)
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
@@ -36,18 +24,7 @@ def rotation_from_quaternion(q: ArrayLike) -> FloatArray:
 
 
 def quaternion_from_rotation_vector(v: ArrayLike) -> FloatArray:
-    """Unit quaternions of rotation vectors.
-
-    Parameters
-    ----------
-    v : (..., 3) array, rad
-        Rotation vectors.
-
-    Returns
-    -------
-    (..., 4) array
-        Unit quaternions xyzw; the identity at v = 0.
-    """
+    """Unit quaternions (..., 4) of rotation vectors (..., 3) [rad]; the identity at v = 0."""
     v = np.asarray(v, dtype=float)
     half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
     # np.sinc is sin(a)/a with a in units of pi, and has the right limit at zero.
@@ -55,19 +32,9 @@ def quaternion_from_rotation_vector(v: ArrayLike) -> FloatArray:
 
 
 def rotation_vectors_between(q: ArrayLike, other: ArrayLike) -> FloatArray:
-    """Rotation vectors, in world axes, of the shortest rotations from one orientation to others.
+    """Shortest rotations from orientation `q` (4,) to others (..., 4), as rotation vectors.
 
-    Parameters
-    ----------
-    q : (4,) array
-        Initial orientation, unit quaternion xyzw.
-    other : (..., 4) array
-        Final orientations, unit quaternions xyzw.
-
-    Returns
-    -------
-    (..., 3) array, rad
-        Rotation vectors with a norm of at most pi.
+    The vectors (..., 3) [rad] are in world axes, with a norm of at most pi.
     """
     q, other = np.asarray(q, dtype=float), np.asarray(other, dtype=float)
     v, w = -q[:3], q[3]
@@ -82,17 +49,7 @@ def rotation_vectors_between(q: ArrayLike, other: ArrayLike) -> FloatArray:
 
 
 def cross_matrix(a: ArrayLike) -> FloatArray:
-    """Cross-product matrices [a]x, with [a]x b = a x b.
-
-    Parameters
-    ----------
-    a : (..., 3) array
-        Vectors.
-
-    Returns
-    -------
-    (..., 3, 3) array
-    """
+    """Cross-product matrices [a]x (..., 3, 3) of vectors (..., 3), with [a]x b = a x b."""
     a = np.asarray(a, dtype=float)
     out = np.zeros(a.shape + (3,))
     out[..., 0, 1], out[..., 0, 2] = -a[..., 2], a[..., 1]
@@ -102,23 +59,10 @@ def cross_matrix(a: ArrayLike) -> FloatArray:
 
 
 def left_jacobian(v: ArrayLike) -> FloatArray:
-    """Left Jacobian of SO(3), which maps a change of a rotation vector to a small rotation.
+    """Left Jacobian J (..., 3, 3) of SO(3) at rotation vectors `v` (..., 3) [rad].
 
-    To first order R(v + d) = R(J d) R(v).
-
-    Parameters
-    ----------
-    v : (..., 3) array, rad
-        Rotation vectors.
-
-    Returns
-    -------
-    (..., 3, 3) array
-        J; the identity at v = 0.
-
-    References
-    ----------
-    [Sola18]_ appendix on SO(3).
+    To first order R(v + d) = R(J d) R(v); J is the identity at v = 0. See [Sola18]_, appendix on
+    SO(3).
     """
     v = np.asarray(v, dtype=float)
     square = np.einsum('...i,...i->...', v, v)[..., None, None]
@@ -134,68 +78,30 @@ def left_jacobian(v: ArrayLike) -> FloatArray:
 
 
 def quaternions_from_yaw(yaw: FloatArray) -> FloatArray:
-    """Unit quaternions of rotations about z.
-
-    Parameters
-    ----------
-    yaw : (n,) array, rad
-        Rotation angles.
-
-    Returns
-    -------
-    (n, 4) array
-        Unit quaternions xyzw.
-    """
+    """Unit quaternions (n, 4) of rotations about z by `yaw` (n,) [rad]."""
     zero = np.zeros(len(yaw))
     return np.stack([zero, zero, np.sin(0.5 * yaw), np.cos(0.5 * yaw)], axis=1)
 
 
 def rotation_about_z(angle: float) -> FloatArray:
-    """Matrix of a rotation about z.
-
-    Parameters
-    ----------
-    angle : float, rad
-
-    Returns
-    -------
-    (3, 3) array
-    """
+    """Matrix (3, 3) of a rotation about z by `angle` [rad]."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def yaw_between(R: FloatArray, other: FloatArray) -> float:
-    """Rotation about the world z axis that brings one orientation closest to another.
+    """Rotation about the world z axis from orientation `R` towards `other`, rad in [-pi, pi].
 
-    Parameters
-    ----------
-    R : (3, 3) array
-        Initial orientation.
-    other : (3, 3) array
-        Target orientation.
-
-    Returns
-    -------
-    float, rad
-        Angle from -pi to pi.
+    It brings `R` as close to `other` as a rotation about this axis can.
     """
     M = other @ R.T
     return float(np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))
 
 
 def quaternion_from_rotation(R: FloatArray) -> FloatArray:
-    """Unit quaternion of a rotation matrix, numerically stable for every rotation.
+    """Unit quaternion (4,) of a rotation matrix, numerically stable for every rotation.
 
-    Parameters
-    ----------
-    R : (3, 3) array
-        Rotation matrix.
-
-    Returns
-    -------
-    (4,) array
-        Unit quaternion xyzw whose largest component is positive.
+    The largest component is positive.
     """
     w2 = np.array([1 + R[0, 0] - R[1, 1] - R[2, 2], 1 - R[0, 0] + R[1, 1] - R[2, 2],
                    1 - R[0, 0] - R[1, 1] + R[2, 2], 1 + R[0, 0] + R[1, 1] + R[2, 2]])
@@ -210,20 +116,10 @@ def quaternion_from_rotation(R: FloatArray) -> FloatArray:
 
 
 def quaternion_between(a: ArrayLike, b: ArrayLike) -> FloatArray:
-    """Shortest rotation from one direction to another.
+    """Shortest rotation from direction `a` (3,) to direction `b` (3,), as a unit quaternion (4,).
 
-    Parameters
-    ----------
-    a : (3,) array
-        Initial direction, with non-zero norm.
-    b : (3,) array
-        Final direction, with non-zero norm.
-
-    Returns
-    -------
-    (4,) array
-        Unit quaternion xyzw. For opposite directions, the rotation axis is an arbitrary vector
-        perpendicular to `a`.
+    The norms must not be zero. For opposite directions, the rotation axis is an arbitrary vector
+    perpendicular to `a`.
     """
     u: FloatArray = np.asarray(a, dtype=float) / np.linalg.norm(a)
     v: FloatArray = np.asarray(b, dtype=float) / np.linalg.norm(b)
@@ -237,19 +133,9 @@ def quaternion_between(a: ArrayLike, b: ArrayLike) -> FloatArray:
 
 
 def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """Speed and its standard deviation.
+    """Speed and its std, of a velocity (d,) with covariance (d, d).
 
-    Parameters
-    ----------
-    velocity : (d,) array, m/s
-    covariance : (d, d) array, m²/s²
-        Covariance of `velocity`.
-
-    Returns
-    -------
-    speed : float, m/s
-    std : float, m/s
-        At zero speed, the largest standard deviation in any direction.
+    At zero speed, the std is the largest one in any direction.
     """
     speed = float(np.linalg.norm(velocity))
     if speed == 0.0:
@@ -259,20 +145,9 @@ def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float
 
 
 def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """Heading and its standard deviation.
+    """Heading anticlockwise from x and its std [rad], of a velocity with two or three components.
 
-    Parameters
-    ----------
-    velocity : (2,) or (3,) array, m/s, world frame
-    covariance : (2, 2) or (3, 3) array, m²/s²
-        Covariance of `velocity`.
-
-    Returns
-    -------
-    heading : float, rad
-        Anticlockwise from the x axis, seen from above; zero at zero speed.
-    std : float, rad
-        Infinite at zero speed.
+    At zero speed, the heading is zero and the std infinite.
     """
     vx, vy = velocity[:2]
     if vx == vy == 0.0:
@@ -282,19 +157,9 @@ def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, flo
 
 
 def propagated_path(path: FloatArray, seconds: float) -> FloatArray:
-    """Shift the time origin of straight paths.
+    """Shift the time origin of straight paths by `seconds`.
 
-    Parameters
-    ----------
-    path : (..., n) array
-        Position [m] and velocity [m/s] at the previous origin, and n - 6 constant states.
-    seconds : float, s
-        New time origin relative to the previous one.
-
-    Returns
-    -------
-    (..., n) array
-        The same paths with the new time origin.
+    A path (..., n) is position [m] and velocity [m/s] at the origin, and n - 6 constant states.
     """
     propagated: FloatArray = path.copy()
     propagated[..., :3] += seconds * path[..., 3:6]
@@ -303,23 +168,10 @@ def propagated_path(path: FloatArray, seconds: float) -> FloatArray:
 
 def overlap(position: FloatArray, velocity: FloatArray, clearance: ArrayLike,
             width: float) -> FloatArray:
-    """Length by which two bodies overlap along the heading of the second.
+    """Length (n,) [m] by which two bodies overlap along the heading of the second, or zero.
 
-    Parameters
-    ----------
-    position : (2, n, 2 or 3) array, m
-        Centres of the two bodies.
-    velocity : (2, n, 2 or 3) array, m/s
-        Velocities of the two bodies.
-    clearance : float or (n,) array, m
-        Minimum distance along the heading at which the bodies do not overlap.
-    width : float, m
-        Minimum distance across the heading at which the bodies do not overlap.
-
-    Returns
-    -------
-    (n,) array, m
-        Zero if the bodies do not overlap.
+    `position` and `velocity` (2, n, 2 or 3) are those of both bodies. From the distance `clearance`
+    [m] along the heading, or `width` [m] across it, they do not overlap.
     """
     offset = position[0, :, :2] - position[1, :, :2]
     speed = np.maximum(np.linalg.norm(velocity[1, :, :2], axis=1), 1e-6)

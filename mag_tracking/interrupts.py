@@ -13,21 +13,12 @@ from types import FrameType
 
 @contextmanager
 def recorded_signals(*signals: signal.Signals) -> Iterator[list[int]]:
-    """Record termination signals, so that a program can check for them where it is safe to stop.
+    """Record termination signals in a growing list, so that a program can stop where it is safe.
 
     If a signal raised an exception, it could interrupt an update or the writing of a table row, and
     a library could suppress or convert it. Only the third signal raises KeyboardInterrupt.
     Ignored signals (SIGINT in a background job) remain ignored. Outside the main thread, no handler
     can be installed, and the list stays empty.
-
-    Parameters
-    ----------
-    *signals : signal.Signals
-
-    Yields
-    ------
-    list of int
-        Numbers of the signals received so far; the list grows when a signal arrives.
     """
     received: list[int] = []
 
@@ -42,24 +33,12 @@ def recorded_signals(*signals: signal.Signals) -> Iterator[list[int]]:
 
 @contextmanager
 def exit_on_signals(status: int, *signals: signal.Signals, message: str = '') -> Iterator[None]:
-    """Exit immediately when one of `signals` arrives.
+    """Exit immediately with `status` when one of `signals` arrives; write `message` to stderr.
 
     This is intended for the imports at the start of a program, when there is nothing to clean up:
     an exception during an import may be suppressed or converted. Buffers are not flushed, and no
     `finally` block runs. As for `recorded_signals`, ignored signals remain ignored, and a call
     outside the main thread has no effect.
-
-    Parameters
-    ----------
-    status : int
-        Exit status of the process.
-    *signals : signal.Signals
-    message : str, optional
-        Line to write to standard error.
-
-    Yields
-    ------
-    None
     """
     text = f'{message}\n'.encode() if message else b''
 

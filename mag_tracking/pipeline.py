@@ -76,24 +76,10 @@ and 3 rad/s), or a magnet that is moved step by step on a bench."""
 
 
 def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Settings:
-    """Settings for a type of target.
+    """Settings for a target, a key of `TARGET_DEFAULTS`, with changes by dotted name.
 
-    Parameters
-    ----------
-    target : str
-        Key of `TARGET_DEFAULTS`.
-    changes : mapping of str to setting, optional
-        Values by dotted name that override the defaults of the target. A value of `track.target`
-        must not differ from that of the target.
-
-    Returns
-    -------
-    Settings
-
-    Raises
-    ------
-    SettingsError
-        If `target` is unknown or contradicts `changes`, or if a change is invalid.
+    Raises SettingsError if `target` is unknown, if a change is invalid, or if the change of
+    `track.target` differs from the target.
     """
     if target not in TARGET_DEFAULTS:
         raise SettingsError(f'target: expected {" or ".join(TARGET_DEFAULTS)}, got {target!r}')
@@ -113,18 +99,6 @@ class Pipeline:
     """Chain of stages that converts raw readings to frames, detections, tracks and passages.
 
     The chain depends neither on ROS nor on a clock.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : Settings
-
-    Attributes
-    ----------
-    network : SensorNetwork
-    settings : Settings
-    calibrate, align, detect, track, traffic : Stage
-        The stages, in order of processing.
     """
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
@@ -143,30 +117,16 @@ class Pipeline:
         self._traffic: Stage[TrackedFrame, VehiclePassage | TrafficSummary] = self.traffic
 
     def feed(self, readings: Readings) -> list[Output]:
-        """Process raw readings.
+        """Process raw readings, and return the resulting records in order of processing.
 
-        Parameters
-        ----------
-        readings : Readings
-            Raw readings. The outputs do not depend on how the readings are split into batches.
-
-        Returns
-        -------
-        list of Output
-            Resulting records, in order of processing.
+        The records do not depend on how the readings are split into batches.
         """
         calibrated = self._calibrate.feed(readings)
         self.track.set_input_doubts(self.calibrate.input_doubts())
         return self._process_calibrated(calibrated)
 
     def flush(self) -> list[Output]:
-        """Process all records that are still buffered at the end of the input.
-
-        Returns
-        -------
-        list of Output
-            Remaining records, in order of processing.
-        """
+        """Process and return all records that are still buffered at the end of the input."""
         out = [*self._process_calibrated(self._calibrate.flush()),
                *self._process_frames(self._align.flush()),
                *self._process_detected(self._detect.flush())]
@@ -198,23 +158,11 @@ class Pipeline:
         return out
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Counters of all stages.
-
-        Returns
-        -------
-        dict of str to dict of str to int
-            Counters of each stage, by name of the stage.
-        """
+        """Counters of all stages, by name of the stage."""
         return {name: dict(sorted(stage.counts.items())) for name, stage in self._stages().items()}
 
     def rejections(self) -> dict[str, int]:
-        """Number of rejections, summed over all stages.
-
-        Returns
-        -------
-        dict of str to int
-            Number by cause.
-        """
+        """Number of rejections by cause, summed over all stages."""
         total: Counter[str] = Counter()
         for stage in self._stages().values():
             total.update(rejected(stage.counts))

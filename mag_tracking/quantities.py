@@ -4,30 +4,11 @@
 def quantity(n: int, singular: str, plural: str = '') -> str:
     """Format a number and its noun, such as '1 track' or '2 tracks'.
 
-    Parameters
-    ----------
-    n : int
-    singular : str
-        Noun for `n` = 1.
-    plural : str
-        Noun for any other number. By default, an s is appended to `singular`.
-
-    Returns
-    -------
-    str
+    By default, the plural is the singular with an s.
     """
     return f'{n} {singular if n == 1 else plural or singular + "s"}'
 
 
 def occurrences(n: int) -> str:
-    """Format a number of occurrences, such as 'once' or '2 times'.
-
-    Parameters
-    ----------
-    n : int
-
-    Returns
-    -------
-    str
-    """
+    """Format a number of occurrences, such as 'once' or '2 times'."""
     return 'once' if n == 1 else f'{n} times'

@@ -27,19 +27,8 @@ def plain(values: ArrayLike, dtype: type[_Number]) -> NDArray[_Number]:
 
 
 def plain(values: ArrayLike, dtype: type[Any] = float) -> NDArray[Any]:
-    """Return a C-contiguous, writable array that compiled code accepts.
-
-    Parameters
-    ----------
-    values : array_like
-    dtype : type, optional
-        Type of the elements.
-
-    Returns
-    -------
-    array
-        `values` itself if it already meets the requirements, otherwise a copy.
-    """
+    """Return a C-contiguous, writable array that compiled code accepts: `values` itself or a
+    copy."""
     # Most arrays meet the requirements, and this check takes a fifth of the time of `np.require`.
     if isinstance(values, np.ndarray) and values.dtype == dtype and values.flags.carray:
         return values
@@ -317,17 +306,10 @@ class Hypotheses(Sequence[Hypothesis]):
 
 
 def best_of_arrivals(members: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Select the most probable hypothesis of each arrival direction.
+    """Copies of the most probable hypothesis of each arrival direction, in descending order of
+    weight.
 
-    Parameters
-    ----------
-    members : sequence of Hypothesis
-
-    Returns
-    -------
-    list of Hypothesis
-        Copies, in descending order of `weight`, which is the total weight of all hypotheses with
-        the same arrival direction.
+    Their `weight` is the total weight of all hypotheses with the same arrival direction.
     """
     if isinstance(members, Hypotheses):
         arrivals, weights = members.arrivals, members.weights.tolist()

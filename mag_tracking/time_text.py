@@ -37,28 +37,14 @@ _TIME = re.compile(r'''(?:(?P<days>[0-9]+)\s*days?,?\s+)?
 
 
 def parse_time(text: str, order: str = 'dmy') -> tuple[int, bool, bool]:
-    """Convert a date and time, or a time of day, to nanoseconds.
+    """Convert a date and time (ns since 1970), or a time of day (ns since midnight), to
+    nanoseconds.
 
-    Parameters
-    ----------
-    text : str
-        A time of day may follow a number of days ('1 day, 00:00:01'). Two numbers with decimals
-        ('56:01.25') are minutes and seconds.
-    order : str, optional
-        Order of a date of three numbers whose year is not the first, a value of `DATE_ORDERS`.
-
-    Returns
-    -------
-    time_ns : int, ns
-        Time since 1970 (UTC unless the text has an offset), or since midnight.
-    has_date : bool
-    has_zone : bool
-        Whether the text contains Z, UTC, GMT or an offset.
-
-    Raises
-    ------
-    ValueError
-        If the text is not a valid time. The message says why.
+    Return also whether there is a date, and whether there is a zone: Z, UTC, GMT or an offset.
+    Without it, the zone is UTC. `order`, a value of `DATE_ORDERS`, applies to a date of three
+    numbers whose year is not the first. A time of day may follow a number of days ('1 day,
+    00:00:01'). Two numbers with decimals ('56:01.25') are minutes and seconds. Raises ValueError
+    that says why a text is invalid.
     """
     # Matching takes long if white space is long, and a time is short.
     text = ' '.join(text.split())
@@ -137,18 +123,7 @@ def _fraction(digits: str) -> int:
 
 
 def date_order(texts: Iterable[str]) -> str | None:
-    """Find the order of day, month and year.
-
-    Parameters
-    ----------
-    texts : iterable of str
-        All times of a table.
-
-    Returns
-    -------
-    str or None
-        Value of `DATE_ORDERS`. None if several orders are possible.
-    """
+    """Order of day, month and year in all times of a table; None if several are possible."""
     orders = set(DATE_ORDERS)
     # Most rows have the date of the previous row.
     for first, separator, second, third in {

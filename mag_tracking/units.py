@@ -43,51 +43,21 @@ _PER_COUNT = re.compile(rf'([+-]?){_NUMBER}\s*([^\s/0-9.]+)(?:\s*(?:/|\bper\b)\s
 
 
 def field_unit(text: str) -> str | None:
-    """Find the unit of the field that a text names.
-
-    Parameters
-    ----------
-    text : str
-        Symbol or name in any usual spelling, such as 'µT', 'uT', '[nT]' or 'Gauss'.
-
-    Returns
-    -------
-    str or None
-        Key of `FIELD_UNITS`.
-    """
+    """Key of `FIELD_UNITS` that a text names in any usual spelling ('µT', 'uT', '[nT]',
+    'Gauss')."""
     name = _plain_name(text)
     # 'MT' is not millitesla, and 'MG' is not milligauss.
     return None if name[:1] == 'M' and len(name) == 2 else _FIELD_OF.get(name.lower())
 
 
 def time_unit(text: str) -> str | None:
-    """Find the unit of time that a text names.
-
-    Parameters
-    ----------
-    text : str
-        Symbol or name in any usual spelling, such as 'ms', 'millis' or 'µs'.
-
-    Returns
-    -------
-    str or None
-        Key of `TIME_UNITS`.
-    """
+    """Key of `TIME_UNITS` that a text names in any usual spelling, such as 'ms', 'millis' or
+    'µs'."""
     return _TIME_OF.get(_plain_name(text).lower())
 
 
 def unit_since_1970(value: float) -> str | None:
-    """Find the unit in which a number is a time of this century since 1970.
-
-    Parameters
-    ----------
-    value : float
-
-    Returns
-    -------
-    str or None
-        's', 'ms', 'us' or 'ns'.
-    """
+    """Unit ('s', 'ms', 'us' or 'ns') in which a number is a time of this century since 1970."""
     return next((unit for unit in ('s', 'ms', 'us', 'ns')
                  if 9e8 <= value * TIME_UNITS[unit] / NS <= LATEST_NS / NS), None)
 
@@ -100,24 +70,11 @@ def _plain_name(text: str) -> str:
 
 
 def field_scale(text: str, name: str = 'unit') -> float:
-    """Convert the unit of a field to tesla.
+    """Convert the unit of a field to tesla; `name` is the setting in the error message.
 
-    Parameters
-    ----------
-    text : str
-        Unit such as 'uT', counts per unit such as '1090/G', unit per count such as '0.15 uT', or
-        tesla per count such as '1.5e-8'.
-    name : str, optional
-        Name of the setting, for the error message.
-
-    Returns
-    -------
-    float, T
-
-    Raises
-    ------
-    SettingsError
-        If the text is neither a unit nor a number other than 0, or exceeds `MAX_SCALE`.
+    The text is a unit such as 'uT', counts per unit such as '1090/G', unit per count such as '0.15
+    uT', or tesla per count such as '1.5e-8'. Raises SettingsError if it is neither a unit nor a
+    number other than 0, or exceeds `MAX_SCALE`.
     """
     text = text.strip()
     if unit := field_unit(text):
@@ -143,23 +100,10 @@ def field_scale(text: str, name: str = 'unit') -> float:
 
 
 def time_scale(text: str, name: str = 'time unit') -> Fraction:
-    """Convert a unit of time to nanoseconds.
+    """Convert a unit of time to nanoseconds; `name` is the setting in the error message.
 
-    Parameters
-    ----------
-    text : str
-        Unit such as 'ms', ticks per unit such as '32768/s', or seconds per tick such as '1e-4'.
-    name : str, optional
-        Name of the setting, for the error message.
-
-    Returns
-    -------
-    Fraction, ns
-
-    Raises
-    ------
-    SettingsError
-        If the text is neither a unit nor a positive number.
+    The text is a unit such as 'ms', ticks per unit such as '32768/s', or seconds per tick such as
+    '1e-4'. Raises SettingsError if it is neither a unit nor a positive number.
     """
     text = text.strip()
     if unit := time_unit(text):

@@ -110,17 +110,8 @@ def _children(node: yaml.Node) -> list[yaml.Node]:
 def read_yaml(path: str | PathLike[str], error: type[MagTrackingError]) -> Any:
     """Read a YAML file.
 
-    Parameters
-    ----------
-    path : path_like
-    error : type of MagTrackingError
-        Exception to raise if the file cannot be read, is not valid YAML, has duplicate keys, or is
-        too large or too deep. Its message names the file.
-
-    Returns
-    -------
-    object
-        Parsed content of the file.
+    Raises `error`, with the name of the file, if it cannot be read, is not valid YAML, has
+    duplicate keys, or is too large or too deep.
     """
     path = checked_path(path, error)
     try:
@@ -135,21 +126,7 @@ def read_yaml(path: str | PathLike[str], error: type[MagTrackingError]) -> Any:
 
 
 def parse_yaml(text: str | TextIO, name: str, error: type[MagTrackingError]) -> Any:
-    """Parse YAML.
-
-    Parameters
-    ----------
-    text : str or text stream
-    name : str
-        Name of the source, with which error messages begin.
-    error : type of MagTrackingError
-        Exception to raise, as for `read_yaml`.
-
-    Returns
-    -------
-    object
-        Parsed content.
-    """
+    """Parse YAML; raises `error`, as `read_yaml`, with a message that begins with `name`."""
     try:
         return yaml.load(text, Loader=_UniqueKeyLoader)
     # ValueError: an invalid date or number (2001-13-45), or bytes that are not UTF-8.
@@ -160,16 +137,7 @@ def parse_yaml(text: str | TextIO, name: str, error: type[MagTrackingError]) -> 
 
 
 def is_utf8_encodable(value: str) -> bool:
-    """Whether a string can be encoded as UTF-8: it has no unpaired surrogate such as "\\ud800".
-
-    Parameters
-    ----------
-    value : str
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a string can be encoded as UTF-8: it has no unpaired surrogate."""
     return not any('\ud800' <= c <= '\udfff' for c in value)
 
 
@@ -183,15 +151,5 @@ class _ShortRepr(Repr):
 
 
 def short_repr(value: object) -> str:
-    """Representation of a value for an error message.
-
-    Parameters
-    ----------
-    value : object
-
-    Returns
-    -------
-    str
-        `repr` of the value, shortened if it is long.
-    """
+    """`repr` of a value for an error message, shortened if it is long."""
     return _ShortRepr().repr(value)

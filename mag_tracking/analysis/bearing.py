@@ -16,32 +16,12 @@ MAX_DIRECTION_STD = 0.5
 
 def scaled_to_range(theta: FloatArray, p: FloatArray, sensor_position: FloatArray,
                     distance: float, duration: float) -> tuple[FloatArray, FloatArray] | None:
-    """Scale a path and its moments to a given CPA range.
+    """Path and moments scaled to a CPA range `distance`; None if the path meets the sensor.
 
-    At a single sensor, (r, v, m) and (u r, u v, u³ m) have the same field. The paths (r, v) and
-    (-r, -v) also have the same field; the path above the sensor at the CPA is returned.
-
-    Parameters
-    ----------
-    theta : (6 or 7,) array, m, m/s, m
-        Path: position, velocity and, for a row of dipoles, length.
-    p : (k,) array, A m²
-        Moments.
-    sensor_position : (3,) array, m, world frame
-        Position of the sensor.
-    distance : float, m
-        CPA range of the returned path.
-    duration : float, s
-        Duration of the pass.
-
-    Returns
-    -------
-    (array, array) or None
-        Scaled path and moments; None if the path passes through the sensor.
-
-    References
-    ----------
-    [TSP14]_ eq. (34).
+    At a single sensor, (r, v, m) and (u r, u v, u³ m) have the same field (TSP14 eq. (34)). The
+    paths (r, v) and (-r, -v) also have the same field; the path above the sensor at the CPA is
+    returned. `theta` (6 or 7,) is position, velocity and, for a row, length; `duration` [s] is that
+    of the pass.
     """
     r, v = theta[:3] - sensor_position, theta[3:6]
     t_cpa, cpa_range, _ = closest_approach(r, v)
@@ -56,19 +36,7 @@ def scaled_to_range(theta: FloatArray, p: FloatArray, sensor_position: FloatArra
 
 
 def bearing_of(fit: PassFit, sensor_position: FloatArray) -> Bearing:
-    """Compute the quantities of a single-sensor fit that do not depend on the CPA range.
-
-    Parameters
-    ----------
-    fit : PassFit
-        Fit with an assumed CPA range.
-    sensor_position : (3,) array, m, world frame
-        Position of the sensor.
-
-    Returns
-    -------
-    Bearing
-    """
+    """Compute the quantities of a single-sensor fit that do not depend on the assumed CPA range."""
     r, v = fit.position - sensor_position, fit.velocity
     P = fit.robust_covariance
     t_cpa, distance, r_cpa = closest_approach(r, v)
@@ -90,10 +58,8 @@ def bearing_of(fit: PassFit, sensor_position: FloatArray) -> Bearing:
 
 
 def _direction_std(x: FloatArray, P: FloatArray) -> float:
-    """Largest standard deviation [rad] of the direction of x (3,) with covariance P (3, 3).
-
-    Infinite if P is not finite.
-    """
+    """Largest std [rad] of the direction of x (3,) with covariance P; infinite if P is not
+    finite."""
     if not np.isfinite(P).all():
         return np.inf
     u = x / np.linalg.norm(x)

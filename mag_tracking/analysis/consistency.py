@@ -21,37 +21,20 @@ def error_over_bound(network: SensorNetwork, log: TrackLog,
     """Ratio of the RMS error of a track to the posterior Cramér-Rao bound along the true path.
 
     The bound applies to a point target with the estimated moment of the track, because the true
-    moment is unknown. It assumes the tracker's motion model, sensor noise and relative field error.
-    The backgrounds are states, and the prior of the first pose is wide. The extent of the vehicle
-    is neglected.
+    moment is unknown, and assumes the tracker's motion model, sensor noise and relative field
+    error. The backgrounds are states, and the prior of the first pose is wide. The extent of the
+    vehicle is neglected. None if fewer than two poses have a ground truth, or no evaluated pose has
+    one. T10 Alg. 2, linearised at the truth; [Tichavsky98]_.
 
     Parameters
     ----------
-    network : SensorNetwork
-    log : TrackLog
-    truth : ((n,) int array, (n, 3) array, (n, 4) array)
-        Timestamps [ns], positions [m] and quaternions (xyzw) of the ground truth.
-    acceleration : (3,) array, m²/s³
-        Spectral density of the acceleration.
-    moment_walk : float, 1/s^0.5
-        Random walk of the moment relative to its magnitude.
-    field_error : float
-        Model error relative to the field.
-    background_std : float, T
-        Prior standard deviation of the backgrounds.
-    rows : (k,) int array
-        Indices of the evaluated poses in the log.
-    axes : int
-        Number of axes: 2 for the horizontal error, 3 for the error in space.
-
-    Returns
-    -------
-    float or None
-        None if fewer than two poses have a ground truth, or no evaluated pose has one.
-
-    References
-    ----------
-    [T10]_ Alg. 2, linearised at the truth; [Tichavsky98]_.
+    truth : timestamps [ns], positions [m] and quaternions (xyzw) of the ground truth
+    acceleration : (3,), spectral density of the acceleration, m²/s³
+    moment_walk : random walk of the moment relative to its magnitude, 1/s^0.5
+    field_error : model error relative to the field
+    background_std : prior std of the backgrounds, T
+    rows : indices of the evaluated poses in the log
+    axes : 2 for the horizontal error, 3 for the error in space
     """
     true_path = interpolate_truth(truth, log.stamp_ns)
     truth_rows = np.flatnonzero(np.isfinite(true_path).all(axis=1))
@@ -75,10 +58,8 @@ def error_over_bound(network: SensorNetwork, log: TrackLog,
 
 def _measurement_model(network: SensorNetwork, log: TrackLog, true_path: FloatArray, t: FloatArray,
                        truth_rows: IntArray, field_error: float) -> tuple[FloatArray, FloatArray]:
-    """Jacobians (k, n_sensors, 3, n_x) of the field, and noise covariances (k, n_sensors, 3, 3).
-
-    The states are [r, v, m, backgrounds]. Jacobians of axes without a measurement are NaN.
-    """
+    """Jacobians (k, n_sensors, 3, n_x) of the field with respect to [r, v, m, backgrounds], NaN
+    without a measurement, and noise covariances (k, n_sensors, 3, 3)."""
     n, n_sensors = len(truth_rows), len(network)
     dr_dx, dm_dx = np.zeros((2, n, 1, 3, 9))
     dr_dx[:, 0, range(3), range(3)] = 1.0
@@ -97,10 +78,8 @@ def _measurement_model(network: SensorNetwork, log: TrackLog, true_path: FloatAr
 
 def _motion_model(t: FloatArray, acceleration: FloatArray, moment_walk: float, log: TrackLog,
                   truth_rows: IntArray, n_x: int) -> tuple[FloatArray, FloatArray]:
-    """Transition matrices F and process noise covariances Q, (k, n_x, n_x), between the poses.
-
-    F[i] and Q[i] lead from pose i - 1 to pose i; F[0] is the identity and Q[0] is zero.
-    """
+    """F and Q (k, n_x, n_x); F[i] and Q[i] lead from pose i - 1 to pose i, F[0] = I and Q[0]
+    = 0."""
     F, Q = np.tile(np.eye(n_x), (len(t), 1, 1)), np.zeros((len(t), n_x, n_x))
     for k, dt in enumerate(np.diff(t), 1):
         F[k, :6, :6] = constant_velocity(dt)
@@ -112,10 +91,8 @@ def _motion_model(t: FloatArray, acceleration: FloatArray, moment_walk: float, l
 
 def _prior_covariance(network: SensorNetwork, true_path: FloatArray, t: FloatArray, log: TrackLog,
                       truth_rows: IntArray, background_std: float) -> FloatArray:
-    """Prior covariance (n_x, n_x) of the first state, diagonal.
-
-    The extent and the speed of the path are the standard deviations of position and velocity.
-    """
+    """Diagonal covariance (n_x, n_x) of the first state, with extent and speed of the path as
+    stds."""
     extent = max(np.ptp(true_path, axis=0).max(), np.ptp(network.positions, axis=0).max())
     speed = max(np.linalg.norm(np.diff(true_path, axis=0), axis=1).max()
                 / np.diff(t).min(), MIN_VELOCITY_STD)

@@ -108,17 +108,7 @@ class CorrelatedMotion:
 
 
 def correlated_motion(data: PassData) -> CorrelatedMotion:
-    """Estimate the velocity of a target from the delays between the sensors that it passed.
-
-    Parameters
-    ----------
-    data : PassData
-        Readings around one pass.
-
-    Returns
-    -------
-    CorrelatedMotion
-    """
+    """Estimate the velocity of a target from the delays between the sensors that it passed."""
     if len(data.sensors) < 2:
         return CorrelatedMotion('one sensor: a delay requires two sensors')
     delays = [d for d in (_estimate_delay(data, i, j) for i, j in _nearest_pairs(data))
@@ -141,23 +131,11 @@ def correlated_motion(data: PassData) -> CorrelatedMotion:
 
 def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
                        delay: CorrelatedMotion) -> bool:
-    """Whether a speed and a heading contradict the delays between the sensors.
+    """Whether a speed and a heading, each with its std, contradict the delays between the sensors.
 
-    On a path oblique to the line through the sensors, the delay is shorter than on a path along the
-    line; the speeds are compared accordingly. A path almost perpendicular to the line, or an
-    unknown value, never contradicts the delays. A significantly opposite heading always does.
-
-    Parameters
-    ----------
-    speed : (float, float), m/s
-        Value and standard deviation.
-    heading : (float, float), rad
-        Value and standard deviation.
-    delay : CorrelatedMotion
-
-    Returns
-    -------
-    bool
+    On a path oblique to the line through the sensors, the delay is shorter than along the line; the
+    speeds are compared accordingly. A path almost perpendicular to the line, or an unknown value,
+    never contradicts the delays. A significantly opposite heading always does.
     """
     if delay.reason or not np.isfinite([*speed, *heading]).all():
         return False
@@ -175,10 +153,7 @@ def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
 
 
 def _nearest_pairs(data: PassData) -> list[tuple[int, int]]:
-    """Pairs of sensors to compare, closest first; at most `MAX_PAIRS`.
-
-    Pairs closer than `MIN_DELAY_BASELINE` are excluded.
-    """
+    """The closest pairs of sensors, at most `MAX_PAIRS`, none closer than `MIN_DELAY_BASELINE`."""
     positions = data.network.positions[:, :2]
     pairs = list(combinations(data.sensors.tolist(), 2))
     distance = np.array([np.linalg.norm(positions[i] - positions[j]) for i, j in pairs])
@@ -315,11 +290,11 @@ def _correlation_maxima(pair: _SmoothedPair) -> list[float]:
 
 
 def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]:
-    """Refine a delay [s]; return the delay, its standard deviation [s] and the similarity.
+    """Refine a delay [s]; return the delay, its std [s] and the similarity.
 
-    The second field is modelled as the delayed first field with small rotation, scale and gain
-    errors and a different background. All parameters are estimated by the Gauss-Newton method. If
-    the result is not plausible, the standard deviation is infinite and the similarity is zero.
+    The second field is modelled by Gauss-Newton as the delayed first field with small rotation,
+    scale and gain errors and another background. An implausible result has infinite std and
+    similarity 0.
     """
     k = pair.second.shape[1]
     theta = np.concatenate([[tau], np.zeros(2 * k + 3)])
@@ -368,10 +343,7 @@ def _delay_std(t: FloatArray, J: FloatArray, residuals: FloatArray, prior: Float
 
 def _residuals(pair: _SmoothedPair, t: FloatArray, y: FloatArray,
                theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Residuals (n k,) [T] of the second field `y`, and derivatives of its model.
-
-    The derivatives (n k, n_theta) are with respect to `theta`.
-    """
+    """Residuals (n k,) [T] of the second field `y`, and derivatives of its model by `theta`."""
     k = y.shape[1]
     tau, background, angles, gain = theta[0], theta[1:1 + k], theta[1 + k:4 + k], theta[4 + k:]
     field, slope = pair.at(t - tau)

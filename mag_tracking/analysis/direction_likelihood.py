@@ -25,28 +25,13 @@ class LaneHypothesis(NamedTuple):
 def direction_likelihood_ratio(t: FloatArray, field: FloatArray, noise_std: float,
                                left_to_right: LaneHypothesis,
                                right_to_left: LaneHypothesis) -> float:
-    """Generalised log-likelihood ratio of two lanes, maximised over moment and CPA time.
+    """Log-likelihood ratio of two lanes, maximised over moment and CPA time.
 
-    Parameters
-    ----------
-    t : (n,) array, s
-        Times of the samples.
-    field : (n, 2) array, T
-        Horizontal field minus the background; x points along the road.
-    noise_std : float, T
-        Standard deviation of one sample, per axis.
-    left_to_right, right_to_left : LaneHypothesis
-        Lanes of the two driving directions.
+    Positive if left to right is more probable.
 
-    Returns
-    -------
-    float
-        Positive if left to right is more probable.
-
-    References
-    ----------
-    [PHD15]_ Paper B eq. (24)-(35), with -||r||² in eq. (27), where the paper prints
-    +||r||².
+    `field` (n, 2) [T] is the horizontal field without the background, with x along the road;
+    `noise_std` is per sample and axis. PHD15 Paper B eq. (24)-(35), with -||r||² in eq. (27), where
+    the paper prints +||r||².
     """
     first, second = (_minimum_residual(t, field, h) for h in (left_to_right, right_to_left))
     return (second - first) / (2.0 * noise_std**2)

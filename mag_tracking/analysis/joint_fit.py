@@ -73,20 +73,8 @@ class GroundPrior:
     """Standard deviation of the vertical speed [m/s]; its mean is zero."""
 
     def prior(self, orders: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Prior mean and standard deviation of the paths of several rows of dipoles.
-
-        Parameters
-        ----------
-        orders : sequence of int
-            Number of dipoles of each row.
-
-        Returns
-        -------
-        mean : (n_theta,) array
-            Zero for parameters without a prior.
-        std : (n_theta,) array
-            Infinite for parameters without a prior.
-        """
+        """Prior mean and std (n_theta,) of the paths of rows of dipoles, 0 and inf without a
+        prior."""
         means, stds = [], []
         for n_dipoles in orders:
             mean, std = np.zeros(6 + (n_dipoles > 1)), np.full(6 + (n_dipoles > 1), np.inf)
@@ -101,29 +89,18 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
               stopped: Callable[[], bool] | None = None) -> tuple[tuple[PassFit, ...], ...]:
     """Fit several rows of dipoles, each at constant velocity, to the sum of their fields.
 
+    Returns, for each target, one fit per candidate order that has enough measurements; the other
+    targets then have their selected orders. Targets are sorted by the time at which they pass the
+    centre of the sensors; time zero is at the strongest field of each. `reason` is set if the best
+    fit of a target differs from its track, or another fit from the best fit. Empty if there are too
+    few measurements or `stopped()` was true.
+
     Parameters
     ----------
-    data : PassData
-        Readings of at least two sensors.
-    paths : (K, 6) array, m, m/s
-        Approximate position of each target at time zero of `data`, and its velocity.
-    ground : GroundPrior
-    orders : sequence of int
-        Candidate numbers of dipoles of each target.
-    errors : SensorErrors
-        Sensor errors included in the robust covariance.
-    stopped : function, optional
-        Called without arguments; returns whether to abandon the fit.
-
-    Returns
-    -------
-    tuple of tuples of PassFit
-        For each target, one fit per candidate order for which there are enough measurements. In
-        each fit, the other targets have their selected orders. Targets are sorted by the time at
-        which they pass the centre of the sensors. Time zero is at the strongest field of each
-        target. `reason` is set if the best fit of a target differs from its track, or if another
-        fit differs from the best fit. Empty if there are too few measurements, or if the fit was
-        abandoned.
+    data : readings of at least two sensors
+    paths : (K, 6), approximate positions at time zero of `data` and velocities, m and m/s
+    orders : candidate numbers of dipoles of each target
+    errors : sensor errors included in the robust covariance
     """
     n_targets, begin_ns = len(paths), data.stamp_ns
     orders = [n for n in orders if not unusable_reason(data, n_targets * (n,))]
@@ -178,9 +155,8 @@ def _initial_paths(averaged: PassData, n_targets: int, ground: GroundPrior) -> F
 class _JointFits:
     """Cached joint fits of several targets, for any combination of their numbers of dipoles.
 
-    Each fit starts at the solutions with point targets, `initial_paths` (n, 6 K), the first of
-    which contains the tracked paths. It also starts at the fit of the current combination, if
-    available, which differs in the number of dipoles of one target.
+    Each fit starts at the point-target solutions `initial_paths` (n, 6 K), the first of which is
+    the tracked paths, and at the fit of the current combination if available.
     """
 
     def __init__(self, data: PassData, averaged: PassData, initial_paths: FloatArray,
@@ -194,10 +170,8 @@ class _JointFits:
 
     def of_target(self, k: int, orders: Sequence[int],
                   candidates: Sequence[int]) -> tuple[PassFit, ...]:
-        """Fits of target `k` with each number of dipoles in `candidates`.
-
-        The other targets have the numbers of dipoles in `orders`.
-        """
+        """Fits of target `k` with each number in `candidates`; the other targets have those in
+        `orders`."""
         previous, fits = self._cache.get(tuple(orders)), []
         for n in candidates:
             combination = (*orders[:k], n, *orders[k + 1:])
@@ -211,8 +185,8 @@ class _JointFits:
                         previous: Sequence[PassFit] | None) -> FloatArray:
         """Starting paths (n, n_theta) for given numbers of dipoles.
 
-        `previous` contains one fit per target from a joint fit, which may differ in the number of
-        dipoles of target `k`; None if there is no such joint fit.
+        `previous` is a joint fit that may differ in the number of dipoles of target `k`; None if
+        there is no such fit.
         """
         starts = [_with_orders(paths, orders) for paths in self._initial_paths]
         if previous is not None and all(len(fit.x) for fit in previous):
@@ -249,29 +223,15 @@ class _JointFits:
 
 
 def _exclude_solutions(cost: FloatArray, is_allowed: BoolArray, max_ratio: float) -> FloatArray:
-    """Return the costs (n,), with infinity for solutions that are not allowed.
-
-    Return the costs unchanged if each allowed cost exceeds `max_ratio` times the lowest cost.
-    """
+    """Set the costs (n,) of disallowed solutions to infinity, unless every allowed cost exceeds
+    `max_ratio` times the lowest cost."""
     has_allowed = (cost[is_allowed] <= max_ratio * cost.min()).any()
     return np.where(is_allowed, cost, np.inf) if has_allowed else cost
 
 
 def are_separate(data: PassData, paths: Sequence[FloatArray], min_gap: float = MIN_GAP) -> bool:
-    """Whether targets do not overlap while any of them is within range of the sensors.
-
-    Parameters
-    ----------
-    data : PassData
-    paths : sequence of (6 or 7,) array, m, m/s, m
-        Position, velocity and, for a row, length.
-    min_gap : float, m
-        Minimum gap between two rows of dipoles, along the heading.
-
-    Returns
-    -------
-    bool
-    """
+    """Whether targets, with paths (6 or 7,), do not overlap within range of the sensors; `min_gap`
+    [m] is the gap along the heading."""
     positions = [path[:3] + data.t[:, None] * path[3:6] for path in paths]
     is_detected = np.any([np.linalg.norm(position - data.positions, axis=1) < MAX_DETECTION_RANGE
                           for position in positions], axis=0)
@@ -286,36 +246,20 @@ def are_separate(data: PassData, paths: Sequence[FloatArray], min_gap: float = M
 
 
 def path_from(data: PassData, fit: PassFit) -> FloatArray:
-    """Path of a fit, propagated to time zero of a pass.
-
-    Parameters
-    ----------
-    data : PassData
-        Pass that defines time zero.
-    fit : PassFit
-
-    Returns
-    -------
-    (6 or 7,) array, m, m/s, m
-    """
+    """Path (6 or 7,) of a fit, propagated to time zero of `data`."""
     return propagated_path(fit.x[:6 + (fit.n_dipoles > 1)],
                            (data.stamp_ns - fit.data.stamp_ns) / NS)
 
 
 def _with_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[FloatArray]:
-    """Convert paths (6 or 7,) to points or rows of dipoles, according to `orders`.
-
-    A point that becomes a row has the length `INITIAL_LENGTH`.
-    """
+    """Convert paths (6 or 7,) to points or rows; a new row has the length `INITIAL_LENGTH`."""
     return [np.concatenate([path[:6], path[6:] if len(path) > 6 else [INITIAL_LENGTH]])
             if n > 1 else path[:6] for path, n in zip(paths, orders, strict=True)]
 
 
 def _check_against_track(fits: Sequence[PassFit], best: int, path: FloatArray) -> list[PassFit]:
-    """Return the fits of one target; reject fits that differ from the track or the best fit.
-
-    The fit `best` is compared with the tracked `path` (6,), the other fits with the best fit.
-    """
+    """Reject the fits of one target that differ: `best` from the tracked `path` (6,), others from
+    `best`."""
     out = []
     for k, fit in enumerate(fits):
         # The other fits cannot be compared if the best fit has no estimate.
@@ -328,10 +272,8 @@ def _check_against_track(fits: Sequence[PassFit], best: int, path: FloatArray) -
 
 
 def _agrees_with_path(fit: PassFit, path: FloatArray) -> bool:
-    """Whether position and velocity of a fit agree with a `path` (6 or more,).
-
-    The fit and the path have the same time zero. They are compared at the strongest field.
-    """
+    """Whether position and velocity of a fit agree at the strongest field with a path (6 or more,)
+    of the same time zero."""
     if not len(fit.x):
         return False
     seconds = _time_of_peak(fit)
@@ -349,8 +291,8 @@ def _time_of_peak(fit: PassFit) -> float:
 def _shift_to_peak(fits: Sequence[PassFit], best: int) -> tuple[float, tuple[PassFit, ...]]:
     """Shift time zero of the fits of one target to the strongest field of the `best` fit.
 
-    Returns the time [s since 1970] at which the best fit is closest to the centre of the sensors,
-    and the shifted fits.
+    Returns also the time [s since 1970] at which the best fit is closest to the centre of the
+    sensors.
     """
     fit = fits[best]
     if not len(fit.x):

@@ -67,34 +67,11 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
                   high: ArrayLike, settings: PoseSettings) -> MagnetPose:
     """Estimate the pose of a dipole of known moment from one reading of all sensors.
 
-    The best points of a grid are refined by the Levenberg-Marquardt method, and the solution with
-    the smallest cost is returned.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-        Every sensor requires a `noise_std`.
-    field : (n, 3) array, T, sensor frame
-        Readings corrected for bias and gain (`NetworkGeometry.signal`); NaN if not measured.
-    moment : float, A m²
-    low, high : (3,) array, m, world frame
-        Opposite corners of the search box.
-    settings : PoseSettings
-
-    Returns
-    -------
-    MagnetPose
-        All values are NaN if too few axes were measured.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match, a reading is infinite, the moment is not positive, the box is
-        empty, or a sensor has no `noise_std`.
-
-    References
-    ----------
-    [PHD15]_ Paper A eq. (3).
+    The best points of a grid in the box between the corners `low` and `high` (3,) [m, world frame]
+    are refined; the solution with the smallest cost is returned. `field` (n, 3) [T, sensor frame]
+    is corrected for bias and gain (`NetworkGeometry.signal`); NaN if not measured. All values are
+    NaN if too few axes were measured. Raises ValueError for an invalid reading, moment or box, or a
+    sensor without `noise_std`. PHD15 Paper A eq. (3).
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
     _check_input(network, field, moment, low, high)
@@ -117,10 +94,8 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
 
 def _residual_function(network: SensorNetwork, field: FloatArray, std: FloatArray,
                        is_measured: BoolArray, moment: float, ambient_std: float) -> _Problem:
-    """Create the residual function of x = [position, axis, ambient field].
-
-    The axis is not normalised; the ambient field is in units of `ambient_std` [T].
-    """
+    """Create the residual function of x = [position, axis (not normalised), ambient field in units
+    of `ambient_std` (T)]."""
     y = (field / std)[is_measured]
     ambient_jacobian = (network.R_sw * ambient_std / std[:, :, None])[is_measured]
     prior = np.hstack([np.zeros((3, 6)), np.eye(3)])

@@ -9,23 +9,12 @@ from mag_tracking.arrays import FloatArray
 
 
 def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
-    """Compare fits of one pass by the Bayesian information criterion (BIC, Schwarz).
+    """Bayesian information criterion (Schwarz) of each fit of one pass, minus the smallest value.
 
-    The criterion adds a penalty of log(n) for each unknown to the cost, which is -2 times the
-    log-likelihood up to a constant. If the normalised cost of the fit with the most dipoles exceeds
-    one, all costs are divided by this value: a residual that no order explains is no evidence for a
-    higher order. TSP14 section V.C does not specify a criterion.
-
-    Parameters
-    ----------
-    fits : sequence of PassFit
-        Fits of the same measurements.
-
-    Returns
-    -------
-    (n,) array
-        Criterion of each fit minus the smallest criterion. Infinite for a fit that is not
-        determined by the measurements.
+    Each unknown adds log(n) to the cost, which is -2 times the log-likelihood up to a constant. If
+    the normalised cost of the fit with the most dipoles exceeds one, all costs are divided by it: a
+    residual that no order explains is no evidence for a higher order. Infinite for a fit that is
+    not determined. TSP14 section V.C does not specify a criterion.
     """
     determined_fits = [f for f in fits if f.determined]
     if not determined_fits:
@@ -41,17 +30,8 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
 def choose_order(fits: Sequence[PassFit]) -> PassFit | None:
     """Return the fit with the smallest criterion, or None if that fit is rejected.
 
-    A fit of another order does not replace a rejected fit, because a fit with fewer dipoles does
-    not always reveal that the target turned.
-
-    Parameters
-    ----------
-    fits : sequence of PassFit
-        Fits of the same measurements.
-
-    Returns
-    -------
-    PassFit or None
+    Another order does not replace a rejected fit, because a fit with fewer dipoles does not always
+    reveal that the target turned.
     """
     criteria = order_criteria(fits)
     if not len(fits) or not np.isfinite(criteria).any():

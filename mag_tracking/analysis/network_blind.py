@@ -28,33 +28,16 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
                              settings: GeometrySettings) -> NetworkGeometry:
     """Estimate the geometry of a network from readings of a magnet at unknown poses.
 
-    The initial poses are estimated with the median reading of each sensor as its bias. Biases,
-    poses and moment are then fitted with an assumed field error of at least 10 %. Finally, all
-    unknowns are fitted with the configured field error.
+    The initial poses are found with the median reading of each sensor as its bias. Biases, poses
+    and moment are then fitted with an assumed field error of at least 10 %; finally, all unknowns
+    are fitted with the configured one. `field` (K, n, 3) [T, sensor frame] includes the constant
+    background, NaN if not measured; `low` and `high` [m, world frame] are corners of the box that
+    contains the magnet.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-        As for `calibrate_geometry`.
-    field : (K, n, 3) array, T, sensor frame
-        Readings including their constant background; NaN if not measured.
-    moment : float, A m²
-    low, high : (3,) array, m, world frame
-        Opposite corners of the box that contains the magnet.
-    settings : GeometrySettings
-
-    Returns
-    -------
-    NetworkGeometry
-        The world frame is defined only by the priors of the sensors and must be registered before
-        a comparison with another frame. `rows` are the indices of the fitted poses. Poses that an
-        earlier stage located outside the box are excluded.
-
-    Raises
-    ------
-    ValueError
-        If an input is invalid (see `calibrate_geometry`), or fewer than `MIN_POSES` poses are
-        inside the box.
+    The world frame is defined only by the priors of the sensors and must be registered before a
+    comparison with another frame. `rows` are the indices of the fitted poses; poses located outside
+    the box by an earlier stage are excluded. Raises ValueError for invalid input (see
+    `calibrate_geometry`), or if fewer than `MIN_POSES` poses are inside the box.
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
     s = settings

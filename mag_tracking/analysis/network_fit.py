@@ -64,37 +64,21 @@ class Priors(Protocol):
 class GeometryProblem:
     """Least-squares problem of a geometry calibration: readings, priors and predictions.
 
-    The methods take the unknowns `x` in units of their prior standard deviations; see `Unknowns`.
+    The methods take the unknowns `x` in units of their prior stds; see `Unknowns`.
 
     Parameters
     ----------
-    network : SensorNetwork
-    field : (K, n, 3) array, T, sensor frame
-        Validated readings; see `calibrate_geometry`.
-    positions, axes : (K, 3) array, m and unit vectors, tracker frame
-        Tracked poses.
-    moment : float, A m²
-        Nominal moment of the magnet.
-    settings : Priors
-    shared_unit : (12,) array
-        Prior standard deviations of the shared unknowns; zero fixes an unknown.
-    pose_unit : (8,) array
-        Prior standard deviations of the unknowns of a pose; zero fixes an unknown.
+    field : (K, n, 3), validated readings; see `calibrate_geometry`
+    positions, axes : (K, 3), tracked poses, m and unit vectors, tracker frame
+    moment : nominal moment of the magnet, A m²
+    shared_unit, pose_unit : (12,) and (8,), prior stds; zero fixes an unknown
 
     Attributes
     ----------
-    network : SensorNetwork
-    settings : Priors
-    shared_unit : (12,) array
-    pose_unit : (8,) array
-    sensor_unit : (n, 10) array
-        Units of the unknowns of the sensors.
-    field : (n, K, 3) array, T, sensor frame
-    variance : (n, 1, 3) array, T²
-        Noise variances.
-    magnet : TrackedMagnet
-    has_readings : (n, 3) bool array
-        Whether an axis has any reading.
+    sensor_unit : (n, 10), units of the unknowns of the sensors
+    field : (n, K, 3), T, sensor frame
+    variance : (n, 1, 3), noise variances, T²
+    has_readings : (n, 3), whether an axis has any reading
     """
 
     def __init__(self, network: SensorNetwork, field: FloatArray, positions: FloatArray,
@@ -114,17 +98,7 @@ class GeometryProblem:
                 [s.gain_std, np.deg2rad(s.rotation_std_deg), s.position_std], [1, 3, 3]), (n, 1))])
 
     def predicted(self, x: Unknowns) -> Prediction:
-        """Predict readings and their derivatives with respect to the unknowns.
-
-        Parameters
-        ----------
-        x : Unknowns
-
-        Returns
-        -------
-        Prediction
-            As for `predicted_readings`, with derivatives in units of the priors.
-        """
+        """`predicted_readings` with derivatives in units of the priors."""
         sensor, shared, pose = self.in_si(x)
         f, signal, by_sensor, by_shared, by_pose = predicted_readings(
             self.network, self.magnet, sensor, shared, pose)
@@ -132,26 +106,13 @@ class GeometryProblem:
                 by_shared * self.shared_unit, by_pose * self.pose_unit)
 
     def in_si(self, x: Unknowns) -> Unknowns:
-        """Convert unknowns from units of their priors to SI units.
-
-        Parameters
-        ----------
-        x : Unknowns
-
-        Returns
-        -------
-        Unknowns
-        """
+        """Convert unknowns from units of their priors to SI units."""
         sensor, shared, pose = x
         return sensor * self.sensor_unit, shared * self.shared_unit, pose * self.pose_unit
 
     def initial_unknowns(self) -> Unknowns:
-        """Create the initial unknowns: biases from the median residuals, all other unknowns zero.
-
-        Returns
-        -------
-        Unknowns
-        """
+        """Create the initial unknowns: biases from the median residuals, all other unknowns
+        zero."""
         n, K = len(self.network), len(self.magnet.tool)
         x = np.zeros((n, N_SENSOR)), np.zeros(N_SHARED), np.zeros((K, N_POSE))
         residuals = self.field - self.predicted(x)[0]
@@ -161,22 +122,9 @@ class GeometryProblem:
 
     def squared_residuals(self, f: FloatArray,
                           signal: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
-        """Squared residuals normalised by their variance.
+        """Squared residuals over their variance, numbers of measured axes (n, K), and the variance.
 
-        Parameters
-        ----------
-        f : (n, K, 3) array, T
-            Predicted readings.
-        signal : (n, K, 3) array, T
-            Predicted readings without biases.
-
-        Returns
-        -------
-        e2 : (n, K, 3) array
-            Normalised squared residuals; zero where nothing was measured.
-        count : (n, K) int array
-            Number of measured axes.
-        variance : (n, K, 3) array, T²
+        `f` (n, K, 3) [T] is predicted with biases, `signal` without; unmeasured residuals are zero.
         """
         squared_signal = np.einsum('nki,nki->nk', signal, signal)[:, :, None]
         variance = self.variance + self.settings.field_error**2 * squared_signal
@@ -184,24 +132,11 @@ class GeometryProblem:
         return np.nan_to_num(e2), (~np.isnan(e2)).sum(axis=2), variance
 
     def weights(self, f: FloatArray, signal: FloatArray, x: Unknowns) -> Weights:
-        """Robust weights of readings and priors.
+        """Robust weights of readings and priors, noise scale, and robust weights (n, K), 0 to 1.
 
-        Parameters
-        ----------
-        f, signal : (n, K, 3) array, T
-            As for `squared_residuals`.
-        x : Unknowns
-
-        Returns
-        -------
-        W : (n, K, 3) array
-            Weights of the readings.
-        prior_weights : Unknowns
-            Weights of the priors.
-        scale : float
-            Median of `median_ratio` over all sensors and poses with readings; at least one.
-        robust_weights : (n, K) array
-            Robust weight of each sensor at each pose, 0 to 1.
+        The weights of the readings (n, K, 3) are over the scaled variance. The scale is the median
+        of `median_ratio` over all sensors and poses with readings, at least one. `f`, `signal` are
+        as for `squared_residuals`.
         """
         e2, count, variance = self.squared_residuals(f, signal)
         d2 = e2.sum(axis=2)
@@ -222,23 +157,8 @@ class GeometryProblem:
                 np.ones(N_SHARED), np.tile(pose, N_POSE))
 
     def cost(self, x: Unknowns, f: FloatArray, W: FloatArray, prior_weights: Unknowns) -> float:
-        """Weighted sum of the squared residuals and of the squared unknowns (priors).
-
-        Parameters
-        ----------
-        x : Unknowns
-        f : (n, K, 3) array, T
-            Predicted readings.
-        W : (n, K, 3) array
-            Weights of the readings.
-        prior_weights : Unknowns
-            Weights of the priors.
-
-        Returns
-        -------
-        float
-            Infinite if a prediction is not finite.
-        """
+        """Weighted sum of the squared residuals and of the squared unknowns (priors); infinite if a
+        prediction is not finite."""
         e = np.nan_to_num(self.field - f)
         cost = (W * e * e).sum() + sum(
             (w * v**2).sum() for w, v in zip(prior_weights, x, strict=True))
@@ -246,20 +166,8 @@ class GeometryProblem:
 
 
 def median_ratio(d2: FloatArray, count: IntArray) -> FloatArray:
-    """Ratio of each sum of squared residuals to the median of such a sum for pure noise.
-
-    Parameters
-    ----------
-    d2 : (...) array
-        Sums of squared normalised residuals.
-    count : (...) int array
-        Number of values of each sum.
-
-    Returns
-    -------
-    (...) array
-        One where no value was measured.
-    """
+    """Ratio of each sum `d2` of `count` squared normalised residuals to its median for pure noise;
+    one where nothing was measured."""
     return np.where(count > 0, d2 / chi2.median(np.maximum(count, 1)), 1.0)
 
 
@@ -272,28 +180,11 @@ def _robust_weights(d2: FloatArray, count: IntArray | int) -> FloatArray:
 class NormalEquations:
     """Normal equations of a geometry calibration; the poses are eliminated block by block.
 
-    Parameters
-    ----------
-    problem : GeometryProblem
-    x : Unknowns
-    predicted : Prediction
-    W : (n, K, 3) array
-        Weights of the readings.
-    prior_weights : Unknowns
-        Weights of the priors.
-
     Attributes
     ----------
-    A : (N, N) array
-        Information of [sensors, shared].
-    g : (N,) array
-        Negative gradient with respect to [sensors, shared].
-    A_pose : (K, 8, 8) array
-        Information of each pose.
-    g_pose : (K, 8) array
-        Negative gradient with respect to each pose.
-    C : (K, N, 8) array
-        Cross information between [sensors, shared] and each pose.
+    A, g : (N, N) and (N,), information and negative gradient of [sensors, shared]
+    A_pose, g_pose : (K, 8, 8) and (K, 8), the same of each pose
+    C : (K, N, 8), cross information between [sensors, shared] and each pose
     """
 
     def __init__(self, problem: GeometryProblem, x: Unknowns, predicted: Prediction, W: FloatArray,
@@ -329,20 +220,8 @@ class NormalEquations:
         self.C = np.concatenate([sensor_pose.reshape(K, m, N_POSE), shared_pose], axis=1)
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Solve the damped normal equations.
-
-        Parameters
-        ----------
-        damping : float
-            Relative increase of the diagonals.
-
-        Returns
-        -------
-        dx : (N,) array
-            Step of [sensors, shared].
-        dpose : (K, 8) array
-            Steps of the poses.
-        """
+        """Steps of [sensors, shared] (N,) and of the poses (K, 8), with diagonals increased by
+        `damping`."""
         A, A_pose = self._damped(damping)
         CB = self.C @ np.linalg.inv(A_pose)
         S = A - self._lost_information(CB)
@@ -351,15 +230,7 @@ class NormalEquations:
         return dx, np.linalg.solve(A_pose, residual[..., None])[..., 0]
 
     def covariance(self) -> tuple[FloatArray, FloatArray]:
-        """Covariances of the solution.
-
-        Returns
-        -------
-        P : (N, N) array
-            Covariance of [sensors, shared].
-        P_pose : (K, 8, 8) array
-            Covariance of each pose.
-        """
+        """Covariances of [sensors, shared] (N, N) and of each pose (K, 8, 8)."""
         B = np.linalg.inv(self.A_pose)
         CB = self.C @ B
         P = np.linalg.inv(self.A - self._lost_information(CB))
@@ -381,21 +252,8 @@ class NormalEquations:
 
 def solve(problem: GeometryProblem,
           iterations: int) -> tuple[Unknowns, Weights, Prediction, bool]:
-    """Minimise a `GeometryProblem` by the Levenberg-Marquardt method.
-
-    Parameters
-    ----------
-    problem : GeometryProblem
-    iterations : int
-        Maximum number of steps.
-
-    Returns
-    -------
-    x : Unknowns
-    weights : Weights
-    predicted : Prediction
-    converged : bool
-    """
+    """Minimise a `GeometryProblem` by Levenberg-Marquardt; the last value is whether it
+    converged."""
     x, damping, converged = problem.initial_unknowns(), 1e-3, False
     predicted = problem.predicted(x)
     for _ in range(iterations):

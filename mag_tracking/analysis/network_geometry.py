@@ -78,8 +78,7 @@ class GeometrySettings:
 class NetworkGeometry:
     """Result of a geometry calibration; valid only if `reason` is empty.
 
-    Standard deviations are posterior. If the residuals exceed the configured noise, the noise is
-    scaled up accordingly.
+    Standard deviations are posterior; noise is scaled up if residuals exceed the configured noise.
     """
 
     network: SensorNetwork
@@ -128,35 +127,14 @@ class NetworkGeometry:
     """Reason why the calibration is not valid; empty if it is valid."""
 
     def signal(self, field: FloatArray) -> FloatArray:
-        """Remove biases and gains from readings.
-
-        Parameters
-        ----------
-        field : (..., n, 3) array, T, sensor frame
-
-        Returns
-        -------
-        (..., n, 3) array, T, sensor frame
-            NaN where `field` is NaN.
-        """
+        """Remove biases and gains from readings (..., n, 3) [T, sensor frame]."""
         signal: FloatArray = (np.asarray(field, dtype=float) - self.bias) / self.gain[:, None]
         return signal
 
     def magnet_poses(self, positions: FloatArray,
                      axes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Convert tracked poses to poses of the magnet in the world frame.
-
-        Parameters
-        ----------
-        positions : (K, 3) array, m, tracker frame
-        axes : (K, 3) array, unit vectors, tracker frame
-            As for `calibrate_geometry`.
-
-        Returns
-        -------
-        positions : (K, 3) array, m, world frame
-        axes : (K, 3) array, unit vectors, world frame
-        """
+        """Convert tracked positions and axes (K, 3), tracker frame, to those of the magnet, world
+        frame."""
         magnet = replace(self.magnet, tool=np.asarray(positions, dtype=float),
                          R_tool=tool_rotations(np.asarray(axes, dtype=float)))
         return _positions_and_axes(magnet, self.shared, np.zeros((len(magnet.tool), N_POSE)))
@@ -169,15 +147,12 @@ class NetworkGeometry:
 
     @property
     def tool_offset(self) -> tuple[FloatArray, FloatArray]:
-        """Offset of the magnet from the tracked point, and its standard deviations.
-
-        Each is (3,) m, tool frame.
-        """
+        """Offset of the magnet from the tracked point and its stds, (3,) m each, tool frame."""
         return self.shared[6:9], self.shared_std[6:9]
 
     @property
     def tool_tilt(self) -> tuple[FloatArray, FloatArray]:
-        """Slopes x/z and y/z of the moment and their standard deviations, (2,) each, tool frame."""
+        """Slopes x/z and y/z of the moment and their stds, (2,) each, tool frame."""
         return self.shared[9:11], self.shared_std[9:11]
 
     @property
@@ -216,34 +191,18 @@ def calibrate_geometry(network: SensorNetwork, field: FloatArray, positions: Flo
     """Estimate the geometry of a network from readings of a tracked magnet.
 
     The posterior is maximised by the Levenberg-Marquardt method with robust weights. A rotation of
-    the board has the same effect as a rotation of all sensors. The priors resolve this ambiguity.
-    PHD15 Paper A section 8 proposes such a calibration.
+    the board has the same effect as a rotation of all sensors; the priors resolve this ambiguity.
+    PHD15 Paper A section 8 proposes such a calibration. Raises ValueError if a pose is invalid, has
+    no readings or is at a sensor, a reading is infinite, a sensor has no `noise_std`, or the moment
+    is not positive.
 
     Parameters
     ----------
-    network : SensorNetwork
-        Nominal network. Every sensor requires a `noise_std`.
-    field : (K, n, 3) array, T, sensor frame
-        Readings including their constant background; NaN if not measured.
-    positions : (K, 3) array, m, tracker frame
-        Positions of the tracked point. The tracker frame differs from the world frame only by a
-        shift and a rotation within the priors of the settings.
-    axes : (K, 3) array, unit vectors, tracker frame
-        Directions of the moment if the magnet is not tilted in the tool.
-    moment : float, A m²
-        Nominal moment of the magnet.
-    settings : GeometrySettings
-
-    Returns
-    -------
-    NetworkGeometry
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match, a pose is not finite or its axis not a unit vector, a pose has no
-        readings or is at the position of a sensor, a reading is infinite, a sensor has no
-        `noise_std`, or the moment is not positive.
+    field : (K, n, 3), T, sensor frame, with the constant background; NaN if not measured
+    positions : (K, 3), tracked points, m; the tracker frame differs from the world frame only by a
+        shift and a rotation within the priors
+    axes : (K, 3) unit vectors, directions of the moment if the magnet is not tilted in the tool
+    moment : nominal moment of the magnet, A m²
     """
     s, deg = settings, np.pi / 180.0
     shared_unit = np.concatenate([
@@ -258,32 +217,11 @@ def calibrate_geometry(network: SensorNetwork, field: FloatArray, positions: Flo
 def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatArray,
                     axes: FloatArray, moment: float, settings: GeometrySettings,
                     shared_unit: FloatArray, pose_unit: FloatArray) -> NetworkGeometry:
-    """Estimate the geometry of a network from readings of a tracked magnet, with given priors.
+    """`calibrate_geometry` with given priors.
 
-    `calibrate_geometry` derives the priors from its settings and describes the first six arguments.
-    The shared unknowns (board pose, magnet alignment, moment) are common to all poses.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    field : (K, n, 3) array, T, sensor frame
-    positions, axes : (K, 3) array, m and unit vectors, tracker frame
-    moment : float, A m²
-    settings : GeometrySettings
-    shared_unit : (12,) array
-        Prior standard deviations of the shared unknowns, in the units of `TrackedMagnet.poses`;
-        zero fixes an unknown.
-    pose_unit : (8,) array
-        Prior standard deviations of the unknowns of a pose; zero fixes an unknown.
-
-    Returns
-    -------
-    NetworkGeometry
-
-    Raises
-    ------
-    ValueError
-        If an argument is invalid; see `calibrate_geometry`.
+    `shared_unit` (12,) are the prior stds of the unknowns common to all poses (board pose, magnet
+    alignment, moment), in the units of `TrackedMagnet.poses`; `pose_unit` (8,) those of each pose.
+    Zero fixes an unknown.
     """
     field, positions, axes = (np.asarray(a, dtype=float) for a in (field, positions, axes))
     _check_input(network, field, positions, axes, moment)
@@ -336,10 +274,8 @@ def _normalised_cost(problem: GeometryProblem, x: Unknowns, predicted: Predictio
 
 def _sensor_and_pose_residuals(problem: GeometryProblem,
                                predicted: Prediction) -> tuple[FloatArray, FloatArray]:
-    """Normalised residuals: RMS (n,) of each sensor over consistent poses, median (K,) per pose.
-
-    The medians are relative to the median for pure noise.
-    """
+    """Normalised residuals: RMS (n,) of each sensor over consistent poses, and median (K,) of each
+    pose relative to the median for pure noise."""
     e2, count, _ = problem.squared_residuals(predicted[0], predicted[1])
     e2 = e2.sum(axis=2)
     pose_residual = np.sqrt([np.median(median_ratio(d2, c)[c > 0])

@@ -32,35 +32,17 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def tool_rotations(axes: FloatArray) -> FloatArray:
-    """Minimal rotations from the tool frame to the tracker frame.
+    """Minimal rotations (K, 3, 3) from the tool frame to the tracker frame, from the tool's z axes.
 
     The roll about a tracked axis is not measured. The minimal rotation is exact if the tool is
-    tilted without roll. Otherwise, a rotated vector has a wrong component perpendicular to the
+    tilted without roll; otherwise, a rotated vector has a wrong component perpendicular to the
     axis.
-
-    Parameters
-    ----------
-    axes : (K, 3) array, unit vectors, tracker frame
-        Directions of the tool's z axis.
-
-    Returns
-    -------
-    (K, 3, 3) array
     """
     return rotation_from_quaternion(np.array([quaternion_between(UP, a) for a in axes]))
 
 
 def rotation(v: FloatArray) -> FloatArray:
-    """Rotation matrices of rotation vectors.
-
-    Parameters
-    ----------
-    v : (..., 3) array, rad
-
-    Returns
-    -------
-    (..., 3, 3) array
-    """
+    """Rotation matrices (..., 3, 3) of rotation vectors [rad]."""
     return rotation_from_quaternion(quaternion_from_rotation_vector(v))
 
 
@@ -79,24 +61,18 @@ class TrackedMagnet:
 
     def poses(self, shared: FloatArray, pose: FloatArray) -> tuple[
             FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Compute positions and moments of the magnet, and their derivatives.
+        """Positions [m] and moments [A m²] of the magnet, world frame, and their derivatives.
+
+        Each is (K, 3), and is first differentiated by `shared`, (K, 3, 12), then by `pose`,
+        (K, 3, 8).
 
         Parameters
         ----------
-        shared : (12,) array
-            Shift [m] and rotation vector [rad] from the tracker frame to the board (world) frame;
+        shared : shift [m] and rotation vector [rad] from the tracker to the board (world) frame;
             offset [m] and tilt [slope] of the magnet in the tool frame; log of the moment over its
-            nominal value.
-        pose : (K, 8) array
-            Corrections of the position [m, world frame] and of the tilt [slope, tool frame]; change
-            of the ambient field [T, world frame], which does not affect the pose.
-
-        Returns
-        -------
-        r : (K, 3) array, m, world frame
-        m : (K, 3) array, A m², world frame
-        dr_dshared, dm_dshared : (K, 3, 12) array
-        dr_dpose, dm_dpose : (K, 3, 8) array
+            nominal value
+        pose : corrections of position [m, world frame] and tilt [slope, tool frame]; change of the
+            ambient field [T, world frame], which does not affect the pose
         """
         K = len(self.tool)
         R_b, J_b = rotation(shared[3:6]), left_jacobian(shared[3:6])
@@ -125,33 +101,11 @@ def predicted_readings(network: SensorNetwork, magnet: TrackedMagnet, sensor: Fl
                        shared: FloatArray, pose: FloatArray) -> Prediction:
     """Predict the reading of each sensor at each pose, and its derivatives.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-        Nominal positions and orientations.
-    magnet : TrackedMagnet
-    sensor : (n, 10) array
-        Bias [T, sensor frame], gain minus one, rotation vector [rad, nominal sensor frame],
-        position minus the nominal position [m, world frame].
-    shared : (12,) array
-        As for `TrackedMagnet.poses`.
-    pose : (K, 8) array
-        As for `TrackedMagnet.poses`.
-
-    Returns
-    -------
-    f : (n, K, 3) array, T, sensor frame
-        Predicted readings.
-    signal : (n, K, 3) array, T, sensor frame
-        Predicted readings without the bias.
-    by_sensor : (n, K, 3, 10) array
-        NaN where the magnet is at the position of a sensor.
-    by_shared : (n, K, 3, 12) array
-    by_pose : (n, K, 3, 8) array
-
-    References
-    ----------
-    [TSP14]_ eq. (2), (30) for the dipole; [T10]_ section 6.3 for the corrections, here with finite
+    `sensor` (n, 10) is bias [T, sensor frame], gain minus one, rotation vector [rad, nominal sensor
+    frame] and position minus the nominal position [m, world frame]; `shared` and `pose` are as for
+    `TrackedMagnet.poses`. Returns readings and readings without the bias (n, K, 3) [T, sensor
+    frame], then derivatives by `sensor`, `shared` and `pose`, NaN for a magnet at a sensor.
+    TSP14 eq. (2), (30) for the dipole; T10 section 6.3 for the corrections, here with finite
     rotations.
     """
     r, m, *derivatives = magnet.poses(shared, pose)

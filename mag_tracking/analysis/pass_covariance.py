@@ -42,17 +42,7 @@ class SensorErrors:
 
 
 def reach(n_dipoles: int, length: float) -> float:
-    """Maximum distance between the iron of a vehicle and the dipoles that model it.
-
-    Parameters
-    ----------
-    n_dipoles : int
-    length : float, m
-
-    Returns
-    -------
-    float, m
-    """
+    """Maximum distance [m] between the iron of a vehicle and the dipoles that model it."""
     if n_dipoles == 1:
         return POINT_REACH
     return max(MIN_ROW_REACH, ROW_REACH * abs(length) / (n_dipoles - 1))
@@ -61,24 +51,10 @@ def reach(n_dipoles: int, length: float) -> float:
 def robust_covariance(data: PassData, whitened: FloatArray, residuals: FloatArray,
                       target: FloatArray, covariance: FloatArray,
                       errors: SensorErrors) -> FloatArray:
-    """Compute the covariance due to noise, model error and sensor errors.
+    """Covariance (n_x, n_x) due to noise (`covariance`), model error and sensor errors.
 
-    Parameters
-    ----------
-    data : PassData
-    whitened : (n, 3, n_x) array
-        Whitened derivatives of the field with respect to the unknowns.
-    residuals : (n, 3) array
-        Whitened residuals.
-    target : (n, 3) array, T, sensor frame
-        Field of the target.
-    covariance : (n_x, n_x) array
-        Covariance due to noise alone.
-    errors : SensorErrors
-
-    Returns
-    -------
-    (n_x, n_x) array
+    `whitened` (n, 3, n_x) are whitened derivatives of the field, `residuals` (n, 3) are whitened,
+    and `target` (n, 3) [T, sensor frame] is the field of the target.
     """
     model_error = model_error_covariance(*_split_by_sensor(data, whitened, residuals), covariance)
     robust: FloatArray = covariance + model_error + _sensor_error_covariance(
@@ -88,30 +64,13 @@ def robust_covariance(data: PassData, whitened: FloatArray, residuals: FloatArra
 
 def shape_covariance(data: PassData, whitened: FloatArray, covariance: FloatArray,
                      position_index: int, n_dipoles: int, theta: FloatArray) -> FloatArray:
-    """Compute the covariance due to the difference between a vehicle and a row of dipoles.
+    """Covariance (3, 3) [m², world frame] of the middle of a vehicle about the centre of its row.
 
-    The field of iron that extends by `reach` beyond the dipoles resembles the field of dipoles at
+    The field of iron that extends by `reach` beyond the dipoles resembles that of dipoles at
     another distance; the relative difference is the square of reach over distance. Sensors on one
-    side of a road measure a wrong range without a residual, whereas the errors of two sides
-    cancel. The row is moreover not centred in the vehicle.
-
-    Parameters
-    ----------
-    data : PassData
-    whitened : (n, 3, n_x) array
-        Whitened derivatives of the field with respect to the unknowns.
-    covariance : (n_x, n_x) array
-        Covariance due to noise alone.
-    position_index : int
-        Index of the unknown x of the target; y and z follow.
-    n_dipoles : int
-    theta : (6 or 7,) array, m, m/s, m
-        Path of the target, with the length of a row.
-
-    Returns
-    -------
-    (3, 3) array, m², world frame
-        Covariance of the middle of the vehicle about the centre of the row.
+    side of a road measure a wrong range without a residual, whereas the errors of two sides cancel.
+    The row is moreover not centred in the vehicle. `position_index` is the index of the unknown x
+    in `whitened` (n, 3, n_x); y and z follow.
     """
     xyz = slice(position_index, position_index + 3)
     length = abs(float(theta[6])) if n_dipoles > 1 else 0.0
@@ -161,31 +120,11 @@ def _sensor_error_covariance(data: PassData, whitened: FloatArray, target: Float
 
 def velocity_change(data: PassData, whitened: FloatArray, residuals: FloatArray, x_index: int,
                     velocity: FloatArray, duration_s: float) -> tuple[float, float]:
-    """Estimate the relative change of the velocity while the target is observed.
+    """Relative change of the velocity during `duration_s`, and its std including model error.
 
-    A constant horizontal acceleration is added to the unknowns and estimated by one Gauss-Newton
-    step from the minimum. The derivatives with respect to the acceleration are t²/2 times the
-    derivatives with respect to x and y.
-
-    Parameters
-    ----------
-    data : PassData
-    whitened : (n, 3, n_x) array
-        Whitened derivatives of the field with respect to the unknowns.
-    residuals : (n, 3) array
-        Whitened residuals.
-    x_index : int
-        Index of the unknown x of the target; the next unknown is y.
-    velocity : (3,) array, m/s
-    duration_s : float, s
-        Duration of the observation.
-
-    Returns
-    -------
-    change : float
-        Change relative to the speed.
-    std : float
-        Standard deviation of the change, including model error.
+    A constant horizontal acceleration is estimated by one Gauss-Newton step from the minimum; its
+    derivatives are t²/2 times those of x and y. `x_index` is the index of the unknown x in
+    `whitened` (n, 3, n_x); y follows.
     """
     by_acceleration = 0.5 * np.square(data.t)[:, None, None] * whitened[:, :, x_index:x_index + 2]
     extended = np.concatenate([whitened, by_acceleration], axis=2)

@@ -44,20 +44,9 @@ class PassData:
                     offsets: Sequence[FloatArray] | None = None) -> 'PassData':
         """Create the data of a pass from frames of all sensors.
 
-        Parameters
-        ----------
-        network : SensorNetwork
-        stamps_ns : sequence of n int, ns
-        fields : sequence of n (n_sensors, 3) array, T, sensor frame
-            Field of each frame; NaN for axes that were not measured.
-        covariances : sequence of n (n_sensors, 3, 3) array, T², sensor frame
-            Noise covariances of each frame.
-        offsets : sequence of n (n_sensors,) array, s, optional
-            Sampling time of each sensor relative to the timestamp of the frame.
-
-        Returns
-        -------
-        PassData
+        `fields` (n_sensors, 3) and `covariances` are in the sensor frame, with NaN for axes that
+        were not measured; `offsets` (n_sensors,) [s] are sampling times relative to the timestamp
+        of the frame.
         """
         n, n_sensors = len(stamps_ns), len(network)
         t = np.tile((np.array(stamps_ns, dtype=np.int64) - stamps_ns[0]) / NS, (n_sensors, 1))
@@ -77,8 +66,8 @@ class PassData:
         """Number of independent values.
 
         Repeated readings of a coarse sensor at rest are not independent and have an increased
-        variance (`calibration.resolution`). Such a value is counted as a fraction: the smallest
-        variance of its axis over its own variance.
+        variance (`calibration.resolution`). Such a value counts as the smallest variance of its
+        axis over its own.
         """
         total = 0.0
         for j in self.sensors:
@@ -102,27 +91,14 @@ class PassData:
         return self.network.positions[self.sensor]
 
     def shifted(self, seconds: float) -> 'PassData':
-        """Return the data with time zero shifted.
-
-        Parameters
-        ----------
-        seconds : float, s
-            Shift of time zero; a positive shift makes time zero later.
-
-        Returns
-        -------
-        PassData
-        """
+        """Return the data with time zero shifted; a positive shift makes it later."""
         return replace(self, stamp_ns=self.stamp_ns + int(round(1e9 * seconds)),
                        t=self.t - seconds)
 
     @cached_property
     def whitening(self) -> FloatArray:
-        """Whitening matrices W, (n, 3, 3), with W C Wᵀ = I for the covariance C of each sample.
-
-        If a sample is a mean, C is the covariance of the mean. Rows and columns of missing axes are
-        zero.
-        """
+        """Whitening matrices W (n, 3, 3) with W C Wᵀ = I for the covariance C of each sample or
+        mean; rows and columns of missing axes are zero."""
         W = np.zeros((len(self.t), 3, 3))
         is_measured = ~np.isnan(self.field)
         for axes in np.unique(is_measured, axis=0):
@@ -133,18 +109,8 @@ class PassData:
         return W if self.count is None else W * np.sqrt(self.count)[:, None, None]
 
     def averaged(self, max_samples: int) -> 'PassData':
-        """Average adjacent samples.
-
-        Parameters
-        ----------
-        max_samples : int
-            Maximum number of means per sensor. Means where the field is strong contain fewer
-            samples.
-
-        Returns
-        -------
-        PassData
-        """
+        """Average adjacent samples to at most `max_samples` means per sensor; means where the field
+        is strong contain fewer samples."""
         field_weight = np.sqrt(np.linalg.norm(self.field_change, axis=1))
         columns = []
         for j in np.unique(self.sensor):
@@ -180,20 +146,8 @@ def separable_problem(data: PassData, create_model: ModelFactory, relative_error
                       prior: tuple[FloatArray, FloatArray] | None = None) -> SeparableProblem:
     """Create the separable least-squares problem of a pass, with unknown backgrounds.
 
-    Parameters
-    ----------
-    data : PassData
-    create_model : function
-        Creates a `SeparableModel` from t (n,), positions (n, 3) and whitened world-to-sensor
-        rotations M (n, 3, 3).
-    relative_error : float
-        Model error relative to the field of each sample, added to the noise.
-    prior : (mean, std), optional
-        Prior of the path; see `SeparableProblem`.
-
-    Returns
-    -------
-    SeparableProblem
+    `create_model` gets whitened world-to-sensor rotations. `relative_error` is the model error
+    relative to the field of each sample, added to the noise; `prior` is as for `SeparableProblem`.
     """
     W = data.whitening
     if relative_error > 0.0:
@@ -206,19 +160,7 @@ def separable_problem(data: PassData, create_model: ModelFactory, relative_error
 
 
 def background_columns(data: PassData, W: FloatArray) -> FloatArray:
-    """Create the whitened design matrix of the backgrounds of all measured axes.
-
-    Parameters
-    ----------
-    data : PassData
-    W : (n, 3, 3) array
-        Whitening matrices.
-
-    Returns
-    -------
-    (3 n, q) array
-        One column for each of the q measured axes of the sensors.
-    """
+    """Whitened design matrix (3 n, q) of the backgrounds of the q measured axes."""
     columns = np.zeros((len(data.t), 3, len(data.network), 3))
     columns[np.arange(len(data.t)), :, data.sensor] = W
     flat = columns.reshape(3 * len(data.t), -1)

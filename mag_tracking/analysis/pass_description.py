@@ -42,25 +42,12 @@ def fits_at_minimum(data: PassData, orders: Sequence[int], minimum: Minimum, p: 
 
     Parameters
     ----------
-    data : PassData
-        Readings of several sensors, or of one sensor and one target.
-    orders : sequence of K int
-        Number of dipoles of each target.
-    minimum : Minimum
-        Minimum of the cost; its parameters are the concatenated paths of the targets.
-    p : (k,) array
-        Linear parameters of `SuperposedPasses`.
-    explained : float
-        Fraction of the energy that is explained by all targets.
-    errors : SensorErrors
-    cpa_range : (float, float), m, optional
-        Range at the CPA and its standard deviation; see `fit_pass`.
-    path_std : (n_theta,) array, optional
-        Prior standard deviations of the paths; infinite for parameters without a prior.
-
-    Returns
-    -------
-    tuple of PassFit
+    data : readings of several sensors, or of one sensor and one target
+    minimum : its parameters are the concatenated paths of the targets
+    p : (k,), linear parameters of `SuperposedPasses`
+    explained : fraction of the energy that all targets explain
+    cpa_range : CPA range and its std; see `fit_pass`
+    path_std : (n_theta,), prior stds of the paths; infinite without a prior
     """
     if len(data.sensors) == 1:
         return (_fit_of_one_sensor(data, orders[0], minimum, p, explained, cpa_range, errors),)
@@ -107,10 +94,8 @@ def _fit_of_one_sensor(data: PassData, n_dipoles: int, minimum: Minimum, p: Floa
 
 @dataclass(frozen=True)
 class _LinearisedFit:
-    """Linearisation of a fit at its minimum.
-
-    The unknowns are the path and the moments of each target, followed by the backgrounds.
-    """
+    """Linearisation of a fit at its minimum: path and moments of each target, then the
+    backgrounds."""
 
     data: PassData
     orders: tuple[int, ...]
@@ -181,10 +166,8 @@ def _flatten(A: FloatArray) -> FloatArray:
 
 def _partial_fits(linear: _LinearisedFit, minimum: Minimum, explained: float, errors: SensorErrors,
                   covariance: FloatArray) -> list[PassFit]:
-    """Create the `PassFit` of each target, except for `rivals`, `reason` and `trusted`.
-
-    `covariance` contains only the effect of the noise.
-    """
+    """Create the `PassFit` of each target without `rivals`, `reason` and `trusted`; `covariance` is
+    that of the noise alone."""
     data, H, T = linear.data, linear.H, linear.T
     total_field = linear.fields.sum(axis=0)
     # The infinite variance of an unobservable state results in NaN.
@@ -216,18 +199,9 @@ def _partial_fits(linear: _LinearisedFit, minimum: Minimum, explained: float, er
 
 
 def assignment(paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> tuple[int, ...]:
-    """Match two sets of paths so that their total distance is minimal.
+    """For each path, the index of its match in `others`, so that the total distance is minimal.
 
     The order of the targets in a solution of a joint fit is arbitrary.
-
-    Parameters
-    ----------
-    paths, others : sequence of K (6 or 7,) array, m, m/s, m
-
-    Returns
-    -------
-    tuple of int
-        For each path, the index of the matching path in `others`.
     """
     distance = [[float(np.square((other[:6] - path[:6]) / PATH_TOLERANCE[:6]).sum())
                  for other in others] for path in paths]
@@ -237,10 +211,8 @@ def assignment(paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> tup
 
 def _select_rivals(fit: PassFit, minima: Iterable[tuple[FloatArray, float]]) -> tuple[
         tuple[float, FloatArray], ...]:
-    """Create `PassFit.rivals` from the minima (path, cost) that differ from the fit.
-
-    A minimum that equals the fit apart from the sign of the length is not a rival.
-    """
+    """Create `PassFit.rivals` from the minima (path, cost) that differ from the fit by more than
+    the sign of the length."""
     rivals, cost_scale = [], max(1.0, fit.normalised_cost)
     for path, cost in minima:
         path = np.append(path[:6], np.abs(path[6:]))

@@ -33,30 +33,10 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
              errors: SensorErrors = DEFAULT_ERRORS) -> PassFit:
     """Fit the path and moments of a row of dipoles at constant velocity to a pass.
 
-    Parameters
-    ----------
-    data : PassData
-    n_dipoles : int
-        Number of dipoles of the row; 1 models a point target without a length.
-    cpa_range : (float, float), m, optional
-        Known CPA range and its standard deviation. Only for a single sensor, for which the scale is
-        not observable (TSP14 section IV.B).
-    errors : SensorErrors
-        Sensor errors included in the robust covariance.
-
-    Returns
-    -------
-    PassFit
-        Time zero is at the strongest field. `reason` is not empty if the fit is rejected.
-
-    Raises
-    ------
-    ValueError
-        If `cpa_range` is given with several sensors, or `n_dipoles` is less than one.
-
-    References
-    ----------
-    [TSP14]_ sections III.A and V; [T10]_ Alg. 1.
+    A row of one dipole is a point target without a length. `cpa_range` is a known CPA range and its
+    std [m], only for a single sensor, for which the scale is not observable (TSP14 section IV.B).
+    Raises ValueError with several sensors, or without a dipole. Time zero is at the strongest
+    field. `errors` are included in the robust covariance. TSP14 sections III.A and V; T10 Alg. 1.
     """
     if cpa_range is not None and len(data.sensors) > 1:
         raise ValueError('cpa_range requires data of a single sensor, got '
@@ -88,19 +68,8 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
 
 
 def centred_on_peak(data: PassData) -> tuple[PassData, PassData]:
-    """Shift time zero of a pass to its strongest field, and average the samples.
-
-    Parameters
-    ----------
-    data : PassData
-
-    Returns
-    -------
-    data : PassData
-        All samples of the pass.
-    averaged : PassData
-        Averaged samples, at most `N_COARSE` per sensor.
-    """
+    """Shift time zero to the strongest field; return all samples, and means of at most `N_COARSE`
+    per sensor."""
     averaged = data.averaged(N_COARSE)
     field_change = averaged.field_change
     seconds = averaged.t[np.argmax(np.einsum('ni,ni->n', field_change, field_change))]
@@ -108,24 +77,7 @@ def centred_on_peak(data: PassData) -> tuple[PassData, PassData]:
 
 
 def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
-    """Check that there are enough measurements for a fit.
-
-    Parameters
-    ----------
-    data : PassData
-    orders : sequence of int
-        Number of dipoles of each target.
-
-    Returns
-    -------
-    str
-        Reason why a fit is not possible; empty if it is possible.
-
-    Raises
-    ------
-    ValueError
-        If an order is less than one.
-    """
+    """Reason why there are too few measurements for a fit; empty if there are enough."""
     if min(orders) < 1:
         raise ValueError(f'number of dipoles is {min(orders)}; at least one dipole is required')
     if not len(data.sensors):
@@ -139,19 +91,10 @@ def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
 
 
 def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
-    """Create starting paths of the search with various headings, offsets and speeds.
+    """Create starting paths (n, 6 or 7) of the search with various headings, offsets and speeds.
 
-    The paths pass the sensor with the strongest field. The duration of the field at this sensor
+    They pass the sensor with the strongest field. The duration of the field at this sensor
     determines the ratio of speed to distance.
-
-    Parameters
-    ----------
-    data : PassData
-    n_dipoles : int
-
-    Returns
-    -------
-    (n, 6 or 7) array, m, m/s, m
     """
     field_change = data.field_change
     energy = np.einsum('ni,ni->n', field_change, field_change)
@@ -174,19 +117,10 @@ def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
 
 
 def shorter_rows(path: FloatArray) -> FloatArray:
-    """Create alternative starting paths of a row: seven shorter rows and one longer row.
+    """Create starting paths of a row (7,): seven shorter rows and one longer row.
 
     If a dipole at the end of a row has no moment, a shorter row with a different centre fits almost
     as well.
-
-    Parameters
-    ----------
-    path : (7,) array, m, m/s, m
-        Path of the row.
-
-    Returns
-    -------
-    (n, 7) array, m, m/s, m
     """
     rows = []
     for ratio, offset in ((0.7, 0.15), (0.7, 0.0), (0.7, -0.15), (0.4, 0.25), (0.4, 0.0),

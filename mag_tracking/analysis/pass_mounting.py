@@ -38,25 +38,10 @@ class MountingEvidence:
 
 def fuse_mounting(network: SensorNetwork, prior_std: Iterable[FloatArray],
                   tracks: Sequence[Track]) -> MountingEvidence:
-    """Fuse the mounting angles estimated by tracks.
+    """Fuse the mounting angles that the last unambiguous poses of tracks estimate.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-        Network of the tracks.
-    prior_std : iterable of n_sensors (3,) array, rad
-        Prior standard deviations of the mounting errors of each sensor, about the world axes.
-    tracks : sequence of Track
-        Last unambiguous pose of each target. Each pose requires mounting angles.
-
-    Returns
-    -------
-    MountingEvidence
-
-    Raises
-    ------
-    ValueError
-        If the number of mounting angles of a track differs from the number of sensors.
+    `prior_std` (3,) [rad] are about the world axes. Raises ValueError for a track with mounting
+    angles of another number of sensors.
     """
     n = len(network)
     prior = np.array([np.diag(1.0 / np.square(std)) for std in prior_std])
@@ -97,11 +82,8 @@ def _remove_negative_eigenvalues(information: FloatArray) -> FloatArray:
 
 def _track_scatter(gains: Sequence[FloatArray], information_vectors: Sequence[FloatArray],
                    rotation: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Scatter (n_sensors,) of the angles of single tracks about the fused angles.
-
-    The scatter is the chi-square per degree of freedom. It is NaN for a sensor without degrees of
-    freedom.
-    """
+    """Chi-square per degree of freedom (n_sensors,) of single tracks about the fused angles; NaN
+    without degrees of freedom."""
     squares, freedom = np.zeros(len(rotation)), np.zeros(len(rotation))
     for gain, information_vector in zip(gains, information_vectors, strict=True):
         residual = information_vector - np.einsum('jik,jk->ji', gain, rotation)
@@ -116,18 +98,7 @@ def _track_scatter(gains: Sequence[FloatArray], information_vectors: Sequence[Fl
 
 
 def with_pass_mounting(network: SensorNetwork, evidence: MountingEvidence) -> SensorNetwork:
-    """Correct the orientations of a network by fused mounting angles.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    evidence : MountingEvidence
-
-    Returns
-    -------
-    SensorNetwork
-        Copy of the network with corrected orientations and their standard deviations.
-    """
+    """Copy the network with orientations and their stds corrected by fused mounting angles."""
     corrections = rotation_from_quaternion(quaternion_from_rotation_vector(evidence.rotation))
     std = np.sqrt(np.einsum('jii->ji', evidence.covariance))
     return replace(network, R_ws=corrections @ network.R_ws, orientation_std=tuple(std))

@@ -32,8 +32,8 @@ equivalent to a point. The maximum length is the distance travelled."""
 class Bearing:
     """Observable quantities of a pass at a single sensor, relative to the sensor.
 
-    The distance is not observable. A path and its reflection through the sensor have the same
-    field and cannot be distinguished.
+    The distance is not observable, and a path and its reflection through the sensor have equal
+    fields.
     """
 
     cpa_direction: FloatArray
@@ -59,7 +59,7 @@ class Bearing:
 class PassFit:
     """Weighted least-squares fit of a pass at constant velocity.
 
-    If `reason` is not empty, the fit as a whole is rejected; only the quantities in `trusted` are
+    If `reason` is not empty, the fit as a whole is rejected; only quantities in `trusted` are
     valid.
     """
 
@@ -170,7 +170,7 @@ class PassFit:
 
     @property
     def position_covariance(self) -> FloatArray:
-        """Covariance of the position of the middle of the vehicle, (3, 3) m², world frame.
+        """Covariance (3, 3) [m², world frame] of the position of the middle of the vehicle.
 
         For a single sensor without a known range, whose unit of length is the range, it is the
         covariance of the centre of the row.
@@ -184,17 +184,7 @@ class PassFit:
         return self.x[3:6]
 
     def shifted(self, seconds: float) -> 'PassFit':
-        """Return the fit with time zero shifted.
-
-        Parameters
-        ----------
-        seconds : float, s
-            Shift of time zero; a positive shift makes time zero later.
-
-        Returns
-        -------
-        PassFit
-        """
+        """Return the fit with time zero shifted; a positive shift makes it later."""
         F = np.eye(len(self.x))
         F[:3, 3:6] = seconds * np.eye(3)
         # An infinite variance times zero is NaN.
@@ -231,24 +221,8 @@ class PassFit:
         return S @ self.x, S @ self.robust_covariance @ S.T
 
     def closest_approach(self, point: FloatArray) -> tuple[float, float, float, float]:
-        """Time and range of the CPA of the target's centre to a point.
-
-        Parameters
-        ----------
-        point : (3,) array, m, world frame
-
-        Returns
-        -------
-        t_cpa : float, s
-            Relative to time zero.
-        t_cpa_std : float, s
-        range : float, m
-        range_std : float, m
-
-        References
-        ----------
-        [TSP14]_ eq. (24), with linearised standard deviations.
-        """
+        """Time [s, relative to time zero] and range [m] of the CPA to a point, each followed by its
+        std; TSP14 eq. (24), with linearised stds."""
         r, v = self.position - point, self.velocity
         t_cpa, distance, r_cpa = closest_approach(r, v)
         u = r_cpa / distance if distance > 0.0 else np.zeros(3)

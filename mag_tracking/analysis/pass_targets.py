@@ -35,28 +35,16 @@ def fit_targets(data: PassData, single_fits: Sequence[PassFit], paths: FloatArra
 
     A fit alone does not determine the number of targets: a long row of dipoles can explain two
     vehicles in a line, and two targets on straight paths can explain a single target that turns.
+    `single_fits` are returned if one target explains the field equally well, or if the fitted
+    targets are parts of one vehicle (long vehicles are sometimes tracked as two). They are returned
+    with a reason if the joint fit is impossible or is rejected.
 
     Parameters
     ----------
-    data : PassData
-    single_fits : sequence of PassFit
-        Fits as a single target, one for each number of dipoles.
-    paths : (K, 6) array, m, m/s
-        Positions of the tracked targets at time zero of `data`, and their velocities.
-    ground : GroundPrior
-    orders : sequence of int
-        Candidate numbers of dipoles of each target in a joint fit.
-    stopped : function, optional
-        Called without arguments; returns whether to abandon the fit. The result of an abandoned fit
-        is not valid.
-
-    Returns
-    -------
-    tuple of tuples of PassFit
-        For each target, one fit per number of dipoles. `single_fits` are returned if one target
-        explains the field equally well, or if the fitted targets are parts of one vehicle (long
-        vehicles are sometimes tracked as two). If the joint fit is impossible or is rejected,
-        `single_fits` are returned with a reason.
+    single_fits : fits as a single target, one for each number of dipoles
+    paths : (K, 6), tracked positions at time zero of `data` and velocities, m and m/s
+    orders : candidate numbers of dipoles of each target in a joint fit
+    stopped : whether to abandon the fit, whose result is then not valid
     """
     n_targets = len(paths)
     if n_targets < 2 or len(data.sensors) < 2:

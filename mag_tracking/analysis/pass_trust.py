@@ -58,26 +58,9 @@ class FittedRow(NamedTuple):
 def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], residuals: FloatArray) -> float:
     """Unexplained fraction of the whitened energy of all targets, outside the reach of vehicles.
 
-    The residual of a vehicle is proportional to its field and decreases with distance. An
-    additional vehicle, in contrast, leaves a residual at other times.
-
-    Parameters
-    ----------
-    data : PassData
-    rows : sequence of FittedRow
-        Fitted targets.
-    residuals : (n, 3) array
-        Whitened residuals.
-
-    Returns
-    -------
-    float
-        Residual energy in excess of the noise and of the model error of ICASSP11 eq. (9), with
-        `reach` in place of lambda, relative to the energy of all targets.
-
-    References
-    ----------
-    [ICASSP11]_ eq. (9).
+    The residual of a vehicle is proportional to its field and decreases with distance; an
+    additional vehicle leaves a residual at other times. The fraction is the energy in excess of the
+    noise and of the model error of ICASSP11 eq. (9), with `reach` in place of lambda.
     """
     def energy(field: FloatArray) -> FloatArray:
         whitened = np.einsum('nij,nj->ni', data.whitening, field)
@@ -107,17 +90,7 @@ def _plausible_residual_fraction(data: PassData, row: FittedRow) -> FloatArray:
 
 
 def rejection_reason(fit: PassFit) -> str:
-    """Reason why a fit as a whole is rejected.
-
-    Parameters
-    ----------
-    fit : PassFit
-
-    Returns
-    -------
-    str
-        Empty if the fit is accepted.
-    """
+    """Reason why a fit as a whole is rejected; empty if it is accepted."""
     if reason := _invalid_pass_reason(fit):
         return reason
     if fit.bearing is not None:
@@ -139,17 +112,10 @@ def rejection_reason(fit: PassFit) -> str:
 
 
 def trusted_quantities(fit: PassFit) -> tuple[str, ...]:
-    """Quantities of a fit whose uncertainty is acceptable.
+    """Those of speed, direction and time (of the CPA) whose uncertainty is acceptable.
 
-    Parameters
-    ----------
-    fit : PassFit
-
-    Returns
-    -------
-    tuple of str
-        Subset of speed, direction and time (of the CPA). Empty if the fit uses a single sensor, did
-        not converge, or shows that the pass is not one target at constant velocity.
+    Empty if the fit uses a single sensor, did not converge, or shows that the pass is not one
+    target at constant velocity.
     """
     if _invalid_pass_reason(fit) or fit.bearing is not None:
         return ()
@@ -188,31 +154,13 @@ def _invalid_pass_reason(fit: PassFit) -> str:
 
 
 def has_plausible_residual(fit: PassFit) -> bool:
-    """Whether `residual_elsewhere` of a fit is within the limit for a vehicle.
-
-    Parameters
-    ----------
-    fit : PassFit
-
-    Returns
-    -------
-    bool
-    """
+    """Whether `residual_elsewhere` of a fit is within the limit for a vehicle."""
     limit = max(MAX_FIELD_ENERGY_ELSEWHERE, MAX_RESIDUAL_ENERGY_ELSEWHERE * (1.0 - fit.explained))
     return fit.residual_elsewhere <= limit
 
 
 def has_velocity_change(fit: PassFit) -> bool:
-    """Whether the change of the velocity is too large to be caused by model errors.
-
-    Parameters
-    ----------
-    fit : PassFit
-
-    Returns
-    -------
-    bool
-    """
+    """Whether the change of the velocity is too large to be caused by model errors."""
     return bool(fit.velocity_change > max(
         MAX_VELOCITY_CHANGE, MIN_VELOCITY_CHANGE_STDS * fit.velocity_change_std))
 
@@ -221,14 +169,6 @@ def contradicts_straight_pass(fit: PassFit) -> bool:
     """Whether a fit rules out a pass of a single target at constant velocity.
 
     A fit of a single dipole rules out nothing, because the target may be extended.
-
-    Parameters
-    ----------
-    fit : PassFit
-
-    Returns
-    -------
-    bool
     """
     return fit.n_dipoles > 1 and (has_velocity_change(fit) or not has_plausible_residual(fit))
 

@@ -97,28 +97,12 @@ class Sampling:
 def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
                 sampling: Sampling, points: FloatArray,
                 heading: float) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
-    """Compute fields and Jacobians of passes through points, for each direction of the moment.
+    """Yield fields and Jacobians of passes through points, for each direction of the moment.
 
-    Parameters
-    ----------
-    positions : (n_sensors, 3) array, m, world frame
-    R_sw : (n_sensors, 3, 3) array
-        World to sensor.
-    target : PlannedTarget
-    sampling : Sampling
-    points : (n, 2) array, m, world frame
-        Horizontal positions of the target at time zero of each pass.
-    heading : float, rad
-        Heading of all passes, anticlockwise from x.
-
-    Yields
-    ------
-    part : slice
-        Slice of `points` with n_p points.
-    h : (n_p, 7, k, n_sensors, 3) array, T
-        Fields at the k times of `sampling`.
-    H : (n_p, 7, k, n_sensors, 3, 9) array
-        Derivatives of `h` with respect to [r, v, m].
+    `points` (n, 2) are in the world frame. Each item is a slice of `points` with n_p points, the
+    fields (n_p, 7, k, n_sensors, 3) [T] at the k times of `sampling`, and their derivatives with
+    respect to [r, v, m]. The target is at the point at time zero; `heading` is anticlockwise from
+    x.
     """
     t, _ = sampling.times()
     v = target.speed * np.array([np.cos(heading), np.sin(heading), 0.0])
@@ -152,29 +136,9 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
 
 def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
                      sampling: Sampling, points: FloatArray, heading: float) -> FloatArray:
-    """Fisher information of each sensor about [r, v, m] when the target is at each point.
+    """Fisher information (n, 7, n_sensors, 9, 9) about [r, v, m] for a target at each point (n, 2).
 
-    The backgrounds are eliminated; their prior is taken into account.
-
-    Parameters
-    ----------
-    positions : (n_sensors, 3) array, m, world frame
-    R_sw : (n_sensors, 3, 3) array
-        World to sensor.
-    target : PlannedTarget
-    sampling : Sampling
-    points : (n, 2) array, m, world frame
-        Horizontal positions of the target.
-    heading : float, rad
-        Heading of the target, anticlockwise from x.
-
-    Returns
-    -------
-    (n, 7, n_sensors, 9, 9) array
-
-    References
-    ----------
-    [TSP14]_ eq. (28), (40); [MITRE12]_ eq. (17), (30).
+    The backgrounds are eliminated, with their prior. TSP14 eq. (28), (40); MITRE12 eq. (17), (30).
     """
     _, frame_weight = sampling.times()
     result = np.empty((len(points), len(DIRECTIONS), len(positions), 9, 9))
@@ -191,24 +155,10 @@ def pass_information(positions: FloatArray, R_sw: FloatArray, target: PlannedTar
 
 
 def bounds_of(information: FloatArray, prior: FloatArray) -> FloatArray:
-    """Cramér-Rao bounds on the standard deviations of position, velocity and moment.
+    """Cramér-Rao bounds (..., 3) on the std of horizontal position, horizontal velocity and moment.
 
-    Parameters
-    ----------
-    information : (..., 9, 9) array
-        Fisher information about [r, v, m].
-    prior : (9, 9) array
-        Prior information.
-
-    Returns
-    -------
-    (..., 3) array, m, m/s, A m²
-        Square roots of the summed variances of horizontal position, horizontal velocity and
-        moment. The bounds of unobservable quantities are large, at most 1e6 of their unit per axis.
-
-    References
-    ----------
-    [TSP14]_ eq. (42)-(45), with the trace in place of the norm; [MITRE12]_ eq. (32).
+    Each is the root of summed variances; unobservable quantities have large bounds, at most 1e6 of
+    their unit per axis. TSP14 eq. (42)-(45), with the trace in place of the norm; MITRE12 eq. (32).
     """
     J = information + prior + 1e-12 * np.eye(9)
     scale = np.sqrt(np.einsum('...ii->...i', J))
@@ -223,30 +173,10 @@ def bounds_of(information: FloatArray, prior: FloatArray) -> FloatArray:
 def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
                             sampling: Sampling, points: FloatArray, false_alarm: float,
                             background_std: float = 0.0) -> FloatArray:
-    """Probability of detection in one frame when the target is at each point.
+    """Detection probability (n, 7) in one frame at each point (n, 2), for each moment direction.
 
-    Parameters
-    ----------
-    positions : (n_sensors, 3) array, m, world frame
-    R_sw : (n_sensors, 3, 3) array
-        World to sensor.
-    target : PlannedTarget
-    sampling : Sampling
-    points : (n, 2) array, m, world frame
-        Horizontal positions of the target.
-    false_alarm : float
-        False alarm probability of one frame.
-    background_std : float, T
-        Standard deviation of the background errors, added to the noise.
-
-    Returns
-    -------
-    (n, 7) array
-        Probability for each direction of the moment.
-
-    References
-    ----------
-    [T10]_ eq. (5.14)-(5.19), applied to all sensors at once.
+    `background_std` [T] of the background errors is added to the noise. T10 eq. (5.14)-(5.19),
+    applied to all sensors at once.
     """
     single_frame = Sampling(sampling.period, sampling.noise_std, half_window=0.0)
     energy_ratio = np.empty((len(points), len(DIRECTIONS)))

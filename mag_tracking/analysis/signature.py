@@ -49,26 +49,14 @@ class Signature:
 
 
 def features(signature: Signature) -> FloatArray:
-    """Compute features of the shape and magnitude of a signature.
+    """Compute features (n_features,) of the shape and magnitude of a signature.
 
-    Parameters
-    ----------
-    signature : Signature
-
-    Returns
-    -------
-    (n_features,) array
-        For each axis: logarithm of the range, fraction of the energy, numbers of maxima and minima,
-        positions of the largest and the smallest value, fraction of the power in the upper third of
-        the spectrum. For the field magnitude: logarithm of its maximum, number of maxima,
-        autocorrelation, DCT coefficients. The duration is not a feature, because the speed is
-        unknown.
-
-    Raises
-    ------
-    ValueError
-        If there are too few samples, a value is not finite, the times do not increase, or the field
-        is constant.
+    For each axis: logarithm of the range, fraction of the energy, numbers of maxima and minima,
+    positions of the largest and the smallest value, fraction of the power in the upper third of the
+    spectrum. For the field magnitude: logarithm of its maximum, number of maxima, autocorrelation,
+    DCT coefficients. The duration is not a feature, because the speed is unknown. Raises ValueError
+    if there are too few samples, a value is not finite, times do not increase, or the field is
+    constant.
     """
     t, field = np.asarray(signature.t, dtype=float), np.asarray(signature.field, dtype=float)
     if len(t) < MIN_SAMPLES:

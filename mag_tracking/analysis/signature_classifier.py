@@ -63,44 +63,17 @@ class SignatureModel:
     """{class: number of training examples}."""
 
     def posterior(self, x: FloatArray) -> FloatArray:
-        """Compute the posterior probabilities of the classes for each signature.
-
-        Parameters
-        ----------
-        x : (n, n_features) array
-
-        Returns
-        -------
-        (n, n_classes) array
-        """
+        """Posterior probabilities (n, n_classes) for features `x` (n, n_features)."""
         return _softmax((self._standardise(x) @ self.weights.T + self.offsets) / self.temperature)
 
     def is_known(self, x: FloatArray) -> FloatArray:
-        """Whether the distance of each signature to the nearest class centre is within `limit`.
-
-        Parameters
-        ----------
-        x : (n, n_features) array
-
-        Returns
-        -------
-        (n,) bool array
-        """
+        """Whether each signature is within `limit` of the nearest class centre."""
         known: FloatArray = _squared_distances(self._standardise(x), self.centres,
                                                self.precision).min(axis=1) <= self.limit
         return known
 
     def names(self, x: FloatArray) -> list[str]:
-        """Most probable class of each signature, or `unknown`.
-
-        Parameters
-        ----------
-        x : (n, n_features) array
-
-        Returns
-        -------
-        list of n str
-        """
+        """Most probable class of each signature, or `unknown`."""
         best = self.posterior(x).argmax(axis=1)
         return [self.classes[k] if known else UNKNOWN
                 for k, known in zip(best.tolist(), self.is_known(x).tolist(), strict=True)]
@@ -135,24 +108,9 @@ class Evaluation:
 
 
 def feature_table(signatures: Sequence[Signature]) -> tuple[FloatArray, IntArray, list[str]]:
-    """Compute the features of several signatures.
+    """Features, indices of the signatures that have features, and reasons for the others.
 
-    Parameters
-    ----------
-    signatures : sequence of Signature
-
-    Returns
-    -------
-    x : (n, n_features) array
-    rows : (n,) int array
-        Indices of the signatures that have features.
-    reasons : list of str
-        Reasons why the other signatures have no features.
-
-    Raises
-    ------
-    LabelsError
-        If the signatures have different axes or units.
+    Raises LabelsError if the signatures have different axes or units.
     """
     axes = Counter((' '.join(s.axes), s.unit) for s in signatures)
     if len(axes) > 1:
@@ -173,29 +131,9 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
           unit: str, seed: int = 0) -> SignatureModel:
     """Train a classifier; select its method and penalty by cross-validation.
 
-    Parameters
-    ----------
-    x : (n, n_features) array
-    labels : sequence of n str
-    groups : sequence of n str
-        Signatures of one target have the same group, which is never split by a fold.
-    axes : tuple of str
-        Names of the axes of the signatures.
-    unit : str
-        Unit of the fields: T, or empty if unknown.
-    seed : int
-        Seed of the random folds.
-
-    Returns
-    -------
-    SignatureModel
-
-    Raises
-    ------
-    LabelsError
-        If there are fewer than two classes, or too few examples of a class.
-    MissingDependencyError
-        If scikit-learn is not installed.
+    A fold never splits the signatures of one target, which have the same group. Raises LabelsError
+    for fewer than two classes or too few examples of one, MissingDependencyError without
+    scikit-learn.
     """
     counts = check_labels(labels, groups)
     classes = tuple(sorted(counts))
@@ -225,25 +163,8 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
 
 
 def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]':
-    """Count the targets of each class and check that a classifier can be trained.
-
-    Parameters
-    ----------
-    labels : sequence of n str
-        Class of each signature.
-    groups : sequence of n str
-        Target of each signature.
-
-    Returns
-    -------
-    Counter of str
-        Number of targets of each class.
-
-    Raises
-    ------
-    LabelsError
-        If a label is empty or reserved, or there are too few classes or examples.
-    """
+    """Count the targets of each class; raises LabelsError if a classifier cannot be trained because
+    a label is empty or reserved, or there are too few classes or examples."""
     counts = Counter(label for label, _ in set(zip(labels, groups, strict=True)))
     if '' in counts:
         raise LabelsError(f'labels are missing for {quantity(counts[""], "target")}; label or '
@@ -265,32 +186,9 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
                     test_fraction: float = 0.3, progress: Any = iter) -> Evaluation:
     """Train and test on stratified random splits.
 
-    Method, penalty and temperature are selected within the training part of each split.
-
-    Parameters
-    ----------
-    x : (n, n_features) array
-    labels, groups : sequence of n str
-    axes : tuple of str
-    unit : str
-        As for `train`.
-    n_splits : int
-        Number of random splits.
-    test_fraction : float
-        Fraction of each class in the test part.
-    progress : function
-        Function that wraps the range of splits, for example to show progress.
-
-    Returns
-    -------
-    Evaluation
-
-    Raises
-    ------
-    LabelsError
-        Under the conditions of `train`, or if no class has enough examples for a test part.
-    MissingDependencyError
-        If scikit-learn is not installed.
+    Method, penalty and temperature are selected within the training part of each split. `progress`
+    wraps the range of splits. Raises the errors of `train`, and LabelsError if no class has enough
+    examples for a test part of `test_fraction`.
     """
     check_labels(labels, groups)
     y, g = np.array(labels), np.array(groups)
@@ -304,23 +202,7 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
 
 
 def evaluate(model: SignatureModel, x: FloatArray, labels: Sequence[str]) -> Evaluation:
-    """Evaluate a trained model on labelled signatures.
-
-    Parameters
-    ----------
-    model : SignatureModel
-    x : (n, n_features) array
-    labels : sequence of n str
-
-    Returns
-    -------
-    Evaluation
-
-    Raises
-    ------
-    LabelsError
-        If a label is not a class of the model.
-    """
+    """Evaluate a trained model; raises LabelsError if a label is not a class of the model."""
     labels_without_class = sorted(set(labels) - set(model.classes))
     if labels_without_class:
         raise LabelsError('the model has no classes for the labels '
@@ -350,21 +232,8 @@ def _evaluate_parts(parts: Sequence[tuple[SignatureModel, FloatArray, Any]]) -> 
 
 def expected_calibration_error(probability: FloatArray, correct: FloatArray, n_bins: int = 10
                                ) -> float:
-    """Expected calibration error of predictions.
-
-    Parameters
-    ----------
-    probability : (n,) array
-        Probability of the predicted class.
-    correct : (n,) bool array
-        Whether the prediction is correct.
-    n_bins : int
-        Number of equal-width bins of the probability.
-
-    Returns
-    -------
-    float
-    """
+    """Expected calibration error of predictions, over `n_bins` equal-width bins of the
+    probability."""
     bins = np.minimum((probability * n_bins).astype(int), n_bins - 1)
     return float(sum(abs(probability[bins == b].mean() - correct[bins == b].mean())
                      * np.mean(bins == b) for b in np.unique(bins)))
@@ -403,10 +272,7 @@ def _logits(fitted: Any, z: FloatArray) -> FloatArray:
 
 
 def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
-    """Create stratified folds without splitting groups; return an iterator of indices.
-
-    Each item contains the indices of the training examples and of the test examples.
-    """
+    """Stratified folds without splitting groups, as pairs of training and test indices."""
     try:
         from sklearn.model_selection import StratifiedGroupKFold
     except ImportError as error:

@@ -49,25 +49,10 @@ class ArchiveRun:
 
 
 def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
-    """Resolve paths, folders and glob patterns to recordings.
+    """Resolve paths, folders and glob patterns to recordings, each once, in the order of `names`.
 
     Folders are searched recursively; entries whose name begins with a dot are skipped. A folder
-    that contains metadata.yaml is a recording.
-
-    Parameters
-    ----------
-    names : iterable of path
-        Recordings, folders and glob patterns.
-
-    Returns
-    -------
-    list of Path
-        Each recording once, in the order of `names`.
-
-    Raises
-    ------
-    RecordingError
-        If a name matches no recording.
+    that contains metadata.yaml is a recording. Raises RecordingError if a name matches none.
     """
     selected: dict[Path, None] = {}
     for name in names:
@@ -84,10 +69,9 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
 
 
 def _recordings_at(path: Path, visited: set[Path]) -> list[Path]:
-    """Return the recordings at or below a path, except in folders that are in `visited`.
+    """Recordings at or below a path, except in folders that are in `visited`, which is extended.
 
-    Each searched folder is added to `visited`. An unreadable folder is returned like a recording,
-    so that it is reported as failed.
+    An unreadable folder is returned like a recording, so that it is reported as failed.
     """
     path = path.resolve()
     if not path.is_dir():
@@ -105,17 +89,7 @@ def _recordings_at(path: Path, visited: set[Path]) -> list[Path]:
 
 
 def size_of(recording: Path) -> int:
-    """Return the size of a recording.
-
-    Parameters
-    ----------
-    recording : Path
-
-    Returns
-    -------
-    int, bytes
-        0 if the recording is not readable.
-    """
+    """Size of a recording in bytes; 0 if it is not readable."""
     try:
         return sum(size for _, size, _ in recording_state(recording))
     except OSError:
@@ -131,48 +105,22 @@ def archive(recordings: Iterable[str | PathLike[str]],
     """Track recordings and write the results to a dataset.
 
     Recordings tracked by an earlier run are skipped unless they have changed. The tables contain
-    the same rows as a separate replay of each recording.
+    the same rows as a separate replay of each recording. Raises RecordingError if a name matches
+    nothing, OutputError if the dataset is in use or was created with another network, other
+    settings or another version of the tables, ClusterError if the scheduler does not respond or has
+    no workers.
 
     Parameters
     ----------
-    recordings : iterable of str or path
-        Recordings, folders and glob patterns.
-    network : SensorNetwork or path of a network file
-    settings : Settings
-    out : path
-        Folder of the dataset; `recording.archive_folder` describes its layout.
-    workers : int
-        Number of processes on this machine.
-    scheduler : str, optional
-        Address of a Dask scheduler, such as tcp://10.0.0.5:8786, used instead of `workers`. The
-        workers of the scheduler need this package, and access to the recordings and `out` under the
-        same paths.
-    progress : function, optional
-        Called with the size in bytes of each completed recording, including skipped recordings.
-    stopped : function, optional
-        Called several times per second; the run ends when it returns true. The next run into
-        `out` continues with the remaining recordings.
-    report : function, optional
-        Called with a message to the user for each recording that fails, and for each damaged file
-        of the dataset.
-
-    Returns
-    -------
-    ArchiveRun
-
-    Raises
-    ------
-    RecordingError
-        If an element of `recordings` matches no recording.
-    NetworkError
-        If the network file is invalid.
-    OutputError
-        If the dataset cannot be written, is in use by another run, or was created with another
-        network, other settings or another version of the tables.
-    ClusterError
-        If the scheduler does not respond or has no workers.
-    MissingDependencyError
-        If Dask or pyarrow is not installed.
+    recordings : recordings, folders and glob patterns
+    out : folder of the dataset, laid out as in `recording.archive_folder`
+    workers : number of processes on this machine
+    scheduler : address of a Dask scheduler, such as tcp://10.0.0.5:8786, used instead of `workers`;
+        its workers need this package, and the recordings and `out` under the same paths
+    progress : called with the size in bytes of each completed recording, including skipped ones
+    stopped : called several times per second; the run ends when it returns true, and the next run
+        continues it
+    report : called with a message for each recording that fails and each damaged file
     """
     import_pyarrow()
     network, paths, run = network_of(network), recordings_of(recordings), ArchiveRun()
@@ -236,7 +184,7 @@ class _Scheduler:
     def run(self, recordings: Sequence[Path], stopped: Callable[[], bool]) -> None:
         """Track recordings until all are processed or `stopped()` returns true.
 
-        At most two recordings per worker, plus one, are processed at a time. This limits the size
+        At most two recordings per worker, plus one, are processed at a time, which limits the size
         of the intermediate files.
         """
         queued = list(reversed(recordings))

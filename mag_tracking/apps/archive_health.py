@@ -17,13 +17,7 @@ ROW_INTERVAL_S = 600.0
 
 
 class HealthRows:
-    """Creates the rows of the table `health`, at intervals (`due_rows`) or on request (`rows`).
-
-    Parameters
-    ----------
-    recording : Path
-    network : SensorNetwork
-    """
+    """Creates the rows of the table `health`, at intervals (`due_rows`) or on request (`rows`)."""
 
     def __init__(self, recording: Path, network: SensorNetwork) -> None:
         self._recording, self._network = recording, network
@@ -31,21 +25,10 @@ class HealthRows:
         self._next_ns: int | None = None
 
     def due_rows(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
-        """Create one row per sensor if `ROW_INTERVAL_S` has passed since the previous rows.
+        """Yield one row per sensor if `ROW_INTERVAL_S` has passed since the previous rows.
 
-        The first interval begins with the first frame. If the time jumps back to before the
-        current interval, a new interval begins.
-
-        Parameters
-        ----------
-        stamp_ns : int, ns
-            Timestamp of the frame.
-        calibrate : Calibrate
-
-        Yields
-        ------
-        dict
-            Columns of the table `health`.
+        The first interval begins with the first frame. If the time jumps back to before the current
+        interval, a new interval begins.
         """
         if self._next_ns is None or stamp_ns < self._next_ns - ROW_INTERVAL_S * NS:
             self._next_ns = stamp_ns + int(ROW_INTERVAL_S * NS)
@@ -54,19 +37,7 @@ class HealthRows:
             yield from self.rows(stamp_ns, calibrate)
 
     def rows(self, stamp_ns: int, calibrate: Calibrate) -> Iterator[dict[str, Any]]:
-        """Create one row per sensor, with its accepted and rejected readings since the last row.
-
-        Parameters
-        ----------
-        stamp_ns : int, ns
-            Timestamp of the rows.
-        calibrate : Calibrate
-
-        Yields
-        ------
-        dict
-            Columns of the table `health`.
-        """
+        """Yield one row per sensor, with its accepted and rejected readings since the last row."""
         for name, background in calibrate.backgrounds().items():
             counts = calibrate.counts_of(name)
             previous, total = self._previous_counts[name], (counts['accepted'], counts['rejected'])

@@ -20,16 +20,11 @@ TRACKED_FILE = 'tracked.json'
 class ClockComparisonHistory(ClockComparison):
     """Clock comparison with the history of the passes added to it.
 
-    Parameters
-    ----------
-    n_sensors : int
-
     Attributes
     ----------
-    passes : list of (RigidPass, (n,) int array)
-        Passes, each with the indices of its sensors in the network.
-    clocks_differed : bool
-        Whether a clock offset was ever significant. Tracks then depend on earlier passes.
+    passes : passes, each with the indices of its sensors in the network
+    clocks_differed : whether a clock offset was ever significant, so that tracks depend on earlier
+        passes
     """
 
     def __init__(self, n_sensors: int) -> None:
@@ -38,14 +33,7 @@ class ClockComparisonHistory(ClockComparison):
         self.clocks_differed = False
 
     def add(self, found: RigidPass, rows: IntArray) -> None:
-        """Add a pass to the comparison and to the history.
-
-        Parameters
-        ----------
-        found : RigidPass
-        rows : (n,) int array
-            Index, in the network, of each sensor of the pass.
-        """
+        """Add a pass; `rows` are the indices of its sensors in the network."""
         super().add(found, rows)
         self.passes.append((found, rows))
         self.clocks_differed |= self.largest_offset is not None
@@ -65,41 +53,14 @@ class SegmentResult(NamedTuple):
 
 
 def write_result(folder: Path, result: SegmentResult) -> None:
-    """Store the result of a segment.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the segment.
-    result : SegmentResult
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Store the result of a segment in its folder."""
     passes = [(dataclasses.asdict(found), rows) for found, rows in result.clock_passes]
     replace_text(folder / TRACKED_FILE, json.dumps(
         result._asdict() | {'clock_passes': passes}, default=np.ndarray.tolist))
 
 
 def read_result(folder: Path) -> SegmentResult:
-    """Read a stored result.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the segment.
-
-    Returns
-    -------
-    SegmentResult
-
-    Raises
-    ------
-    RecordingError
-        If the file is damaged.
-    """
+    """Read the result of a segment; raises RecordingError if the file is damaged."""
     with work_file_errors(folder / TRACKED_FILE):
         values: dict[str, Any] = json.loads((folder / TRACKED_FILE).read_text())
         passes = [(_rigid_pass(found), np.array(rows, dtype=np.int64))

@@ -64,15 +64,8 @@ class FrameChunk:
     """Passes that ended within the chunk."""
 
     def frames(self) -> Iterator[tuple[FieldFrame, Doubts | None]]:
-        """Iterate over the frames.
-
-        Yields
-        ------
-        frame : FieldFrame
-            Frame with its detection result.
-        doubts : Doubts or None
-            Doubtful times of each sensor if they change with this frame, otherwise None.
-        """
+        """Iterate over the frames, with the doubtful times of each sensor if they change, otherwise
+        None."""
         for k in range(len(self.stamp_ns)):
             yield FieldFrame(
                 int(self.stamp_ns[k]), self.field[k], self.covariance[k], self.n_samples[k],
@@ -87,18 +80,7 @@ _PASS_ARRAYS = ('t', 'sensor', 'field', 'covariance')
 
 @contextmanager
 def work_file_errors(path: Path) -> Iterator[None]:
-    """Convert the errors of reading a file of intermediate results to a RecordingError.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Raises
-    ------
-    RecordingError
-        If reading fails.
-    """
+    """Convert the errors of reading a file of intermediate results to a RecordingError."""
     try:
         yield
     except (OSError, ValueError, TypeError, LookupError, EOFError, RecursionError,
@@ -108,24 +90,8 @@ def work_file_errors(path: Path) -> Iterator[None]:
 
 
 def read_segment(folder: Path, network: SensorNetwork) -> Iterator[FrameChunk]:
-    """Read a segment written by `SegmentWriter`.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the segment.
-    network : SensorNetwork
-        Network of the recording.
-
-    Yields
-    ------
-    FrameChunk
-
-    Raises
-    ------
-    RecordingError
-        If a file of the segment is damaged.
-    """
+    """Read the segment that `SegmentWriter` wrote to a folder; raises RecordingError if it is
+    damaged."""
     with work_file_errors(folder):
         paths = sorted(folder.iterdir(), key=lambda path: int(path.stem))
     for path in paths:
@@ -165,19 +131,8 @@ def _write_chunk(path: Path, chunk: FrameChunk) -> None:
 class SegmentWriter:
     """Writes each segment of a recording to a separate folder, using bounded memory.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder for the folders `segment-0`, ..., each with the chunks `0.npz`, ...
-    lookback_s : float, s
-        Time span of the earlier frames that a new track uses.
-
-    Attributes
-    ----------
-    n_segments : int
-        Number of completed segments.
-    n_frames : int
-        Number of frames added.
+    The folders are `segment-0`, ..., each with the chunks `0.npz`, ... `lookback_s` is the time
+    span of the earlier frames that a new track uses.
     """
 
     def __init__(self, folder: Path, lookback_s: float) -> None:
@@ -194,24 +149,12 @@ class SegmentWriter:
         self._last_frame: FieldFrame | None = None
 
     def add_frame(self, frame: FieldFrame, doubts: Doubts) -> None:
-        """Add the next frame.
+        """Add the next frame, with the doubtful times of each sensor as known then.
 
         A chunk is written when it has `CHUNK_FRAMES` frames. A segment with at least
         `MIN_SEGMENT_FRAMES` frames ends after an interval without a target that is longer than
         `lookback_s` and `MIN_QUIET_S`. Any segment ends if the time jumps back while no target is
         present.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-            Frame with its detection result.
-        doubts : Doubts
-            Doubtful times of each sensor, as known at this frame.
-
-        Raises
-        ------
-        OutputError
-            If a file of the segment cannot be written.
         """
         last, self._last_frame = self._last_frame, frame
         self.n_frames += 1
@@ -241,26 +184,11 @@ class SegmentWriter:
             self._write()
 
     def add_pass(self, number: int, data: PassData, notes: tuple[str, ...]) -> None:
-        """Add a pass that ended with the latest frame.
-
-        Parameters
-        ----------
-        number : int
-            Index of the pass in the recording, from 1.
-        data : PassData
-        notes : tuple of str
-            Notes for the user.
-        """
+        """Add pass `number` (from 1 in the recording), which ended with the latest frame."""
         self._passes.append((number, data, notes))
 
     def close(self) -> None:
-        """End the current segment, if there is one.
-
-        Raises
-        ------
-        OutputError
-            If a file of the segment cannot be written.
-        """
+        """End the current segment, if there is one."""
         if self._unwritten or self._passes:
             self._write()
         self.n_segments += self._n_chunks > 0

@@ -30,20 +30,9 @@ SEGMENT_TABLES = ('tracks', 'poses', 'smoothed', 'passes')
 class SegmentTables:
     """Writes the tracks and passes of a segment to tables; a context manager.
 
-    Parameters
-    ----------
-    recording : Path
-    paths : dict of str to Path
-        File of each table in `SEGMENT_TABLES`.
-    n_dipoles : int
-        Number of dipoles in the row that models a vehicle. A joint fit of several vehicles also
-        tries one dipole fewer.
-    settings : TrackSettings
-
-    Attributes
-    ----------
-    n_tracks, n_passes : int
-        Numbers of written tracks and passes. A pass of several vehicles counts once per vehicle.
+    `paths` are the files of `SEGMENT_TABLES`. `n_dipoles` in the row model a vehicle; a joint fit
+    of several vehicles also tries one fewer. `n_passes` counts a pass of several vehicles once per
+    vehicle.
     """
 
     def __init__(self, recording: Path, paths: dict[str, Path], n_dipoles: int,
@@ -63,13 +52,7 @@ class SegmentTables:
         self._files.__exit__(*error)
 
     def track(self, chunk: FrameChunk, tracker: TrackManager) -> None:
-        """Track the targets in a chunk of the segment, fit its passes, and write the rows.
-
-        Parameters
-        ----------
-        chunk : FrameChunk
-        tracker : TrackManager
-        """
+        """Track the targets in a chunk of the segment, fit its passes, and write the rows."""
         for frame, doubts in chunk.frames():
             if doubts is not None:
                 tracker.set_input_doubts(doubts)
@@ -82,59 +65,29 @@ class SegmentTables:
             self._add_pass(*numbered_pass)
 
     def finish(self, tracker: TrackManager) -> None:
-        """End the segment and write the remaining tracks.
-
-        Parameters
-        ----------
-        tracker : TrackManager
-        """
+        """End the segment and write the remaining tracks."""
         self._collector.add(tracker.flush())
         for log in list(self._collector.logs.values()):
             self._add_track_row(log)
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Ignore a frame, because frames have no table.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-        """
+        """Ignore a frame, because frames have no table."""
 
     def add_detection(self, detection: Detection) -> None:
-        """Ignore a detection, because detections have no table.
-
-        Parameters
-        ----------
-        detection : Detection
-        """
+        """Ignore a detection, because detections have no table."""
 
     def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Ignore a disturbance, because disturbances have no table.
-
-        Parameters
-        ----------
-        disturbance : Disturbance
-        """
+        """Ignore a disturbance, because disturbances have no table."""
 
     def add_track(self, track: Track) -> None:
-        """Write the row of a pose; the closing record of a track has no row.
-
-        Parameters
-        ----------
-        track : Track
-        """
+        """Write the row of a pose; the closing record of a track has no row."""
         if not track.ended:
             self._tables['poses'].add(self._pose_columns(track) | {
                 'weight': track.weight, 'kind_weight': _nullable(track.kind_weight),
                 'arrival': track.arrival, 'doubts': ' '.join(track.doubts)})
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Write the row of a pose smoothed over a whole track; fixed-lag poses have no row.
-
-        Parameters
-        ----------
-        pose : SmoothedPose
-        """
+        """Write the row of a pose smoothed over a whole track; fixed-lag poses have no row."""
         if pose.complete:
             self._tables['smoothed'].add(self._pose_columns(pose))
 

@@ -70,37 +70,13 @@ class Job:
         return self.work_folder / 'cut'
 
     def segment_folder(self, k: int) -> Path:
-        """Return the folder that `track_segment` writes for a segment.
-
-        Parameters
-        ----------
-        k : int
-            Index of the segment.
-
-        Returns
-        -------
-        Path
-        """
+        """Folder that `track_segment` writes for a segment."""
         return self.work_folder / f'segment-{k}'
 
 
 def cut(job: Job) -> dict[str, Any]:
-    """Read a recording and write its segments and its table of sensor health.
-
-    Parameters
-    ----------
-    job : Job
-
-    Returns
-    -------
-    dict
-        Columns of the recording in the table `recordings`, except tracks, passes and error.
-
-    Raises
-    ------
-    MagTrackingError
-        If the recording cannot be read, or a file cannot be written.
-    """
+    """Write the segments and the table of sensor health of a recording; return its columns in the
+    table `recordings`, except tracks, passes and error."""
     if not job.cut_folder.exists():
         with _atomic_folder(job.cut_folder) as folder:
             with TableWriter(folder / 'health.parquet', TABLES['health']) as table:
@@ -201,21 +177,8 @@ class _Segmenter:
 
 
 def track_segment(job: Job, k: int) -> None:
-    """Track a segment, fit its passes, and write its tables.
-
-    Parameters
-    ----------
-    job : Job
-    k : int
-        Index of the segment.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    RecordingError
-        If a file of the segment is damaged.
-    """
+    """Track segment `k`, fit its passes, and write its tables; raises RecordingError if it is
+    damaged."""
     if not job.segment_folder(k).exists():
         with _atomic_folder(job.segment_folder(k)) as folder:
             result = _track_into(folder, job, k, ClockComparisonHistory(len(job.network)))
@@ -236,26 +199,11 @@ def _track_into(folder: Path, job: Job, k: int, evidence: ClockComparisonHistory
 
 
 def join(job: Job) -> dict[str, Any]:
-    """Join the tables of the segments and write the joined tables to the archive.
+    """Join the tables of the segments, write them to the archive, and return the columns in the
+    table `recordings`.
 
     If the clocks of sensors differ, the tracks of a segment depend on the passes in earlier
-    segments. Such a segment is tracked again.
-
-    Parameters
-    ----------
-    job : Job
-
-    Returns
-    -------
-    dict
-        Columns of the recording in the table `recordings`.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    RecordingError
-        If a file of intermediate results is damaged.
+    segments, and it is tracked again. Raises RecordingError if intermediate results are damaged.
     """
     columns = cut(job)
     name, evidence = recording_key(job.recording), ClockComparisonHistory(len(job.network))

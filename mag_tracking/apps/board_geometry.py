@@ -61,25 +61,9 @@ class GeometrySurvey:
 
 
 def board_of(path: str | PathLike[str]) -> SensorNetwork:
-    """Create a network of uncalibrated sensors from a table of positions.
+    """Network of uncalibrated sensors from a CSV table of positions x, y, z [m].
 
-    The sensors are named `mag_0`, `mag_1`, ... and are aligned with the axes.
-
-    Parameters
-    ----------
-    path : path
-        CSV file with the position x, y, z [m] of each sensor.
-
-    Returns
-    -------
-    SensorNetwork
-
-    Raises
-    ------
-    RecordingError
-        If the table cannot be read.
-    NetworkError
-        If the positions do not form a valid network.
+    They are named `mag_0`, `mag_1`, ... and aligned with the axes.
     """
     positions = read_sensor_positions(path)
     names = tuple(f'mag_{j}' for j in range(len(positions)))
@@ -96,34 +80,12 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
                     noise_std: float | None = None) -> GeometrySurvey:
     """Estimate the geometry of a network from its readings for many poses of a magnet.
 
-    Parameters
-    ----------
-    table : path
-        CSV file; see `read_pose_table`.
-    network : SensorNetwork
-        Nominal network, with the sensors in the order of the table columns. Its offsets and
-        corrections are applied to the readings.
-    moment : float, A m²
-        Magnitude of the magnet's moment.
-    settings : GeometrySettings
-    date : str
-        Date of the calibration, stored in the network.
-    box : (low, high), optional
-        Corners (3,) [m] of the box that contains the magnet. If given, the poses are estimated, and
-        the table needs only readings.
-    noise_std : float, T, optional
-        Noise of sensors without a configured noise. By default, `ASSUMED_NOISE` is used, but not
-        stored in the network.
-
-    Returns
-    -------
-    GeometrySurvey
-
-    Raises
-    ------
-    RecordingError
-        If the table cannot be read, does not match the network, or is not sufficient for the
-        estimation.
+    The sensors of the nominal network are in the order of the columns of `table`
+    (`read_pose_table`); its offsets and corrections are applied. `moment` is in A m². With the
+    corners `box` (low, high) [m] around the magnet, the poses are estimated, and the table needs
+    only readings. `noise_std` [T], by default `ASSUMED_NOISE`, is that of sensors without a
+    configured noise and is stored only if given. Raises RecordingError if the table does not match
+    the network or does not suffice.
     """
     if box is None:
         readings, positions, axes = read_pose_table(table)
@@ -156,18 +118,8 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
 
 
 def corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
-    """Apply the offsets and corrections of a network to readings, as the stage Calibrate does.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    readings : (K, n, 3) array, T, sensor frame
-
-    Returns
-    -------
-    (K, n, 3) array, T, sensor frame
-        Corrected readings, including the background.
-    """
+    """Apply the offsets and corrections of a network to readings (K, n, 3), T, sensor frames, as
+    the stage Calibrate does; the background remains."""
     corrected_readings = np.array(readings, dtype=float)
     for j, (offset, C) in enumerate(zip(network.offset, network.correction, strict=True)):
         if offset is not None:
@@ -182,25 +134,11 @@ def corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
 
 def calibrated_network(network: SensorNetwork, geometry: NetworkGeometry, date: str,
                        method: str) -> SensorNetwork:
-    """Return a network with the estimated positions, orientations, gains and biases.
+    """Network with the estimated positions, orientations, gains and biases.
 
     A reading is gain * field + bias. The stage Calibrate applies the correction before it removes
-    the background. The stored background and noise therefore refer to corrected readings. A sensor
-    without readings is not changed.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-        Network before the calibration.
-    geometry : NetworkGeometry
-    date : str
-        Date of the calibration.
-    method : str
-        Method of the calibration.
-
-    Returns
-    -------
-    SensorNetwork
+    the background, so the stored background and noise refer to corrected readings. A sensor without
+    readings is not changed.
     """
     estimated_network = geometry.network
     columns = {name: list(getattr(network, name)) for name in (
@@ -236,10 +174,7 @@ def _world_std(geometry: NetworkGeometry, j: int) -> FloatArray:
 
 
 def _with_noise(network: SensorNetwork, noise_std: float | None) -> SensorNetwork:
-    """Return `network` with the noise `noise_std` [T] for sensors whose noise is unknown.
-
-    If `noise_std` is None, the network is not changed.
-    """
+    """Return `network` with `noise_std` [T], unless None, for sensors whose noise is unknown."""
     if noise_std is None:
         return network
     return replace(network, noise_std=tuple(

@@ -46,36 +46,11 @@ class Calibration:
 def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, date: str,
               passes: bool = True, progress: Callable[[int], object] | None = None,
               stopped: Callable[[], bool] | None = None) -> Calibration:
-    """Estimate orientations, clock offsets and noise of a network from a recording.
+    """Estimate orientations, clock offsets (from knocks) and noise of a network from a recording.
 
-    The recording must start without a target near the sensors. Clock offsets are estimated from
-    knocks.
-
-    Parameters
-    ----------
-    recording : Recording
-    network : SensorNetwork
-        Network before the calibration, with nominal orientations.
-    settings : Settings
-    date : str
-        Date of the calibration, stored in the network.
-    passes : bool
-        Whether to refine the orientations with passing targets. This step is omitted if
-        `track.mounting_std_deg` is zero, or if a sensor contradicts the Earth's field.
-    progress : function, optional
-        Called with the number of bytes read since the last call. If the orientations are refined
-        with passing targets, the recording is read twice.
-    stopped : function, optional
-        Called after every batch of readings; reading ends when it returns true.
-
-    Returns
-    -------
-    Calibration
-
-    Raises
-    ------
-    RecordingError
-        If the recording has none of the network's topics, or no samples.
+    The recording must start without a target near the sensors. `passes` refines the nominal
+    orientations with passing targets, which reads the recording twice; it is omitted if
+    `track.mounting_std_deg` is zero or a sensor contradicts the Earth's field.
     """
     levels, survey, stage, interrupted = _survey_recording(
         recording, network, settings, date, progress, stopped)
@@ -157,10 +132,8 @@ def _track_passes(recording: Recording, network: SensorNetwork, settings: Settin
 
 def _with_pass_records(network: SensorNetwork, surveyed: SensorNetwork, date: str,
                        n_tracks: int) -> SensorNetwork:
-    """Return `network` with the calibration records of `surveyed`.
-
-    The date and the number of passes are added to each record.
-    """
+    """Return `network` with the calibration records of `surveyed`, plus date and number of
+    passes."""
     passes = quantity(n_tracks, 'pass', 'passes')
     return replace(network, calibrated=tuple(
         surveyed.calibration_record(j, date, f'nominal orientation; {passes}') if record is None

@@ -22,41 +22,12 @@ KNOCK_MARGIN_S = 0.25
 
 
 def write_report(calibration: Calibration, nominal: SensorNetwork, name: str, path: Path) -> None:
-    """Write the report of a calibration.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    nominal : SensorNetwork
-        Network before the calibration.
-    name : str
-        Name of the recording.
-    path : Path
-        File to write.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write the report of a calibration of the network `nominal` from the recording `name`."""
     replace_text(path, report_html(calibration_page(calibration, nominal, name)))
 
 
 def calibration_page(calibration: Calibration, nominal: SensorNetwork, name: str) -> Page:
-    """Create the page of a calibration.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    nominal : SensorNetwork
-        Network before the calibration.
-    name : str
-        Name of the recording.
-
-    Returns
-    -------
-    Page
-    """
+    """Create the page of a calibration of the network `nominal` from the recording `name`."""
     survey = calibration.survey
     severity = ERROR if survey.disagreements else WARNING
     notes = [Note(severity, text) for text in survey.warnings()]

@@ -54,21 +54,8 @@ class Examples:
 
 
 def examples_of(signatures: list[Signature]) -> Examples:
-    """Compute the features of signatures.
-
-    Parameters
-    ----------
-    signatures : list of Signature
-
-    Returns
-    -------
-    Examples
-
-    Raises
-    ------
-    LabelsError
-        If there is no usable signature, or axes or units differ.
-    """
+    """Compute the features of signatures; raises LabelsError if none is usable or axes or units
+    differ."""
     if not signatures:
         raise LabelsError('the input contains no signatures')
     x, rows, reasons = feature_table(signatures)
@@ -84,28 +71,8 @@ def labelled_signatures(path: str | PathLike[str], labels: str | PathLike[str] |
                         ) -> list[Signature]:
     """Read the signatures in a table, or extract them from labelled intervals of a recording.
 
-    Parameters
-    ----------
-    path : path
-        A CSV table of signatures, or a recording.
-    labels : path, optional
-        A CSV table of the intervals; required for a recording.
-    network : SensorNetwork, optional
-        Required for a recording.
-    is_labelled : bool
-        Whether a table of signatures must have labels.
-
-    Returns
-    -------
-    list of Signature
-
-    Raises
-    ------
-    LabelsError
-        If labels or the network are missing, a label is empty, intervals overlap, or an interval
-        contains no readings.
-    RecordingError
-        If a file cannot be read.
+    A recording requires `labels`, a CSV table of the intervals, and `network`. Raises LabelsError
+    if either is missing, a label is empty, intervals overlap, or an interval contains no readings.
     """
     if Path(path).suffix.lower() == '.csv' and labels is None:
         return read_signatures(path, is_labelled)
@@ -163,50 +130,16 @@ def _calibrated_readings(path: Path, network: SensorNetwork) -> Readings:
 
 
 def train_classes(examples: Examples) -> SignatureModel:
-    """Train a classifier.
-
-    Parameters
-    ----------
-    examples : Examples
-
-    Returns
-    -------
-    SignatureModel
-
-    Raises
-    ------
-    LabelsError
-        If there are too few examples or classes.
-    MissingDependencyError
-        If scikit-learn is not installed.
-    """
+    """Train a classifier; raises LabelsError if there are too few examples or classes."""
     return train(examples.x, examples.labels, examples.groups, examples.axes, examples.unit)
 
 
 def evaluate_classes(examples: Examples, model: SignatureModel | None = None, n_splits: int = 20,
                      progress: Callable[[Iterable[int]], Iterable[int]] = iter) -> Evaluation:
-    """Evaluate a trained model, or models trained on stratified splits.
+    """Evaluate a trained model, or models trained on `n_splits` stratified splits.
 
-    Parameters
-    ----------
-    examples : Examples
-    model : SignatureModel, optional
-        Model to evaluate; by default, a model is trained for each split.
-    n_splits : int
-        Number of splits; ignored if `model` is given.
-    progress : function
-        Wraps the iterable of splits, as `tqdm` does.
-
-    Returns
-    -------
-    Evaluation
-
-    Raises
-    ------
-    LabelsError
-        If there are too few examples, or the model has different axes or classes.
-    MissingDependencyError
-        If scikit-learn is not installed.
+    `progress` wraps the iterable of splits, as `tqdm` does. Raises LabelsError if there are too few
+    examples, or the model has different axes or classes.
     """
     if model is None:
         return evaluate_splits(examples.x, examples.labels, examples.groups, examples.axes,
@@ -216,18 +149,7 @@ def evaluate_classes(examples: Examples, model: SignatureModel | None = None, n_
 
 
 def check_axes(examples: Examples, model: SignatureModel) -> None:
-    """Check that signatures have the axes and the unit of a model.
-
-    Parameters
-    ----------
-    examples : Examples
-    model : SignatureModel
-
-    Raises
-    ------
-    LabelsError
-        If axes or unit differ.
-    """
+    """Raise LabelsError if signatures do not have the axes and the unit of a model."""
     if examples.axes != model.axes:
         raise LabelsError(f'the signatures have the axes {" ".join(examples.axes)}, but the model '
                           f'was trained on {" ".join(model.axes)}')

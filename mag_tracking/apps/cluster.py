@@ -57,25 +57,10 @@ class _Task(NamedTuple):
 class Cluster(Generic[_Key]):
     """Runs tasks on workers; a context manager that cancels unfinished tasks on exit.
 
-    Parameters
-    ----------
-    workers : int
-        Number of processes on this machine.
-    scheduler : str or None
-        Address of a Dask scheduler, used instead of `workers`. Certificates for tls:// are those of
-        the configuration of Dask (`TLS_VARIABLES`).
-
-    Attributes
-    ----------
-    n_lost : int
-        Number of workers lost.
-
-    Raises
-    ------
-    MissingDependencyError
-        If Dask is not installed.
-    ClusterError
-        If the workers do not start, or the scheduler does not respond or has no workers.
+    `workers` processes on this machine, or the Dask scheduler at the address `scheduler`;
+    certificates for tls:// are those of the configuration of Dask (`TLS_VARIABLES`). `n_lost`
+    counts lost workers. Raises ClusterError if the workers do not start, or the scheduler does not
+    respond or has none.
     """
 
     def __init__(self, workers: int, scheduler: str | None) -> None:
@@ -121,26 +106,13 @@ class Cluster(Generic[_Key]):
         return max(1, len(self._workers))
 
     def keys(self) -> list[_Key]:
-        """Return the keys of the running tasks.
-
-        Returns
-        -------
-        list
-        """
+        """Keys of the running tasks."""
         return [task.key for task in self._running.values()]
 
     def submit(self, key: _Key, priority: int, task: Callable[..., Any], *arguments: Any) -> None:
-        """Submit the call `task(*arguments)` to the workers.
+        """Submit the call `task(*arguments)`, picklable, to the workers.
 
-        Parameters
-        ----------
-        key : hashable
-            Identifies the task; `finished` yields it with the result.
-        priority : int
-            Tasks with a higher priority are started first.
-        task : function
-            Called by a worker.
-        *arguments : picklable
+        `finished` yields `key` with the result. Tasks with a higher priority are started first.
         """
         self._run(_Task(key, priority, task, arguments, False))
 
@@ -151,19 +123,10 @@ class Cluster(Generic[_Key]):
         self._running[future] = task
 
     def finished(self) -> Iterator[tuple[_Key, Any]]:
-        """Wait up to `POLL_S` for tasks to finish and yield their results.
+        """Wait up to `POLL_S` for tasks; yield the key and result, or exception, of each that
+        finished.
 
-        Yields
-        ------
-        key : hashable
-            Key of the task.
-        result : object
-            Return value of the task, or the exception that it raised.
-
-        Raises
-        ------
-        ClusterError
-            If the connection to the scheduler is lost, or there have been no workers for too long.
+        Raises ClusterError if the scheduler is lost, or there have been no workers for too long.
         """
         from distributed import wait
 
@@ -220,9 +183,9 @@ class Cluster(Generic[_Key]):
 def _event_loop() -> 'IOLoop':
     """Return the event loop that all clusters share; raises ClusterError.
 
-    The loop runs in a daemon thread. Dask would start its own loop while holding a lock that a
-    failed client also acquires when it is garbage-collected. A garbage collection in the starting
-    thread would block the start for ten seconds.
+    It runs in a daemon thread. Dask would start its own loop while holding a lock that a failed
+    client also acquires when it is garbage-collected; a collection in the starting thread would
+    block it for ten seconds.
     """
     from tornado.ioloop import IOLoop
 

@@ -42,20 +42,8 @@ field by about fifty times as much."""
 
 
 def level_of(calibrate: Calibrate, name: str, health: SensorHealth) -> FloatArray:
-    """Return the field that a sensor measures while no target is present.
-
-    Parameters
-    ----------
-    calibrate : Calibrate
-    name : str
-        Sensor.
-    health : SensorHealth
-
-    Returns
-    -------
-    (3,) array, T, sensor frame
-        Background if it was learnt from readings, otherwise the median of the latest readings.
-    """
+    """Field (3,), T, sensor frame, that a sensor measures without a target: the background if it
+    was learnt from readings, otherwise the median of the latest readings."""
     background = calibrate.backgrounds()[name]
     if background.measured and calibrate.last_stamp_ns(name) is not None:
         return calibrate.background(name)
@@ -64,19 +52,7 @@ def level_of(calibrate: Calibrate, name: str, health: SensorHealth) -> FloatArra
 
 def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: Calibrate,
                      sensors: Mapping[str, SensorHealth]) -> list[Finding]:
-    """Diagnose faults that are visible only by comparing sensors.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    survey : SurveySettings
-    calibrate : Calibrate
-    sensors : {name: SensorHealth}
-
-    Returns
-    -------
-    list of Finding
-    """
+    """Diagnose faults that are visible only by comparing sensors."""
     clocks = {name: health.clock for name, health in sensors.items()}
     findings = list(clock_findings({name: c for name, c in clocks.items() if c is not None}))
     levels = np.array([level_of(calibrate, name, sensors[name]) for name in network.names])
@@ -92,21 +68,9 @@ def network_findings(network: SensorNetwork, survey: SurveySettings, calibrate: 
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
                         n_reported: int = 0) -> Iterator[Finding]:
-    """Diagnose the background of one sensor.
+    """Diagnose the background of a sensor, frozen since `frozen_since_ns` or not (None).
 
-    Parameters
-    ----------
-    name : str
-        Sensor.
-    calibrate : Calibrate
-    frozen_since_ns : int, ns, or None
-        Timestamp from which the background has been frozen; None if it is not frozen.
-    n_reported : int
-        Number of relearnt backgrounds that were reported earlier.
-
-    Yields
-    ------
-    Finding
+    `n_reported` is the number of relearnt backgrounds that were reported earlier.
     """
     background, last = calibrate.backgrounds()[name], calibrate.last_stamp_ns(name)
     if last is not None and not background.ready and background.stuck:
@@ -136,21 +100,7 @@ def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | 
 
 def rate_findings(name: str, rate: float, network: SensorNetwork,
                   settings: TrackSettings) -> Iterator[Finding]:
-    """Report a sensor that is too slow for tracks.
-
-    Parameters
-    ----------
-    name : str
-        Sensor.
-    rate : float, Hz
-        NaN or inf if unknown.
-    network : SensorNetwork
-    settings : TrackSettings
-
-    Yields
-    ------
-    Finding
-    """
+    """Report a sensor whose rate [Hz; NaN or inf if unknown] is too low for tracks."""
     fault = low_rate_fault(rate, network, settings)
     if fault is not None:
         yield Finding(True, name, fault, 'raise the rate of the sensor; for parked vehicles, use '
@@ -158,29 +108,13 @@ def rate_findings(name: str, rate: float, network: SensorNetwork,
 
 
 class MissedTargets:
-    """Counts targets that other sensors detect while the readings of a sensor stay constant.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Names of the sensors.
-    """
+    """Counts targets that other sensors detect while the readings of a sensor stay constant."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self._missed: dict[str, Counter[str]] = {name: Counter() for name in names}
 
     def add_target(self, name: str, begin_ns: int, sensors: Mapping[str, SensorHealth]) -> None:
-        """Add a target that one sensor detected and that has passed.
-
-        Parameters
-        ----------
-        name : str
-            Sensor that detected the target.
-        begin_ns : int, ns
-            Time at which the detection began.
-        sensors : {name: SensorHealth}
-            Health of all sensors.
-        """
+        """Add a target that has passed and that sensor `name` detected from `begin_ns` on."""
         for other, health in sensors.items():
             since_ns = health.unchanged_since_ns
             if since_ns is not None and since_ns < begin_ns:
@@ -189,12 +123,7 @@ class MissedTargets:
                 self._missed[other].clear()
 
     def findings(self) -> Iterator[Finding]:
-        """Report each sensor that missed several consecutive targets.
-
-        Yields
-        ------
-        Finding
-        """
+        """Report each sensor that missed several consecutive targets."""
         for name, missed in self._missed.items():
             for other, n in missed.most_common(1):
                 if n >= MIN_MISSED_TARGETS:
@@ -204,21 +133,7 @@ class MissedTargets:
 
 
 class Doctor:
-    """Diagnoses a network from its readings.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : Settings
-
-    Attributes
-    ----------
-    network : SensorNetwork
-    sensors : dict of str to SensorHealth
-        Health of each sensor.
-    calibrate : Calibrate
-        Calibration stage.
-    """
+    """Diagnoses a network from its readings."""
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         self.network, self._settings = network, settings
@@ -230,14 +145,7 @@ class Doctor:
         self._n_faults_found, self._stalls = 0, HostStalls()
 
     def feed(self, readings: Readings, received_ns: int | None = None) -> None:
-        """Add raw readings.
-
-        Parameters
-        ----------
-        readings : Readings
-        received_ns : int, ns, optional
-            Time of reception of the message; None if unknown.
-        """
+        """Add raw readings, with the time of reception of their message if known."""
         names, stamps = readings.sensor_names(), readings.stamp_ns.tolist()
         if received_ns is not None:
             self._stalls.add(received_ns, names)
@@ -257,13 +165,7 @@ class Doctor:
                 self._missed.add_target(name, begin_ns, self.sensors)
 
     def findings(self) -> list[Finding]:
-        """Return the findings from all readings so far.
-
-        Returns
-        -------
-        list of Finding
-            Without ranking; see `stages.health.diagnosis.ranked`.
-        """
+        """Findings from all readings so far, without ranking (`stages.health.diagnosis.ranked`)."""
         found = list(self._stalls.findings())
         for j, (name, health) in enumerate(self.sensors.items()):
             found += health.findings(name, self.network.noise_std[j],
@@ -289,27 +191,8 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
             stopped: Callable[[], bool] | None = None) -> tuple[Doctor, list[Finding]]:
     """Diagnose a network from a recording.
 
-    Parameters
-    ----------
-    recording : Recording
-    network : SensorNetwork
-    settings : Settings
-    progress : function, optional
-        Called with the number of bytes read since the last call.
-    stopped : function, optional
-        Called after every message; reading ends when it returns true.
-
-    Returns
-    -------
-    doctor : Doctor
-        Doctor after reading the recording.
-    findings : list of Finding
-        Damage to the recording, which `doctor.findings` does not include.
-
-    Raises
-    ------
-    RecordingError
-        If the recording has none of the network's topics.
+    The findings returned with the doctor are damage to the recording, which `doctor.findings` does
+    not include.
     """
     reader, doctor = SampleReader(recording, network), Doctor(network, settings)
     prescan_of(recording, network, settings.calibrate, stopped).apply(doctor.calibrate)
@@ -321,18 +204,7 @@ def examine(recording: Recording, network: SensorNetwork, settings: Settings,
 
 
 def recording_findings(recording: Recording, reader: SampleReader) -> list[Finding]:
-    """Report the parts of a recording that could not be read.
-
-    Parameters
-    ----------
-    recording : Recording
-    reader : SampleReader
-        Reader at the end of the recording.
-
-    Returns
-    -------
-    list of Finding
-    """
+    """Report the parts of a recording that could not be read; `reader` is at its end."""
     name, found = recording.path.name, []
     without_time = {fault: n for fault, n in reader.rejected.items()
                     if fault.startswith(ZERO_STAMP)}

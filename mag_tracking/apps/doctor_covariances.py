@@ -15,19 +15,9 @@ _UNITS_PER_TESLA = (('millitesla', 1e3), ('gauss', 1e4), ('microtesla', 1e6), ('
 
 
 def likely_cause(declared: float, measured: float) -> str:
-    """Guess why the noise declared in messages differs from the noise of the readings.
+    """Guess why the noise std [T] declared in messages differs from that of quiet readings.
 
-    Parameters
-    ----------
-    declared : float, T
-        Standard deviation according to the messages.
-    measured : float, T
-        Standard deviation of quiet readings.
-
-    Returns
-    -------
-    str
-        Probable meaning of the declared covariance, such as 'a placeholder'.
+    The result is a probable meaning of the declared covariance, such as 'a placeholder'.
     """
     if abs(np.log(declared**2 / measured)) < np.log(MAX_MISMATCH):
         return 'the standard deviation instead of the variance'
@@ -40,20 +30,7 @@ def likely_cause(declared: float, measured: float) -> str:
 
 
 def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator[Finding]:
-    """Report a sensor whose messages declare a noise that contradicts its readings.
-
-    Parameters
-    ----------
-    name : str
-        Sensor.
-    topic : str
-        Topic of its messages.
-    calibrate : Calibrate
-
-    Yields
-    ------
-    Finding
-    """
+    """Report a sensor whose messages on `topic` declare a noise that contradicts its readings."""
     n, declared, measured = calibrate.overruled_covariances(name)
     if not n:
         return

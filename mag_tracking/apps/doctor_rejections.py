@@ -30,18 +30,7 @@ ADVICE = {
 
 
 def rejection_findings(name: str, calibrate: Calibrate) -> Iterator[Finding]:
-    """Report the rejected readings of one sensor.
-
-    Parameters
-    ----------
-    name : str
-        Sensor.
-    calibrate : Calibrate
-
-    Yields
-    ------
-    Finding
-    """
+    """Report the rejected readings of one sensor."""
     for (cause, description), n in calibrate.rejections.of(name).items():
         if cause in ADVICE:
             yield Finding(n > MIN_SERIOUS, name,
@@ -49,18 +38,7 @@ def rejection_findings(name: str, calibrate: Calibrate) -> Iterator[Finding]:
 
 
 def driver_findings(name: str, calibrate: Calibrate) -> Iterator[Finding]:
-    """Report the marks and the repeated readings of one sensor that were left out.
-
-    Parameters
-    ----------
-    name : str
-        Sensor.
-    calibrate : Calibrate
-
-    Yields
-    ------
-    Finding
-    """
+    """Report the marks and the repeated readings of one sensor that were left out."""
     faults = calibrate.driver_faults.of(name)
     if len(faults.marks):
         n = calibrate.driver_faults.n_marked(name)

@@ -17,39 +17,13 @@ from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S
 
 def write_report(doctor: Doctor, diagnoses: Sequence[Diagnosis], subject: str,
                  path: Path) -> None:
-    """Write the report of the diagnoses.
-
-    Parameters
-    ----------
-    doctor : Doctor
-    diagnoses : sequence of Diagnosis
-    subject : str
-        Name of the examined recording or network.
-    path : Path
-        File to write.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write the report of the diagnoses of `subject`, a recording or network."""
     replace_text(path, report_html(doctor_page(doctor, diagnoses, subject)))
 
 
 def doctor_page(doctor: Doctor, diagnoses: Sequence[Diagnosis], subject: str) -> Page:
-    """Create the page with diagnoses, noise and sample rates.
-
-    Parameters
-    ----------
-    doctor : Doctor
-    diagnoses : sequence of Diagnosis
-    subject : str
-        Name of the examined recording or network.
-
-    Returns
-    -------
-    Page
-    """
+    """Create the page of `subject`, a recording or network, with diagnoses, noise and sample
+    rates."""
     notes = [Note(ERROR if d.serious else NOTE, str(d))
              for d in diagnoses] or [Note(NOTE, 'no faults found')]
     n_serious = sum(d.serious for d in diagnoses)

@@ -84,27 +84,7 @@ def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLi
 def find_events(recording: Recording, network: SensorNetwork, settings: Settings,
                 progress: Callable[[int], object] | None = None,
                 stopped: Callable[[], bool] | None = None) -> EventsResult:
-    """Describe the passes in an open recording.
-
-    Parameters
-    ----------
-    recording : Recording
-    network : SensorNetwork
-    settings : Settings
-    progress : function, optional
-        Called with the number of bytes read since the last call.
-    stopped : function, optional
-        Called after every batch of readings; reading ends when it returns true.
-
-    Returns
-    -------
-    EventsResult
-
-    Raises
-    ------
-    RecordingError
-        If the recording has none of the network's topics.
-    """
+    """Describe the passes in an open recording."""
     reader = SampleReader(recording, network)
     calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
     stage = Events(network, settings.align, settings.detect, settings.track)

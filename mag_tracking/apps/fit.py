@@ -36,24 +36,10 @@ FIT_UNITS = {
 
 
 class RecordingFit:
-    """Fits every pass in a recording.
+    """Fits every pass in a recording with each number of dipoles in `orders`.
 
-    Parameters
-    ----------
-    recording : Recording
-    network : SensorNetwork
-    settings : Settings
-        Settings of calibration, alignment, detection and tracking.
-    orders : sequence of int
-        Numbers of dipoles to try.
-    cpa_range : (range, std), m, optional
-        Range at the closest point of approach, only for a network of one sensor; see
-        `analysis.pass_fit.fit_pass`.
-
-    Raises
-    ------
-    RecordingError
-        If the recording has none of the network's topics.
+    `cpa_range` is the (range, std) [m] at the closest point of approach, only for a network of one
+    sensor (`analysis.pass_fit.fit_pass`).
     """
 
     def __init__(self, recording: Recording, network: SensorNetwork, settings: Settings,
@@ -68,17 +54,7 @@ class RecordingFit:
                stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
         """Read the recording, fit each pass, and yield the results.
 
-        Parameters
-        ----------
-        progress : function, optional
-            Called with the number of bytes read since the last call.
-        stopped : function, optional
-            Called after every batch of readings and every fit; iteration ends when it returns
-            true.
-
-        Yields
-        ------
-        FittedPass
+        `stopped` is called after every batch of readings and every fit.
         """
         prescan_of(self._recording, self._network, self._settings,
                    stopped).apply(self._fitter.collector.calibrate)
@@ -89,13 +65,8 @@ class RecordingFit:
         yield from self._fitter.flush(stopped)
 
     def warnings(self) -> list[str]:
-        """Describe missing topics, backgrounds and detections, and faulty or rejected readings.
-
-        Returns
-        -------
-        list of str
-            One line per warning.
-        """
+        """Describe missing topics, backgrounds and detections, and faulty or rejected readings, one
+        a line."""
         collector = self._fitter.collector
         lines = [f'no messages on {topic}' for topic in self._reader.missing_topics()]
         lines += [f'no background was learnt for {name}: its quiet intervals are too short; '
@@ -186,38 +157,14 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
 
 
 def check_orders(name: str, orders: Sequence[int]) -> None:
-    """Check that the numbers of dipoles are distinct and from 1 to 8.
-
-    Parameters
-    ----------
-    name : str
-        Name of the argument in the message.
-    orders : sequence of int
-
-    Raises
-    ------
-    SettingsError
-        If a number is repeated or out of range, or `orders` is empty.
-    """
+    """Raise SettingsError unless the numbers of dipoles are distinct and from 1 to 8."""
     if not len(orders) or min(orders) < 1 or max(orders) > 8 or len(set(orders)) < len(orders):
         raise SettingsError(f'{name}: expected different numbers from 1 to 8, got {list(orders)}')
 
 
 def check_cpa_range(name: str, cpa_range: Sequence[float] | None, network: SensorNetwork) -> None:
-    """Check the range at the closest point of approach, which requires a single sensor.
-
-    Parameters
-    ----------
-    name : str
-        Name of the argument in the message.
-    cpa_range : (range, std), m, or None
-    network : SensorNetwork
-
-    Raises
-    ------
-    SettingsError
-        If `cpa_range` is not a pair of positive values, or the network has several sensors.
-    """
+    """Raise SettingsError unless (range, std) [m] are positive and the network has a single
+    sensor."""
     if cpa_range is None:
         return
     if len(network) > 1:

@@ -26,27 +26,7 @@ N_POSES = 120
 
 def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
                  out: Path) -> Path:
-    """Write the report of fitted passes to `report.html`.
-
-    Parameters
-    ----------
-    passes : sequence of FittedPass
-    network : SensorNetwork
-    warnings : sequence of str
-        Lines of `RecordingFit.warnings` of all recordings.
-    out : Path
-        Output folder.
-
-    Returns
-    -------
-    Path
-        File written.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write the report of fitted passes, with `RecordingFit.warnings`, to `report.html`."""
     path = out / REPORT
     replace_text(path, report_html(fit_page(passes, network, warnings)))
     return path
@@ -54,21 +34,7 @@ def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings:
 
 def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
              warnings: Sequence[str]) -> Page:
-    """Create the page of fitted passes.
-
-    A pass without an estimate is not shown on the map.
-
-    Parameters
-    ----------
-    passes : sequence of FittedPass
-    network : SensorNetwork
-    warnings : sequence of str
-        Lines for the notes.
-
-    Returns
-    -------
-    Page
-    """
+    """Create the page of fitted passes; those without an estimate are not on the map."""
     notes = [Note(WARNING, text) for text in (*warnings, *_poor_fits(passes))]
     if not passes:
         notes.append(Note(NOTE, 'no passes: nothing was detected'))

@@ -19,21 +19,8 @@ from mag_tracking.recording.fleet_file import FleetPass
 
 
 def earth_field_strength(network: SensorNetwork) -> FloatArray:
-    """Return the magnetic field strength of the Earth at a network.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-
-    Returns
-    -------
-    (3,) array, A/m, world frame
-
-    Raises
-    ------
-    NetworkError
-        If the Earth's field is unknown.
-    """
+    """Magnetic field strength of the Earth at a network, (3,), A/m, world frame; raises
+    NetworkError if it is unknown."""
     if network.earth_field is None or not network.earth_field.any():
         raise NetworkError('hard and soft iron cannot be separated without the field of the Earth: '
                            'add earth_field to the network file')
@@ -43,21 +30,7 @@ def earth_field_strength(network: SensorNetwork) -> FloatArray:
 def pass_of(recording: str, passages: Sequence[VehiclePassage]) -> FleetPass:
     """Convert the only passage in a recording to a pass for the enrolment of a vehicle.
 
-    Parameters
-    ----------
-    recording : str
-        Name of the recording.
-    passages : sequence of VehiclePassage
-        All passages in the recording.
-
-    Returns
-    -------
-    FleetPass
-
-    Raises
-    ------
-    LabelsError
-        If there is not exactly one passage, or it is ambiguous.
+    Raises LabelsError if there is not exactly one passage, or it is ambiguous.
     """
     if len(passages) != 1:
         raise LabelsError(f'{recording}: expected exactly one vehicle to enrol, but '
@@ -70,25 +43,10 @@ def pass_of(recording: str, passages: Sequence[VehiclePassage]) -> FleetPass:
 
 
 class Fleet:
-    """Enrolled vehicles of one site.
+    """Enrolled vehicles of one site, from the passes of each.
 
-    Parameters
-    ----------
-    passes : dict of str to list of FleetPass
-        Passes of each vehicle.
-    network : SensorNetwork
-
-    Attributes
-    ----------
-    vehicles : list of EnrolledVehicle
-        One entry per vehicle.
-
-    Raises
-    ------
-    LabelsError
-        If a vehicle cannot be enrolled.
-    NetworkError
-        If the Earth's field is unknown.
+    Raises LabelsError if a vehicle cannot be enrolled, NetworkError if the Earth's field is
+    unknown.
     """
 
     def __init__(self, passes: dict[str, list[FleetPass]], network: SensorNetwork) -> None:
@@ -104,16 +62,7 @@ class Fleet:
                 raise LabelsError(str(error)) from error
 
     def identify(self, passage: VehiclePassage) -> Identification:
-        """Identify the vehicle of a passage.
-
-        Parameters
-        ----------
-        passage : VehiclePassage
-
-        Returns
-        -------
-        Identification
-        """
+        """Identify the vehicle of a passage."""
         return identify(self.vehicles, passage.moment, passage.moment_covariance,
                         _heading(passage), passage.heading_std, self._field_strength)
 

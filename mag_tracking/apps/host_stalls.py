@@ -35,15 +35,7 @@ class HostStalls:
         self.n_stalls, self.longest_s, self._n_delayed = 0, 0.0, 0
 
     def add(self, received_ns: int, sensors: Collection[str]) -> None:
-        """Add a message.
-
-        Parameters
-        ----------
-        received_ns : int, ns
-            Time of receipt.
-        sensors : collection of str
-            Sensors of its readings.
-        """
+        """Add a message received at `received_ns` with readings of `sensors`."""
         self._sensors.update(sensors)
         if self._first_ns is None:
             self._first_ns = self._last_ns = received_ns
@@ -63,12 +55,7 @@ class HostStalls:
             self._gap_s = 0.0
 
     def findings(self) -> Iterator[Finding]:
-        """Report an overloaded computer.
-
-        Yields
-        ------
-        Finding
-        """
+        """Report an overloaded computer."""
         if len(self._sensors) > 1 and self.n_stalls >= MIN_STALLS \
                 and self._n_delayed < MAX_FRACTION * self._n:
             yield Finding(False, 'computer', f'the messages of all sensors stopped {self.n_stalls} '
@@ -82,19 +69,7 @@ def load_findings(found: Collection[Finding], sensors: Collection[str], load: fl
                   n_processors: int) -> Iterator[Finding]:
     """Report a high load of the computer if readings of all sensors are late or lost.
 
-    Parameters
-    ----------
-    found : collection of Finding
-        Findings of all sensors.
-    sensors : collection of str
-        Names of the sensors.
-    load : float
-        Mean number of processes that run or wait for a processor.
-    n_processors : int
-
-    Yields
-    ------
-    Finding
+    `load` is the mean number of processes that run or wait for a processor.
     """
     late = {f.subject for f in found if f.cause in TIME_CAUSES}
     if load > n_processors and sensors and late.issuperset(sensors):

@@ -53,14 +53,8 @@ class Timing:
         self._bins: dict[int, tuple[int, int]] = {}
 
     def add(self, times_ns: IntArray, log_times_ns: IntArray) -> None:
-        """Add messages in the order of the recording.
-
-        Parameters
-        ----------
-        times_ns : (n,) int array, ns
-            Timestamps. Zeros are omitted; if all are 0, log times are used.
-        log_times_ns : (n,) int array, ns
-        """
+        """Add messages in the order of the recording, by timestamp, or by log time if all stamps
+        are 0."""
         if not len(times_ns):
             return
         self.n_messages += len(times_ns)
@@ -119,13 +113,7 @@ class Timing:
         return longest_bin
 
     def describe(self) -> str:
-        """Format rate, gaps and steps backward.
-
-        Returns
-        -------
-        str
-            Empty for fewer than two messages.
-        """
+        """Format rate, gaps and steps backward; empty for fewer than two messages."""
         if self.n_messages < 2:
             return ''
         longest_bin = self._longest_regular_bin()
@@ -146,22 +134,10 @@ class Timing:
 
 def time_topics(recording: Recording, progress: Callable[[int], object] | None = None
                 ) -> tuple[dict[Source, Timing], 'Counter[str]', 'Counter[str]']:
-    """Compute the statistics of the times of all topics.
+    """Compute the statistics of the times of all topics, in order of appearance.
 
-    Parameters
-    ----------
-    recording : Recording
-    progress : callable, optional
-        Called with the number of bytes read since the last call.
-
-    Returns
-    -------
-    timings : dict of Source to Timing
-        In order of appearance. Sensors that share a topic are separate.
-    faults : Counter
-        Number of readings that cannot be decoded, by cause.
-    counts : Counter
-        Number of messages that were read, by topic.
+    Sensors that share a topic are separate. The counters are the readings that cannot be decoded,
+    by cause, and the messages that were read, by topic.
     """
     timings: dict[Source, Timing] = {}
     faults: Counter[str] = Counter()

@@ -18,22 +18,7 @@ from mag_tracking.stages.track.settings import TrackSettings
 
 def input_findings(recording: Recording, reader: SampleReader, network: SensorNetwork,
                    calibrate: Calibrate, settings: TrackSettings) -> list[Finding]:
-    """Findings about a recording and the sensors, without ranking.
-
-    Parameters
-    ----------
-    recording : Recording
-    reader : SampleReader
-        Reader at the end of the recording.
-    network : SensorNetwork
-    calibrate : Calibrate
-        Calibration stage after the whole recording.
-    settings : TrackSettings
-
-    Returns
-    -------
-    list of Finding
-    """
+    """Findings about a recording and its sensors, without ranking, after its end."""
     return [*recording_findings(recording, reader), *sensor_findings(
         network, calibrate, settings, reader.missing_topics(), reader.clocks)]
 
@@ -41,22 +26,9 @@ def input_findings(recording: Recording, reader: SampleReader, network: SensorNe
 def sensor_findings(network: SensorNetwork, calibrate: Calibrate, settings: TrackSettings,
                     missing_topics: Sequence[str], clocks: Mapping[str, ClockSpan]
                     ) -> list[Finding]:
-    """Findings about the sensors, without ranking.
+    """Findings about the sensors, without ranking, after all readings.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-    calibrate : Calibrate
-        Calibration stage after all readings.
-    settings : TrackSettings
-    missing_topics : sequence of str
-        Topics of the network without messages.
-    clocks : {sensor: ClockSpan}
-        Raw timestamps, and their times of receipt; empty if unknown.
-
-    Returns
-    -------
-    list of Finding
+    `clocks` are the raw timestamps and times of receipt; empty if unknown.
     """
     found = list(clock_findings(corrected(clocks, network)))
     for name, topic in zip(network.names, network.absolute_topics, strict=True):

@@ -17,26 +17,7 @@ MAX_NOISE_RATIO = 3.0
 def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
                         detect: Detect, missing_topics: Sequence[str],
                         rejected: Mapping[str, int]) -> str | None:
-    """Explain why nothing was detected.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : Settings
-    calibrate : Calibrate
-        Calibration stage after the whole recording.
-    detect : Detect
-        Detection stage after the whole recording.
-    missing_topics : sequence of str
-        Topics of the network that were not recorded.
-    rejected : {cause: number}
-        Rejected readings.
-
-    Returns
-    -------
-    str or None
-        One sentence; None if a target was detected.
-    """
+    """Explain in a sentence why nothing was detected in a whole recording; None if a target was."""
     if detect.counts['onsets']:
         return None
     n_accepted = sum(calibrate.counts_of(name)['accepted'] for name in network.names)

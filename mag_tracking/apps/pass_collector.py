@@ -29,16 +29,10 @@ MAX_PASS_S = 60.0
 
 
 class PassCollector:
-    """Extracts passes from readings.
+    """Extracts passes from readings, each with notes for the user.
 
     A pass contains all measurements from `PAD_S` before the onset of a detection to its release.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : Settings
-    on_frame : function, optional
-        Called with every `FieldFrame` that the detection stage has processed.
+    `on_frame` is called with every frame that the detection stage has processed.
     """
 
     def __init__(self, network: SensorNetwork, settings: Settings,
@@ -69,43 +63,17 @@ class PassCollector:
         return total
 
     def no_detection_reason(self, missing_topics: Sequence[str]) -> str | None:
-        """Explain why nothing was detected; see `apps.no_detection.no_detection_reason`.
-
-        Parameters
-        ----------
-        missing_topics : sequence of str
-            Topics of the network that were not recorded.
-
-        Returns
-        -------
-        str or None
-            One sentence; None if a target was detected.
-        """
+        """Explain why nothing was detected (`apps.no_detection`); None if a target was."""
         calibrate, _, detect = self._stages
         return no_detection_reason(self._network, self._settings, calibrate, detect, missing_topics,
                                    self.rejected)
 
     def sensors_without_background(self) -> list[str]:
-        """Return the names of the sensors whose background was never learnt.
-
-        Returns
-        -------
-        list of str
-        """
+        """Names of the sensors whose background was never learnt."""
         return self._stages[0].unready()
 
     def feed(self, readings: Readings) -> list[tuple[PassData, tuple[str, ...]]]:
-        """Add raw readings and return the passes that they complete.
-
-        Parameters
-        ----------
-        readings : Readings
-
-        Returns
-        -------
-        list of (PassData, notes)
-            Measurements of each pass, and notes for the user.
-        """
+        """Add raw readings and return the passes that they complete, with notes for the user."""
         calibrate, align, _ = self._stages
         passes: list[tuple[PassData, tuple[str, ...]]] = []
         batches = calibrate.feed(readings)
@@ -122,13 +90,7 @@ class PassCollector:
         return passes
 
     def flush(self) -> list[tuple[PassData, tuple[str, ...]]]:
-        """End the recording and return the pass that was still in progress.
-
-        Returns
-        -------
-        list of (PassData, notes)
-            Measurements of the pass, and notes for the user.
-        """
+        """End the recording and return the pass that was still in progress."""
         calibrate, align, _ = self._stages
         passes: list[tuple[PassData, tuple[str, ...]]] = []
         for calibrated in calibrate.flush():
@@ -222,8 +184,8 @@ def _common_covariance(covariances: FloatArray) -> FloatArray:
     """Replace the covariances (n, 3, 3) of readings by the first one if they are similar.
 
     While the noise is being learnt, its estimate varies slightly although the noise is constant.
-    The covariances of a coarse sensor are not similar: they are much larger in a constant field
-    than in a changing field.
+    The covariances of a coarse sensor differ: they are much larger in a constant field than in a
+    changing one.
     """
     traces = np.nansum(np.einsum('kii->ki', covariances), axis=1)
     if traces.max() > 2.0 * traces.min():

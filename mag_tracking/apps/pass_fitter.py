@@ -91,25 +91,10 @@ class FittedPass:
 
 
 class PassFitter:
-    """Fits every pass in a stream of readings.
+    """Fits every pass in a stream of readings with each number of dipoles in `orders`.
 
-    A tracker runs in parallel and determines the number of vehicles in each pass.
-
-    Parameters
-    ----------
-    recording : str
-        Name of the recording.
-    network : SensorNetwork
-    settings : Settings
-    orders : sequence of int
-        Numbers of dipoles to try.
-    cpa_range : (range, std), m, optional
-        Range at the closest point of approach, only for a network of one sensor.
-
-    Attributes
-    ----------
-    collector : PassCollector
-        Extracts the passes.
+    A tracker runs in parallel and determines the number of vehicles in each pass. `cpa_range` is
+    the (range, std) [m] at the closest point of approach, only for a network of one sensor.
     """
 
     def __init__(self, recording: str, network: SensorNetwork, settings: Settings,
@@ -123,34 +108,11 @@ class PassFitter:
 
     def feed(self, readings: Readings,
              stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """Add raw readings and fit the passes that they complete.
-
-        Parameters
-        ----------
-        readings : Readings
-        stopped : function, optional
-            Fitting ends when it returns true.
-
-        Returns
-        -------
-        iterator of FittedPass
-            The passes are fitted during the iteration.
-        """
+        """Add raw readings; the passes that they complete are fitted during the iteration."""
         return self._fit_passes(self.collector.feed(readings), stopped)
 
     def flush(self, stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """End the stream and fit the pass that was still in progress.
-
-        Parameters
-        ----------
-        stopped : function, optional
-            Fitting ends when it returns true.
-
-        Returns
-        -------
-        iterator of FittedPass
-            The passes are fitted during the iteration.
-        """
+        """End the stream; the pass in progress is fitted during the iteration."""
         return self._fit_passes(self.collector.flush(), stopped)
 
     def _track(self, frame: FieldFrame) -> None:
@@ -180,31 +142,11 @@ def fitted_vehicles(recording: str, number: int, data: PassData, single_fits: Se
                     paths: FloatArray, ground: GroundPrior, orders: Sequence[int],
                     notes: tuple[str, ...],
                     stopped: Callable[[], bool] | None = None) -> list[FittedPass]:
-    """Fit the vehicles in a pass, jointly if there are several.
+    """Fit the vehicles in detection `number` (from 1), jointly if there are several.
 
-    Parameters
-    ----------
-    recording : str
-        Name of the recording.
-    number : int
-        Index of the detection in the recording, from 1.
-    data : PassData
-    single_fits : sequence of PassFit
-        Fits of the pass as a single vehicle.
-    paths : (K, 6) array, m and m/s, world frame
-        Position and velocity of each tracked vehicle when `data.t` is zero.
-    ground : GroundPrior
-    orders : sequence of int
-        Numbers of dipoles to try if there are several vehicles.
-    notes : tuple of str
-        Remarks on the pass for the user.
-    stopped : function, optional
-        Fitting ends when it returns true; the result is then invalid.
-
-    Returns
-    -------
-    list of FittedPass
-        One entry per vehicle.
+    `single_fits` are the fits as a single vehicle; `paths` (K, 6) [m, m/s, world frame] are the
+    positions and velocities of the tracked vehicles when `data.t` is zero; `orders` are the numbers
+    of dipoles for several vehicles. The result is invalid after `stopped` has returned true.
     """
     vehicles = fit_targets(data, single_fits, paths, ground, orders, stopped)
     if len(vehicles) == 1:

@@ -27,12 +27,7 @@ class _Pose:
 
 
 class PassTracks:
-    """Determines the targets in each pass from the records of a tracker.
-
-    Parameters
-    ----------
-    settings : TrackSettings
-    """
+    """Determines the targets in each pass from the records of a tracker."""
 
     def __init__(self, settings: TrackSettings) -> None:
         self._is_for_vehicles = settings.target == 'vehicle'
@@ -42,12 +37,7 @@ class PassTracks:
         self._last_stamp_ns = 0
 
     def add(self, records: Iterable[object]) -> None:
-        """Store the poses and the ends of tracks from the outputs of a tracker.
-
-        Parameters
-        ----------
-        records : iterable
-        """
+        """Store the poses and the ends of tracks from the outputs of a tracker."""
         for record in records:
             if isinstance(record, Track) and record.stamp_ns < self._last_stamp_ns:
                 # The time jumped back: earlier poses belong to another pass.
@@ -63,20 +53,12 @@ class PassTracks:
                     float(np.trace(record.covariance[:3, :3]))))
 
     def paths(self, data: PassData) -> FloatArray:
-        """Return the path of each vehicle in a pass.
+        """Position and velocity (K, 6) [m, m/s, world frame] of each vehicle in a pass when
+        `data.t` is zero.
 
         A vehicle belongs to the pass that contains its pose of smallest variance. Overlapping
         tracks belong to one vehicle that was lost and found again; the track with the smallest
-        variance is used. The method must be called with passes in chronological order.
-
-        Parameters
-        ----------
-        data : PassData
-
-        Returns
-        -------
-        (K, 6) array, m and m/s, world frame
-            Position and velocity at the time when `data.t` is zero. Empty for magnets.
+        variance is used. Passes must come in chronological order. There are no paths for magnets.
         """
         end_ns = data.stamp_ns + int(NS * data.t.max())
         candidates = sorted((pose for pose in self._poses_of_smallest_variance(end_ns)
@@ -89,10 +71,11 @@ class PassTracks:
         return np.array(paths).reshape(-1, 6)
 
     def _poses_of_smallest_variance(self, end_ns: int) -> list[_Pose]:
-        """Return the pose with the smallest variance up to `end_ns` [ns] for each track.
+        """Take the pose with the smallest variance up to `end_ns` [ns] of each track; drop the
+        others.
 
-        The other poses up to `end_ns` are dropped. Vehicles that are still approaching are omitted:
-        their latest pose has the smallest variance.
+        Vehicles that are still approaching are omitted: their latest pose has the smallest
+        variance.
         """
         selected = []
         for track, poses in list(self._poses.items()):
@@ -112,16 +95,7 @@ class PassTracks:
 
 
 def ground_prior(settings: TrackSettings) -> GroundPrior:
-    """Compute the prior of the height and vertical speed of vehicles from tracker settings.
-
-    Parameters
-    ----------
-    settings : TrackSettings
-
-    Returns
-    -------
-    GroundPrior
-    """
+    """Prior of the height and vertical speed of vehicles from tracker settings."""
     height, std = np.array([(k.height, k.height_std) for k in settings.vehicle.kinds]).T
     height_std = float(np.sqrt(height.var() + np.square(std).mean()))
     return GroundPrior((float(height.mean()), height_std), CLIMB_STD)

@@ -98,28 +98,11 @@ class Plan:
 
 def detection_range(target: PlannedTarget, noise_std: float, n_axes: int,
                     false_alarm: float) -> float:
-    """Compute the approximate range at which one sensor detects half of the targets in one frame.
+    """Approximate range [m] at which one sensor detects half of the targets in one frame, [T10]_
+    eq. (5.20).
 
-    The signal energy is averaged over all directions of the moment. The average is twice the energy
-    at a point perpendicular to the axis of the dipole.
-
-    Parameters
-    ----------
-    target : PlannedTarget
-    noise_std : float, T
-        Standard deviation of the noise of one axis in a frame.
-    n_axes : int
-        Number of axes of the sensor.
-    false_alarm : float
-        False-alarm probability.
-
-    Returns
-    -------
-    float, m
-
-    References
-    ----------
-    [T10]_ eq. (5.20).
+    `noise_std` [T] is that of one axis. The signal energy is averaged over all directions of the
+    moment: twice the energy at a point perpendicular to the axis of the dipole.
     """
     return float(snr_range(np.sqrt(2.0) * target.moment, noise_std,
                            energy_threshold(false_alarm, n_axes)))
@@ -133,25 +116,12 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
 
     Parameters
     ----------
-    network : SensorNetwork
-    target : PlannedTarget
-    sampling : Sampling
-    lanes : sequence of (name, heading [rad], lateral offset [m])
-        The offset is measured from the centre of the sensors, positive to the left of the heading.
-    area : (x0, y0, x1, y1), m
-        Area of the maps.
-    settings : Settings
-        Settings of detection and tracking.
-    clearance : float, m
-        Minimum distance of an additional sensor from a lane.
-    n_grid : int
-        Number of points along the longer side of the maps.
-    progress : function, optional
-        Called with 1 whenever one of the `n_parts` parts is completed.
-
-    Returns
-    -------
-    Plan
+    lanes : (name, heading [rad], lateral offset [m] from the centre of the sensors, positive to the
+        left of the heading)
+    area : (x0, y0, x1, y1), m, of the maps
+    clearance : minimum distance of an additional sensor from a lane, m
+    n_grid : number of points along the longer side of the maps
+    progress : called with 1 whenever one of the `n_parts` parts is completed
     """
     report_part = progress or (lambda n: None)
     x, y = _grid(area, n_grid)
@@ -201,10 +171,8 @@ def _position_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sa
 def _closest_point_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                           lane: Lane, distance_scale: float,
                           ) -> tuple[Observability, dict[str, FloatArray]]:
-    """Compute `Plan.observability` and `Plan.bounds_at_closest`.
-
-    `distance_scale` [m] is the unit of the positions for the observability.
-    """
+    """Compute `Plan.observability`, with positions in units of `distance_scale` [m], and
+    `Plan.bounds_at_closest`."""
     closest = lane.points[np.argmin(np.abs(lane.along))][None]
     J = pass_information(network.positions, network.R_sw, target, sampling, closest,
                          lane.heading)[0].sum(axis=1)
@@ -223,16 +191,7 @@ def _lane_distances(lane: Lane, points: FloatArray) -> FloatArray:
 
 
 def n_parts(lanes: Sequence[tuple[str, float, float]]) -> int:
-    """Return the number of times that `compute_plan` calls `progress`.
-
-    Parameters
-    ----------
-    lanes : sequence of (name, heading [rad], lateral offset [m])
-
-    Returns
-    -------
-    int
-    """
+    """Number of times that `compute_plan` calls `progress`."""
     return len({heading % np.pi for _, heading, _ in lanes}) + 3
 
 
@@ -304,10 +263,9 @@ def _filter_bound(network: SensorNetwork, target: PlannedTarget, sampling: Sampl
 def _added_sensor_bounds(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                          near_lanes: Sequence[tuple[float, FloatArray]],
                          candidates: FloatArray) -> tuple[float, FloatArray]:
-    """Compute the median position bound [m] without and with an additional sensor.
+    """Median position bound [m] without and with an additional sensor at each of the candidates.
 
-    The second result has the shape (n_candidates,): one bound per candidate position. If
-    `near_lanes` or `candidates` is empty, the results are NaN and an empty array.
+    If `near_lanes` or `candidates` is empty, the results are NaN and an empty array.
     """
     height = network.positions[:, 2].mean()
     candidate_positions = np.column_stack([candidates, np.full(len(candidates), height)])
@@ -333,10 +291,8 @@ def _added_sensor_bounds(network: SensorNetwork, target: PlannedTarget, sampling
 
 def _miss_probabilities(network: SensorNetwork, target: PlannedTarget, sampling: Sampling,
                         lane: Lane, area: Area, settings: Settings) -> FloatArray:
-    """Compute `Plan.miss_curve`.
-
-    A pass is missed unless `detect.onset_frames` consecutive frames detect the target.
-    """
+    """Compute `Plan.miss_curve`: a pass is missed unless `detect.onset_frames` consecutive frames
+    detect the target."""
     half_length = 0.5 * max(area[2] - area[0], area[3] - area[1])
     offsets = np.linspace(0.0, 2.0 * half_length, 25)
     u = np.array([np.cos(lane.heading), np.sin(lane.heading)])

@@ -49,19 +49,7 @@ class PlanInputs:
 
     def run(self, network: SensorNetwork, settings: Settings,
             progress: Callable[[int], object] | None = None) -> Plan:
-        """Compute the plan.
-
-        Parameters
-        ----------
-        network : SensorNetwork
-        settings : Settings
-        progress : function, optional
-            Called with 1 whenever one of the `n_parts` parts is completed.
-
-        Returns
-        -------
-        Plan
-        """
+        """Compute the plan; `progress` is called with 1 for each of its `n_parts` parts."""
         return compute_plan(network, self.target, self.sampling, self.lanes, self.area, settings,
                             self.clearance, self.n_grid, progress)
 
@@ -74,31 +62,7 @@ def plan_inputs(network: SensorNetwork, settings: Settings, target: str | None =
                 clearance: float | None = None, grid: int = 41) -> PlanInputs:
     """Check and complete the inputs of a plan, which are described in `plan`.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : Settings
-    target : str, optional
-    moment : float, A m², optional
-    height : float, m, optional
-    speed : float, m/s
-    heading : sequence of float, deg, optional
-    offset : sequence of float, m, optional
-    noise_std : float, T, optional
-    rate : float, Hz
-    field_error : float, optional
-    area : (x0, y0, x1, y1), m, optional
-    clearance : float, m, optional
-    grid : int
-
-    Returns
-    -------
-    PlanInputs
-
-    Raises
-    ------
-    SettingsError
-        If an input is out of range; the message begins with its name.
+    Raises SettingsError if one is out of range; the message begins with its name.
     """
     planned_target = _target(settings.track, target, moment, height, speed)
     lanes = _lanes(settings.track.vehicle, _to_floats(heading), _to_floats(offset))
@@ -237,7 +201,7 @@ def _lanes(vehicle: VehicleSettings, heading: Sequence[float] | None,
 
 def _sampling(network: SensorNetwork, settings: Settings, noise_std: float | None, rate: float,
               field_error: float | None) -> Sampling:
-    """Create the sampling of the sensors; the caller sets `half_window`.
+    """Sampling of the sensors; the caller sets `half_window`.
 
     A field error that persists over many frames is not averaged out. It is represented here by
     additional noise in each frame, whereas the tracker estimates it as a state.

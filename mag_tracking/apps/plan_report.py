@@ -19,43 +19,14 @@ LOW_QUANTILE = 0.02
 
 
 def write_report(plan: Plan, lines: list[str], out: Path) -> Path:
-    """Write the report of a plan to `report.html`.
-
-    Parameters
-    ----------
-    plan : Plan
-    lines : list of str
-        Lines returned by `summary_lines`.
-    out : Path
-        Output folder.
-
-    Returns
-    -------
-    Path
-        File written.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write the report of a plan, with its `summary_lines`, to `report.html`."""
     path = out / REPORT
     replace_text(path, report_html(plan_page(plan, lines)))
     return path
 
 
 def summary_lines(p: Plan) -> list[str]:
-    """Summarise a plan.
-
-    Parameters
-    ----------
-    p : Plan
-
-    Returns
-    -------
-    list of str
-        One line per result.
-    """
+    """Summarise a plan, one line per result."""
     noise, lines = float(np.median(p.sampling.noise_std)), list[str]()
     lines.append(f'{quantity(len(p.network), "sensor")}, {1e9 * noise:.2g} nT noise per frame; '
                  f'target with {p.target.moment:g} A m^2 at {p.target.speed:g} m/s')
@@ -98,18 +69,7 @@ def summary_lines(p: Plan) -> list[str]:
 
 
 def plan_page(plan: Plan, lines: list[str]) -> Page:
-    """Create the page of a plan.
-
-    Parameters
-    ----------
-    plan : Plan
-    lines : list of str
-        Lines returned by `summary_lines`.
-
-    Returns
-    -------
-    Page
-    """
+    """Create the page of a plan with its `summary_lines`."""
     network = plan.network
     return Page(f'Plan for {quantity(len(network), "sensor")}',
                 f'target with {plan.target.moment:g} A m^2 at {plan.target.speed:g} m/s',

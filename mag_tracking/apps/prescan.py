@@ -56,46 +56,23 @@ class Prescan:
     """{sensor: timestamps and times of receipt}; empty if the times of receipt are unknown."""
 
     def segment_of(self, sensor: str) -> list[float] | None:
-        """Return the interval in which the background level of a sensor was observed.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        [begin, end], s, or None
-            Relative to the first reading of the sensor; None if no level was found.
-        """
+        """Interval [begin, end] in which a sensor's background level was observed, s after its
+        first reading."""
         level = self.levels.get(sensor)
         return None if level is None else [level.begin, level.end]
 
     def apply(self, calibrate: Calibrate) -> None:
-        """Initialise the calibration stage with the results.
-
-        Parameters
-        ----------
-        calibrate : Calibrate
-        """
+        """Initialise the calibration stage with the results."""
         calibrate.start_from(self.levels, self.steps, self.faults)
         calibrate.compare_clocks(self.clocks)
 
 
 def prescan(batches: Iterable[Readings], network: SensorNetwork,
             settings: CalibrateSettings) -> Prescan:
-    """Find the backgrounds of sensors if a target is present at the start of the readings.
+    """Find the backgrounds of sensors if a target is present at the start of the raw readings.
 
-    Parameters
-    ----------
-    batches : iterable of Readings
-        Raw readings from the start of the recording; consumed up to `LOOK_AHEAD_S`.
-    network : SensorNetwork
-    settings : CalibrateSettings
-
-    Returns
-    -------
-    Prescan
-        Only the faults if the network file contains all backgrounds.
+    The batches are consumed up to `LOOK_AHEAD_S`. If the network file contains all backgrounds,
+    there are only faults.
     """
     without_background = [name for name, level in zip(network.names, network.background,
                                                       strict=True) if level is None]
@@ -159,11 +136,8 @@ def _level_of(recorder: BlockRecorder, departed_at: float | None,
 
 def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
            learnt: dict[str, tuple[float, FloatArray]]) -> None:
-    """Feed readings to `learner`; update `first_ns` and `learnt`.
-
-    `first_ns` is {sensor: first timestamp}. `learnt` is {sensor: (learning time after the first
-    reading [s], (3,) background [T])}.
-    """
+    """Feed readings to `learner`; update {sensor: first timestamp} and {sensor: (learning time
+    after the first reading [s], (3,) background [T])}."""
     for i in range(0, len(readings), N_READINGS_AT_ONCE):
         if len(learnt) == len(learner.backgrounds()):
             learner.feed(readings.part(slice(i, None)))
@@ -193,25 +167,7 @@ def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: MostFrequent
 
 def prescan_of(recording: Recording, network: SensorNetwork, settings: CalibrateSettings,
                stopped: Callable[[], bool] | None = None) -> Prescan:
-    """Find the backgrounds of sensors if a target is present at the start of a recording.
-
-    Parameters
-    ----------
-    recording : Recording
-    network : SensorNetwork
-    settings : CalibrateSettings
-    stopped : function, optional
-        Called after every batch of readings; reading ends when it returns true.
-
-    Returns
-    -------
-    Prescan
-
-    Raises
-    ------
-    RecordingError
-        If the recording has none of the network's topics.
-    """
+    """Find the backgrounds of sensors if a target is present at the start of a recording."""
     # A separate Recording is used, because losses are counted whenever a recording is read.
     reader = SampleReader(Recording(recording.path), network)
 

@@ -45,21 +45,7 @@ class RecordedReadings:
 
 
 def network_of(network: SensorNetwork | str | PathLike[str]) -> SensorNetwork:
-    """Return a network, or read it from a file.
-
-    Parameters
-    ----------
-    network : SensorNetwork or path of a network file
-
-    Returns
-    -------
-    SensorNetwork
-
-    Raises
-    ------
-    NetworkError
-        If the network file is invalid.
-    """
+    """Return a network, or read it from a file; raises NetworkError."""
     return network if isinstance(network, SensorNetwork) else read_network(network)
 
 
@@ -95,19 +81,7 @@ def read_recording(path: str | PathLike[str],
 
 def recorded_readings(recording: Recording, reader: SampleReader,
                       readings: Readings) -> RecordedReadings:
-    """Combine readings with the ground truth, losses and rejections of a recording.
-
-    Parameters
-    ----------
-    recording : Recording
-    reader : SampleReader
-        Reader at the end of the recording.
-    readings : Readings
-
-    Returns
-    -------
-    RecordedReadings
-    """
+    """Combine readings with the ground truth, losses and rejections of a recording at its end."""
     return RecordedReadings(readings, reader.truth_arrays(), dict(reader.rejected),
                             dict(recording.losses), tuple(reader.missing_topics()))
 
@@ -167,19 +141,7 @@ def _with_nan(values: ArrayLike) -> NDArray[Any]:
 def checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
     """Check readings and convert them to the array types that the stages expect.
 
-    Parameters
-    ----------
-    readings : Readings
-    network : SensorNetwork
-
-    Returns
-    -------
-    Readings
-
-    Raises
-    ------
-    ReadingsError
-        If shapes or types are wrong, or no reading belongs to a sensor of the network.
+    Raises ReadingsError if shapes or types are wrong, or no reading belongs to the network.
     """
     readings = _to_standard_types(readings)
     if len(readings) and not set(readings.names) & set(network.names):
@@ -221,19 +183,8 @@ def _to_standard_types(readings: Readings) -> Readings:
 
 
 def check_order(readings: Readings, tolerance: float = MAX_DELAY_S) -> None:
-    """Check the chronological order of readings.
-
-    Parameters
-    ----------
-    readings : Readings
-    tolerance : float, s
-        Maximum time by which a reading may be older than a preceding reading.
-
-    Raises
-    ------
-    ReadingsError
-        If a reading is delayed by more than `tolerance`.
-    """
+    """Raise ReadingsError if a reading is older than a preceding one by more than `tolerance`
+    [s]."""
     if not len(readings):
         return
     delay_ns = np.maximum.accumulate(readings.stamp_ns) - readings.stamp_ns

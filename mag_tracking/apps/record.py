@@ -57,17 +57,7 @@ class Selection(NamedTuple):
     """Result topics that do not begin with a prefix in `result_prefixes`."""
 
     def resolved(self, resolve: Callable[[str], str]) -> 'Selection':
-        """Return the selection with absolute names.
-
-        Parameters
-        ----------
-        resolve : function
-            Returns the absolute name of a topic.
-
-        Returns
-        -------
-        Selection
-        """
+        """Selection with absolute names of topics, which `resolve` returns."""
         return self._replace(
             fields=tuple(map(resolve, self.fields)), imus=tuple(map(resolve, self.imus)),
             topics=tuple(map(resolve, self.topics)), readings=resolve(self.readings),
@@ -75,17 +65,7 @@ class Selection(NamedTuple):
             result_topics=tuple(map(resolve, self.result_topics)))
 
     def includes(self, topic: str) -> bool:
-        """Return whether to record a topic.
-
-        Parameters
-        ----------
-        topic : str
-            Absolute name.
-
-        Returns
-        -------
-        bool
-        """
+        """Whether to record a topic, given by its absolute name."""
         if topic == self.readings or topic in self.fields + self.imus + self.topics:
             return True
         # Topics with a name component that begins with an underscore are hidden, as in rosbag2.
@@ -97,18 +77,7 @@ class Selection(NamedTuple):
 
 
 def progress_line(recorder: RecorderState, seconds: float) -> str:
-    """Describe the progress of a recording in one line.
-
-    Parameters
-    ----------
-    recorder : RecorderState
-    seconds : float, s
-        Time since the start.
-
-    Returns
-    -------
-    str
-    """
+    """Describe the progress of a recording in one line, `seconds` after the start."""
     dropped = recorder.dropped.total()
     messages = quantity(recorder.counts.total(), 'message')
     return (f'{seconds:.0f} s: {messages}, {recorder.size / 1e6:.1f} MB'
@@ -117,22 +86,8 @@ def progress_line(recorder: RecorderState, seconds: float) -> str:
 
 def summary(recorder: RecorderState, selection: Selection, lost: Mapping[str, int],
             refused: Mapping[str, str]) -> Iterator[str]:
-    """Summarise the content of a recording and the missing messages.
-
-    Parameters
-    ----------
-    recorder : RecorderState
-    selection : Selection
-    lost : {topic: number}
-        Messages lost before they were recorded.
-    refused : {topic: reason}
-        Topics that could not be recorded.
-
-    Yields
-    ------
-    str
-        Line of the summary.
-    """
+    """Summarise a recording: its content, the messages lost before they were recorded, by topic,
+    and the reasons for refused topics."""
     messages = quantity(recorder.counts.total(), 'message')
     yield f'{recorder.folder}: {messages}, {recorder.size / 1e6:.2f} MB'
     for topic, n in sorted((+recorder.counts).items()):

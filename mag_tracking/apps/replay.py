@@ -76,37 +76,19 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
            out: str | PathLike[str], progress: Callable[[int], object] | None = None,
            stopped: Callable[[], bool] | None = None,
            report: Callable[[str], object] | None = None, truth: str | None = None) -> Run:
-    """Track the targets in a recording and write the results.
+    """Track the targets in a recording and write the results to the folder `out`.
+
+    Raises RecordingError if the recording has none of the network's topics or the ground truth
+    cannot be read, OutputError if `out` is the folder of the recording.
 
     Parameters
     ----------
-    recording : Recording
-    network : SensorNetwork
-    settings : Settings
-    out : path
-        Folder for the results; created if it does not exist.
-    progress : function, optional
-        Called with the number of bytes read since the last call.
-    stopped : function, optional
-        Called after every batch of readings and every progress report. When it returns true,
-        reading ends, partial results are written, and the summary is marked as interrupted.
-    report : function, optional
-        Called with a message to the user if the results of an earlier run are replaced.
-    truth : str, optional
-        Source of the ground truth: a CSV file (see `recording.truth`), or a topic of the recording
-        with messages of type PoseStamped, PoseWithCovarianceStamped or Odometry. By default, all
-        topics below /ground_truth are used.
-
-    Returns
-    -------
-    Run
-
-    Raises
-    ------
-    RecordingError
-        If the recording has none of the network's topics, or the ground truth cannot be read.
-    OutputError
-        If the results cannot be written, or `out` is the folder of the recording.
+    progress : called with the number of bytes read since the last call
+    stopped : called after every batch of readings and every progress report; when it returns true,
+        partial results are written and the summary is marked as interrupted
+    report : called with a message if the results of an earlier run are replaced
+    truth : a CSV file (`recording.truth`), or a topic with messages of type PoseStamped,
+        PoseWithCovarianceStamped or Odometry; by default all topics below /ground_truth
     """
     if recording.lies_in(out):
         raise OutputError(f'{out} is the folder of the recording; choose another output folder')
@@ -184,18 +166,10 @@ class Results(Protocol):
 class RunCollector:
     """Forwards the outputs of the pipeline to the results and stores the history of each track.
 
-    Parameters
-    ----------
-    results : Results
-
     Attributes
     ----------
-    logs : dict of int to TrackLog
-        History of each track.
-    smoothed : dict of int to SmoothedLog
-        History of each smoothed track.
-    disturbances : dict of int to Disturbance
-        Latest record of each disturbance.
+    logs, smoothed : history of each track and each smoothed track, by id
+    disturbances : latest record of each disturbance, by id
     """
 
     def __init__(self, results: Results) -> None:
@@ -207,12 +181,7 @@ class RunCollector:
         self.disturbances: dict[int, Disturbance] = {}
 
     def add(self, records: Iterable[Output]) -> None:
-        """Add the outputs of a batch of readings.
-
-        Parameters
-        ----------
-        records : iterable of Output
-        """
+        """Add the outputs of a batch of readings."""
         for record in records:
             if isinstance(record, FieldFrame):
                 self._frame = record
@@ -235,24 +204,9 @@ class RunCollector:
 def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
               collector: RunCollector, truth: Mapping[str, Truth],
               prescan: Prescan) -> dict[str, Any]:
-    """Summarise a replay.
+    """Content of `summary.json` for a replay, after the whole recording has been processed.
 
-    Parameters
-    ----------
-    recording : Recording
-    reader : SampleReader
-        Reader at the end of the recording.
-    pipeline : Pipeline
-        Pipeline after the whole recording has been processed.
-    collector : RunCollector
-    truth : {target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}
-    prescan : Prescan
-        Result of the first pass over the recording.
-
-    Returns
-    -------
-    dict
-        Content of `summary.json`.
+    `prescan` is the result of the first pass over the recording.
     """
     rejections = dict(reader.rejected + Counter(pipeline.rejections()))
     sensors: dict[str, dict[str, Any]] = {}
@@ -333,19 +287,10 @@ def _mounting(log: TrackLog, pipeline: Pipeline) -> dict[str, dict[str, Any]]:
 
 def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Configured,
                          truth: Mapping[str, Truth]) -> dict[str, Any] | None:
-    """Compute the errors of a track relative to the best-matching target of the ground truth.
+    """Errors of a track relative to the best-matching target of the ground truth.
 
-    Parameters
-    ----------
-    log : TrackLog or SmoothedLog
-    pipeline : Configured
-        Provides the network and the settings.
-    truth : {target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}
-
-    Returns
-    -------
-    dict or None
-        Entry `truth` of a track in `summary.json`; None if no ground truth covers the track.
+    The result is the entry `truth` of the track in `summary.json`; None if no ground truth covers
+    it.
     """
     best_match: tuple[float, dict[str, Any]] | None = None
     for name, truth_arrays in truth.items():
@@ -383,24 +328,7 @@ def _bound_ratio(log: TrackLog, pipeline: Pipeline, truth: Truth) -> float | Non
 
 
 def write_trajectories(run: Run, out: Path) -> list[Path]:
-    """Write each track and each smoothed track as a TUM trajectory.
-
-    Parameters
-    ----------
-    run : Run
-    out : Path
-        Output folder.
-
-    Returns
-    -------
-    list of Path
-        Files written.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write each track and each smoothed track as a TUM trajectory, and return the files."""
     paths = []
     for logs, suffix in ((run.logs, ''), (run.smoothed, '_smoothed')):
         for log in logs.values():
@@ -411,23 +339,9 @@ def write_trajectories(run: Run, out: Path) -> list[Path]:
 
 def write_figures(run: Run, network: SensorNetwork, out: Path, max_tracks: int = 6,
                   stopped: Callable[[], bool] | None = None) -> list[Path]:
-    """Draw and save the figures of the first tracks.
+    """Draw the figures of the first `max_tracks` tracks, and return the files.
 
-    Parameters
-    ----------
-    run : Run
-    network : SensorNetwork
-    out : Path
-        Output folder.
-    max_tracks : int
-        Maximum number of tracks.
-    stopped : function, optional
-        Called before each track; drawing ends when it returns true.
-
-    Returns
-    -------
-    list of Path
-        Files written.
+    `stopped` is called before each track.
     """
     # Imported here because it loads matplotlib.
     from mag_tracking.report.figure_file import save_figure

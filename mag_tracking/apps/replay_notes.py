@@ -21,22 +21,8 @@ from mag_tracking.units import NS
 
 def replay_findings(recording: Recording, reader: SampleReader, pipeline: Pipeline,
                     no_detection_reason: str | None) -> list[Finding]:
-    """Findings about the input of a replay and the stages, without ranking.
-
-    Parameters
-    ----------
-    recording : Recording
-    reader : SampleReader
-        Reader at the end of the recording.
-    pipeline : Pipeline
-        Pipeline after the whole recording has been processed.
-    no_detection_reason : str or None
-        Reason why nothing was detected.
-
-    Returns
-    -------
-    list of Finding
-    """
+    """Findings about the input of a replay and its stages, without ranking, after the whole
+    recording."""
     found = input_findings(recording, reader, pipeline.network, pipeline.calibrate,
                            pipeline.settings.track)
     for stage, counts in pipeline.counts().items():
@@ -52,33 +38,13 @@ def replay_findings(recording: Recording, reader: SampleReader, pipeline: Pipeli
 
 
 def diagnosis_entries(diagnoses: Iterable[Diagnosis]) -> list[dict[str, Any]]:
-    """Entries of diagnoses in `summary.json`.
-
-    Parameters
-    ----------
-    diagnoses : iterable of Diagnosis
-
-    Returns
-    -------
-    list of dict
-        Cause, whether it is serious, and the text.
-    """
+    """Entries of diagnoses in `summary.json`: cause, whether it is serious, and the text."""
     return [{'cause': d.finding.cause.value, 'serious': d.serious, 'text': str(d)}
             for d in diagnoses]
 
 
 def notes_of(summary: Mapping[str, Any]) -> list[Note]:
-    """Create the notes on a replay.
-
-    Parameters
-    ----------
-    summary : dict
-        Content of `summary.json`.
-
-    Returns
-    -------
-    list of Note
-    """
+    """Create the notes on a replay from the content of `summary.json`."""
     return [*_input_notes(summary), *_limit_notes(summary), *_truth_notes(summary),
             *(Note(NOTE, _describe_disturbance(d)) for d in summary['disturbances'])]
 
@@ -95,17 +61,9 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
 
 
 def no_track_reason(counts: Mapping[str, int]) -> str | None:
-    """Explain why nothing was tracked with a single sensor.
+    """Explain from the tracker's counts why nothing was tracked with a single sensor.
 
-    Parameters
-    ----------
-    counts : dict
-        Counts of the tracker.
-
-    Returns
-    -------
-    str or None
-        Explanation; None if vehicles were tracked, or several sensors measured the target.
+    The result is None if vehicles were tracked, or several sensors measured the target.
     """
     if counts.get(NO_SCALE, 0) or counts.get(NO_SCALE_FRAMES, 0) and not counts.get('tracks', 0):
         return ('no track: the scale is not observable with a single sensor. Use `mag-tracking '

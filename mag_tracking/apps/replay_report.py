@@ -29,42 +29,14 @@ from mag_tracking.report.track_log import TrackLog
 
 
 def write_report(run: Run, network: SensorNetwork, out: Path) -> Path:
-    """Write the report of a replay to `report.html`.
-
-    Parameters
-    ----------
-    run : Run
-    network : SensorNetwork
-    out : Path
-        Output folder.
-
-    Returns
-    -------
-    Path
-        File written.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write the report of a replay to `report.html`."""
     path = out / REPORT
     replace_text(path, report_html(replay_page(run, network)))
     return path
 
 
 def replay_page(run: Run, network: SensorNetwork) -> Page:
-    """Create the page of a replay.
-
-    Parameters
-    ----------
-    run : Run
-    network : SensorNetwork
-
-    Returns
-    -------
-    Page
-    """
+    """Create the page of a replay."""
     summary, logs = run.summary, list(run.logs.values())
     notes, scene = notes_of(summary), None
     if summary['interrupted']:

@@ -373,10 +373,8 @@ class _Results:
 
 def _tracking_result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
                      recording: RecordedReadings, found: list[Finding]) -> TrackingResult:
-    """Create a `TrackingResult`; the readings of `recording` are not used.
-
-    `found` are the findings about the input.
-    """
+    """Create a `TrackingResult` with the findings about the input; readings of `recording` are
+    unused."""
     rejections = dict(Counter(recording.rejected) + Counter(pipeline.rejections()))
     reason = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
                                  pipeline.detect, recording.missing_topics, rejections)

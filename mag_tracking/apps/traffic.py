@@ -114,29 +114,8 @@ def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathL
 def count_traffic(recording: Recording, network: SensorNetwork, settings: Settings,
                   progress: Callable[[int], object] | None = None,
                   stopped: Callable[[], bool] | None = None) -> TrafficResult:
-    """Count the vehicles in an open recording.
-
-    Parameters
-    ----------
-    recording : Recording
-    network : SensorNetwork
-    settings : Settings
-    progress : function, optional
-        Called with the number of bytes read since the last call.
-    stopped : function, optional
-        Called after every batch of readings; reading ends when it returns true.
-
-    Returns
-    -------
-    TrafficResult
-
-    Raises
-    ------
-    RecordingError
-        If the recording has none of the network's topics.
-    SettingsError
-        If the target is not a vehicle.
-    """
+    """Count the vehicles in an open recording; raises SettingsError if the target is not a
+    vehicle."""
     if settings.track.target != 'vehicle':
         raise SettingsError('traffic counts only vehicles; set the target to vehicle instead of '
                             f'{settings.track.target}')

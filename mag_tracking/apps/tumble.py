@@ -23,39 +23,10 @@ def tumble(source: Recording | Sequence[Readings], network: SensorNetwork,
            ) -> tuple[SensorNetwork, dict[str, EllipsoidFit], dict[str, FloatArray], bool]:
     """Estimate the hard and soft iron of sensors that were rotated during a recording.
 
-    Parameters
-    ----------
-    source : Recording, or batches of Readings
-    network : SensorNetwork
-    sensors : collection of str
-        Names of the rotated sensors; an empty collection selects all sensors.
-    date : str
-        Date of the calibration, stored in the network.
-    field_magnitude : float, T, optional
-        Magnitude of the ambient field. By default, the mean gain of a sensor is not calibrated.
-    progress : function, optional
-        Called with the number of bytes read since the last call.
-    stopped : function, optional
-        Called after every batch of readings; reading ends when it returns true.
-
-    Returns
-    -------
-    network : SensorNetwork
-        Network with the corrections of the sensors whose fit converged. The background and noise
-        of these sensors are removed, because these values refer to uncorrected readings.
-    fits : dict of str to EllipsoidFit
-        Result of each sensor.
-    readings : dict of str to (n, 3) array, T, sensor frame
-        Readings of each sensor.
-    interrupted : bool
-        Whether reading was stopped before the end of the recording.
-
-    Raises
-    ------
-    NetworkError
-        If a sensor is not in the network.
-    RecordingError
-        If the recording has none of the network's topics, or the readings none of its sensors.
+    No `sensors` selects all. Without `field_magnitude` [T] of the ambient field, the mean gain of a
+    sensor is not calibrated. The results are the network with the corrections of the sensors whose
+    fit converged, the fits, the readings (n, 3) [T, sensor frame], and whether reading was stopped.
+    Background and noise of corrected sensors are removed: they refer to uncorrected readings.
     """
     selected = tuple(sensors) or network.names
     rows = {name: network.index(name) for name in selected}

@@ -26,24 +26,10 @@ HEALTH_INTERVAL_S = 1.0
 
 def view(recording: Recording, network: SensorNetwork, settings: Settings, scene: LiveScene,
          rate: float, stopped: Callable[[], bool]) -> None:
-    """Track a recording in real time until it ends or `stopped()` returns true.
+    """Track a recording in real time (`rate` 1) until it ends or `stopped()` returns true.
 
-    Parameters
-    ----------
-    recording : Recording
-    network : SensorNetwork
-    settings : Settings
-    scene : LiveScene
-        Receives frames, tracks and the state of the sensors.
-    rate : float
-        Playback speed; 1 is real time.
-    stopped : function
-        Called several times per second; tracking ends when it returns true.
-
-    Raises
-    ------
-    RecordingError
-        If the recording has none of the network's topics.
+    `scene` receives frames, tracks and the state of the sensors; `stopped` is called several times
+    per second.
     """
     reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
     prescan_of(recording, network, settings.calibrate, stopped).apply(pipeline.calibrate)

@@ -1,8 +1,8 @@
 """Comparison of measured fields with the Earth's field, and explanations of differences.
 
-Without a target, all sensors measure the same field in different frames. Flipped axes, swapped
-axes, a wrong unit, a wrong gain or two exchanged sensors are therefore detected and named. Such a
-fault also distorts the field of a target. A constant offset does not.
+Without a target, all sensors measure the same field in different frames. Flipped or swapped axes, a
+wrong unit, a wrong gain or exchanged sensors are therefore detected and named. Such a fault also
+distorts the field of a target; a constant offset does not.
 """
 
 import functools
@@ -91,24 +91,10 @@ class FieldInconsistency:
 
 
 def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
-    """Median of the measured fields of a network, for each world axis.
+    """Median per world axis, T, of fields (n, 3) in the sensor frames; NaN for an unreported axis.
 
-    Parameters
-    ----------
-    fields : (n, 3) array, T, sensor frames
-        Measured fields; NaN for an unreported axis.
-    R_ws : (n, 3, 3) array
-        Sensor to world.
-
-    Returns
-    -------
-    (3,) array, T, world frame
-
-    Raises
-    ------
-    ValueError
-        If fewer than three sensors report all axes. With two sensors, the faulty sensor cannot
-        be identified.
+    Raises ValueError if fewer than three sensors report all axes: with two, the faulty sensor
+    cannot be identified.
     """
     is_complete = ~np.isnan(fields).any(axis=1)
     if np.count_nonzero(is_complete) < 3:
@@ -122,28 +108,12 @@ def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
 def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
                   orientation_std: FloatArray, earth_field: FloatArray,
                   bias_std: float, offset_std: float) -> list[FieldInconsistency]:
-    """Find the sensors that do not measure the Earth's field.
+    """Find the sensors whose fields (n, 3) in T without a target differ from the Earth's field.
 
-    Parameters
-    ----------
-    names : sequence of n str
-    fields : (n, 3) array, T, sensor frames
-        Fields measured without a target; NaN for an unreported axis.
-    R_ws : (n, 3, 3) array
-        Sensor to world.
-    orientation_std : (n, 3) array, rad
-        Standard deviations of the orientations, about the world axes.
-    earth_field : (3,) array, T, world frame
-    bias_std : float, T
-        Standard deviation of the bias of a sensor, including nearby iron, per axis.
-    offset_std : float, T
-        Standard deviation of the offset of an uncalibrated sensor, per axis. A difference that it
-        explains is not misleading; 0 makes no difference misleading.
-
-    Returns
-    -------
-    list of FieldInconsistency
-        In the order of `names`.
+    `fields` is in the sensor frames, NaN for an unreported axis. `orientation_std` (n, 3) in rad is
+    about the world axes. `bias_std` and `offset_std` in T are per axis: that of the bias including
+    nearby iron, and that of the offset of an uncalibrated sensor. A difference within the offset is
+    not misleading; an `offset_std` of 0 makes no difference misleading.
     """
     B0 = np.asarray(earth_field, dtype=float)
     sensors = [_Sensor(names[j], fields[j], R_ws[j], orientation_std[j], B0, bias_std)
@@ -204,10 +174,7 @@ def _cache_key(a: FloatArray) -> tuple[float, ...]:
 def _probability(field: tuple[float, ...], orientation: tuple[float, ...],
                  orientation_std: tuple[float, ...], earth_field: tuple[float, ...],
                  bias_std: float) -> float:
-    """Probability of a larger difference from the Earth's field, at the best heading.
-
-    The arguments are tuples, which are hashable, so that the result is cached.
-    """
+    """Probability of a larger difference from the Earth's field, at the best heading (cached)."""
     y, R_ws, std, B0 = (np.array(field), np.array(orientation).reshape(3, 3),
                         np.array(orientation_std), np.array(earth_field))
     is_reported = ~np.isnan(y)
@@ -280,10 +247,7 @@ def _gain_text(gain: float, relative_std: float) -> str:
 
 def _partial_explanation(y: FloatArray, R_ws: FloatArray, std: FloatArray,
                          B0: FloatArray) -> tuple[str, ...]:
-    """Describe the simplest change of axes that explains most of the difference from `B0`.
-
-    Empty if there is no such change, or if it is not unique.
-    """
+    """Simplest change of axes that explains most of the difference from `B0`, unless ambiguous."""
     original_difference = _remaining_difference(y, R_ws, std, B0)
     for changes in _axis_changes():
         remainders = sorted(
@@ -306,10 +270,7 @@ def _remaining_difference(y: FloatArray, R_ws: FloatArray, std: FloatArray,
 
 
 def _headings(std: FloatArray, B0: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Tested heading errors (n,) [rad] of a sensor, and the Earth's fields (n, 3) [T].
-
-    Each field is rotated by the corresponding heading error.
-    """
+    """Tested heading errors (n,) [rad], and the Earth's fields rotated by them (n, 3) [T]."""
     max_error = min(np.pi, MAX_HEADING_STDS * std[2])
     yaw = np.linspace(-max_error, max_error, 1 + 2 * max(1, round(max_error / YAW_STEP)))
     return yaw, np.stack([B0[0] * np.cos(yaw) + B0[1] * np.sin(yaw),

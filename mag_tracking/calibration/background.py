@@ -48,54 +48,34 @@ class RelearntBackground(NamedTuple):
 
 
 class RunningBackground:
-    """Running estimate of a sensor's background; times are in seconds since the first reading.
+    """Running estimate of a sensor's background; times are in s since the first reading.
 
     Parameters
     ----------
-    learn : float, s
-        Quiet time required before the background is ready.
-    memory : float, s
-        Length of the interval that the line is fitted to.
-    guard : float, s
-        Delay after which a quiet block enters that interval, so that the onset of a target is
-        excluded.
-    block : float, s
-        Length of a block.
-    freeze_std : float
-        A block departs from the background if its mean differs by more than this number of standard
-        deviations of the noise.
-    relearn : float, s
-        Duration of another steady level after which that level becomes the background. The
-        duration is shorter if the background was observed only briefly, or if it contains the field
-        of a target that has left. 0 disables the replacement, except of a background set by
-        `resume`.
-    background : (3,) array, T, optional
-        Background, if it is known in advance.
-    noise_std : (3,) array, T, optional
-        Standard deviation of the noise, if it is known in advance. If `background` is also given,
-        the background is ready immediately.
-    phase : float, optional
-        Extra length of the first block, as a fraction of `block`. The extra length staggers the
-        blocks of sensors that started together. If `phase` is given, each complete block is
-        evaluated by a later call of `evaluate_block`, at the latest before the next reading.
-        Default: each block is evaluated when it is complete.
-    sensors : (1,) SENSOR array
-        State of the sensor: the current block, and the line and noise for compiled code.
-    evaluate_change : ChangeEvaluator, optional
-        Classifies level changes of the sensor together with the changes at other sensors.
+    learn : s, quiet time required before the background is ready
+    memory : s, length of the interval that the line is fitted to
+    guard : s, delay after which a quiet block enters that interval, to exclude a target's onset
+    block : s, length of a block
+    freeze_std : number of noise std by which the mean of a departing block differs
+    relearn : s, duration of another steady level after which it becomes the background
+        Shorter if the background was observed briefly or contains the field of a departed target.
+        0 disables the replacement, except of a background set by `resume`.
+    background, noise_std : (3,) arrays, T, known in advance
+        If both are given, the background is ready immediately.
+    phase : extra length of the first block, as a fraction of `block`
+        It staggers the blocks of sensors that started together. If it is given, each complete block
+        is evaluated by a later call of `evaluate_block`, at the latest before the next reading;
+        otherwise when it is complete.
+    sensors : (1,) SENSOR array with the current block, and the line and noise for compiled code
+    evaluate_change : classifies level changes together with the changes at other sensors
 
     Attributes
     ----------
-    frozen : bool
-        Whether the field departs from the background, e.g. because of a target.
-    stuck : bool
-        Whether the readings do not change.
-    n_relearnt : int
-        Number of times another steady level became the background.
-    relearnt : tuple of RelearntBackground
-        The latest of these changes.
-    doubtful_times : DoubtfulTimes
-        Intervals in which the background was doubtful.
+    frozen : whether the field departs from the background, e.g. because of a target
+    stuck : whether the readings do not change
+    n_relearnt : number of times another steady level became the background
+    relearnt : the latest of these changes
+    doubtful_times : intervals in which the background was doubtful
     """
 
     def __init__(self, learn: float, memory: float, guard: float, block: float,
@@ -143,16 +123,9 @@ class RunningBackground:
                         else (0.0, self._known_background, np.zeros(3), 0.0), self._known_noise)
 
     def resume(self, background: FloatArray, covariance: FloatArray) -> None:
-        """Resume with a recently stored background.
+        """Resume with a recently stored background (3,) T and noise (3, 3) T² of a reading.
 
         The level remains constant until the new quiet interval is as long as `learn`.
-
-        Parameters
-        ----------
-        background : (3,) array, T
-            Stored background; NaN for an unreported axis.
-        covariance : (3, 3) array, T²
-            Noise of one reading.
         """
         noise = np.asarray(covariance, dtype=float)
         self._level.set((0.0, np.asarray(background, dtype=float), np.zeros(3), 0.0),
@@ -162,17 +135,10 @@ class RunningBackground:
         self._level.set_uncertainty()
 
     def start_from(self, level: FloatArray, covariance: FloatArray) -> None:
-        """Start with a level that was determined from other readings.
+        """Start with a level (3,) T and noise (3, 3) T² determined from other readings.
 
-        Unlike after `resume`, another level must last for the full `relearn` time to replace this
-        level. This method has no effect if the noise of all axes is unknown.
-
-        Parameters
-        ----------
-        level : (3,) array, T
-            Initial background; NaN for an unreported axis.
-        covariance : (3, 3) array, T²
-            Noise of one reading.
+        Unlike after `resume`, another level must last for the full `relearn` time to replace it. No
+        effect if the noise of all axes is unknown.
         """
         covariance = self._level.without_unknown_noise(covariance)
         if not np.isnan(covariance).all():
@@ -201,10 +167,7 @@ class RunningBackground:
 
     @property
     def covariance(self) -> FloatArray | None:
-        """Noise covariance of one sample, (3, 3) T²; None if unknown, NaN for an unreported axis.
-
-        The quantisation variance of the sensor is included.
-        """
+        """Noise (3, 3) T² of one sample with quantisation; None if unknown, NaN if unreported."""
         return self._level.covariance
 
     @property
@@ -213,29 +176,12 @@ class RunningBackground:
         return self._level.drift
 
     def level(self, time: float) -> FloatArray:
-        """Background at a time.
-
-        Parameters
-        ----------
-        time : float, s
-
-        Returns
-        -------
-        (3,) array, T
-
-        Raises
-        ------
-        ValueError
-            If the background is not ready.
-        """
+        """Background (3,) T at a time in s; raises ValueError if it is not ready."""
         return self._level.at(time)
 
     @property
     def scatter_std(self) -> FloatArray:
-        """Standard deviation of quiet readings, (3,) T; NaN if unknown.
-
-        The quantisation error of the sensor is included.
-        """
+        """Standard deviation (3,) T of quiet readings, with quantisation; NaN if unknown."""
         variance = self._quiet.scatter() + self._state['step_variance']
         return np.where(variance > 0.0, np.sqrt(variance), np.nan)
 
@@ -272,10 +218,7 @@ class RunningBackground:
             self._start_provisionally(block)
 
     def _start_provisionally(self, block: Block) -> None:
-        """Add a block; adopt the given background or a frequent level once such a level exists.
-
-        An uncertain frequent level is adopted provisionally.
-        """
+        """Add a block; adopt the given background or a frequent level, provisional if uncertain."""
         self._provisional.collect(block)
         frequent = self._provisional.frequent_level(corrected_steps(self._sensors))
         if frequent is not None and self._known_background is not None:
@@ -362,10 +305,7 @@ class RunningBackground:
         self.relearnt = (*self.relearnt, change)[-MAX_CHANGES:]
 
     def _adopt_if_background(self, new_blocks: deque[Block]) -> bool:
-        """Adopt the level of `new_blocks` if it is a former level or a vehicle has departed.
-
-        Returns whether the level was adopted.
-        """
+        """Adopt a former level, or a level after a vehicle departed; return whether adopted."""
         former_observed_s = self._departure.former_observed_s()
         if former_observed_s:
             self._change_to(new_blocks, former_observed_s, False)
@@ -397,10 +337,7 @@ class RunningBackground:
         self._departure.end()
 
     def _adopt_if_steady(self, collected: deque[Block]) -> bool:
-        """Adopt blocks as the background if all blocks lie on one line.
-
-        Returns whether the blocks were adopted.
-        """
+        """Adopt blocks that all lie on one line as the background; return whether adopted."""
         blocks = stacked(collected)
         noise = pooled_covariance(blocks) if self._known_noise is None else self._known_noise
         noise = None if noise is None else self._level.without_dead_axes(noise)
@@ -429,10 +366,7 @@ class RunningBackground:
         return True
 
     def _fit(self, blocks: Blocks) -> None:
-        """Fit line and noise to the quiet `blocks`.
-
-        A given or resumed background is retained until the blocks span the time `learn`.
-        """
+        """Fit line and noise; keep a given or resumed background until the blocks span `learn`."""
         if (self._known_background is not None or self._is_resumed) \
                 and np.ptp(blocks.time) < self._learn:
             return

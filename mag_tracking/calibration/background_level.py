@@ -18,27 +18,14 @@ constant."""
 
 
 class BackgroundLevel:
-    """Linear trend and noise of the background, stored in the state of its sensor.
-
-    Parameters
-    ----------
-    sensors : (1,) SENSOR array
-        State of the sensor.
-    freeze_std : float
-        Threshold of the difference between the mean of a block and the background, in standard
-        deviations of the noise.
+    """Linear trend and noise of the background, stored in the state (1,) SENSOR of its sensor.
 
     Attributes
     ----------
-    line : (float, (3,), (3,), float) or None
-        Linear trend: centre [s], mean [T], slope [T/s], and horizon [s], after which the trend is
-        constant. None if unknown.
-    noise : (3, 3) array or None, T²
-        Noise covariance of one reading, without the quantisation variance.
-    limits : (3,) array, T
-        Maximum difference between the mean of a block and the background.
-    is_provisional : bool
-        Whether the trend is preliminary and may differ from the background.
+    line : centre [s], mean (3,) [T], slope (3,) [T/s], and horizon [s], after which it is constant
+    noise : (3, 3) [T²] covariance of one reading, without the quantisation variance
+    limits : (3,) [T] maximum difference of a block mean from the background: `freeze_std` noise std
+    is_provisional : whether the trend is preliminary and may differ from the background
     """
 
     def __init__(self, sensors: StructArray, freeze_std: float) -> None:
@@ -54,15 +41,7 @@ class BackgroundLevel:
         return self.line is not None and self.noise is not None
 
     def set(self, line: _Line | None, noise: FloatArray | None) -> None:
-        """Set trend and noise, and copy them to the sensor state that compiled code reads.
-
-        Parameters
-        ----------
-        line : (float, (3,), (3,), float) or None
-            Linear trend: centre [s], mean [T], slope [T/s] and horizon [s].
-        noise : (3, 3) array or None, T²
-            Noise covariance of one reading, without the quantisation variance.
-        """
+        """Set trend and noise, and copy them to the sensor state that compiled code reads."""
         s = self._state
         self.line, self.noise = line, noise
         s['is_ready'] = self.is_ready
@@ -76,18 +55,7 @@ class BackgroundLevel:
         core.apply_steps(self._sensors, self._freeze_std, self.limits)
 
     def without_dead_axes(self, noise: FloatArray) -> FloatArray:
-        """Return the noise with NaN for dead axes.
-
-        Parameters
-        ----------
-        noise : (3, 3) array, T²
-            Noise covariance of one reading.
-
-        Returns
-        -------
-        (3, 3) array, T²
-            NaN for a dead axis: an axis that is constant although its steps are not coarse.
-        """
+        """Noise (3, 3) with NaN for dead axes: constant although their steps are not coarse."""
         steps, variance = corrected_steps(self._sensors), noise.diagonal()
         if np.isfinite(steps).all() and (variance > MIN_STD**2).all():
             return noise
@@ -96,31 +64,13 @@ class BackgroundLevel:
         return np.where(is_dead[:, None] | is_dead, np.nan, noise)
 
     def without_unknown_noise(self, covariance: FloatArray) -> FloatArray:
-        """Return a covariance with NaN for axes whose noise is unknown.
-
-        Parameters
-        ----------
-        covariance : (3, 3) array, T²
-
-        Returns
-        -------
-        (3, 3) array, T²
-            NaN for a constant axis whose steps are unknown or too fine to be observed.
-        """
+        """Covariance with NaN for constant axes whose steps are unknown or too fine to observe."""
         steps = corrected_steps(self._sensors)
         is_unknown = (covariance.diagonal() <= MIN_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
         return np.where(is_unknown[:, None] | is_unknown, np.nan, covariance)
 
     def set_uncertainty(self, std: FloatArray | float = 0.0, is_provisional: bool = False) -> None:
-        """Set the uncertainty of the background level.
-
-        Parameters
-        ----------
-        std : (3,) array or float, T
-            Standard deviation; NaN for an unreported axis.
-        is_provisional : bool
-            Whether the trend is preliminary and may differ from the background.
-        """
+        """Set the std of the level, (3,) or scalar T, and whether the trend is preliminary."""
         self.is_provisional = is_provisional
         self._state['level_variance'] = np.where(np.isnan(std), 0.0, np.square(std))
 
@@ -141,48 +91,15 @@ class BackgroundLevel:
         return np.full(3, np.nan) if self.line is None else self.line[2]
 
     def at(self, time: float) -> FloatArray:
-        """Background at a time.
-
-        Parameters
-        ----------
-        time : float, s
-
-        Returns
-        -------
-        (3,) array, T
-
-        Raises
-        ------
-        ValueError
-            If the background is not ready.
-        """
+        """Background (3,) T at a time in s; raises ValueError if it is not ready."""
         return -self.departure(time, np.zeros(3))
 
     def set_constant(self, blocks: Blocks) -> None:
-        """Set a constant level, the mean of the given blocks.
-
-        Parameters
-        ----------
-        blocks : Blocks
-        """
+        """Set a constant level, the mean of the given blocks."""
         self.set((0.0, line_through(blocks)[1], np.zeros(3), 0.0), self.noise)
 
     def at_all(self, times: FloatArray) -> FloatArray:
-        """Background at several times.
-
-        Parameters
-        ----------
-        times : (k,) array, s
-
-        Returns
-        -------
-        (k, 3) array, T
-
-        Raises
-        ------
-        ValueError
-            If the background is not ready.
-        """
+        """Background (k, 3) T at times (k,) in s; raises ValueError if it is not ready."""
         if self.line is None:
             raise ValueError('the background has not been learnt yet')
         centre, mean, slope, horizon = self.line
@@ -190,22 +107,7 @@ class BackgroundLevel:
         return out
 
     def departure(self, time: float, field: FloatArray) -> FloatArray:
-        """Field minus the background.
-
-        Parameters
-        ----------
-        time : float, s
-        field : (3,) array, T
-
-        Returns
-        -------
-        (3,) array, T
-
-        Raises
-        ------
-        ValueError
-            If the background is not ready.
-        """
+        """Field (3,) T minus the background; raises ValueError if the background is not ready."""
         if self.line is None:
             raise ValueError('the background has not been learnt yet')
         out = np.empty(3)
@@ -213,19 +115,7 @@ class BackgroundLevel:
         return out
 
     def steady_end(self, blocks: Sequence[Block], length: float) -> deque[Block] | None:
-        """Latest blocks, if they are at a steady level.
-
-        Parameters
-        ----------
-        blocks : sequence of Block
-        length : float, s
-            Required duration.
-
-        Returns
-        -------
-        deque of Block or None
-            None if the blocks are not steady, fewer than three, or shorter than `length`.
-        """
+        """Latest blocks over `length` s; None if not steady, fewer than three, or too short."""
         start = blocks[-1].time - length
         latest_blocks: deque[Block] = deque()
         for block in reversed(blocks):
@@ -236,16 +126,7 @@ class BackgroundLevel:
         return latest_blocks if is_long and self.are_steady(stacked(latest_blocks)) else None
 
     def are_steady(self, blocks: Blocks) -> bool:
-        """Whether blocks lie on one line within `limits`, and have similar noise.
-
-        Parameters
-        ----------
-        blocks : Blocks
-
-        Returns
-        -------
-        bool
-        """
+        """Whether blocks lie on one line within `limits`, and have similar noise."""
         centre, mean, slope = line_through(blocks)
         residual = np.abs(blocks.mean - mean - slope * (blocks.time - centre)[:, None])
         return not has_noisy_block(blocks, self._state['step_variance']) \

@@ -31,16 +31,7 @@ class Block:
 
 
 def block_of(sensors: StructArray) -> Block:
-    """Summarise the latest complete block of a sensor.
-
-    Parameters
-    ----------
-    sensors : (1,) SENSOR array
-
-    Returns
-    -------
-    Block
-    """
+    """Summarise the latest complete block of a sensor, (1,) SENSOR array."""
     return Block(*core.block_moments(sensors))
 
 
@@ -54,13 +45,7 @@ class Blocks(NamedTuple):
 
 
 class BlockWindow:
-    """Ring buffer of the latest blocks, stored as arrays to speed up line fits.
-
-    Parameters
-    ----------
-    max_blocks : int
-        Maximum number of blocks.
-    """
+    """Ring buffer of the latest blocks, stored as arrays to speed up line fits."""
 
     def __init__(self, max_blocks: int) -> None:
         self._time, self._n = np.zeros(max_blocks), np.zeros((max_blocks, 3))
@@ -75,42 +60,22 @@ class BlockWindow:
         self._count = 0
 
     def append(self, block: Block) -> None:
-        """Append a block; if the window is full, the oldest block is replaced.
-
-        Parameters
-        ----------
-        block : Block
-        """
+        """Append a block; if the window is full, it replaces the oldest block."""
         i = self._count % len(self._time)
         self._time[i], self._mean[i], self._scatter[i] = block.time, block.mean, block.scatter
         self._n[i] = block.n
         self._count += 1
 
     def blocks(self) -> Blocks:
-        """Stored blocks, in no particular order.
-
-        Returns
-        -------
-        Blocks
-        """
+        """Stored blocks, in no particular order."""
         k = len(self)
         return Blocks(self._time[:k], self._mean[:k], self._scatter[:k], self._n[:k])
 
 
 def line_through(blocks: Blocks) -> tuple[float, FloatArray, FloatArray]:
-    """Weighted least-squares line through the means of blocks, for each axis.
+    """Weighted least-squares line through block means: mean time [s], value there, slope [T/s].
 
-    Parameters
-    ----------
-    blocks : Blocks
-
-    Returns
-    -------
-    centre : float, s
-        Mean time of the blocks.
-    mean : (3,) array, T
-        Value at the centre; NaN for an axis that no block reports.
-    slope : (3,) array, T/s
+    The value is NaN for an axis that no block reports.
     """
     centre = float(blocks.time.mean())
     return centre, *core.line_through(
@@ -118,32 +83,15 @@ def line_through(blocks: Blocks) -> tuple[float, FloatArray, FloatArray]:
 
 
 def stacked(blocks: Iterable[Block]) -> Blocks:
-    """Convert blocks to arrays.
-
-    Parameters
-    ----------
-    blocks : iterable of Block
-
-    Returns
-    -------
-    Blocks
-    """
+    """Convert blocks to arrays."""
     return Blocks(*(np.array(values, dtype=float) for values in zip(*(
         (b.time, b.mean, b.scatter, b.n) for b in blocks), strict=True)))
 
 
 def has_noisy_block(blocks: Blocks, step_variance: FloatArray) -> bool:
-    """Whether the variance of any block far exceeds that of the quietest block, on any axis.
+    """Whether the variance of a block far exceeds that of the quietest block, on any axis.
 
-    Parameters
-    ----------
-    blocks : Blocks
-    step_variance : (3,) array, T²
-        Quantisation variance of the sensor.
-
-    Returns
-    -------
-    bool
+    `step_variance` (3,) in T² is the quantisation variance, the least variance compared.
     """
     n = blocks.n
     variance = np.where(n > 1, np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1, 1), np.nan)
@@ -154,15 +102,8 @@ def has_noisy_block(blocks: Blocks, step_variance: FloatArray) -> bool:
 
 
 def pooled_covariance(blocks: Blocks) -> FloatArray | None:
-    """Noise covariance from the scatter within blocks, pooled over all blocks.
+    """Noise covariance (3, 3) T² from the scatter within blocks, pooled over all blocks.
 
-    Parameters
-    ----------
-    blocks : Blocks
-
-    Returns
-    -------
-    (3, 3) array or None, T²
-        NaN for an axis with too few samples; None if all axes have too few.
+    NaN for an axis with too few samples; None if all axes have too few.
     """
     return core.pooled_covariance(plain(blocks.scatter), plain(blocks.n))

@@ -51,16 +51,9 @@ def _no_lag(reason: str, correlation: float = float('nan')) -> Lag:
 
 
 def shock(acceleration: FloatArray) -> FloatArray:
-    """Magnitude of shocks in an acceleration, independent of the orientation of the sensor.
+    """Magnitude (n,) of shocks in an acceleration (n, 3), m/s², in any orientation of the sensor.
 
-    Parameters
-    ----------
-    acceleration : (n, 3) array, m/s²
-
-    Returns
-    -------
-    (n,) array, m/s²
-        Distance from the median acceleration, minus the median of all distances.
+    It is the distance from the median acceleration, minus the median of all distances.
     """
     a = np.asarray(acceleration, dtype=float)
     magnitude = np.linalg.norm(a - np.nanmedian(a, axis=0), axis=1)
@@ -70,37 +63,13 @@ def shock(acceleration: FloatArray) -> FloatArray:
 
 def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, signal: FloatArray,
               max_lag: float) -> Lag:
-    """Clock offset of a sensor relative to a reference, from knocks measured by both.
+    """Clock offset of a sensor relative to a reference, from knocks that both measured.
 
-    The lag with the largest correlation is refined below the sampling interval by least squares,
-    which also yields the standard deviation.
-
-    Parameters
-    ----------
-    t_reference : (n,) array, s
-        Increasing times by the clock of the reference.
-    reference : (n,) array
-        Shock of the reference, see `shock`.
-    t : (m,) array, s
-        Increasing times by the clock of the sensor, relative to the same zero.
-    signal : (m,) array
-        Shock of the sensor.
-    max_lag : float, s
-        Maximum absolute value of the offset.
-
-    Returns
-    -------
-    Lag
-        The offset is positive if the sensor's clock is ahead.
-
-    Raises
-    ------
-    ValueError
-        If times and values have different shapes, or times do not increase.
-
-    References
-    ----------
-    [T10]_ section 6.3 for the correlation of the accelerometers.
+    `reference` and `signal` are shocks (see `shock`) at increasing times in s since the same zero;
+    `max_lag` bounds the absolute offset, which is positive if the sensor's clock is ahead. The lag
+    of the largest correlation ([T10]_ section 6.3) is refined below the sampling interval by least
+    squares, which also yields the std. Raises ValueError for differing shapes, or times that do not
+    increase.
     """
     a, b = (_validated_series(t_reference, reference, 'reference'),
             _validated_series(t, signal, 'sensor'))
@@ -156,10 +125,7 @@ def _without_cut_knocks(t: FloatArray, s: FloatArray) -> _Series:
 
 
 def _knock_separation(a: _Series, b: _Series, max_lag: float) -> float | None:
-    """Smallest interval [s] between knocks of two series.
-
-    None if the interval is at most `max_lag` + `MARGIN_S`, or if a series contains no knock.
-    """
+    """Smallest interval [s] between knocks of two series; None if none, or within `max_lag`."""
     if not (len(a[1]) > 7 and len(b[1]) > 7 and _is_knock(a[1]).any() and _is_knock(b[1]).any()):
         return None
     s, t = a[0][_is_knock(a[1])], b[0][_is_knock(b[1])]

@@ -19,18 +19,7 @@ RATE_SAMPLES = 32
 
 
 def lowpass(factor: int) -> FloatArray:
-    """Low-pass filter for decimation.
-
-    Parameters
-    ----------
-    factor : int
-        Ratio of input to output rate.
-
-    Returns
-    -------
-    (n,) array
-        Taps that sum to one; n is odd.
-    """
+    """Odd number of taps, which sum to one, of a low-pass filter for decimation by `factor`."""
     # The import takes 0.3 s, and most sensors need no filter.
     from scipy.signal import firwin, kaiserord
 
@@ -41,25 +30,12 @@ def lowpass(factor: int) -> FloatArray:
 
 
 class Decimator:
-    """Decimator of the samples of one sensor.
+    """Decimator of one sensor to about `rate` Hz, an integer fraction of the sensor's rate.
 
     The filter has linear phase (`scipy.signal.firwin`), and its delay is subtracted from the
-    timestamps. The rate is measured from the first samples. After a gap or a step of the clock the
-    filter restarts, because filtering across the gap would produce an invalid field.
-
-    Parameters
-    ----------
-    rate : float, Hz
-        Requested output rate; the nearest integer fraction of the sensor's rate is used.
-
-    Attributes
-    ----------
-    factor : int or None
-        Ratio of input to output rate; None before the rate is known.
-
-    References
-    ----------
-    [T10]_ section 6.3: a low-pass filter before the reduction of 100 Hz to 12.5 Hz.
+    timestamps ([T10]_ section 6.3 reduces 100 Hz to 12.5 Hz likewise). The rate is measured from
+    the first samples; `factor`, the ratio of input to output rate, is None until then. After a gap
+    or a clock step the filter restarts, because filtering across it would produce an invalid field.
     """
 
     def __init__(self, rate: float) -> None:
@@ -75,18 +51,10 @@ class Decimator:
         self._n_until_output = 0
 
     def feed(self, stamp_ns: int, field: FloatArray) -> list[tuple[int, FloatArray]]:
-        """Add a sample, and return the outputs that become available; usually an empty list.
+        """Add a sample (3,) T; return the outputs that become available, usually none.
 
-        Parameters
-        ----------
-        stamp_ns : int, ns
-        field : (3,) array, T
-
-        Returns
-        -------
-        list of (int, (3,) array)
-            Timestamp [ns] of the centre of the filter and field [T]; NaN for an axis that any
-            sample of the filter lacks.
+        An output is the timestamp [ns] of the filter's centre and a field; NaN for an axis that any
+        sample of the filter lacks.
         """
         if self._window and self._is_gap(stamp_ns):
             self.reset()
@@ -104,17 +72,7 @@ class Decimator:
         return len(self._window) if self.factor is None else 0
 
     def noise_gain(self) -> float:
-        """Ratio of output to input variance for white noise.
-
-        Returns
-        -------
-        float
-
-        Raises
-        ------
-        ValueError
-            If the rate is not known yet.
-        """
+        """Ratio of output to input variance of white noise; ValueError before the rate is known."""
         if self.factor is None:
             raise ValueError('the sampling rate of the sensor is not known yet')
         return 1.0 if self._taps is None else float(self._taps @ self._taps)

@@ -37,61 +37,27 @@ def _octant_name(signs: FloatArray) -> str:
 
 
 def binned(q: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
-    """Assign directions to cells.
-
-    Parameters
-    ----------
-    q : (n, 3) array
-        Vectors of any length.
-
-    Returns
-    -------
-    u : (n, 3) array
-        Unit vectors.
-    cell : (n,) int array
-        Index of the cell of each direction.
-    count : (N_CELLS,) int array
-        Number of directions in each cell.
-    """
+    """Unit vectors of `q` (n, 3), the cell of each (n,), and the count of each cell (N_CELLS,)."""
     u = q / np.maximum(np.linalg.norm(q, axis=1), 1e-12)[:, None]
     cell = np.asarray(_CELLS.query(u)[1], dtype=np.int64)
     return u, cell, np.asarray(np.bincount(cell, minlength=N_CELLS), dtype=np.int64)
 
 
 def even_weights(q: FloatArray) -> FloatArray:
-    """Weights that limit the influence of crowded directions.
+    """Weights (n,), 0 to 1, that limit the influence of crowded directions of `q` (n, 3).
 
-    Parameters
-    ----------
-    q : (n, 3) array
-        Vectors of any length.
-
-    Returns
-    -------
-    (n,) array
-        Weight of each vector, 0 to 1. The total weight of a cell is at most `MAX_CELL_WEIGHT`
-        times the median number of directions in the cells that are not empty.
+    The total weight of a cell is at most `MAX_CELL_WEIGHT` times the median number of directions in
+    the cells that are not empty.
     """
     _, cell, n = binned(q)
     return np.minimum(1.0, MAX_CELL_WEIGHT * np.median(n[n > 0]) / n[cell])
 
 
 def coverage(u: FloatArray, w: FloatArray) -> float:
-    """Coverage of the sphere by directions.
+    """Coverage of the sphere by unit vectors (n, 3) with weights (n,): 0 to 1, 1 if even.
 
-    The coverage is the smallest eigenvalue of the weighted mean of f fᵀ, with the spherical
-    harmonics f to degree two.
-
-    Parameters
-    ----------
-    u : (n, 3) array, unit vectors
-    w : (n,) array
-        Weights of the directions.
-
-    Returns
-    -------
-    float
-        0 to 1; 1 for even coverage.
+    It is the smallest eigenvalue of the weighted mean of f fᵀ, with the spherical harmonics f to
+    degree two.
     """
     x, y, z = u.T
     s = np.sqrt(15.0)
@@ -102,18 +68,6 @@ def coverage(u: FloatArray, w: FloatArray) -> float:
 
 
 def empty_octants(u: FloatArray, w: FloatArray) -> tuple[str, ...]:
-    """Find the octants with few or no readings: those below `EMPTY_OCTANT` of the mean weight.
-
-    Parameters
-    ----------
-    u : (n, 3) array, unit vectors
-    w : (n,) array
-        Weights of the directions.
-
-    Returns
-    -------
-    tuple of str
-        Names, e.g. '+x-y+z'.
-    """
+    """Octants, e.g. '+x-y+z', whose weight is below `EMPTY_OCTANT` of the mean weight."""
     weight = 8.0 * np.bincount(np.argmax(u @ _OCTANTS.T, axis=1), w, 8) / w.sum()
     return tuple(_octant_name(signs) for signs in _OCTANTS[weight < EMPTY_OCTANT])

@@ -24,21 +24,9 @@ MAX_INTERVALS = 16
 
 def updated(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool,
             max_intervals: int = MAX_INTERVALS) -> DoubtfulTimes:
-    """Return the intervals, updated with the state of the background at a timestamp.
+    """Return the intervals, updated with the state of the background from a timestamp on.
 
-    Parameters
-    ----------
-    times : DoubtfulTimes
-    stamp_ns : int, ns
-        Timestamp from which the state applies.
-    is_doubtful : bool
-        Whether the background is doubtful from then on.
-    max_intervals : int
-        Maximum number of intervals; the oldest intervals are removed.
-
-    Returns
-    -------
-    DoubtfulTimes
+    Beyond `max_intervals`, the oldest intervals are removed.
     """
     is_open = bool(times) and times[-1][1] is None
     if is_doubtful and not is_open:
@@ -49,18 +37,7 @@ def updated(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool,
 
 
 def doubtful_since(times: DoubtfulTimes, since_ns: int) -> DoubtfulTimes:
-    """Add an open interval that begins at a given time, and return the intervals.
-
-    Parameters
-    ----------
-    times : DoubtfulTimes
-    since_ns : int, ns
-        Start of the open interval, which replaces all later intervals.
-
-    Returns
-    -------
-    DoubtfulTimes
-    """
+    """Add an open interval from `since_ns` on, which replaces all later intervals."""
     earlier = tuple((begin, end) for begin, end in times if begin < since_ns)
     if earlier and (earlier[-1][1] is None or earlier[-1][1] >= since_ns):
         return (*earlier[:-1], (earlier[-1][0], None))
@@ -71,20 +48,9 @@ def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTi
            ) -> dict[str, DoubtfulTimes]:
     """Merge earlier and latest doubtful intervals of sensors.
 
-    An interval in `latest` replaces an earlier interval that begins at the same time or within it.
-    If the end of an earlier interval is missing, the interval ends where the next one begins. If
-    a sensor has no latest intervals, its background was replaced, and its open earlier interval is
-    removed.
-
-    Parameters
-    ----------
-    earlier : dict of str to DoubtfulTimes
-    latest : dict of str to DoubtfulTimes
-        The most recent intervals of each sensor.
-
-    Returns
-    -------
-    dict of str to DoubtfulTimes
+    A latest interval replaces an earlier one that begins at the same time or within it. An earlier
+    interval without an end ends where the next one begins. If a sensor has no latest intervals, its
+    background was replaced, and its open interval is removed.
     """
     out = dict(earlier)
     for name, times in latest.items():
@@ -102,31 +68,10 @@ def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTi
 
 
 def shifted(times: DoubtfulTimes, ns: int) -> DoubtfulTimes:
-    """Shift intervals by a clock offset.
-
-    Parameters
-    ----------
-    times : DoubtfulTimes
-    ns : int, ns
-        Offset that is added to all times.
-
-    Returns
-    -------
-    DoubtfulTimes
-    """
+    """Shift intervals by a clock offset, which is added to all times."""
     return tuple((begin + ns, None if end is None else end + ns) for begin, end in times)
 
 
 def are_doubtful(times: DoubtfulTimes, stamp_ns: int) -> bool:
-    """Whether the background was doubtful at a timestamp.
-
-    Parameters
-    ----------
-    times : DoubtfulTimes
-    stamp_ns : int, ns
-
-    Returns
-    -------
-    bool
-    """
+    """Whether the background was doubtful at a timestamp."""
     return any(begin <= stamp_ns and (end is None or stamp_ns < end) for begin, end in times)

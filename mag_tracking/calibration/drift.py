@@ -37,18 +37,7 @@ class FormerLevel:
     """[s] Duration for which the level was observed."""
 
     def is_at(self, block: Block, limits: FloatArray) -> bool:
-        """Whether a block is at this level, at most `MAX_AGE_S` after the end of the level.
-
-        Parameters
-        ----------
-        block : Block
-        limits : (3,) array, T
-            Tolerance of the mean of a block.
-
-        Returns
-        -------
-        bool
-        """
+        """Whether a block is within `limits` (3,) T of this level and at most `MAX_AGE_S` later."""
         age = block.time - self.until
         tolerance = limits + np.minimum(TYPICAL_DRIFT * age, MAX_DRIFT * limits)
         # A comparison with NaN is false: an axis that is not reported does not differ.
@@ -57,19 +46,9 @@ class FormerLevel:
 
 
 def is_steep(blocks: Blocks, slope: FloatArray, variance: FloatArray) -> bool:
-    """Whether a line through blocks is significantly steeper than `STEEP_DRIFT`, on any axis.
+    """Whether a line's slope (3,) T/s significantly exceeds `STEEP_DRIFT` on any axis.
 
-    Parameters
-    ----------
-    blocks : Blocks
-    slope : (3,) array, T/s
-        Slope of the line; NaN for an unreported axis.
-    variance : (3,) array, T²
-        Variance of one reading; NaN for an unreported axis.
-
-    Returns
-    -------
-    bool
+    `variance` (3,) in T² is that of one reading; NaN for an unreported axis.
     """
     relative_time = blocks.time - blocks.time.mean()
     spread = (blocks.n * np.square(relative_time)[:, None]).sum(axis=0)

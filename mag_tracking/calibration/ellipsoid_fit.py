@@ -115,18 +115,7 @@ class EllipsoidFit:
     """Warnings about readings and accuracy."""
 
     def correct(self, readings: FloatArray) -> FloatArray:
-        """Apply the calibration.
-
-        Parameters
-        ----------
-        readings : (n, 3) array
-            Uncorrected readings, in the unit of `offset`.
-
-        Returns
-        -------
-        (n, 3) array
-            Corrected field, in the unit of `field_magnitude`.
-        """
+        """Field (n, 3), in the unit of `field_magnitude`, of readings in the unit of `offset`."""
         field: FloatArray = (np.asarray(readings, dtype=float) - self.offset) @ self.correction
         return field
 
@@ -155,34 +144,17 @@ class _Parameters(TypedDict):
 def fit_ellipsoid(readings: FloatArray, field_magnitude: float | None = None) -> EllipsoidFit:
     """Fit the offset and the symmetric correction that map all readings to the same magnitude.
 
-    A linear quadric fit initialises a robust geometric least-squares fit of ‖C (y - o)‖. Readings
-    are weighted by direction: crowded directions, e.g. of a sensor at rest, have smaller weights.
-    Noise of relative standard deviation s increases the radius by s², which is not corrected. The
-    standard deviations are from a block jackknife in time.
+    `readings` (n, 3) are chronological, in any unit, from a sensor rotated in a uniform field;
+    those with a NaN are excluded. `field_magnitude` is in the unit requested for the corrected
+    field. The result is not converged, with a reason, if the readings do not determine the nine
+    parameters. Raises ValueError for a wrong shape, an infinite reading, or a magnitude that is not
+    positive and finite.
 
-    Parameters
-    ----------
-    readings : (n, 3) array, any unit, sensor frame
-        Chronological readings of a sensor that is rotated in a uniform field. Readings with a NaN
-        are excluded.
-    field_magnitude : float, optional
-        True magnitude of the field, in the requested unit of the corrected field.
-
-    Returns
-    -------
-    EllipsoidFit
-        Not converged, with a reason, if the readings do not determine the nine parameters.
-
-    Raises
-    ------
-    ValueError
-        If the shape of `readings` is not (n, 3), a reading is infinite, or `field_magnitude` is
-        not positive and finite.
-
-    References
-    ----------
-    [Renaudin10]_ and [KokSchon16]_ section V.A for the conversion of the quadric into offset and
-    correction. The measure of coverage and the rejection criteria are additions of this package.
+    A linear quadric fit initialises a robust geometric least-squares fit of ‖C (y - o)‖, with
+    smaller weights for crowded directions, e.g. of a sensor at rest. Noise of relative std s
+    increases the radius by s², which is not corrected. The stds are from a block jackknife in time.
+    [Renaudin10]_ and [KokSchon16]_ section V.A convert the quadric into offset and correction; the
+    measure of coverage and the rejection criteria are additions of this package.
     """
     readings = _validated(readings, field_magnitude)
     marks = missing_marks(readings)

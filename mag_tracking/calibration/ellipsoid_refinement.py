@@ -44,29 +44,11 @@ class Quality(TypedDict):
 
 def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
         FloatArray, FloatArray, FloatArray, Quality]:
-    """Fit the ellipsoid ‖C (z - o)‖ = 1 to normalised readings.
+    """Fit ‖C (z - o)‖ = 1 to normalised readings (n, 3), from initial `o` and `C`.
 
-    Parameters
-    ----------
-    z : (n, 3) array
-        Normalised readings.
-    o : (3,) array
-        Initial offset.
-    C : (3, 3) array
-        Initial correction.
-
-    Returns
-    -------
-    offset : (3,) array
-    correction : (3, 3) array
-    covariance : (9, 9) array
-        Covariance of the offset and the six entries of the correction.
-    quality : Quality
-
-    References
-    ----------
-    [KokSchon16]_ section V.A. The weights by direction and the robust loss are additions of this
-    package.
+    Returns the offset, the correction, the covariance (9, 9) of the offset and the six entries of
+    the correction, and the quality. [KokSchon16]_ section V.A; the weights by direction and the
+    robust loss are additions of this package.
     """
     theta: FloatArray = np.concatenate([o, C[_UPPER]])
     for _ in range(2):
@@ -113,8 +95,8 @@ def _loss(square: FloatArray, w: FloatArray) -> FloatArray:
 def _covariance(f: FloatArray, J: FloatArray, w: FloatArray) -> FloatArray:
     """Covariance (9, 9) by a block jackknife in time, one Newton step per block.
 
-    The residuals of a real sensor are correlated in time, so the number of residuals overstates
-    the information. The covariance is infinite if the fit is singular without one of the blocks.
+    Real residuals are correlated in time, so their number overstates the information. Infinite if
+    the fit is singular without one of the blocks.
     """
     n_blocks = min(N_BLOCKS, len(f))
     starts = np.arange(n_blocks) * len(f) // n_blocks

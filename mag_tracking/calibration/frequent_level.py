@@ -58,37 +58,16 @@ class MostFrequentLevel:
     """(3,) [T] Maximum difference between the mean of a block and the level."""
 
     def is_at(self, level: FloatArray) -> bool:
-        """Whether another level is the same within `MIN_LEVEL_DISTANCE` widths.
-
-        Parameters
-        ----------
-        level : (3,) array, T
-            Level to compare; NaN for an unreported axis.
-
-        Returns
-        -------
-        bool
-        """
+        """Whether a level (3,) T is the same within `MIN_LEVEL_DISTANCE` widths."""
         return not bool((np.abs(self.level - level) > MIN_LEVEL_DISTANCE * self.width).any())
 
 
 def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int
                         ) -> MostFrequentLevel | None:
-    """Find the most frequent level of the blocks of a sensor.
+    """Find the most frequent level of chronological blocks, from the earliest `max_blocks` at it.
 
-    Parameters
-    ----------
-    blocks : Blocks
-        Blocks in chronological order.
-    steps : (3,) array, T
-        Quantisation step of each axis; 0 if unknown.
-    max_blocks : int
-        Maximum number of blocks that determine the level; the earliest blocks are used.
-
-    Returns
-    -------
-    MostFrequentLevel or None
-        None if no level has at least `MIN_BLOCKS` blocks, or the noise is unknown on all axes.
+    `steps` (3,) in T are the quantisation steps, 0 if unknown. None if no level has `MIN_BLOCKS`
+    blocks, or the noise is unknown on all axes.
     """
     n = np.maximum(blocks.n, 1.0)
     variance = np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1.0, 1.0)

@@ -1,9 +1,8 @@
 """Growth rate of a field change, which distinguishes approaching from starting targets.
 
 The field of a vehicle that approaches at constant speed grows with the inverse cube of its
-distance; its relative growth accelerates. The change due to a vehicle that starts or stops grows
-with the distance travelled, and so with the square of time; its relative growth decelerates. The
-test is an addition of this package.
+distance: its relative growth accelerates. The change due to a vehicle that starts or stops grows
+with the square of time: its relative growth decelerates. The test is an addition of this package.
 """
 
 from dataclasses import dataclass
@@ -20,11 +19,10 @@ unknown."""
 
 @dataclass(frozen=True)
 class Growth:
-    """Durations of the four quarters in which the magnitude of a change grows between two values.
+    """Durations of the four quarters in which the magnitude of a change grows by a factor q.
 
-    Let q be the ratio of the two values. If the magnitude grows with the inverse cube of a
-    distance, each quarter takes q**(1/12) times as long as the next quarter. If it grows with the
-    square of time, each quarter takes q**(1/8) times as long as the previous quarter.
+    If it grows with the inverse cube of a distance, each quarter takes q**(1/12) times as long as
+    the next; if with the square of time, q**(1/8) times as long as the previous one.
     """
 
     quarters: tuple[float, ...]
@@ -47,23 +45,10 @@ class Growth:
 
 
 def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> Growth | None:
-    """Measure the time in which the magnitude of a change grows from `low` to `high`.
+    """Measure the growth of `size` (k,) at increasing times (k,) in s, between `low` and `high`.
 
-    Parameters
-    ----------
-    time : (k,) array, s
-        Times of the blocks, increasing.
-    size : (k,) array
-        Magnitude of the change.
-    low, high : float
-        The growth ends where `size` first exceeds `high`. It starts where `size` was last below
-        `low` before that time.
-
-    Returns
-    -------
-    Growth or None
-        None if `size` never exceeds `high`, was never below `low` before that time, or has a gap
-        in between.
+    It ends where `size` first exceeds `high` and starts where it was last below `low` before. None
+    if it never exceeds `high`, was never below `low` before, or has a gap in between.
     """
     times, end, begin = [], int(np.flatnonzero(size > high).min(initial=len(size))), 0
     for level in np.geomspace(low, high, 5):

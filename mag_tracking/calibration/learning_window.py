@@ -9,14 +9,8 @@ from mag_tracking.calibration.blocks import Block
 class LearningWindow:
     """Window of the latest blocks, which provides candidates for the first quiet interval.
 
-    Parameters
-    ----------
-    learn : float, s
-        Required duration of a quiet interval.
-    length : float, s
-        Length of a block.
-    max_blocks : int
-        Maximum number of stored blocks whose readings are all equal.
+    `learn` [s] is the required duration of a quiet interval, `length` [s] that of a block. At most
+    `max_blocks` blocks whose readings are all equal are stored.
     """
 
     def __init__(self, learn: float, length: float, max_blocks: int) -> None:
@@ -31,17 +25,9 @@ class LearningWindow:
         self._recent.clear()
 
     def segments(self, block: Block, is_stuck: bool) -> Iterator[deque[Block]]:
-        """Add a block, and yield the candidate intervals that are long enough, best first.
+        """Add a block; yield the candidate intervals that are long enough, best first.
 
-        Parameters
-        ----------
-        block : Block
-        is_stuck : bool
-            Whether all readings of the block are equal.
-
-        Yields
-        ------
-        deque of Block
+        `is_stuck` means that all readings of the block are equal.
         """
         self._recent.append(block)
         if is_stuck:

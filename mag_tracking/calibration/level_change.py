@@ -1,10 +1,10 @@
 """Classification of a lasting level change as the arrival or departure of a vehicle.
 
-A vehicle approaches from far away, where its field grows with the inverse cube of its distance, and
-brakes to a stop. A departing vehicle starts slowly, and its field decays with the inverse cube of
-its distance. The far end of a change (distant vehicle) therefore lasts longer than the near end
-(vehicle at the sensor). The growth accelerates at the far end and decelerates at the near end. The
-test is an addition of this package.
+An approaching vehicle's field grows with the inverse cube of its distance, and the vehicle brakes
+to a stop; a departing vehicle starts slowly, and its field decays with the inverse cube. The far
+end of a change (distant vehicle) therefore lasts longer than the near end (vehicle at the sensor):
+growth accelerates at the far end and decelerates at the near end. The test is an addition of this
+package.
 """
 
 from collections.abc import Callable
@@ -69,24 +69,11 @@ ChangeEvaluator: TypeAlias = Callable[[LevelChange], bool | None]
 
 def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: FloatArray,
                  origin: float) -> LevelChange:
-    """Evaluate a change to a steady level.
+    """Evaluate a change to a steady level from chronological blocks that begin at the old level.
 
-    Parameters
-    ----------
-    blocks : Blocks
-        Blocks in chronological order, beginning at the earlier level.
-    n_steady : int
-        Number of blocks at the end that are at the later level.
-    before : (k, 3) array, T
-        Earlier level at the times of the blocks; NaN for an unreported axis.
-    noise_std : (3,) array, T
-        Standard deviation of one reading.
-    origin : float, s
-        Zero of the block times, in the time common to all sensors.
-
-    Returns
-    -------
-    LevelChange
+    The last `n_steady` blocks are at the later level. `before` (k, 3) in T is the earlier level at
+    the times of the blocks; `noise_std` (3,) in T is that of one reading. `origin` in s is the zero
+    of the block times in the time common to all sensors.
     """
     after = np.average(blocks.mean[-n_steady:], axis=0)
     distance_before, distance_after = (
@@ -113,10 +100,9 @@ def _asymmetry(time: FloatArray, distance_before: FloatArray, distance_after: Fl
                detection_limit: float, largest: float) -> float:
     """Binary logarithm of the asymmetry between the ends of a change; positive for a departure.
 
-    Zero if the growth stalls at one end, for example because a second vehicle stops behind the
-    first one. Zero also if neither end matches a starting or stopping vehicle. The arguments
-    `distance_before` and `distance_after` (k,) are the distances from the two levels in standard
-    deviations of a reading. The ends are evaluated from `detection_limit` to `largest`.
+    Zero if the growth stalls at one end, e.g. because a second vehicle stops behind the first, or
+    if neither end matches a starting or stopping vehicle. The distances (k,) from the two levels
+    are in std of a reading; the ends are evaluated from `detection_limit` to `largest`.
     """
     block_length = float(np.median(np.diff(time)))
     first = growth_of(time, distance_before, detection_limit, largest)
@@ -145,20 +131,9 @@ class SharedChanges:
         self._latest_changes: dict[int, LevelChange] = {}
 
     def evaluate_change(self, sensor: int, change: LevelChange) -> bool | None:
-        """Store a change of a sensor, and classify it together with changes at other sensors.
+        """Store a sensor's change; return whether a vehicle has departed (None: unknown).
 
-        A change that is not clear is classified by the largest simultaneous change.
-
-        Parameters
-        ----------
-        sensor : int
-            Index of the sensor in the network.
-        change : LevelChange
-
-        Returns
-        -------
-        bool or None
-            Whether a vehicle has departed, as `LevelChange.has_departed`.
+        A change that is not clear is classified by the largest simultaneous change at any sensor.
         """
         self._latest_changes[sensor] = change
         if change.size >= CLEAR_SIZE and change.has_departed is not None:

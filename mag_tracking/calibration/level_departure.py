@@ -28,31 +28,13 @@ evaluated, since each evaluation uses all blocks."""
 class LevelDeparture:
     """Interval in which the blocks of a sensor depart from its frozen background.
 
-    Parameters
-    ----------
-    learn, relearn : float, s
-        As for `RunningBackground`.
-    state : SENSOR record
-        State of the sensor.
-    level : BackgroundLevel
-        Background of the sensor.
-    evaluate_change : ChangeEvaluator
-        Classifies a level change of the sensor.
-
     Attributes
     ----------
-    blocks : deque of Block
-        Blocks since the departure began.
-    former : FormerLevel or None
-        Previous background.
-    has_arrived : bool
-        Whether a vehicle has arrived and is present.
-    was_steady : bool
-        Whether the sensor stayed at another steady level for the required duration during the
-        departure.
-    departed_at : float or None, s
-        Time by which a vehicle that was part of the first background had departed; None if no such
-        departure was detected.
+    blocks : blocks since the departure began
+    former : previous background
+    has_arrived : whether a vehicle has arrived and is present
+    was_steady : whether the sensor stayed at another steady level for the required duration
+    departed_at : s, time by which a vehicle that was part of the first background had departed
     """
 
     def __init__(self, learn: float, relearn: float, state: Record, level: BackgroundLevel,
@@ -77,15 +59,7 @@ class LevelDeparture:
         self.has_arrived = self.was_steady = False
 
     def add(self, block: Block, before: Iterable[Block]) -> None:
-        """Add a block to the departure.
-
-        Parameters
-        ----------
-        block : Block
-        before : iterable of Block
-            Blocks immediately before the departure; used only with the first block of the
-            departure.
-        """
+        """Add a block; `before` are the blocks before the departure, used with its first block."""
         if not self.blocks:
             self._blocks_before = list(before)
         self.blocks.append(block)
@@ -96,36 +70,16 @@ class LevelDeparture:
         self._has_first_block = False
 
     def steady_end(self, ratio: float = 1.0) -> deque[Block] | None:
-        """Return the latest blocks if they are at a steady level, and update `was_steady`.
-
-        Parameters
-        ----------
-        ratio : float
-            Required duration relative to the usual duration.
-
-        Returns
-        -------
-        deque of Block or None
-            None if the latest blocks are not steady for the required duration.
-        """
+        """Latest blocks if steady for `ratio` of the usual time, else None; set `was_steady`."""
         new_blocks = self._level.steady_end(self.blocks, ratio * self._learn)
         self.was_steady |= new_blocks is not None
         return new_blocks
 
     def relearn_time(self, observed_s: float, relearns_soon: bool) -> float:
-        """Time on another steady level after which that level becomes the background.
+        """Time [s] on another steady level until it becomes the background; 0 if it never does.
 
-        Parameters
-        ----------
-        observed_s : float, s
-            Duration for which the background was observed.
-        relearns_soon : bool
-            Whether the sensor may have been moved, or its surroundings changed.
-
-        Returns
-        -------
-        float, s
-            0 if no other level becomes the background.
+        `observed_s` is the time for which the background was observed; `relearns_soon` means that
+        the sensor may have been moved, or its surroundings changed.
         """
         if relearns_soon:
             return min(self._relearn or inf, max(self._learn, MIN_RELEARN_S))
@@ -136,29 +90,15 @@ class LevelDeparture:
             self._relearn, max(self._learn, MIN_RELEARN_S, MIN_DURATION_RATIO * observed_s))
 
     def former_observed_s(self) -> float:
-        """Duration for which the former level was observed, if the latest block is at that level.
-
-        Returns
-        -------
-        float, s
-            0 if the latest block is not at the former level.
-        """
+        """Duration [s] for which the former level was observed; 0 if the latest block left it."""
         former = self.former
         is_at_former = former is not None and former.is_at(self.blocks[-1], self._level.limits)
         return former.observed_s if former is not None and is_at_former else 0.0
 
     def has_departed(self, new_blocks: deque[Block]) -> bool | None:
-        """Determine and store whether a vehicle that was part of the background has departed.
+        """Determine and store whether a vehicle in the background has departed.
 
-        Parameters
-        ----------
-        new_blocks : deque of Block
-            Blocks of the new level.
-
-        Returns
-        -------
-        bool or None
-            True: a vehicle has departed. False: a vehicle has arrived. None: unknown.
+        False if a vehicle has arrived, None if unknown.
         """
         if self.has_arrived or not self._has_first_block or len(self.blocks) > MAX_EVALUATED_BLOCKS:
             return False if self.has_arrived else None

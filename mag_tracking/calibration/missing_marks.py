@@ -1,8 +1,7 @@
 """Marks for missing readings: values that a driver publishes when it has no reading.
 
-Typical marks are 0, 99999, the end of the range and the largest number of a type. A mark is
-entered and left by a jump, and always has exactly the same value; the noise prevents that for
-readings.
+Typical marks are 0, 99999, the end of the range and the largest number of a type. A mark is entered
+and left by a jump, and always has exactly the same value, which noise prevents for readings.
 """
 
 import numpy as np
@@ -31,18 +30,10 @@ LARGEST = 1e30
 
 
 def missing_marks(fields: FloatArray) -> FloatArray:
-    """Find the values that mark a missing reading.
+    """Find the marks (k, 3) among chronological raw readings (n, 3) in T, NaN for a missing axis.
 
-    Parameters
-    ----------
-    fields : (n, 3) array, T
-        Raw readings in chronological order; NaN for a missing axis.
-
-    Returns
-    -------
-    (k, 3) array, T
-        Marks; NaN for an axis that the mark does not concern. Values of several axes that always
-        occur together are one mark.
+    A mark is NaN for an axis that it does not concern. Values of several axes that always occur
+    together are one mark.
     """
     fields = np.where(np.isinf(fields), np.nan, fields)
     marks_of_axis = [_marks_of_axis(fields, axis) for axis in range(3)]
@@ -66,18 +57,7 @@ def missing_marks(fields: FloatArray) -> FloatArray:
 
 
 def are_marked(fields: FloatArray, marks: FloatArray) -> BoolArray:
-    """Find the axes with a mark.
-
-    Parameters
-    ----------
-    fields : (n, 3) array, T
-    marks : (k, 3) array, T
-        From `missing_marks`.
-
-    Returns
-    -------
-    (n, 3) bool array
-    """
+    """Axes (n, 3) of fields that hold a mark of `missing_marks`."""
     found = np.zeros(fields.shape, dtype=bool)
     for mark in marks:
         concerned = ~np.isnan(mark)
@@ -86,16 +66,7 @@ def are_marked(fields: FloatArray, marks: FloatArray) -> BoolArray:
 
 
 def describe_marks(marks: FloatArray) -> str:
-    """Format marks, with the names of the axes unless a mark concerns all of them.
-
-    Parameters
-    ----------
-    marks : (k, 3) array, T
-
-    Returns
-    -------
-    str
-    """
+    """Format marks (k, 3) in T, with axis names unless a mark concerns all axes."""
     return ' or '.join(map(_describe_mark, marks))
 
 
@@ -149,17 +120,7 @@ def _isolated_runs(values: FloatArray) -> tuple[FloatArray, FloatArray, IntArray
 
 
 def typical_change(values: FloatArray) -> float:
-    """Median of the changes of an axis, without repetitions.
-
-    Parameters
-    ----------
-    values : (n,) array, T
-
-    Returns
-    -------
-    float, T
-        0 if there are no changes.
-    """
+    """Median of the changes of an axis (n,), without repetitions; 0 if there are none."""
     changes = np.abs(np.diff(np.clip(values, -LARGEST, LARGEST)))
     return float(np.median(changes[changes > 0.0])) if (changes > 0.0).any() else 0.0
 

@@ -55,26 +55,11 @@ class UpDirection:
 
 
 def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
-    """Up direction from the accelerometer of a sensor at rest.
+    """Up direction from accelerations (n, 3) in m/s² of a sensor at rest, which may contain knocks.
 
-    At rest, an accelerometer measures the reaction to gravity.
-
-    Parameters
-    ----------
-    acceleration : (n, 3) array, m/s², sensor frame
-        Accelerations, which may contain knocks.
-    bias : float, m/s²
-        Standard deviation of the bias of the accelerometer, per axis.
-
-    Returns
-    -------
-    UpDirection
-
-    Raises
-    ------
-    ValueError
-        If fewer than 8 readings are at rest, or the magnitude of their mean differs from gravity by
-        more than `MAX_GRAVITY_DIFFERENCE`.
+    At rest, an accelerometer measures the reaction to gravity; `bias` is the std of its bias per
+    axis. Raises ValueError if fewer than 8 readings are at rest, or the magnitude of their mean
+    differs from gravity by more than `MAX_GRAVITY_DIFFERENCE`.
     """
     a = np.asarray(acceleration, dtype=float).reshape(-1, 3)
     finite = a[np.isfinite(a).all(axis=1)]
@@ -115,34 +100,14 @@ class Orientation:
 
 def compass_orientation(up: UpDirection, field: FloatArray, earth_field: FloatArray,
                         bias_std: float, nominal: FloatArray | None = None) -> Orientation:
-    """Orientation of a sensor from the up direction and the Earth's field.
+    """Orientation from the up direction and the field (3,), T, measured without a target.
 
-    Parameters
-    ----------
-    up : UpDirection
-    field : (3,) array, T, sensor frame
-        Field measured without a target; NaN for an unreported axis.
-    earth_field : (3,) array, T, world frame
-    bias_std : float, T
-        Standard deviation of the bias of the sensor, including nearby iron, per axis. A bias is
-        not distinguishable from a heading error: 0.6 uT rotates a compass by two degrees.
-    nominal : (3, 3) array, optional
-        Nominal orientation, sensor to world. It selects one of several headings that fit equally
-        well (two for a sensor with one axis). Default: the best heading is selected.
-
-    Returns
-    -------
-    Orientation
-
-    Raises
-    ------
-    ValueError
-        If the heading is not observable: the field is vertical, or no reported axis has a component
-        across the horizontal field.
-
-    References
-    ----------
-    [T10]_ section 6.3.1, eq. (6.2)-(6.9). The standard deviations are an addition of this package.
+    The field is NaN for an unreported axis. `bias_std` is per axis and includes nearby iron; a bias
+    is not distinguishable from a heading error: 0.6 uT rotates a compass by two degrees. `nominal`
+    (sensor to world) selects one of several headings that fit equally well (two for a sensor with
+    one axis); without it, the best heading is used. Raises ValueError if the heading is not
+    observable: the field is vertical, or no reported axis has a component across the horizontal
+    field. [T10]_ section 6.3.1, eq. (6.2)-(6.9); the stds are an addition of this package.
     """
     y, B0 = np.asarray(field, dtype=float), np.asarray(earth_field, dtype=float)
     is_reported = ~np.isnan(y)
@@ -191,20 +156,10 @@ def _refined_yaw(fit: _Fit, yaw: float) -> float:
 
 def levelled(up: UpDirection | None, nominal: FloatArray,
              nominal_std: FloatArray) -> Orientation | None:
-    """Correct the tilt of a nominal orientation by means of a measured up direction.
+    """Correct the tilt of a nominal orientation (3, 3) by a measured up direction; None without it.
 
-    Parameters
-    ----------
-    up : UpDirection or None
-    nominal : (3, 3) array
-        Nominal orientation, sensor to world.
-    nominal_std : (3,) array, rad
-        Standard deviations about the world axes.
-
-    Returns
-    -------
-    Orientation or None
-        The heading is unchanged, and the bias is NaN. None if `up` is None.
+    The heading is unchanged, and the bias is NaN. `nominal_std` (3,) in rad is about the world
+    axes.
     """
     if up is None:
         return None
@@ -216,22 +171,10 @@ def levelled(up: UpDirection | None, nominal: FloatArray,
 
 def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
                     weight: float = 4.0) -> float:
-    """Estimate the standard deviation of the biases of the sensors of a network.
+    """Standard deviation [T] of the biases in a network, with a prior `bias_std`.
 
-    The bias is observable along the heading and the vertical, but not across the heading. Each
-    sensor therefore contributes one axis less.
-
-    Parameters
-    ----------
-    orientations : sequence of Orientation
-    bias_std : float, T
-        Prior standard deviation.
-    weight : float
-        Weight of the prior, as an equivalent number of observed components.
-
-    Returns
-    -------
-    float, T
+    The bias is observable along the heading and the vertical but not across the heading, so each
+    sensor contributes one axis less. `weight` is that of the prior, in observed components.
     """
     square = sum(float(np.nansum(o.bias**2)) for o in orientations)
     n_observed = sum(np.count_nonzero(~np.isnan(o.bias)) - 1 for o in orientations)
@@ -240,23 +183,9 @@ def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
 
 def with_nominal_heading(orientation: Orientation, nominal: FloatArray, nominal_std: float,
                          limit: float = 3.0) -> Orientation | None:
-    """Fuse the compass heading with a nominal heading.
+    """Fuse a compass heading with a nominal heading of std `nominal_std` rad.
 
-    Parameters
-    ----------
-    orientation : Orientation
-        From accelerometer and compass.
-    nominal : (3, 3) array
-        Nominal orientation, sensor to world.
-    nominal_std : float, rad
-        Standard deviation of the nominal heading.
-    limit : float
-        Maximum difference in standard deviations; beyond it, the nominal heading is rejected.
-
-    Returns
-    -------
-    Orientation or None
-        None if the difference exceeds the limit.
+    None if they differ by more than `limit` std.
     """
     difference = yaw_between(orientation.R_ws, nominal)
     compass_std = orientation.std[2]

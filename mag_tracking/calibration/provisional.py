@@ -57,13 +57,7 @@ class FrequentLevel:
 
 
 class ProvisionalLevel:
-    """Collects the blocks of a sensor and periodically determines their most frequent level.
-
-    Parameters
-    ----------
-    learn_s : float, s
-        Required duration of a quiet interval.
-    """
+    """Collects the blocks of a sensor and periodically determines their most frequent level."""
 
     def __init__(self, learn_s: float) -> None:
         self._min_duration_s = WAIT_RATIO * learn_s
@@ -75,28 +69,14 @@ class ProvisionalLevel:
         self._n_new, self._n_required = 0, MIN_BLOCKS
 
     def collect(self, block: Block) -> None:
-        """Add the next block.
-
-        Parameters
-        ----------
-        block : Block
-        """
+        """Add the next block."""
         self._blocks.append(block)
         self._n_new += 1
 
     def frequent_level(self, steps: FloatArray) -> FrequentLevel | None:
-        """Determine the most frequent level if enough blocks have been added.
+        """Most frequent level; None if none is frequent enough, or too few blocks are new.
 
-        Parameters
-        ----------
-        steps : (3,) array, T
-            Quantisation steps of the sensor; inf if unknown.
-
-        Returns
-        -------
-        FrequentLevel or None
-            None if too few blocks have been added since the last search, or no level is frequent
-            enough.
+        `steps` (3,) in T are the quantisation steps; inf if unknown.
         """
         blocks = self._blocks
         if self._n_new < self._n_required \

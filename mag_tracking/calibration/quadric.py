@@ -17,24 +17,10 @@ POSSIBLE_CAUSES = ('possible causes are too few directions, a sensor at rest, or
 
 
 def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
-    """Fit an ellipsoid to normalised readings, excluding outliers.
+    """Fit an ellipsoid to normalised readings (n, 3), excluding outliers ([Renaudin10]_).
 
-    Parameters
-    ----------
-    z : (n, 3) array
-        Normalised readings.
-
-    Returns
-    -------
-    offset : (3,) array
-    correction : (3, 3) array
-    reason : str
-        Reason for the failure; empty if an ellipsoid was found.
-
-    References
-    ----------
-    [Renaudin10]_. The weights by direction and the exclusion of outliers are additions of this
-    package.
+    Returns offset, correction, and the reason for a failure, empty if an ellipsoid was found. The
+    weights by direction and the exclusion of outliers are additions of this package.
     """
     # The midpoint of the extremes is inside the ellipsoid, even if the sensor was mostly at rest.
     w = even_weights(z - 0.5 * (z.min(axis=0) + z.max(axis=0)))
@@ -69,20 +55,7 @@ def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
 
 
 def robust_std(d: FloatArray, w: FloatArray) -> float:
-    """Robust standard deviation of residuals, from the weighted median of their magnitudes.
-
-    Parameters
-    ----------
-    d : (n,) array
-        Residuals.
-    w : (n,) array
-        Weights.
-
-    Returns
-    -------
-    float
-        At least `MIN_SCALE`.
-    """
+    """Robust std of residuals (n,) from the weighted median of their magnitudes, >= `MIN_SCALE`."""
     order = np.argsort(np.abs(d))
     cumulative_weight = np.cumsum(w[order])
     median = np.abs(d)[order][np.searchsorted(cumulative_weight, 0.5 * cumulative_weight[-1])]

@@ -18,19 +18,8 @@ from mag_tracking.calibration.blocks import (
 class QuietInterval:
     """Window of the latest quiet blocks.
 
-    A block enters only after the guard time, so that the gradual onset of a target is excluded.
-
-    Parameters
-    ----------
-    guard : float, s
-        Time after which a quiet block enters the window.
-    max_blocks : int
-        Maximum number of blocks.
-
-    Attributes
-    ----------
-    pending : deque of Block
-        Quiet blocks that have not entered the window yet.
+    A block enters only after the guard time in s, so that the gradual onset of a target is
+    excluded; until then it is `pending`.
     """
 
     def __init__(self, guard: float, max_blocks: int) -> None:
@@ -47,72 +36,32 @@ class QuietInterval:
         self.pending.clear()
 
     def begin(self, blocks: Iterable[Block]) -> None:
-        """Restart the interval with the given blocks.
-
-        Parameters
-        ----------
-        blocks : iterable of Block
-        """
+        """Restart the interval with the given blocks."""
         self._window.clear()
         for block in blocks:
             self._window.append(block)
 
     def extend(self, block: Block) -> Iterator[Blocks]:
-        """Queue the next quiet block, and yield the window after each block that enters it.
-
-        Parameters
-        ----------
-        block : Block
-
-        Yields
-        ------
-        Blocks
-            All blocks of the window.
-        """
+        """Queue the next quiet block, and yield the window after each block that enters it."""
         self.pending.append(block)
         while self.pending and self.pending[0].time <= block.time - self._guard:
             self._window.append(self.pending.popleft())
             yield self.blocks()
 
     def blocks(self) -> Blocks:
-        """Blocks of the interval, in no particular order.
-
-        Returns
-        -------
-        Blocks
-        """
+        """Blocks of the interval, in no particular order."""
         return self._window.blocks()
 
     def scatter(self) -> FloatArray:
-        """Pooled variance of the readings within the blocks.
-
-        Returns
-        -------
-        (3,) array, T²
-            NaN if unknown.
-        """
+        """Pooled variance (3,) T² of the readings within the blocks; NaN if unknown."""
         covariance = pooled_covariance(self.blocks()) if self else None
         return np.full(3, np.nan) if covariance is None else covariance.diagonal()
 
 
 def line_of(blocks: Blocks) -> tuple[float, FloatArray, FloatArray, float]:
-    """Fit the linear trend of a `BackgroundLevel` to blocks.
+    """Linear trend as in `BackgroundLevel`: centre [s], mean [T], slope [T/s] and horizon [s].
 
     The drift is extrapolated for at most twice the duration of the blocks.
-
-    Parameters
-    ----------
-    blocks : Blocks
-
-    Returns
-    -------
-    centre : float, s
-        Mean time of the blocks.
-    mean : (3,) array, T
-        Value at the centre.
-    slope : (3,) array, T/s
-    horizon : float, s
-        Time after which the trend is constant.
     """
     first, last = float(blocks.time.min()), float(blocks.time.max())
     return *line_through(blocks), last + 2.0 * (last - first)

@@ -43,17 +43,9 @@ class BlockRecorder(RunningBackground):
         super().forget()
 
     def quiet_level(self, since: float = 0.0) -> MostFrequentLevel | None:
-        """Most frequent level of the collected blocks.
+        """Most frequent level from `since` s on; None if no level has `MIN_BLOCKS` blocks.
 
-        Parameters
-        ----------
-        since : float, s
-            Time of the earliest block that is evaluated.
-
-        Returns
-        -------
-        MostFrequentLevel or None
-            None if no level has at least `MIN_BLOCKS` blocks, or the noise is unknown.
+        None also if the noise is unknown.
         """
         blocks = [block for block in self._blocks if block.time >= since]
         if len(blocks) < MIN_BLOCKS:
@@ -64,21 +56,10 @@ class BlockRecorder(RunningBackground):
                                    np.where(np.isfinite(steps), steps, 0.0), self._max_blocks)
 
     def is_known_level(self, initial: FloatArray, found: MostFrequentLevel) -> bool:
-        """Whether the initial level is the level of the background.
+        """Whether the initial level (3,) T of a recording is the level of the background.
 
-        True if the field drifts from the initial level to the most frequent level, or is at the
-        most frequent level for not much longer than at the initial level.
-
-        Parameters
-        ----------
-        initial : (3,) array, T
-            Level at the start of the recording.
-        found : MostFrequentLevel
-            Most frequent level.
-
-        Returns
-        -------
-        bool
+        True if the field drifts from it to the most frequent level, or is at the latter for not
+        much longer than at the former.
         """
         level, previous_time, n = initial, 0.0, 0
         for block in self._blocks:
@@ -97,21 +78,7 @@ class BlockRecorder(RunningBackground):
         return (NEAR_DURATION_RATIO if is_near else MIN_DURATION_RATIO) * n > found.n_blocks
 
     def has_returned(self, initial: FloatArray, found: MostFrequentLevel, since: float) -> bool:
-        """Whether at least `MIN_BLOCKS` blocks from `since` on are at the initial level.
-
-        Parameters
-        ----------
-        initial : (3,) array, T
-            Level at the start of the recording.
-        found : MostFrequentLevel
-            Level whose width is used as the tolerance.
-        since : float, s
-            Time of the earliest block that is evaluated.
-
-        Returns
-        -------
-        bool
-        """
+        """Whether `MIN_BLOCKS` blocks from `since` s on are at `initial`, within `found.width`."""
         is_different = [np.abs(b.mean - initial) > found.width
                         for b in self._blocks if b.time >= since]
         return sum(not o.any() for o in is_different) >= MIN_BLOCKS

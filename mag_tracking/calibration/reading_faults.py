@@ -32,16 +32,7 @@ class ReadingFaults:
         return len(self.marks) > 0 or self.repetition > 1.0
 
     def merged(self, latest: 'ReadingFaults') -> 'ReadingFaults':
-        """Add the marks, or the repetition, that were found in later readings.
-
-        Parameters
-        ----------
-        latest : ReadingFaults
-
-        Returns
-        -------
-        ReadingFaults
-        """
+        """Add the marks, or the repetition, found in later readings."""
         marks = [*self.marks, *(mark for mark in latest.marks if not any(
             np.array_equal(mark, known, equal_nan=True) for known in self.marks))]
         return ReadingFaults(np.array(marks[:MAX_MARKS]).reshape(-1, 3),
@@ -49,17 +40,7 @@ class ReadingFaults:
                              latest.rate)
 
     def without(self, fields: FloatArray) -> FloatArray:
-        """Replace marks, and readings that repeat the previous reading, by NaN.
-
-        Parameters
-        ----------
-        fields : (n, 3) array, T
-            Raw readings in chronological order.
-
-        Returns
-        -------
-        (n, 3) array, T
-        """
+        """Chronological raw readings (n, 3) in T, with marks and repetitions replaced by NaN."""
         out: FloatArray = np.where(are_marked(fields, self.marks), np.nan, fields)
         if self.repetition > 1.0:
             present = np.flatnonzero(~np.isnan(out).all(axis=1))
@@ -72,18 +53,9 @@ NO_FAULTS = ReadingFaults(np.zeros((0, 3)), 1.0)
 
 
 def reading_faults(fields: FloatArray, stamps: IntArray | None = None) -> ReadingFaults:
-    """Find marks and repetitions.
+    """Find marks and repetitions in chronological raw readings (n, 3) in T, NaN for a missing axis.
 
-    Parameters
-    ----------
-    fields : (n, 3) array, T
-        Raw readings in chronological order; NaN for a missing axis.
-    stamps : (n,) int array, ns, optional
-        Timestamps, which show where readings were lost.
-
-    Returns
-    -------
-    ReadingFaults
+    The timestamps (n,) in ns show where readings were lost.
     """
     marks = missing_marks(fields)
     kept = np.where(are_marked(fields, marks), np.nan, fields)

@@ -28,37 +28,16 @@ OVERSAMPLING = 4
 
 
 def changes_of(fields: FloatArray) -> BoolArray:
-    """Find the readings that differ from the previous reading.
-
-    Parameters
-    ----------
-    fields : (n, 3) array
-        Readings in chronological order; NaN for a missing axis.
-
-    Returns
-    -------
-    (n,) bool array
-        True for the first reading.
-    """
+    """Whether each reading (n, 3) differs from the previous one; True for the first."""
     before, after = fields[:-1], fields[1:]
     equal = (after == before) | np.isnan(after) & np.isnan(before)
     return np.append(np.ones(min(1, len(fields)), dtype=bool), ~equal.all(axis=1))
 
 
 def with_lost_readings(fields: FloatArray, stamps: IntArray) -> FloatArray:
-    """Insert a missing reading wherever one was lost.
+    """Insert a NaN row wherever a reading was lost, by the timestamps (n,) in ns.
 
-    Parameters
-    ----------
-    fields : (n, 3) array
-        Readings in chronological order.
-    stamps : (n,) int array, ns
-        Timestamps.
-
-    Returns
-    -------
-    (m, 3) array
-        NaN for lost readings; unchanged if the timestamps are irregular, or most readings are lost.
+    Unchanged if the timestamps are irregular, or most readings are lost.
     """
     intervals = np.diff(stamps) / max(1.0, float(np.median(np.diff(stamps)))) if len(stamps) > 1 \
         else np.zeros(0)
@@ -73,21 +52,12 @@ def with_lost_readings(fields: FloatArray, stamps: IntArray) -> FloatArray:
 
 
 def repetition_of(fields: FloatArray) -> float:
-    """Number of readings per measurement, from the regularity of the changes.
+    """Number of chronological readings (n, 3) per measurement, from the regularity of the changes.
 
     A source that is read every r readings changes at the readings ceil(k r). The phases of the
     changes modulo r then cover 1/r of the circle, so their resultant is sin(π/r) / (π/r). Changes
-    that are missing because two measurements are equal do not matter.
-
-    Parameters
-    ----------
-    fields : (n, 3) array
-        Readings in chronological order; NaN for a missing axis.
-
-    Returns
-    -------
-    float
-        1 if readings are not repeated regularly. An integer unless the rates are incommensurate.
+    missing because two measurements are equal do not matter. 1 if readings are not repeated
+    regularly; an integer unless the rates are incommensurate.
     """
     n, present = len(fields), np.flatnonzero(~np.isnan(fields).all(axis=1))
     is_change = np.zeros(n, dtype=bool)
@@ -117,10 +87,7 @@ def repetition_of(fields: FloatArray) -> float:
 
 
 def _refined(changes: IntArray, frequency: float, width: float) -> float:
-    """Period of the most regular frequency within `width` of a `frequency` [1/reading].
-
-    `changes` are the indices of the readings that changed.
-    """
+    """Period of the most regular `frequency` [1/reading] within `width`, at the changed indices."""
     frequencies = frequency + width * np.linspace(-1.0, 1.0, 65)
     resultant = np.abs(np.exp(2j * np.pi * np.outer(frequencies, changes)).sum(axis=1))
     return float(1.0 / frequencies[np.argmax(resultant)])

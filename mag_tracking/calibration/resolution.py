@@ -1,8 +1,8 @@
 """Resolution of a sensor: the quantisation steps of its readings and the resulting error.
 
-If the steps are larger than the noise, a reading is constant while the field changes by up to a
-step. Averaging does not remove that error, and a repeated reading adds little information. The
-operations on every reading are compiled: `resolution.hpp`.
+If the steps exceed the noise, a reading is constant while the field changes by up to a step.
+Averaging does not remove that error, and a repeated reading adds little information. The operations
+on every reading are compiled: `resolution.hpp`.
 """
 
 import numpy as np
@@ -22,52 +22,21 @@ TOGGLE_TOLERANCE = core.TOGGLE_TOLERANCE
 
 
 def corrected_steps(sensors: StructArray) -> FloatArray:
-    """Quantisation steps of a sensor's axes after the soft-iron correction.
-
-    Parameters
-    ----------
-    sensors : (1,) SENSOR array
-
-    Returns
-    -------
-    (3,) array, T
-        0 if the steps are too fine to be observed, inf if the axis has never changed.
-    """
+    """Quantisation steps (3,) T after soft-iron correction; 0 if too fine, inf if unchanged."""
     return core.steps_of(sensors, True)
 
 
 def raw_steps(sensors: StructArray) -> FloatArray:
-    """Quantisation steps of a sensor's axes before the soft-iron correction.
-
-    Parameters
-    ----------
-    sensors : (1,) SENSOR array
-
-    Returns
-    -------
-    (3,) array, T
-        0 if the steps are too fine to be observed, inf if the axis has never changed.
-    """
+    """Quantisation steps (3,) T before soft-iron correction; 0 if too fine, inf if unchanged."""
     return core.steps_of(sensors, False)
 
 
 def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
-    """Replace unknown steps by the steps of other axes at rest.
+    """Replace unknown steps (3,) T by those of other axes at rest; NaN for a dead axis.
 
-    An axis that has never changed is dead if another axis of the same sensor changes with every
-    reading. If no axis has changed, all axes may be at rest.
-
-    Parameters
-    ----------
-    variance : (3,) array, T²
-        Variance of quiet readings; NaN for a missing axis.
-    steps : (3,) array, T
-        From `corrected_steps`.
-
-    Returns
-    -------
-    (3,) array, T
-        NaN for a dead axis; inf if no axis has changed.
+    An axis that has never changed is dead if another axis of the sensor changes with every reading.
+    If no axis has changed, all may be at rest: inf. `variance` (3,) in T² is that of quiet
+    readings.
     """
     out = plain(steps).copy()
     core.complete_steps(plain(variance), out)
@@ -75,18 +44,7 @@ def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
 
 
 def smallest_steps(fields: FloatArray) -> FloatArray:
-    """Smallest non-zero change between consecutive readings of each axis.
-
-    Parameters
-    ----------
-    fields : (n, 3) array, T
-        Readings in chronological order; NaN for a missing axis.
-
-    Returns
-    -------
-    (3,) array, T
-        Infinite if an axis has never changed.
-    """
+    """Smallest non-zero change (3,) T between consecutive readings (n, 3); inf if none."""
     out = np.full(3, np.inf)
     for axis, values in enumerate(fields.T):
         values = values[~np.isnan(values)]

@@ -40,19 +40,9 @@ differences between and next to these neighbours."""
 
 
 def isolated_readings(values: FloatArray, min_height: float = 0.0) -> IntArray:
-    """Find single readings of one axis that differ from two neighbours that agree with each other.
+    """Indices of single readings (n,) that differ from two neighbours that agree with each other.
 
-    Parameters
-    ----------
-    values : (n,) array
-        Readings in chronological order; NaN next to a reading excludes it.
-    min_height : float, optional
-        Minimum difference from both neighbours; NaN excludes all readings.
-
-    Returns
-    -------
-    (k,) int array
-        Indices of the readings.
+    NaN next to a reading excludes it. `min_height` is the least difference from both neighbours.
     """
     if len(values) < 5:
         return np.zeros(0, dtype=np.int64)
@@ -69,20 +59,10 @@ def isolated_readings(values: FloatArray, min_height: float = 0.0) -> IntArray:
 
 
 def saturated_readings(fields: FloatArray, max_run: float = MAX_RUN) -> BoolArray:
-    """Find readings at the limit of the range of an axis.
+    """Find readings at the limit of the range of an axis among chronological raw readings (n, 3).
 
-    Parameters
-    ----------
-    fields : (n, 3) array
-        Raw readings in chronological order; NaN for a missing axis.
-    max_run : float, optional
-        Maximum number of readings for which a single excursion stays at the limit, about half a
-        second.
-
-    Returns
-    -------
-    (n, 3) bool array
-        See `with_margin` for the adjacent readings.
+    `max_run` is the most readings, about half a second, for which a single excursion stays at the
+    limit. See `with_margin` for the adjacent readings.
     """
     fields = np.asarray(fields, dtype=float)
     is_saturated = np.zeros(fields.shape, dtype=bool)
@@ -96,16 +76,7 @@ def saturated_readings(fields: FloatArray, max_run: float = MAX_RUN) -> BoolArra
 
 
 def with_margin(is_saturated: BoolArray) -> BoolArray:
-    """Add the `N_MARGIN` readings on both sides of each saturated reading of the same axis.
-
-    Parameters
-    ----------
-    is_saturated : (n, 3) bool array
-
-    Returns
-    -------
-    (n, 3) bool array
-    """
+    """Add the `N_MARGIN` readings on both sides of each saturated reading of the same axis."""
     out = np.zeros_like(is_saturated)
     for axis, rows in enumerate(map(np.flatnonzero, is_saturated.T)):
         nearby = rows[:, None] + np.arange(-N_MARGIN, N_MARGIN + 1)

@@ -22,11 +22,6 @@ readings and the current reading pass."""
 
 
 def clear_spikes(sensor: Record) -> None:
-    """Reset spike detection: discard the previous and the held readings.
-
-    Parameters
-    ----------
-    sensor : SENSOR record
-    """
+    """Reset spike detection: discard the previous and the held readings."""
     sensor['before_ns'], sensor['n_steps'] = NEVER, 0
     sensor['n_held'] = sensor['n_released'] = 0

@@ -25,17 +25,7 @@ SENSOR = core.SENSOR
 
 
 def new_sensors(n: int) -> StructArray:
-    """Create the state of sensors without any reading.
-
-    Parameters
-    ----------
-    n : int
-        Number of sensors.
-
-    Returns
-    -------
-    (n,) SENSOR array
-    """
+    """Create the state of `n` sensors without any reading, (n,) SENSOR array."""
     sensors = np.zeros(n, SENSOR)
     for name in ('first_ns', 'last_ns', 'unconfirmed_ns', 'before_ns'):
         sensors[name] = NEVER

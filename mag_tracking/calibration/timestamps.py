@@ -61,17 +61,7 @@ class TimestampFault:
     """Mean interval between readings [s]; NaN if unknown."""
 
     def after(self, earlier: 'TimestampFault | None') -> 'TimestampFault':
-        """Return the worse of this fault and an earlier one of the same sensor.
-
-        Parameters
-        ----------
-        earlier : TimestampFault or None
-
-        Returns
-        -------
-        TimestampFault
-            This fault if both are of one kind, because it is based on more readings.
-        """
+        """Worse of this and an earlier fault of the sensor; this one if both are of one kind."""
         return self if earlier is None or self.error is earlier.error \
             or self.error_s >= earlier.error_s else earlier
 
@@ -79,17 +69,9 @@ class TimestampFault:
 def timestamp_fault(stamps: IntArray, fields: FloatArray) -> TimestampFault | None:
     """Find a regular error in the timestamps of consecutive readings of one sensor.
 
-    Parameters
-    ----------
-    stamps : (n,) int array, ns
-        In order of arrival.
-    fields : (n, 3) array, T
-        A reading that repeats timestamp and field was published twice, which is another fault.
-
-    Returns
-    -------
-    TimestampFault or None
-        None if the timestamps are regular, or there are too few readings.
+    `stamps` (n,) in ns are in order of arrival. A reading that repeats timestamp and field was
+    published twice, which is another fault. None if the timestamps are regular, or the readings are
+    too few.
     """
     if len(stamps) < MIN_READINGS:
         return None
@@ -152,8 +134,8 @@ def _burst_fault(stamps: IntArray, intervals: IntArray) -> TimestampFault | None
 def _coarse_fault(stamps: IntArray, intervals: IntArray) -> TimestampFault | None:
     """Fault of timestamps (n,) [ns] of which none are equal, although the clock is coarse.
 
-    The intervals are then different multiples of the step. Lost readings have the same effect, but
-    they move all later timestamps away from a line.
+    The intervals are then different multiples of the step. Lost readings look alike, but move all
+    later timestamps away from a line.
     """
     step_ns = int(np.gcd.reduce(intervals))
     if step_ns < 2.0 * MAX_ERROR_S * NS or not _is_coarse_step(stamps, step_ns) \
@@ -178,9 +160,9 @@ def _is_coarse_step(stamps: IntArray, step_ns: int) -> bool:
 def _groups(is_joined: BoolArray, stamps: IntArray) -> tuple[int, float, float]:
     """Median size and period [s] of groups of readings, and mean interval [s] between readings.
 
-    `is_joined` (n - 1,) marks the readings after the first that belong to the group of the previous
-    reading. The first and the last group may be incomplete, and are not used. With fewer than two
-    other groups, the size is that of the largest group.
+    `is_joined` (n - 1,) marks the readings that belong to the group of the previous one. The first
+    and last group may be incomplete and are not used; with fewer than two others, the size is that
+    of the largest group.
     """
     first = np.flatnonzero(np.append(True, ~is_joined))
     sizes = np.diff(np.append(first, len(stamps)))
@@ -194,16 +176,6 @@ def _groups(is_joined: BoolArray, stamps: IntArray) -> tuple[int, float, float]:
 
 
 def latest_interval_s(stamps: IntArray) -> float:
-    """Median of the latest intervals, which a few lost readings do not change.
-
-    Parameters
-    ----------
-    stamps : (n,) int array, ns
-
-    Returns
-    -------
-    float, s
-        0 if there are too few readings.
-    """
+    """Median of the latest intervals, robust to a few lost readings; 0 if there are too few."""
     intervals = np.diff(stamps[-N_INTERVALS - 1:])
     return max(float(np.median(intervals)) / NS, 0.0) if len(intervals) == N_INTERVALS else 0.0

@@ -31,18 +31,10 @@ def command() -> NoReturn:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command.
+    """Run the command with `argv`, by default `sys.argv[1:]`, and return its exit status.
 
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Command-line arguments without the program name; default: `sys.argv[1:]`.
-
-    Returns
-    -------
-    int
-        Exit status: 0 for success, 1 for an error that has been printed, 130 after Ctrl-C.
-        Some commands return other values, which their help texts describe.
+    It is 0 for success, 1 for an error that has been printed, 130 after Ctrl-C. Some commands
+    return other values, which their help texts describe.
     """
     arguments = sys.argv[1:] if argv is None else argv
     for argument in arguments:

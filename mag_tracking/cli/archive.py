@@ -41,12 +41,7 @@ how to use one with certificates (tls://...).
 
 
 def add(commands: Commands) -> None:
-    """Register the command.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the command."""
     p = add_command(commands, 'archive', _archive, _ARCHIVE_HELP)
     p.add_argument('recordings', nargs='+', metavar='FOLDER|GLOB|RECORDING',
                    help='recordings; folders are searched recursively')

@@ -51,12 +51,7 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the command."""
     settings = '\n'.join(f'  {p.name}: {p.value}  # {p.doc}{f" [{p.unit}]" if p.unit else ""}'
                          for p in flatten(GeometrySettings()))
     p = add_command(commands, 'board-geometry', _geometry,

@@ -49,12 +49,7 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the command."""
     p = add_command(commands, 'classes', _reject_missing_action, _CLASSES_HELP)
     actions = p.add_subparsers(dest='action', metavar='ACTION', required=True)
     for name, run, description in (

@@ -53,18 +53,9 @@ COMMANDS = {
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
-    """Parse a command line.
+    """Parse a command line without the program name.
 
-    Parameters
-    ----------
-    arguments : sequence of str
-        Command-line arguments without the program name.
-
-    Returns
-    -------
-    argparse.Namespace
-        Options, and `run_command`: a function that takes the namespace and returns the exit
-        status.
+    `run_command` of the namespace takes the namespace and returns the exit status.
     """
     parser = argparse.ArgumentParser(
         prog='mag-tracking', description='Track magnetic targets with stationary magnetometers. '

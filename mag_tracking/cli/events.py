@@ -42,12 +42,7 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the command."""
     p = add_command(commands, 'events', _events, _EVENTS_HELP)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
@@ -87,16 +82,7 @@ def _print(result: EventsResult, names: tuple[str, ...]) -> None:
 
 
 def line_of(event: PassEvent) -> str:
-    """Describe an event in one line.
-
-    Parameters
-    ----------
-    event : PassEvent
-
-    Returns
-    -------
-    str
-    """
+    """Describe an event in one line."""
     p = event.left_to_right
     direction = f'left to right ({p:.0%})' if p > 0.9 else f'right to left ({1.0 - p:.0%})' \
         if p < 0.1 else 'direction unknown'

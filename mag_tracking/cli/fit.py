@@ -66,12 +66,7 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the command."""
     p = add_command(commands, 'fit', _fit, _FIT_HELP)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
@@ -274,20 +269,9 @@ def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any
 
 
 def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
-    """Find reasons not to use an estimate of hard and soft iron.
+    """Find reasons not to use an estimate of hard and soft iron from the moments of `n_passes`.
 
-    Parameters
-    ----------
-    iron : Iron
-    n_passes : int
-        Number of moments from which `iron` was estimated.
-    soft_std : float, m³
-        Standard deviation of the soft iron, inflated if the normalised cost exceeds 1.
-
-    Yields
-    ------
-    str
-        One warning per reason.
+    `soft_std` [m³] is the std of the soft iron, inflated if the normalised cost exceeds 1.
     """
     degrees_of_freedom = 3 * n_passes - 4
     if iron.normalised_cost * degrees_of_freedom > energy_threshold(P_WARNING, degrees_of_freedom):

@@ -17,12 +17,7 @@ namespace set with --ros-args -r __ns:=/NAMESPACE.
 
 
 def add(commands: Commands) -> None:
-    """Register the commands.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the commands."""
     add_command(commands, 'topics', _topics, _GRAPH_HELP)
     p = add_command(commands, 'echo', _echo, _GRAPH_HELP)
     p.add_argument('topic', metavar='TOPIC', help='name of the topic')

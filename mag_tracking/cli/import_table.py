@@ -37,12 +37,7 @@ and a network file.
 
 
 def add(commands: Commands) -> None:
-    """Register the command.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the command."""
     p = add_command(commands, 'import', _import, _IMPORT_HELP)
     p.add_argument('table', type=Path, metavar='TABLE', help='table of readings or poses')
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')

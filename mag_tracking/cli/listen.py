@@ -42,12 +42,7 @@ MAX_PLAUSIBLE_FIELD = 1e-3
 
 
 def add(commands: Commands) -> None:
-    """Register the command.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the command."""
     p = add_command(commands, 'listen', _listen, _LISTEN_HELP)
     p.add_argument('drivers', type=Path, metavar='DRIVERS', help='file that lists the devices')
     add_network(p, False, 'network file; check that its sensors match the drivers file')

@@ -42,12 +42,7 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the commands.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the commands."""
     p = add_command(commands, 'view', _view, _VIEW_HELP)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
@@ -61,14 +56,7 @@ def add(commands: Commands) -> None:
 
 
 def add_page(parser: argparse.ArgumentParser, port: bool = True) -> None:
-    """Add --host and --port.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-    port : bool
-        Whether to add --port.
-    """
+    """Add --host and --port, or only --host."""
     if port:
         parser.add_argument('--port', type=int, default=DEFAULT_PORT, metavar='PORT',
                             help=f'port of the page (default: {DEFAULT_PORT}; 0 selects a free '
@@ -129,23 +117,7 @@ def _end_of_input_event() -> threading.Event:
 def page_process(host: str, port: int, ros_arguments: Sequence[str]) -> Iterator[None]:
     """Run the live page in a separate process, so that it cannot delay the nodes.
 
-    Parameters
-    ----------
-    host : str
-        Local address of the page.
-    port : int
-        Port of the page.
-    ros_arguments : sequence of str
-        ROS arguments; the first is `--ros-args`.
-
-    Yields
-    ------
-    None
-
-    Raises
-    ------
-    DeviceError
-        If the port cannot be opened.
+    The first of the ROS arguments is `--ros-args`. Raises DeviceError if the port cannot be opened.
     """
     check_port(host, port)
     # The page process ends when its stdin is closed, even if this process is killed.

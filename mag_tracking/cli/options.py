@@ -24,21 +24,10 @@ FIGURE_SUFFIXES = ('.png', '.pdf', '.svg')
 
 def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace], int],
                 text: str = '') -> argparse.ArgumentParser:
-    """Add the parser of a command.
+    """Add the parser of a command; `name` is a key in `COMMANDS`.
 
-    Parameters
-    ----------
-    commands : Commands
-    name : str
-        Key in `COMMANDS`.
-    run : function
-        Takes the parsed arguments and returns the exit status.
-    text : str
-        Description and examples, printed after the options.
-
-    Returns
-    -------
-    argparse.ArgumentParser
+    `run` takes the parsed arguments and returns the exit status. `text`, with the description and
+    examples, is printed after the options.
     """
     _, summary, aliases = COMMANDS[name]
     parser = commands.add_parser(name, aliases=aliases, help=summary, description=summary,
@@ -50,26 +39,12 @@ def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace
 
 def add_network(parser: argparse._ActionsContainer, required: bool = True,
                 text: str = 'network file with the sensors (network.yaml)') -> None:
-    """Add --network.
-
-    Parameters
-    ----------
-    parser : argparse container
-    required : bool
-        Whether the option is required.
-    text : str
-        Help text.
-    """
+    """Add --network, with the help `text`."""
     parser.add_argument('--network', required=required, type=Path, metavar='FILE', help=text)
 
 
 def add_recorded_network(parser: argparse._ActionsContainer) -> None:
-    """Add --network and --namespace.
-
-    Parameters
-    ----------
-    parser : argparse container
-    """
+    """Add --network and --namespace."""
     add_network(parser)
     parser.add_argument('--namespace', metavar='NAMESPACE', help='namespace of the relative topics '
                         'in the network file (e.g. /robot1), if the recording contains several '
@@ -77,22 +52,7 @@ def add_recorded_network(parser: argparse._ActionsContainer) -> None:
 
 
 def recorded_network(args: argparse.Namespace) -> SensorNetwork:
-    """Read the network given by --network and --namespace.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments with the options of `add_recorded_network`.
-
-    Returns
-    -------
-    SensorNetwork
-
-    Raises
-    ------
-    NetworkError
-        If the network file or the namespace is invalid.
-    """
+    """Read the network of --network and --namespace; raises NetworkError if one is invalid."""
     network = read_network(args.network)
     if args.namespace is None:
         return network
@@ -100,21 +60,9 @@ def recorded_network(args: argparse.Namespace) -> SensorNetwork:
 
 
 def distinct_names(paths: Iterable[Path]) -> list[str]:
-    """Return the names under which the results of the recordings are stored.
+    """Names without extension under which the results of the recordings are stored.
 
-    Parameters
-    ----------
-    paths : iterable of Path
-
-    Returns
-    -------
-    list of str
-        File names without extension.
-
-    Raises
-    ------
-    OutputError
-        If two names are equal, so that the results would overwrite each other.
+    Raises OutputError if two names are equal, so that the results would overwrite each other.
     """
     names = [path.resolve().stem for path in paths]
     duplicates = sorted({name for name in names if names.count(name) > 1})
@@ -125,40 +73,19 @@ def distinct_names(paths: Iterable[Path]) -> list[str]:
 
 
 def utc_timestamp() -> str:
-    """Return the current time, for use as the date of a calibration.
-
-    Returns
-    -------
-    str
-        Time in UTC, ISO 8601.
-    """
+    """Current time (UTC, ISO 8601), for use as the date of a calibration."""
     return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
 
 
 def add_report(parser: argparse.ArgumentParser) -> None:
-    """Add --report.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-    """
+    """Add --report."""
     parser.add_argument('--report', type=Path, metavar='FILE.html',
                         help='write an HTML report to FILE.html')
 
 
 def check_writable(path: Path | None) -> None:
-    """Check that an output file can be created: its folder exists, and it is not a folder.
-
-    Parameters
-    ----------
-    path : Path or None
-        None is not checked.
-
-    Raises
-    ------
-    OutputError
-        If the folder is missing, or `path` is a folder.
-    """
+    """Check that an output file can be created; raises OutputError if its folder is missing, or if
+    it is a folder."""
     if path is not None and not path.absolute().parent.is_dir():
         raise OutputError(f'cannot write {path}: the folder {path.parent} does not exist')
     if path is not None and path.is_dir():
@@ -168,18 +95,8 @@ def check_writable(path: Path | None) -> None:
 def check_report(args: argparse.Namespace, *others: Path | None) -> None:
     """Check that the report can be written without replacing another file of the command.
 
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments with the option of `add_report`.
-    *others : Path or None
-        Other input and output files of the command.
-
-    Raises
-    ------
-    OutputError
-        If the folder is missing, the path is a folder, the name ends in neither .html nor .htm,
-        or the file is one of `others`.
+    Raises OutputError if the folder is missing, the path is a folder, the name ends in neither
+    .html nor .htm, or the file is one of `others`.
     """
     path = args.report
     if path is None:
@@ -195,17 +112,8 @@ def check_report(args: argparse.Namespace, *others: Path | None) -> None:
 def check_outputs(args: argparse.Namespace) -> None:
     """Check that the files of --out and --figure can be written.
 
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments with --out and --figure.
-
-    Raises
-    ------
-    OutputError
-        If the folder of a file is missing, or the file is a folder.
-    SettingsError
-        If the file type of the figure is not supported.
+    Raises OutputError if the folder of a file is missing or the file is a folder, and SettingsError
+    if the file type of the figure is not supported.
     """
     for path in (args.out, args.figure):
         check_writable(path)
@@ -215,11 +123,6 @@ def check_outputs(args: argparse.Namespace) -> None:
 
 
 def print_diagnoses(diagnoses: Iterable[Diagnosis]) -> None:
-    """Print one line per diagnosis.
-
-    Parameters
-    ----------
-    diagnoses : iterable of Diagnosis
-    """
+    """Print one line per diagnosis."""
     for diagnosis in diagnoses:
         print(f'  {"warning: " if diagnosis.serious else ""}{diagnosis}')

@@ -42,12 +42,7 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the command."""
     p = add_command(commands, 'plan', _plan, _PLAN_HELP)
     add_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')

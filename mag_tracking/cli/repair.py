@@ -19,12 +19,7 @@ example:
 
 
 def add(commands: Commands) -> None:
-    """Register the command.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the command."""
     p = add_command(commands, 'repair', _repair, _REPAIR_HELP)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='.mcap file or rosbag2 folder')

@@ -75,12 +75,7 @@ TRUTH_METRICS = {
 
 
 def add(commands: Commands) -> None:
-    """Register the command.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the command."""
     p = add_command(commands, 'replay', _replay, _REPLAY_HELP)
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')

@@ -29,12 +29,7 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the command."""
     p = add_command(commands, 'run', _run, _RUN_HELP)
     add_network(p)
     add_settings(p)

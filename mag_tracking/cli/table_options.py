@@ -12,14 +12,7 @@ if TYPE_CHECKING:
 
 
 def add_table_options(parser: argparse.ArgumentParser, sensor: bool = True) -> None:
-    """Add the options that describe a table of readings.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-    sensor : bool, optional
-        Whether to add --sensor.
-    """
+    """Add the options that describe a table of readings, with or without --sensor."""
     p = parser.add_argument_group('table of readings', 'properties that are found if not given')
     p.add_argument('--columns', nargs='+', metavar='KEY=COLUMN',
                    help='columns, by name or number (from 1): time=, and x= y= z= with sensor=, or '
@@ -53,22 +46,9 @@ def add_table_options(parser: argparse.ArgumentParser, sensor: bool = True) -> N
 
 
 def table_options(args: argparse.Namespace, sensor: str | None = None) -> 'TableOptions':
-    """Collect the options of `add_table_options`.
+    """Collect the options of `add_table_options`; raises SettingsError if --sensors is not valid.
 
-    Parameters
-    ----------
-    args : argparse.Namespace
-    sensor : str, optional
-        Name of the only sensor, if --sensor is not one of the options.
-
-    Returns
-    -------
-    TableOptions
-
-    Raises
-    ------
-    SettingsError
-        If an assignment of a sensor is not valid.
+    `sensor` is the name of the only sensor, if --sensor is not one of the options.
     """
     from mag_tracking.recording.field_table import TableOptions
 
@@ -83,14 +63,7 @@ def table_options(args: argparse.Namespace, sensor: str | None = None) -> 'Table
 
 
 def print_notes(table: Path, notes: Iterable[str]) -> None:
-    """Print what was found out about a table, with each warning on its own line.
-
-    Parameters
-    ----------
-    table : Path
-    notes : iterable of str
-        Notes of a `FieldTable`.
-    """
+    """Print what was found out about a table, with each warning on its own line."""
     notes = list(notes)
     print(f'{table}: {"; ".join(n for n in notes if not n.startswith("warning"))}')
     for note in notes:

@@ -10,12 +10,7 @@ from mag_tracking.settings import read_parameter_file
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
-    """Add --target and --params.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-    """
+    """Add --target and --params."""
     parser.add_argument('--params', type=Path, metavar='FILE',
                         help='YAML file with the settings to override')
     parser.add_argument('--target', choices=list(TARGET_DEFAULTS),
@@ -24,24 +19,9 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
 
 
 def settings_of(args: argparse.Namespace, network: SensorNetwork) -> Settings:
-    """Return the settings selected by --target and --params.
+    """Settings of --target and --params; raises SettingsError if the parameter file is invalid.
 
     Without both, a board of sensors selects a magnet, and a line is printed.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments with the options of `add_settings`.
-    network : SensorNetwork
-
-    Returns
-    -------
-    Settings
-
-    Raises
-    ------
-    SettingsError
-        If the parameter file is invalid.
     """
     changes = read_parameter_file(args.params) if args.params else {}
     if args.target is not None:

@@ -64,12 +64,7 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command.
-
-    Parameters
-    ----------
-    commands : Commands
-    """
+    """Register the command."""
     p = add_command(commands, 'traffic', _traffic, _TRAFFIC_HELP)
     p.add_argument('recordings', type=Path, nargs='+', metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
@@ -195,16 +190,7 @@ def _print(name: str, result: TrafficResult,
 
 
 def line_of(vehicle: CountedVehicle) -> str:
-    """Describe a passage in one line.
-
-    Parameters
-    ----------
-    vehicle : CountedVehicle
-
-    Returns
-    -------
-    str
-    """
+    """Describe a passage in one line."""
     p = vehicle.passage
     time = datetime.fromtimestamp(p.stamp_ns / NS, tz=timezone.utc)
     error = '' if np.isnan(p.direction_error) else f' (error probability {p.direction_error:.3f})'

@@ -9,13 +9,11 @@
       unit: nT
       sensors: {A: mag_1, B: mag_2}
 
-The kind of a transport, framing or device is a name in `KINDS`, or `package.module:Class` for a
-custom class. Such a class has an attribute `SETTINGS` and the methods of `reading.Transport`,
-`Framing` or `Device`; a transport also has the class attribute `is_message_oriented`. The optional
-attributes `CLOCK` and `DRIVER` are mappings of clock and driver settings that replace the defaults
-for every device of that kind. The settings of a kind in `KINDS` are listed under its name. The
-settings of a custom class are listed under `transport_settings`, `framing_settings` or
-`device_settings`.
+The kind of a transport, framing or device is a name in `KINDS`, with its settings under that name,
+or `package.module:Class`, with its settings under `transport_settings`, `framing_settings` or
+`device_settings`. Such a class has an attribute `SETTINGS` and the methods of `reading.Transport`,
+`Framing` or `Device`; a transport also has the class attribute `is_message_oriented`. Optional
+attributes `CLOCK` and `DRIVER` are defaults of clock and driver settings for every such device.
 """
 
 import dataclasses
@@ -59,23 +57,10 @@ Settings = TypeVar('Settings', ClockSettings, DriverSettings)
 
 
 def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None) -> list[Driver]:
-    """Read a drivers file.
+    """Read a drivers file; all drivers are closed.
 
-    Parameters
-    ----------
-    path : path
-    network : SensorNetwork, optional
-        Network that must contain every sensor of the file.
-
-    Returns
-    -------
-    list of Driver
-        All drivers are closed.
-
-    Raises
-    ------
-    SettingsError
-        If an entry is not valid. The message names the file and the device.
+    Raises SettingsError, which names file and device, for an invalid entry or a sensor that is not
+    in `network`.
     """
     content = read_yaml(path, SettingsError)
     if not isinstance(content, Mapping) or not content:
@@ -90,23 +75,10 @@ def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None
 
 
 def load_class(role: str, name: object) -> Any:
-    """Import the class of a transport, framing or device.
+    """Import the class of a 'transport', 'framing' or 'device' (`role`).
 
-    Parameters
-    ----------
-    role : str
-        'transport', 'framing' or 'device'.
-    name : str
-        Key of `KINDS[role]`, or package.module:Class.
-
-    Returns
-    -------
-    type
-
-    Raises
-    ------
-    SettingsError
-        If the class cannot be loaded, or lacks `SETTINGS` or another required member.
+    `name` is a key of `KINDS[role]` or package.module:Class. Raises SettingsError if the class
+    cannot be loaded, or lacks `SETTINGS` or another required member.
     """
     target = KINDS[role].get(name, name) if isinstance(name, str) else ''
     module, colon, class_name = target.partition(':')
@@ -127,24 +99,8 @@ def load_class(role: str, name: object) -> Any:
 
 
 def driver_of(name: object, entry: object) -> Driver:
-    """Create a driver from an entry of a drivers file.
-
-    Parameters
-    ----------
-    name : str
-        Name of the device.
-    entry : dict
-        Settings of the device.
-
-    Returns
-    -------
-    Driver
-
-    Raises
-    ------
-    SettingsError
-        If the entry is not valid. The message names the device.
-    """
+    """Create a driver from an entry of a drivers file; raises SettingsError, which names the
+    device."""
     if not isinstance(name, str) or not isinstance(entry, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {short_repr(entry)}')
     if not is_utf8_encodable(name):
@@ -328,14 +284,7 @@ def _check_devices(content: Mapping[object, object]) -> None:
 
 
 def settings_by_kind() -> dict[str, Any]:
-    """Default settings of all kinds, as listed in the settings reference.
-
-    Returns
-    -------
-    dict of str to settings
-        The keys are the names of the groups in the drivers file; '' stands for the top level of a
-        device.
-    """
+    """Default settings by group in the drivers file; '' is the top level of a device."""
     settings = {'': DriverSettings(), 'clock': ClockSettings()}
     for role, kinds in KINDS.items():
         for name in kinds:

@@ -80,20 +80,7 @@ class ClockSettings:
 class ArrivalClock:
     """Clock that timestamps readings by their arrival, with the interface of `DeviceClock`.
 
-    `drift_ppm`, `spread_s` and `stamp_std` are always NaN.
-
-    Parameters
-    ----------
-    settings : ClockSettings
-
-    Attributes
-    ----------
-    counts : Counter
-        Always empty.
-    restarts : Counter
-        Always empty.
-    examples : dict of str to str
-        Always empty.
+    The counters and examples are always empty, the estimates always NaN.
     """
 
     drift_ppm = spread_s = stamp_std = math.nan
@@ -105,19 +92,7 @@ class ArrivalClock:
         self._min_delay_ns = round(settings.min_delay_s * 1e9)
 
     def stamp(self, ticks: float | None, arrival_ns: int) -> int:
-        """Return the time of arrival minus the minimum delay.
-
-        Parameters
-        ----------
-        ticks : float or None
-            Not used.
-        arrival_ns : int, ns
-            Monotonic time of arrival.
-
-        Returns
-        -------
-        int, ns
-        """
+        """Monotonic time of arrival minus the minimum delay, ns; `ticks` are not used."""
         return arrival_ns - self._min_delay_ns
 
 
@@ -198,34 +173,23 @@ class DeviceClock:
 
     The rounding error of float64 is below 1 ns for 30 days, and below 0.1 µs for ten years.
 
-    Parameters
-    ----------
-    settings : ClockSettings
+    Raises SettingsError if `min_step_s` exceeds `max_delay_s`, or the counter wraps within four
+    times `min_step_s`.
 
     Attributes
     ----------
-    counts : Counter
-        Number of readings without a timestamp, by cause.
-    restarts : Counter
-        Number of clocks started after the first, by cause.
-    examples : dict of str to str
-        First device time and what to change, by cause of `counts`. The dict is replaced, never
-        changed.
-    drift_ppm : float, ppm
-        Ratio of the true to the nominal tick, minus 1; positive for a slow device. NaN until
-        estimated.
-    spread_s : float, s
-        95th percentile of the delays of recent messages, relative to the fastest message. NaN until
-        estimated.
-    stamp_std : float, s
-        Estimated error of a timestamp due to delays and changes of the drift. It is the 90th
-        percentile of the height above the line, taken over the lowest points of all blocks. An
-        error of `min_delay_s` is not included. NaN until estimated, and again after a restart.
-
-    Raises
-    ------
-    SettingsError
-        If `min_step_s` exceeds `max_delay_s`, or the counter wraps within four times `min_step_s`.
+    counts : number of readings without a timestamp, by cause
+    restarts : number of clocks started after the first, by cause
+    examples : first device time and what to change, by cause; the dict is replaced, never changed
+    drift_ppm : ratio of the true to the nominal tick, minus 1, ppm; positive for a slow device; NaN
+        until estimated
+    spread_s : 95th percentile of the delays of recent messages, relative to the fastest; NaN until
+        estimated
+    stamp_std : error of a timestamp [s] due to delays and changes of the drift: 90th percentile of
+        the
+        height above the line, over the lowest points of all blocks; without an error of
+        `min_delay_s`;
+        NaN until estimated, and again after a restart
     """
 
     def __init__(self, settings: ClockSettings) -> None:
@@ -262,21 +226,11 @@ class DeviceClock:
         self._has_begun, self._drift_bound = True, self._max_drift
 
     def stamp(self, ticks: float | None, arrival_ns: int) -> int | None:
-        """Update the clock with a reading; return the measurement time of the reading.
+        """Update the clock with a reading; return its monotonic measurement time, ns, at most
+        `arrival_ns` minus the minimum delay.
 
-        Parameters
-        ----------
-        ticks : float or None
-            Device counter, at least 0 and less than `wrap`. Repeated and slightly earlier values
-            are accepted.
-        arrival_ns : int, ns
-            `time.monotonic_ns()` at arrival.
-
-        Returns
-        -------
-        int or None, ns
-            Monotonic time of the measurement, at most `arrival_ns` minus the minimum delay. None if
-            the time is unknown; the cause is counted in `counts`.
+        `ticks` are at least 0 and less than `wrap`; repeated and slightly earlier values are
+        accepted. The cause of an unknown time, None, is counted in `counts`.
         """
         if ticks is None:
             self.counts[NO_TICKS] += 1

@@ -47,35 +47,10 @@ MIN_CLOCK_STEP_NS = 10_000_000
 class Driver:
     """Keeps one device open and converts its readings to samples.
 
-    Parameters
-    ----------
-    name : str
-        Name of the device, for messages.
-    device : reading.Device
-    settings : DriverSettings
-    clock_settings : ClockSettings
-    sensors : dict of str to str
-        Network name of each sensor. The key is the name of the sensor at the device, the source of
-        its readings, or '' for the only sensor of the device.
-    monotonic_ns : callable, optional
-        Monotonic clock of the host; tests replace it.
-    wall_ns : callable, optional
-        Wall clock of the host.
-    sleep : callable, optional
-        Function that waits for a time in seconds.
-
-    Attributes
-    ----------
-    name : str
-    sensors : dict of str to str
-    driver_counts : Counter
-        Number of samples by sensor, and number of losses and faults detected by the driver itself,
-        by cause.
-
-    Raises
-    ------
-    SettingsError
-        If a unit or `stamp_by` is not valid.
+    Keys of `sensors` are the sensor's name at the device, the source of its readings, or '' for the
+    only sensor; values are names in the network. Tests replace the clocks and `sleep`.
+    `driver_counts` are samples by sensor, and losses and faults that the driver itself detects, by
+    cause. Raises SettingsError if a unit or `stamp_by` is not valid.
     """
 
     def __init__(self, name: str, device: Device, settings: DriverSettings,
@@ -143,23 +118,12 @@ class Driver:
         return self._failure or self._contest
 
     def clocks(self) -> dict[str, ArrivalClock | DeviceClock]:
-        """Clocks of the sources whose readings were accepted.
-
-        Returns
-        -------
-        dict of str to ArrivalClock or DeviceClock
-            Clock of each source.
-        """
+        """Clock of each source whose readings were accepted."""
         return dict(self._clocks)
 
     def counts(self) -> Counter[str]:
-        """Numbers of samples, losses, faults and suspect readings.
-
-        Returns
-        -------
-        Counter
-            Number by sensor or cause, such as 'samples: mag_1' or 'connections lost'.
-        """
+        """Numbers of samples, losses, faults and suspect readings, such as 'samples: mag_1' or
+        'connections lost'."""
         # Each counter is copied in one step, because the polling thread may add a cause meanwhile.
         total = self.driver_counts.copy()
         n_changes = sum(claim.changes for claim in list(self._claims.values()))
@@ -173,39 +137,17 @@ class Driver:
         return total
 
     def examples(self) -> dict[str, str]:
-        """Rejected lines and device times, and what to change.
-
-        Returns
-        -------
-        dict of str to str
-            First example and remedy, by cause; the cause is a key of `counts`.
-        """
+        """First rejected line or device time and the remedy, by cause in `counts`."""
         found = dict(getattr(self._device, 'examples', {}))
         for clock in self.clocks().values():
             found.update(clock.examples)
         return found
 
     def poll(self, timeout_s: float) -> PollResult:
-        """Return the samples received since the last call.
+        """Return the samples received since the last call; wait for data for at most `timeout_s`.
 
         A closed device is opened when the retry interval has elapsed. Device errors are not raised
-        but stored in `fault`.
-
-        Parameters
-        ----------
-        timeout_s : float, s
-            Maximum time to wait for data.
-
-        Returns
-        -------
-        readings : Readings
-            Empty if nothing arrived in time.
-        accelerations : sequence of AccelerationSample
-
-        Raises
-        ------
-        ValueError
-            If a field does not consist of three numbers.
+        but stored in `fault`. Raises ValueError if a field does not consist of three numbers.
         """
         if not self._is_open and not self._try_to_open(timeout_s):
             return EMPTY_RESULT
@@ -255,12 +197,7 @@ class Driver:
         self._is_open, self._retry_ns = False, None
 
     def fail(self, error: Exception) -> None:
-        """Close the device after an unexpected error and schedule its reopening.
-
-        Parameters
-        ----------
-        error : Exception
-        """
+        """Close the device after an unexpected error and schedule its reopening."""
         self.driver_counts['errors'] += 1
         self._schedule_retry(f'{type(error).__name__}: {error}')
 
@@ -339,10 +276,10 @@ class Driver:
         return readings, accelerations
 
     def _resolve(self, reading: Reading, arrival: Arrival) -> tuple[str | None, int | None]:
-        """Identify the sensor of a reading, and timestamp the reading unless it is a duplicate.
+        """Return (network name of a reading, monotonic time [ns]).
 
-        Return (network name, monotonic time [ns]). The name is None if the sensor is unknown or
-        ignored; the time is None for a duplicate, or if no clock provides it.
+        The name is None if the sensor is unknown or ignored; the time is None for a duplicate, or
+        if no clock provides it.
         """
         key = reading.sensor, arrival.source
         sensor = self._known_sensors.get(key) or self._sensor_of(*key)
@@ -411,8 +348,8 @@ class Driver:
 
 
 def _clock_settings_for(ticks: float | None, settings: ClockSettings) -> ClockSettings:
-    """Adapt the settings of a clock to a date, or to a number that only a time since 1970 can be.
-    """
+    """Adapt the settings of a clock to a date, or to a number that only a time since 1970 can
+    be."""
     unit = 'us' if isinstance(ticks, DeviceDate) else None
     # A counter of microseconds has no decimals.
     if unit is None and ticks is not None and (
@@ -435,16 +372,8 @@ def serve(driver: Driver, take: Callable[[Readings, Sequence[AccelerationSample]
           stopping: Callable[[], bool]) -> None:
     """Poll a driver and pass its samples to `take` until `stopping()` is true; then close it.
 
-    No error is raised, because `serve` may run in its own thread. Errors of the device are
-    stored in `driver.fault`; errors of `take` are counted in `driver.driver_counts`.
-
-    Parameters
-    ----------
-    driver : Driver
-    take : callable
-        Called with `Readings` and a sequence of `AccelerationSample`.
-    stopping : callable
-        Returns whether to stop.
+    No error is raised, because `serve` may run in its own thread. Errors of the device are stored
+    in `driver.fault`; errors of `take` are counted in `driver.driver_counts`.
     """
     while not stopping():
         try:

@@ -13,24 +13,16 @@ WEAK_S = 5.0
 
 
 class FieldStrength:
-    """Finds sensors whose field stays below `WEAK_FIELD`. Each sensor is judged once."""
+    """Finds sensors whose field stays below `WEAK_FIELD`, and judges each once."""
 
     def __init__(self) -> None:
         self._judged: set[str] = set()
         self._since_ns: dict[str, int] = {}
 
     def add(self, readings: Readings) -> list[str]:
-        """Add readings; return the sensors that are weak.
+        """Add readings; return the sensors that are judged as weak by this call.
 
-        Parameters
-        ----------
-        readings : Readings
-            Readings with a missing axis are not judged.
-
-        Returns
-        -------
-        list of str
-            Names of the sensors that are judged as weak by this call.
+        Readings with a missing axis are not judged.
         """
         if self._judged.issuperset(readings.names):
             return []

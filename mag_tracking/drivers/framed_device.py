@@ -6,21 +6,12 @@ from mag_tracking.drivers.reading import Arrival, Framing, Transport
 
 
 class FramedDevice:
-    """Device that applies a framing to the data of a transport. Implements `reading.Device`.
-
-    Parameters
-    ----------
-    transport : Transport
-    framing : Framing
+    """Device that applies a framing to the data of a transport, a `reading.Device`.
 
     Attributes
     ----------
-    CLOCK : dict of str to float
-        Clock settings common to all devices with this framing.
-    DRIVER : dict of str to int
-        Driver settings common to all devices with this framing.
-    examples : dict of str to str
-        The first rejected line and the remedy, by cause. The dict is replaced, never changed.
+    CLOCK, DRIVER : settings common to all devices with this framing
+    examples : first rejected line and the remedy, by cause; the dict is replaced, never changed
     """
 
     def __init__(self, transport: Transport, framing: Framing) -> None:
@@ -39,36 +30,14 @@ class FramedDevice:
         return total
 
     def open(self) -> None:
-        """Open the transport; discard and count unconsumed bytes of the previous connection.
-
-        Raises
-        ------
-        DeviceError
-            If opening fails.
-        """
+        """Open the transport; discard and count unconsumed bytes of the previous connection."""
         if self._unconsumed:
             self._rejected['bytes of truncated frames'] += len(self._unconsumed)
             self._unconsumed = b''
         self._transport.open()
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """Return the readings received; wait only if no data is available.
-
-        Parameters
-        ----------
-        timeout_s : float, s
-            Maximum time to wait for data.
-
-        Returns
-        -------
-        list of Arrival
-            Empty if nothing arrived in time.
-
-        Raises
-        ------
-        DeviceError
-            If the connection is lost.
-        """
+        """Return the readings received; wait only if no data is available."""
         out: list[Arrival] = []
         for chunk in self._transport.read(timeout_s):
             data = (chunk.data if self._transport.is_message_oriented

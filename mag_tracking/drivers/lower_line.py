@@ -14,18 +14,7 @@ Point: TypeAlias = tuple[float, float]
 
 
 def lower_hull(points: Sequence[Point]) -> list[Point]:
-    """Vertices of the lower convex hull.
-
-    Parameters
-    ----------
-    points : sequence of Point
-        Points in ascending order of x, then y.
-
-    Returns
-    -------
-    list of Point
-        Vertices in ascending order of x.
-    """
+    """Vertices of the lower convex hull; points and vertices ascend in x, then y."""
     hull: list[Point] = []
     for x, y in points:
         while len(hull) > 1:
@@ -38,21 +27,11 @@ def lower_hull(points: Sequence[Point]) -> list[Point]:
 
 
 def slope_range(points: Sequence[Point]) -> tuple[float, float]:
-    """Range of slopes that are about as likely as the slope of the best line under the points.
+    """Smallest and largest slope about as likely as that of the best line under the points.
 
     The best line, according to Moon et al., is the edge of the lower convex hull at the mean of x.
-
-    Parameters
-    ----------
-    points : sequence of Point
-        At least three points in ascending order of x, then y, with at least two values of x.
-
-    Returns
-    -------
-    low : float
-        Minimum slope.
-    high : float
-        Maximum slope; equal to `low` if all points are on the best line.
+    At least three points ascend in x, then y, with at least two values of x. Both slopes are equal
+    if all points are on the best line.
     """
     hull = lower_hull(points)
     middle = sum(x for x, _ in points) / len(points)

@@ -9,17 +9,9 @@ MAX_GAP = 1_000_000
 
 
 class SequenceCheck:
-    """Checks the sequence numbers of one sensor.
+    """Checks the sequence numbers of one sensor, which return to 0 at `wrap` (0: never).
 
-    Parameters
-    ----------
-    wrap : int
-        Number at which the sequence returns to 0; 0 if it never does.
-
-    Attributes
-    ----------
-    counts : Counter
-        Number of lost, late, duplicate and implausible readings, by cause.
+    `counts` are lost, late, duplicate and implausible readings.
     """
 
     def __init__(self, wrap: int) -> None:
@@ -38,23 +30,10 @@ class SequenceCheck:
         self._begin()
 
     def is_new(self, sequence: int, values: bytes) -> bool:
-        """Record a reading; return whether it is new.
+        """Record a reading; return whether it is not a duplicate (the same number and values).
 
         Skipped numbers are counted as lost; the count is corrected if they arrive late. An older
-        number that is neither lost nor a duplicate (the same number and values) restarts the
-        sequence.
-
-        Parameters
-        ----------
-        sequence : int
-            Sequence number of the reading.
-        values : bytes
-            Values of the reading.
-
-        Returns
-        -------
-        bool
-            False for a duplicate.
+        number that is neither lost nor a duplicate restarts the sequence.
         """
         if sequence < 0 or self._wrap and sequence >= self._wrap:
             self.counts['sequence numbers out of range'] += 1

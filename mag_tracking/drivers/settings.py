@@ -42,22 +42,8 @@ class DriverSettings:
 
 
 def acceleration_scale(unit: str) -> float:
-    """Convert the unit of an acceleration to m/s².
-
-    Parameters
-    ----------
-    unit : str
-        Key of `ACCELERATION_UNITS`, or a number (m/s² per count).
-
-    Returns
-    -------
-    float, m/s²
-
-    Raises
-    ------
-    SettingsError
-        If `unit` is neither a known unit nor a finite number other than 0.
-    """
+    """Convert a key of `ACCELERATION_UNITS` or a number (m/s² per count) to m/s²; raises
+    SettingsError."""
     if unit in ACCELERATION_UNITS:
         return ACCELERATION_UNITS[unit]
     try:

@@ -57,28 +57,10 @@ class SimulatorSettings:
 
 
 class SimulatedDevice:
-    """Simulates all sensors of a network; readings are in tesla. Implements `reading.Device`.
+    """Simulates all sensors of a network, in tesla, as a `reading.Device`.
 
-    Parameters
-    ----------
-    settings : SimulatorSettings
-    monotonic_ns : callable, optional
-        Monotonic clock; tests replace it.
-    sleep : callable, optional
-        Function that waits for a time in seconds.
-
-    Attributes
-    ----------
-    counts : Counter
-        Number of readings that were dropped because they were not read in time.
-
-    Raises
-    ------
-    SettingsError
-        If no network is configured, if the network has no Earth field, or if the path past the
-        sensors has length 0.
-    NetworkError
-        If the network file is not valid.
+    `counts` are readings dropped because they were not read in time. Raises SettingsError without a
+    network, without its Earth field, or if the path past the sensors has length 0.
     """
 
     SETTINGS = SimulatorSettings
@@ -112,23 +94,7 @@ class SimulatedDevice:
         self._next_index = math.ceil(self._elapsed() * self._settings.rate_hz) * len(self._network)
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """Return the readings that are due; wait for the next reading if no reading is due.
-
-        Parameters
-        ----------
-        timeout_s : float, s
-            Maximum time to wait.
-
-        Returns
-        -------
-        list of Arrival
-            Empty if no reading is due in time.
-
-        Raises
-        ------
-        DeviceError
-            If the device has not been opened.
-        """
+        """Return the readings that are due; wait for the next reading if no reading is due."""
         if self._table is None:
             raise DeviceError('the simulator is not open; call open() first')
         wait = self._due(self._next_index) - self._elapsed()
@@ -182,10 +148,8 @@ class SimulatedDevice:
                                       index.tolist(), j.tolist(), B.tolist(), strict=True)]
 
     def _field_of_pass(self) -> FloatArray:
-        """Field at each time of a pass, (n, n_sensors, 3) T, sensor frames.
-
-        The last row is the field without a vehicle.
-        """
+        """Field at each time of a pass, (n, n_sensors, 3) T, sensor frames; the last row has no
+        vehicle."""
         s, network = self._settings, self._network
         t = np.arange(0.0, self._passing_s, 1.0 / s.rate_hz)
         body = random_vehicle(np.random.default_rng(s.seed), length=s.length, moment=s.moment)

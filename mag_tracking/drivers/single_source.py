@@ -76,17 +76,12 @@ class _Sender:
 
 
 class SingleSource:
-    """Selects the steadiest source of a sensor's readings.
+    """Selects the steadiest source of a sensor's readings and counts `changes`.
 
     The first source is selected. It remains selected until it has been silent for
     `RELEASE_TIMEOUT_S` and for `MAX_INTERVALS` of its intervals, or another source is steadier by
     `MARGIN`. Stray messages, whether before the start of the device or later, therefore do not
     block the device, and two equal sources do not alternate.
-
-    Attributes
-    ----------
-    changes : int
-        Number of times another source was selected.
     """
 
     def __init__(self) -> None:
@@ -101,18 +96,7 @@ class SingleSource:
         return self._selected
 
     def accepts(self, source: Source, now_ns: int) -> bool:
-        """Update the selection; return whether `source` is selected.
-
-        Parameters
-        ----------
-        source : Source
-        now_ns : int, ns
-            Monotonic time of arrival.
-
-        Returns
-        -------
-        bool
-        """
+        """Update the selection at a monotonic time; return whether `source` is selected."""
         sender = self._senders.get(source)
         if sender is None:
             sender = self._senders[source] = _Sender(now_ns)
@@ -135,24 +119,14 @@ class SingleSource:
         return selected.is_silent(now_ns) or sender.unsteadiness + MARGIN < selected.unsteadiness
 
     def _drop_oldest(self) -> None:
-        """Drop the source that was silent longest, other than the selected one, if there are too
+        """Drop the source that was silent longest, except the selected one, if there are too
         many."""
         if len(self._senders) > MAX_SENDERS:
             del self._senders[next(s for s in self._senders if s != self._selected)]
 
     def rates_hz(self, now_ns: int) -> dict[Source, float]:
-        """Forget silent sources other than the selected one; return the rates of the others.
-
-        Parameters
-        ----------
-        now_ns : int, ns
-            Monotonic time.
-
-        Returns
-        -------
-        dict of Source to float, Hz
-            Rate of each source that is not silent; 0 for a single reading.
-        """
+        """Forget silent sources other than the selected one; return the rates of the others, 0 for
+        a single reading."""
         silent = {s for s, sender in self._senders.items() if sender.is_silent(now_ns)}
         for source in silent - {self._selected}:
             del self._senders[source]
@@ -161,20 +135,7 @@ class SingleSource:
 
 
 def contest(sensor: str, selected: Source | None, rates_hz: Mapping[Source, float]) -> str:
-    """Describe the sources of a sensor, with the remedy.
-
-    Parameters
-    ----------
-    sensor : str
-        Name in the network.
-    selected : Source or None
-    rates_hz : dict of Source to float, Hz
-
-    Returns
-    -------
-    str
-        Empty if there is at most one source.
-    """
+    """Describe the sources of a sensor with the remedy; empty if there is at most one."""
     if len(rates_hz) < 2:
         return ''
     others = sorted(rates_hz.keys() - {selected}, key=rates_hz.__getitem__, reverse=True)

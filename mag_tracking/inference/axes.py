@@ -11,33 +11,11 @@ MIN_PIVOT = 1e-12
 
 
 def whitened_energy(y: FloatArray, C: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Whitened energy y' C^-1 y of each measurement, over the measured axes.
+    """Whitened energy y' C^-1 y (n,) over the measured axes, and their number (n,), T10 eq. (5.16).
 
-    Parameters
-    ----------
-    y : (n, 3) array
-        Measurement of each sensor; NaN for a missing axis.
-    C : (n, 3, 3) array
-        Noise covariance, in the squared unit of `y`, symmetric. Entries of missing axes are not
-        read.
-
-    Returns
-    -------
-    energy : (n,) array
-        Chi-square distributed for noise alone; 0 if no axis is measured.
-    axes : (n,) int array
-        Number of measured axes.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not match.
-    numpy.linalg.LinAlgError
-        If a covariance is not positive definite.
-
-    References
-    ----------
-    [T10]_ eq. (5.16).
+    Chi-square distributed for noise alone; 0 if no axis is measured. NaN in `y` (n, 3) marks a
+    missing axis, whose entries in `C` (n, 3, 3) are not read. Raises numpy.linalg.LinAlgError if a
+    covariance is not positive definite.
     """
     y, C = _contiguous(y, C)
     energy, axes = np.empty(len(y)), np.empty(len(y), dtype=np.int64)
@@ -47,26 +25,11 @@ def whitened_energy(y: FloatArray, C: FloatArray) -> tuple[FloatArray, IntArray]
 
 
 def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
-    """Distance of covariances from singularity, over the measured axes.
+    """Smallest pivot (n,) of each correlation matrix of `C` (n, 3, 3), over the measured axes.
 
-    Parameters
-    ----------
-    y : (n, 3) array
-        Measurement of each sensor; NaN for a missing axis.
-    C : (n, 3, 3) array
-        Noise covariance, in the squared unit of `y`, symmetric.
-
-    Returns
-    -------
-    (n,) array
-        Smallest pivot of the correlation matrix: the smallest fraction of an axis's variance that
-        the preceding axes do not explain. 1 for uncorrelated axes; NaN or at most 0 if the
-        covariance is not positive definite.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not match.
+    A pivot is the fraction of an axis's variance that the preceding axes do not explain: 1 for
+    uncorrelated axes; NaN or at most 0 if the covariance is not positive definite. NaN in `y`
+    (n, 3) marks a missing axis.
     """
     y, C = _contiguous(y, C)
     out = np.empty(len(y))
@@ -75,24 +38,8 @@ def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
 
 
 def are_valid_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
-    """Whether covariances are finite, symmetric and positive definite over the measured axes.
-
-    Parameters
-    ----------
-    y : (n, 3) array
-        Measurement of each sensor; NaN for a missing axis.
-    C : (n, 3, 3) array
-        Noise covariance, in the squared unit of `y`.
-
-    Returns
-    -------
-    (n,) bool array
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not match.
-    """
+    """Whether covariances `C` (n, 3, 3) are finite, symmetric and positive definite over the axes
+    measured in `y` (n, 3)."""
     y, C = _contiguous(y, C)
     is_measured = ~np.isnan(y)
     finite = np.isfinite(C)

@@ -18,8 +18,7 @@ class TargetBayesFactor:
 
     Attributes
     ----------
-    log_ratio : float, nats
-        Log Bayes factor over the whole track.
+    log_ratio : log Bayes factor over the whole track, nats
     """
 
     def __init__(self) -> None:
@@ -29,21 +28,11 @@ class TargetBayesFactor:
         self._recent_sum = SlidingSum(WINDOW_S)
 
     def add(self, log_ratio: float, stamp_ns: int, min_bayes_factor: float) -> None:
-        """Update the Bayes factor with a frame.
+        """Add the log-density [nats] of a frame with a target minus that with the alternative.
 
-        Parameters
-        ----------
-        log_ratio : float, nats
-            Log-density of the frame with a target, minus the log-density with the alternative.
-        stamp_ns : int, ns
-            Timestamp of the frame.
-        min_bayes_factor : float
-            Required Bayes factor. The alternative is favoured at or below the reciprocal.
-
-        Notes
-        -----
-        After a `log_ratio` that is not finite, the Bayes factor remains unknown, and a target is
-        never favoured.
+        The alternative is favoured at or below the reciprocal of `min_bayes_factor`. After a
+        `log_ratio` that is not finite, the Bayes factor remains unknown, and a target is never
+        favoured.
         """
         if not np.isfinite(log_ratio):
             self._is_known = False
@@ -57,64 +46,24 @@ class TargetBayesFactor:
         self._recent_sum.add(stamp_ns, log_ratio)
 
     def would_be_favoured(self, log_ratio: float, min_bayes_factor: float) -> bool:
-        """Whether a target would be favoured after an assumed increase of its log-likelihood.
-
-        Parameters
-        ----------
-        log_ratio : float, nats
-            Assumed increase of the log-likelihood of the whole track.
-        min_bayes_factor : float
-            Required Bayes factor.
-
-        Returns
-        -------
-        bool
-            False if the Bayes factor is unknown, or at or below `MIN_LOG_RATIO`.
-        """
+        """Whether a target would be favoured if the log-likelihood of the track increased by
+        `log_ratio` [nats]; False if the Bayes factor is unknown, or at or below `MIN_LOG_RATIO`."""
         return self._is_known and self.log_ratio > MIN_LOG_RATIO \
             and self.log_ratio + log_ratio >= float(np.log(min_bayes_factor))
 
     def is_favoured(self, min_bayes_factor: float) -> bool:
-        """Whether the Bayes factor of the whole track favours a target.
-
-        Parameters
-        ----------
-        min_bayes_factor : float
-            Required Bayes factor.
-
-        Returns
-        -------
-        bool
-        """
+        """Whether the Bayes factor of the whole track favours a target."""
         return self._is_known and self.log_ratio >= float(np.log(min_bayes_factor))
 
     def is_recently_disfavoured(self, min_bayes_factor: float) -> bool:
-        """Whether the Bayes factor of the latest `WINDOW_S` favours the alternative.
-
-        Parameters
-        ----------
-        min_bayes_factor : float
-            Required Bayes factor.
-
-        Returns
-        -------
-        bool
-        """
+        """Whether the Bayes factor of the latest `WINDOW_S` favours the alternative."""
         return bool(self._recent_sum.total < -np.log(min_bayes_factor))
 
     def disfavoured_s(self, stamp_ns: int) -> float:
         """Time for which the Bayes factor of the whole track has favoured the alternative.
 
-        Parameters
-        ----------
-        stamp_ns : int, ns
-            Present time.
-
-        Returns
-        -------
-        float, s
-            0 if the Bayes factor is unknown. 0 also if a target was favoured earlier, because the
-            field of a stopped vehicle is as smooth as the alternative.
+        0 if the Bayes factor is unknown. 0 also if a target was favoured earlier, because the field
+        of a stopped vehicle is as smooth as the alternative.
         """
         if self._was_favoured or self._disfavoured_since_ns is None or not self._is_known:
             return 0.0

@@ -10,32 +10,12 @@ from mag_tracking.arrays import FloatArray
 
 
 def inflated_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
-    """Inflate the covariance of a state until it covers another estimate of the position.
+    """Inflate `P`, whose state begins with x and y, to cover another estimate ([Uhlmann03]_).
 
-    The standard deviation along the horizontal difference becomes at least the length of that
-    difference. Each other component is inflated in proportion to its own difference; the added
-    errors of all components are fully correlated.
-
-    Parameters
-    ----------
-    P : (n, n) array
-        Covariance of a state that begins with x and y [m].
-    difference : (k,) array
-        Other estimate minus this estimate, for the first k <= n components.
-
-    Returns
-    -------
-    (n, n) array
-        `P` itself if it already covers the other estimate.
-
-    Notes
-    -----
-    Only the horizontal position determines the inflation. The covariance of the other estimate is
-    not used.
-
-    References
-    ----------
-    [Uhlmann03]_, covariance union.
+    `difference` is the other estimate minus this one, for the first components. The std along its
+    horizontal part becomes at least the length of that part; the other components are inflated in
+    proportion to their differences, fully correlated. `P` itself is returned if it suffices. The
+    covariance of the other estimate is not used.
     """
     d = difference[:2]
     square, variance = float(d @ d), float(d @ P[:2, :2] @ d)

@@ -33,25 +33,11 @@ _K_DIPOLE = 1e-7
 
 
 def information(H: ArrayLike, C: ArrayLike | None = None) -> FloatArray:
-    """Fisher information of independent measurements, summed over all measurements.
+    """Fisher information (n_x, n_x) summed over independent measurements with Jacobians `H`.
 
-    Parameters
-    ----------
-    H : (..., n_y, n_x) array
-        Jacobians; n_y = 3 axes for a magnetometer, any leading axes (times, sensors). A row of NaN
-        is an axis that was not measured.
-    C : (..., n_y, n_y) array, optional
-        Noise covariance of each measurement; leading axes broadcast against `H`. Entries of missing
-        axes are not read. Omit if `H` is whitened.
-
-    Returns
-    -------
-    (n_x, n_x) array
-        Entry (i, j) has the reciprocal unit of x_i x_j.
-
-    References
-    ----------
-    [TSP14]_ eq. (28), (40); [T10]_ eq. (2.16), (5.7).
+    `H` is (..., n_y, n_x); a row of NaN is an unmeasured axis. The noise covariances `C`
+    (..., n_y, n_y) broadcast against `H`; None if `H` is whitened. TSP14 eq. (28), (40);
+    T10 eq. (2.16), (5.7).
     """
     A = whitened(H, C)
     A = A.reshape(-1, A.shape[-1])
@@ -81,32 +67,12 @@ class Observability:
 
 def observability(information: ArrayLike, names: Sequence[str],
                   scale: ArrayLike | None = None) -> Observability:
-    """Local observability of states, from the eigenvalues of their information matrix.
+    """Local observability of states from the eigenvalues of their Fisher information.
 
-    Parameters
-    ----------
-    information : (n_x, n_x) array
-        Fisher information.
-    names : sequence of str
-        Names of the n_x states.
-    scale : (n_x,) array, optional
-        Typical magnitude of each state, in its unit. Eigenvalues, condition number and rank
-        refer to diag(scale) information diag(scale), the information about x / scale. Default: 1;
-        a scale is required if the units differ by decades (metres and tesla).
-
-    Returns
-    -------
-    Observability
-
-    Raises
-    ------
-    ValueError
-        If the number of names or scales is not n_x, a scale is not positive, or the matrix is
-        invalid.
-
-    References
-    ----------
-    [T10]_ sections 5.1-5.3 and eq. (5.11); [TSP14]_ section IV.
+    Eigenvalues, condition number and rank refer to the states divided by `scale` (n_x,), their
+    typical magnitudes (default 1), required if the units differ by decades (metres and tesla).
+    Raises ValueError for an invalid matrix, scale or number of names. T10 sections 5.1-5.3 and
+    eq. (5.11); TSP14 section IV.
     """
     J = np.asarray(information, dtype=float)
     unit_diagonal('information', J)
@@ -121,27 +87,12 @@ def observability(information: ArrayLike, names: Sequence[str],
 
 
 def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
-    """Cramér-Rao bound on the covariance of an estimate.
+    """Cramér-Rao bound (n_x, n_x), the inverse of the total information of measurements and prior.
 
-    Parameters
-    ----------
-    information : (n_x, n_x) array
-        Fisher information of the measurements.
-    prior : (n_x, n_x) array, optional
-        Prior information: diag(1 / std^2) for independent Gaussian states, or `cpa_information`.
-        On the diagonal, 0 means that there is no prior, and inf that the state is exactly known;
-        the other entries of the row and column of an exactly known state are not read.
-
-    Returns
-    -------
-    (n_x, n_x) array
-        Inverse of the total information. If the total is singular, an unobservable state has
-        variance inf and covariances NaN; the entries of the other states are the limits for a
-        vanishing prior. The entries of an exactly known state are zero.
-
-    References
-    ----------
-    [TSP14]_ eq. (42); [MITRE12]_ eq. (18), (28), (32).
+    On the diagonal of `prior`, 0 means no prior and inf an exactly known state, whose entries in
+    the bound are zero. If the total is singular, an unobservable state has variance inf and
+    covariances NaN; the other entries are the limits for a vanishing prior. TSP14 eq. (42);
+    MITRE12 eq. (18), (28), (32).
     """
     J = np.asarray(information, dtype=float)
     unit_diagonal('information', J)
@@ -160,30 +111,11 @@ def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
 
 
 def marginal(information: ArrayLike, keep: ArrayLike) -> FloatArray:
-    """Fisher information about some states if all other states are unknown.
+    """Fisher information about the states `keep` (indices or mask) if all others are unknown.
 
-    Parameters
-    ----------
-    information : (n_x, n_x) array
-        Fisher information.
-    keep : (k,) int array or (n_x,) bool array
-        States of interest. The other states (backgrounds, moments) are eliminated and need not be
-        observable.
-
-    Returns
-    -------
-    (k, k) array
-        Schur complement J_kk - J_ko J_oo^-1 J_ok, in the order of `keep`; its inverse is the
-        corresponding block of the bound. Zero in directions that `bound` finds unobservable.
-
-    Raises
-    ------
-    ValueError
-        If an index in `keep` is out of range or occurs twice, or if the matrix is invalid.
-
-    References
-    ----------
-    [TSP14]_ eq. (44).
+    This is the Schur complement J_kk - J_ko J_oo^-1 J_ok (TSP14 eq. (44)); its inverse is the block
+    of the bound. It is zero in directions that `bound` finds unobservable; eliminated states need
+    not be observable. Raises ValueError for an index that is out of range or occurs twice.
     """
     J = np.asarray(information, dtype=float)
     try:
@@ -206,36 +138,12 @@ def marginal(information: ArrayLike, keep: ArrayLike) -> FloatArray:
 
 
 def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
-    """Fisher information of a known range at the closest point of approach (CPA).
+    """Fisher information (9, 9) about [r0, v0, m] of a known range at the CPA (closest approach).
 
-    Parameters
-    ----------
-    r0 : (3,) array, m
-        Position of the target at time zero, relative to the sensor from which the range is
-        measured.
-    v0 : (3,) array, m/s
-        Velocity of the target.
-    std : float, m
-        Standard deviation of the range; TSP14 uses the limit of zero.
-
-    Returns
-    -------
-    (9, 9) array
-        Information about the states [r0, v0, m]; rank one.
-
-    Raises
-    ------
-    ValueError
-        If `std` is not positive, `v0` is zero, or `r0` is parallel to `v0`. In the last case the
-        path goes through the sensor (TSP14 Proposition 2).
-
-    Notes
-    -----
-    The gradient with respect to v0 printed in the proof of TSP14 Proposition 2 lacks a minus sign.
-
-    References
-    ----------
-    [TSP14]_ eq. (35)-(37).
+    `r0` [m] is the position at time zero relative to the sensor, `std` [m] that of the range
+    (zero in TSP14). Raises ValueError if `std` is not positive, `v0` is zero, or `r0` is parallel
+    to `v0`: the path then goes through the sensor. TSP14 eq. (35)-(37); the gradient with respect
+    to v0 printed in the proof of Proposition 2 lacks a minus sign.
     """
     r0, v0 = np.asarray(r0, dtype=float), np.asarray(v0, dtype=float)
     if r0.shape != (3,) or v0.shape != (3,):
@@ -255,38 +163,12 @@ def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
 
 def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
                P0: ArrayLike) -> FloatArray:
-    """Posterior Cramér-Rao bound of a filter along a given path.
+    """Posterior Cramér-Rao bound (n_steps, n_x, n_x) of a filter along a given path.
 
-    The bound is the covariance of an extended Kalman filter that is linearised at the truth. Step k
-    predicts with F[k] and Q[k], then updates with H[k] and C[k].
-
-    Parameters
-    ----------
-    F : (n_steps, n_x, n_x) or (n_x, n_x) array
-        Jacobian of the motion, per step or common to all steps.
-    Q : (n_steps, n_x, n_x) or (n_x, n_x) array
-        Covariance of the process noise; may be singular.
-    H : (n_steps, ..., n_y, n_x) array
-        Measurement Jacobians at the truth.
-    C : (..., n_y, n_y) array or None
-        Noise covariances, broadcast against `H`; None if `H` is whitened.
-    P0 : (n_x, n_x) array
-        Covariance before the first prediction; may be singular. If it refers to the time of the
-        first measurement, pass F[0] = I and Q[0] = 0.
-
-    Returns
-    -------
-    (n_steps, n_x, n_x) array
-        Covariance after each update.
-
-    Raises
-    ------
-    ValueError
-        If `H` has no axis of steps, or a matrix is invalid.
-
-    References
-    ----------
-    [Tichavsky98]_, without the mean over paths; [T10]_ Alg. 2.
+    It is the covariance, after each update, of an extended Kalman filter linearised at the truth
+    ([Tichavsky98]_ without the mean over paths; T10 Alg. 2). Step k predicts with F[k] and Q[k]
+    (or a common F, Q), then updates with H[k] and C[k]; C is None if H is whitened. Q and P0 may be
+    singular. If P0 refers to the first measurement, pass F[0] = I and Q[0] = 0.
     """
     A = whitened(H, C)
     if A.ndim < 3:
@@ -311,25 +193,10 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
 
 
 def snr(h: ArrayLike, C: ArrayLike) -> FloatArray:
-    """Signal-to-noise energy ratio h' C^-1 h of a field.
+    """Signal-to-noise energy ratio h' C^-1 h of a noise-free field (..., n_y), T10 eq. (5.14).
 
-    The ratio is the non-centrality parameter of `detection_theory.detection_probability`.
-
-    Parameters
-    ----------
-    h : (..., n_y) array
-        Field without noise and background; NaN for an unmeasured axis.
-    C : (..., n_y, n_y) array
-        Noise covariance, in the squared unit of `h`.
-
-    Returns
-    -------
-    (...) array
-        0 if no axis is measured.
-
-    References
-    ----------
-    [T10]_ eq. (5.14).
+    It is the non-centrality parameter of `detection_theory.detection_probability`. NaN in `h` marks
+    an unmeasured axis; 0 if no axis is measured.
     """
     A = whitened(np.asarray(h, dtype=float)[..., None], C)
     energy: FloatArray = np.einsum('...ij,...ij->...', A, A)
@@ -338,67 +205,29 @@ def snr(h: ArrayLike, C: ArrayLike) -> FloatArray:
 
 def snr_at_distance(moment: float | FloatArray, noise_std: float | FloatArray,
                     distance: float | FloatArray) -> FloatArray:
-    """Signal-to-noise ratio of one sample at a distance from a dipole, perpendicular to its axis.
+    """Energy ratio of one sample at a `distance` [m] from a dipole, perpendicular to its axis.
 
-    Along the axis of the dipole the ratio is four times larger.
-
-    Parameters
-    ----------
-    moment : float or array, A m²
-        Magnitude of the moment: 300-600 for a car, 1800 for a truck (TSP14).
-    noise_std : float or array, T
-        Noise standard deviation of one axis, equal on all axes; 1.1e-8 in TSP14.
-    distance : float or array, m
-
-    Returns
-    -------
-    (...) array
-
-    Notes
-    -----
-    T10 eq. (5.23) prints the squared norm of R instead of the norm. Moment and noise in T10 eq.
-    (5.22) are both too small by a factor of about 450.
-
-    References
-    ----------
-    [T10]_ eq. (5.20), (5.21).
+    Along the axis it is four times larger. `moment` is in A m² (300-600 for a car, 1800 for a
+    truck), `noise_std` in T per axis (1.1e-8 in TSP14). T10 eq. (5.20), (5.21); eq. (5.23) prints
+    the squared norm of R instead of the norm. Moment and noise in T10 eq. (5.22) are both too small
+    by a factor of about 450.
     """
     return cast(FloatArray, (_K_DIPOLE * moment / (noise_std * distance**3))**2)
 
 
 def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
               ratio: float | FloatArray) -> FloatArray:
-    """Distance at which `snr_at_distance` has a given value.
+    """Distance [m] at which `snr_at_distance` equals `ratio` (9.2 in T10), T10 eq. (5.24).
 
-    Along the axis of the dipole the distance is larger by a factor of 2^(1/3).
-
-    Parameters
-    ----------
-    moment : float or array, A m²
-        Magnitude of the dipole moment.
-    noise_std : float or array, T
-        Noise standard deviation of one axis.
-    ratio : float or array
-        Signal-to-noise ratio; 9.2 in T10.
-
-    Returns
-    -------
-    (...) array, m
-
-    References
-    ----------
-    [T10]_ eq. (5.24).
+    Along the axis of the dipole it is larger by a factor of 2^(1/3).
     """
     distance: FloatArray = np.cbrt(_K_DIPOLE * moment / (noise_std * np.sqrt(ratio)))
     return distance
 
 
 def _inverse_root(J: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scale J to unit diagonal, and decompose the scaled matrix.
-
-    Returns the scale (n,), a root G (n, rank) of the pseudo-inverse G G' of the scaled matrix, and
-    an orthonormal basis of its kernel (n, n - rank).
-    """
+    """Scale J to unit diagonal; return the scale (n,), a root G (n, rank) of the pseudo-inverse
+    G G' of the scaled matrix, and an orthonormal basis (n, n - rank) of its kernel."""
     scale, w, V = unit_diagonal('information', J)
     zero = w <= RANK_TOLERANCE * w.max(initial=0.0)
     return scale, V[:, ~zero] / np.sqrt(w[~zero]), V[:, zero]

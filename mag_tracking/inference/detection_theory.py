@@ -11,81 +11,27 @@ from mag_tracking.arrays import FloatArray, IntArray
 
 def energy_threshold(false_alarm_probability: float | FloatArray,
                      degrees_of_freedom: float | IntArray) -> FloatArray:
-    """Threshold of the energy test for a given false-alarm probability.
-
-    Parameters
-    ----------
-    false_alarm_probability : float or array
-        P(chi2_n > threshold) without a target.
-    degrees_of_freedom : float or array
-        Number n of measured axes.
-
-    Returns
-    -------
-    float or (...) array
-
-    References
-    ----------
-    [T10]_ eq. (5.18).
-    """
+    """Threshold that chi-square noise exceeds with the false-alarm probability, T10 eq. (5.18)."""
     return cast(FloatArray, chdtri(degrees_of_freedom, false_alarm_probability))
 
 
 def false_alarm_probability(threshold: float | FloatArray,
                             degrees_of_freedom: int | IntArray) -> FloatArray:
-    """False-alarm probability of the energy test, P(chi2_n > threshold).
-
-    Parameters
-    ----------
-    threshold : float or array
-    degrees_of_freedom : int or array
-        Number n of measured axes.
-
-    Returns
-    -------
-    float or (...) array
-        Inverse of `energy_threshold`.
-    """
+    """Probability P(chi2_n > threshold) without a target, the inverse of `energy_threshold`."""
     return cast(FloatArray, chdtrc(degrees_of_freedom, threshold))
 
 
 def detection_probability(snr: float | FloatArray, threshold: float | FloatArray,
                           degrees_of_freedom: int | IntArray) -> FloatArray:
-    """Detection probability of the energy test, P(chi2_n(snr) > threshold).
-
-    Parameters
-    ----------
-    snr : float or array
-        Signal-to-noise ratio, the non-centrality parameter.
-    threshold : float or array
-    degrees_of_freedom : int or array
-        Number n of measured axes.
-
-    Returns
-    -------
-    float or (...) array
-
-    References
-    ----------
-    [T10]_ eq. (5.19).
-    """
+    """Probability P(chi2_n(snr) > threshold); `snr` is the non-centrality, T10 eq. (5.19)."""
     return cast(FloatArray, 1.0 - chndtr(threshold, degrees_of_freedom, snr))
 
 
 def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray:
-    """Probability that a pass contains no `run` consecutive detections.
+    """Exact probability that a pass contains no `run` consecutive detections.
 
-    Parameters
-    ----------
-    probability : (n, ...) array
-        Detection probability of each frame, chronological; frames are assumed independent.
-    run : int
-        Number of consecutive frames required for an onset.
-
-    Returns
-    -------
-    (...) array
-        Exact: computed from the distribution of the current number of consecutive detections.
+    `probability` (n, ...) is the detection probability of each frame, in time order and
+    independent.
     """
     p = np.asarray(probability, dtype=float)
     run_probability = np.zeros((run, *p.shape[1:]))

@@ -33,7 +33,7 @@ is treated as vertical."""
 
 
 class FieldRotation(NamedTuple):
-    """Statistic of the sense of rotation of a field; it is treated as normally distributed."""
+    """Statistic of the sense of rotation of a field, treated as normally distributed."""
 
     correlation: float
     """Correlation of the horizontal axes, T²; negative for a target that moves from left to
@@ -43,12 +43,7 @@ class FieldRotation(NamedTuple):
 
     @property
     def error_probability(self) -> float:
-        """Probability that the sign of the correlation is wrong.
-
-        References
-        ----------
-        [PHD15]_ Paper B eq. (17), (18).
-        """
+        """Probability that the sign of the correlation is wrong; PHD15 Paper B eq. (17), (18)."""
         return float(ndtr(-abs(self.correlation) / np.sqrt(self.variance)))
 
     @property
@@ -64,31 +59,11 @@ class FieldRotation(NamedTuple):
 
 
 def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotation:
-    """Correlation of the two horizontal axes at a lag, with the estimated variance.
+    """Correlation of the horizontal axes at a lag, with a variance of at least that of noise alone.
 
-    Parameters
-    ----------
-    field : (n, 2) array, T
-        Horizontal field x, y in a frame with z up, without the background. The first and the last
-        `lag` samples must not contain the field of the target.
-    noise_std : float, T
-        Noise standard deviation of one sample, per axis.
-    lag : int
-        Lag in samples; 2 lag < n.
-
-    Returns
-    -------
-    FieldRotation
-        Its variance is at least the variance of noise alone.
-
-    Raises
-    ------
-    ValueError
-        If the lag is not valid for the length of the window.
-
-    References
-    ----------
-    [PHD15]_ Paper B eq. (5), (11), (16).
+    `field` (n, 2) [T] is the field in x, y (z up) without the background; its first and last `lag`
+    samples must not contain the target. `noise_std` [T] is per axis. Raises ValueError unless 0 < 2
+    lag < n. PHD15 Paper B eq. (5), (11), (16).
     """
     n = len(field) - 2 * lag
     if lag < 1 or n < 1:
@@ -99,25 +74,8 @@ def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotati
 
 
 def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRotation:
-    """Mean and variance of `field_rotation` for a known signal.
-
-    Parameters
-    ----------
-    signal : (n, 2) array, T
-        Noise-free field in the window; the field outside is assumed to be zero.
-    noise_std : float, T
-        Noise standard deviation of one sample, per axis.
-    lag : int
-        Lag in samples; at least 1.
-
-    Returns
-    -------
-    FieldRotation
-
-    References
-    ----------
-    [PHD15]_ Paper B eq. (12), (14).
-    """
+    """Mean and variance of `field_rotation` for a noise-free field (n, 2) [T] that is zero outside
+    the window; PHD15 Paper B eq. (12), (14)."""
     padded = np.pad(signal, ((lag, lag), (0, 0)))
     return FieldRotation(
         _correlation(padded, lag), noise_std**2 / lag**2 * _squared_lag_differences(padded, lag)
@@ -125,10 +83,8 @@ def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRo
 
 
 def _correlation(field: FloatArray, lag: int) -> float:
-    """Correlation [T²] of the horizontal axes at a lag, excluding the first `lag` samples.
-
-    [PHD15]_ Paper B eq. (5a).
-    """
+    """Correlation [T²] of the axes at a lag without the first `lag` samples; PHD15 Paper B
+    eq. (5a)."""
     current, delayed = field[lag:-lag], field[2 * lag:]
     return float(np.sum(current[:, 0] * delayed[:, 1] - current[:, 1] * delayed[:, 0])) / lag
 
@@ -139,22 +95,10 @@ def _squared_lag_differences(field: FloatArray, lag: int) -> float:
 
 
 def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
-    """Lag that matches the width of a pass.
+    """Lag that matches the width of a pass; 0 if the field does not exceed the noise.
 
-    Parameters
-    ----------
-    field : (n, 2) array, T
-        As for `field_rotation`.
-    noise_std : float, T
-        Noise standard deviation of one sample, per axis.
-    max_lag : int
-        Maximum lag: the number of samples of the window before the pass, and after it.
-
-    Returns
-    -------
-    int
-        Samples, from 1 to the smaller of `max_lag` and a quarter of the window; 0 if the field does
-        not exceed the noise.
+    It is at least 1 and at most `max_lag`, the number of samples of the window before the pass and
+    after it, and a quarter of the window. `field` and `noise_std` are as for `field_rotation`.
     """
     window = 1 + len(field) // 20
     energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(window), 'same')
@@ -167,26 +111,7 @@ def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
 
 
 def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int]) -> int:
-    """Lag with the smallest mean error probability over a training set.
-
-    Parameters
-    ----------
-    windows : iterable of (n, 2) array, T
-        As for `field_rotation`.
-    noise_std : float, T
-        Noise standard deviation of one sample, per axis.
-    lags : sequence of int
-        Candidate lags.
-
-    Returns
-    -------
-    int
-        Samples; one of `lags`.
-
-    References
-    ----------
-    [PHD15]_ Paper B eq. (19).
-    """
+    """Lag of the smallest mean error probability over training windows; PHD15 Paper B eq. (19)."""
     windows = list(windows)
     errors = [np.mean([field_rotation(w, noise_std, lag).error_probability for w in windows])
               for lag in lags]
@@ -194,43 +119,19 @@ def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int
 
 
 def fused_log_odds(log_odds: Iterable[float], same_side: Iterable[bool]) -> float:
-    """Fuse the log-odds of several sensors.
+    """Sum the log-odds of left to right of sensors, whose errors are treated as independent.
 
-    Parameters
-    ----------
-    log_odds : iterable of float
-        Log-odds of left to right, as viewed from each sensor.
-    same_side : iterable of bool
-        False for a sensor on the opposite side of the road, where left and right are exchanged.
-
-    Returns
-    -------
-    float
-        Log-odds of left to right, as viewed from the side for which `same_side` is true. The errors
-        of the sensors are treated as independent.
-
-    References
-    ----------
-    [PHD15]_ Paper B eq. (20)-(23).
+    `same_side` is False for a sensor on the opposite side of the road, where left and right are
+    exchanged. PHD15 Paper B eq. (20)-(23).
     """
     return float(sum(value if is_same_side else -value
                      for value, is_same_side in zip(log_odds, same_side, strict=True)))
 
 
 def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
-    """Horizontal field components in the world frame.
+    """Horizontal field (n, 2) in the world frame from readings (n, 3) in the sensor frame.
 
-    Parameters
-    ----------
-    field : (n, 3) array, T, sensor frame
-        Measured field; NaN for a missing axis. A missing axis that is nearly vertical is ignored.
-    R_ws : (3, 3) array
-        Rotation from the sensor frame to the world frame.
-
-    Returns
-    -------
-    (n, 2) array, T, world frame
-        NaN where a component is unknown.
+    A missing axis (NaN) that is nearly vertical is ignored; otherwise the component is NaN.
     """
     out: FloatArray = np.zeros((len(field), 2))
     for a in range(3):
@@ -243,24 +144,11 @@ def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
 
 
 def rotation_of_pass(field: FloatArray, noise_std: float, n_quiet: int) -> FieldRotation | None:
-    """Compute `field_rotation` at the lag that matches the width of a pass.
+    """`field_rotation` at the lag that matches the width of a pass.
 
-    The prior of the correlation is uniform. The probability of the direction is therefore
-    overconfident for a target below the noise.
-
-    Parameters
-    ----------
-    field : (n, 2) array, T
-        As for `field_rotation`.
-    noise_std : float, T
-        Noise standard deviation of one sample, per axis.
-    n_quiet : int
-        Number of samples of the window before the pass, and after it.
-
-    Returns
-    -------
-    FieldRotation or None
-        None if the window is too short or the field does not exceed the noise.
+    None if the window is too short or the field does not exceed the noise. `n_quiet` samples of the
+    window precede the pass, and as many follow it. The prior of the correlation is uniform, so the
+    direction of a target below the noise is overconfident.
     """
     lag = lag_of(field, noise_std, n_quiet) if len(field) >= MIN_SAMPLES else 0
     return field_rotation(field, noise_std, lag) if lag else None

@@ -21,20 +21,8 @@ _SINGULAR_TOLERANCE = 1e-15
 
 
 def log_sum_exp(a: ArrayLike, axis: int | None = None) -> FloatArray:
-    """Logarithm of a sum of exponentials, log(sum(exp(a))), without overflow.
-
-    Parameters
-    ----------
-    a : (...) array
-        Logarithms.
-    axis : int, optional
-        Axis of the sum. Default: all axes.
-
-    Returns
-    -------
-    (...) array
-        -inf if all elements are -inf.
-    """
+    """log(sum(exp(a))) over `axis` (default: all) without overflow; -inf if all elements are
+    -inf."""
     a = np.asarray(a, dtype=float)
     top = np.max(a, axis=axis, keepdims=True)
     top = np.where(np.isfinite(top), top, 0.0)
@@ -46,10 +34,7 @@ def log_sum_exp(a: ArrayLike, axis: int | None = None) -> FloatArray:
 
 @dataclass
 class FilterBank:
-    """Hypotheses of one target, or of several targets with a joint state.
-
-    The hypothesis is the first axis of every array.
-    """
+    """Hypotheses of one target, or of several targets with a joint state, on the first axis."""
 
     x: FloatArray
     """States, (n_hyp, n_x)."""
@@ -71,30 +56,11 @@ class FilterBank:
     def from_targets(cls, x: FloatArray, P: FloatArray, label: IntArray, n_sensors: int,
                      background_std: float, own_covariance: FloatArray | None = None,
                      kind: IntArray | None = None) -> 'FilterBank':
-        """Create a bank with equal weights from target states.
+        """Create a bank with equal weights from target states `x` (n_hyp, n_t).
 
-        The own states of all sensors, then three backgrounds per sensor, are appended to the target
-        states. All appended states are zero.
-
-        Parameters
-        ----------
-        x : (n_hyp, n_t) array
-            Target states.
-        P : (n_hyp, n_t, n_t) array
-            Covariances of the target states.
-        label : (n_hyp,) int array
-            Assumed direction of arrival.
-        n_sensors : int
-        background_std : float, T
-            Standard deviation of the backgrounds.
-        own_covariance : (n_sensors, n_own, n_own) array, optional
-            Covariance of each sensor's own states. Default: no own states.
-        kind : (n_hyp,) int array, optional
-            Assumed kind of target. Default: 0.
-
-        Returns
-        -------
-        FilterBank
+        The own states of each sensor, with covariances `own_covariance` (n_sensors, n_own, n_own),
+        then three backgrounds [T] per sensor, are appended; all are zero. `label` and `kind` are
+        (n_hyp,).
         """
         n, n_t = x.shape
         own = np.zeros((n_sensors, 0, 0)) if own_covariance is None else own_covariance
@@ -118,33 +84,16 @@ class FilterBank:
     def best(self) -> int:
         """Index of the hypothesis to publish.
 
-        The candidates are the hypotheses of the heaviest label and, within that label, of the
-        heaviest kind. The candidate at the maximum density of their mixture is selected, because
-        the heaviest hypothesis would be a random choice if many neighbours share the weight.
-
-        Returns
-        -------
-        int
+        The candidates are the hypotheses of the heaviest label and, within it, of the heaviest
+        kind; the maximum density of their mixture decides, because the heaviest hypothesis would be
+        a random choice if many neighbours share the weight.
         """
         return core.best(self.x, self.P, self.log_w, _class_indices(self.label),
                          _class_indices(self.kind), _NEGLIGIBLE_LOG_RATIO)
 
     def extract_target(self, i: int, n_one: int) -> 'FilterBank':
-        """Marginalise a joint bank to one target.
-
-        Parameters
-        ----------
-        i : int
-            Index of the target.
-        n_one : int
-            Number of states per target.
-
-        Returns
-        -------
-        FilterBank
-            The same hypotheses with the states of target `i` and of the sensors. The bank itself if
-            it has a single target.
-        """
+        """Marginalise a joint bank to target `i` of `n_one` states, with the sensor states; the
+        bank itself if it has a single target."""
         if self.label.ndim == 1:
             return self
         n_target_states = n_one * self.label.shape[1]
@@ -154,20 +103,7 @@ class FilterBank:
                           self.label[:, i].copy(), self.kind[:, i].copy(), self.origin, self.nis)
 
     def without_target(self, i: int, n_one: int) -> 'FilterBank':
-        """Marginalise one target out of a joint bank.
-
-        Parameters
-        ----------
-        i : int
-            Index of the target to be marginalised out.
-        n_one : int
-            Number of states per target.
-
-        Returns
-        -------
-        FilterBank
-            The same hypotheses without the states of target `i`.
-        """
+        """Marginalise target `i` of `n_one` states out of a joint bank."""
         n_targets = self.label.shape[1]
         columns = np.delete(np.arange(self.x.shape[1]), np.arange(i * n_one, (i + 1) * n_one))
         label, kind = np.delete(self.label, i, axis=1), np.delete(self.kind, i, axis=1)
@@ -177,90 +113,29 @@ class FilterBank:
                           kind, self.origin.copy(), self.nis.copy())
 
     def copy(self) -> 'FilterBank':
-        """Return a deep copy.
-
-        Returns
-        -------
-        FilterBank
-        """
+        """Return a deep copy."""
         return FilterBank(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
     def rows(self, rows: IntArray) -> 'FilterBank':
-        """Select hypotheses and assign equal weights.
-
-        Parameters
-        ----------
-        rows : (n,) int array
-            Indices of the hypotheses; may repeat.
-
-        Returns
-        -------
-        FilterBank
-            Its arrays are copies.
-        """
+        """Copy the hypotheses of the given indices, which may repeat, with equal weights."""
         selected = {f.name: np.ascontiguousarray(getattr(self, f.name)[rows]) for f in fields(self)}
         return FilterBank(**{**selected, 'log_w': np.full(len(rows), -np.log(len(rows)))})
 
     def alone(self, i: int) -> 'FilterBank':
-        """Create a bank that contains a single hypothesis of this bank.
-
-        Parameters
-        ----------
-        i : int
-            Index of the hypothesis.
-
-        Returns
-        -------
-        FilterBank
-            Its arrays are copies.
-        """
+        """Copy hypothesis `i` to a bank of its own."""
         return self.rows(np.array([i]))
 
     def weight(self, mask: BoolArray) -> float:
-        """Total weight of the selected hypotheses.
-
-        Parameters
-        ----------
-        mask : (n_hyp,) bool array
-            True for the selected hypotheses.
-
-        Returns
-        -------
-        float
-        """
+        """Total weight of the hypotheses selected by `mask` (n_hyp,)."""
         return float(np.exp(log_sum_exp(self.log_w[mask]))) if mask.any() else 0.0
 
     def is_concentrated_in(self, n: int, fraction: float) -> bool:
-        """Whether the `n` heaviest hypotheses have at least a given fraction of the weight.
-
-        Parameters
-        ----------
-        n : int
-            Number of hypotheses.
-        fraction : float
-            Required fraction of the total weight.
-
-        Returns
-        -------
-        bool
-        """
+        """Whether the `n` heaviest hypotheses have at least a given fraction of the weight."""
         return bool(np.exp(np.sort(self.log_w)[-n:]).sum() >= fraction)
 
     def is_separated(self, i: int, distance: float = 3.0) -> BoolArray:
-        """Flag the hypotheses whose position differs significantly from a reference hypothesis.
-
-        Parameters
-        ----------
-        i : int
-            Index of the reference hypothesis.
-        distance : float
-            Minimum Mahalanobis distance, with the sum of both covariances.
-
-        Returns
-        -------
-        (n_hyp,) bool array
-            True where the positions differ.
-        """
+        """Flag the hypotheses (n_hyp,) whose position differs from hypothesis `i` by more than the
+        Mahalanobis `distance`, with the sum of both covariances."""
         difference = self.x[:, :3] - self.x[i, :3]
         C = self.P[:, :3, :3] + self.P[i, :3, :3]
         try:
@@ -277,18 +152,10 @@ class FilterBank:
         return is_separated
 
     def reweight(self, log_likelihood: FloatArray) -> float:
-        """Update the weights by Bayes' rule.
+        """Update the weights with the log-likelihoods of a frame; return the frame's log-evidence.
 
-        Parameters
-        ----------
-        log_likelihood : (n_hyp,) array
-            Log-likelihood of a frame. A hypothesis whose value is not finite gets zero weight.
-
-        Returns
-        -------
-        float
-            Log-evidence of the frame. If no value is finite, the evidence is -inf and the weights
-            do not change.
+        A hypothesis whose value is not finite gets zero weight. If no value is finite, the evidence
+        is -inf and the weights do not change.
         """
         log_likelihood = np.where(np.isfinite(log_likelihood), log_likelihood, -np.inf)
         joint_log_w = self.log_w + log_likelihood
@@ -298,20 +165,8 @@ class FilterBank:
         return evidence
 
     def keep(self, mask: BoolArray) -> int:
-        """Remove all hypotheses except the selected ones, and normalise the weights.
+        """Keep the hypotheses of `mask` and normalise the weights; return the number removed.
 
-        Parameters
-        ----------
-        mask : (n_hyp,) bool array
-            True for the selected hypotheses.
-
-        Returns
-        -------
-        int
-            Number of hypotheses removed.
-
-        Notes
-        -----
         The arrays `x` and `P` may be overwritten in place.
         """
         rows = np.flatnonzero(mask)
@@ -324,20 +179,8 @@ class FilterBank:
         return n_removed
 
     def prune(self, log_ratio: float, max_hypotheses: int) -> int:
-        """Remove hypotheses of low weight.
-
-        Parameters
-        ----------
-        log_ratio : float, nats
-            Maximum difference from the log-weight of the heaviest hypothesis.
-        max_hypotheses : int
-            Maximum number of hypotheses; the lightest are removed.
-
-        Returns
-        -------
-        int
-            Number of hypotheses removed.
-        """
+        """Keep the heaviest hypotheses, at most `log_ratio` nats below the heaviest one and
+        `max_hypotheses` in number; return the number removed."""
         mask = self.log_w >= self.log_w.max() - log_ratio
         if np.count_nonzero(mask) > max_hypotheses:
             order = np.argsort(-self.log_w, kind='stable')
@@ -362,11 +205,8 @@ def _class_indices(labels: IntArray) -> IntArray:
 
 
 def _compacted(a: FloatArray, rows: IntArray) -> FloatArray:
-    """Select the ascending `rows` (n,) of an array by moving the rows to the beginning.
-
-    Moving rows in place is faster than a copy. A copy is returned if the selected rows occupy less
-    than half of the buffer.
-    """
+    """Select ascending `rows` (n,) by moving them to the beginning in place, which is faster than a
+    copy; a copy is returned if they occupy less than half of the buffer."""
     buffer = a if a.base is None else a.base
     if len(rows) * a[:1].nbytes < buffer.nbytes // 2:
         return a[rows]

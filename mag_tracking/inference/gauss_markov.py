@@ -20,25 +20,13 @@ SWITCH_INTERVAL_S = 0.75
 
 
 class GaussMarkovVectors:
-    """Kalman filters for vectors that start at zero and change independently of each other.
+    """Kalman filters for `n` independent vectors that start at zero ([BarShalom01]_ 6.2.2, 11.6).
 
     Parameters
     ----------
-    n : int
-        Number of vectors.
-    scale : (m,) array
-        Factor of `STRENGTHS` for each component; zero for constant components, which come last.
-    std : float
-        Initial standard deviation of each component.
-
-    Raises
-    ------
-    ValueError
-        If a constant component precedes a changing component.
-
-    References
-    ----------
-    [BarShalom01]_ sections 6.2.2 and 11.6.
+    scale : (m,), factor of `STRENGTHS` for each component; zero for constant components, which must
+        come last, otherwise ValueError
+    std : initial std of each component
     """
 
     def __init__(self, n: int, scale: FloatArray, std: float) -> None:
@@ -57,25 +45,10 @@ class GaussMarkovVectors:
 
     def log_density(self, vector: IntArray, H: FloatArray, y: FloatArray, variance: FloatArray,
                     dt: float) -> float:
-        """Update with scalar measurements, and return the log-density of these measurements.
+        """Update with scalar measurements; return their log-density [nats] given the earlier ones.
 
-        Parameters
-        ----------
-        vector : (n_y,) int array
-            Index of the vector that each measurement observes, ascending.
-        H : (n_y, m) array
-            Measurement rows: the measurement is H times the vector.
-        y : (n_y,) array
-            Measurements, without NaN.
-        variance : (n_y,) array
-            Noise variances, positive.
-        dt : float, s
-            Time since the previous measurements.
-
-        Returns
-        -------
-        float, nats
-            Log-density given the earlier measurements.
+        Measurement i is H[i] (m,) times vector[i], plus noise of positive variance[i]. `vector` is
+        ascending, and `y` has no NaN. `dt` [s] is the time since the previous measurements.
         """
         return core.step_vectors(self._x, self._P, self._log_w, self._densities,
                                  plain(vector, np.int64), plain(H), plain(y), plain(variance), dt,

@@ -42,25 +42,10 @@ class EnrolledVehicle:
 
     def moment_at(self, heading: float, heading_std: float, field_strength: FloatArray
                   ) -> tuple[FloatArray, FloatArray] | None:
-        """Predict the moment of a pass at a given heading.
+        """Predict the moment (3,) [A m², world frame] of a pass at a heading, and its covariance.
 
-        Parameters
-        ----------
-        heading : float, rad, world frame
-        heading_std : float, rad
-            Standard deviation of the heading.
-        field_strength : (3,) array, A/m, world frame
-            B0/mu0.
-
-        Returns
-        -------
-        (moment, covariance) or None
-            Moment (3,) [A m², world frame] and covariance of the prediction (3, 3), without the
-            measurement noise. None if the vehicle was enrolled at another heading only.
-
-        References
-        ----------
-        [T10]_ eq. (6.16); [TSP14]_ eq. (15), (16).
+        `field_strength` is B0/mu0 [A/m, world frame]. The measurement noise is not included. None
+        if the vehicle was enrolled at another heading only. T10 eq. (6.16); TSP14 eq. (15), (16).
         """
         pass_to_pass = PASS_TO_PASS_STD**2 * np.eye(3)
         if self.iron is None:
@@ -78,7 +63,7 @@ class EnrolledVehicle:
 
 @dataclass(frozen=True)
 class Identification:
-    """Result of the comparison of a pass with the enrolled vehicles."""
+    """Comparison of a pass with the enrolled vehicles."""
 
     name: str
     """The most probable vehicle; `UNKNOWN` if the moment matches none of the compared vehicles."""
@@ -93,29 +78,11 @@ class Identification:
 
 def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: FloatArray,
           field_strength: FloatArray) -> EnrolledVehicle:
-    """Enrol a vehicle from its passes at known headings.
+    """Enrol a vehicle from fitted moments (n, 3) [A m², world frame] of passes at known headings.
 
-    Parameters
-    ----------
-    name : str
-        Name of the vehicle.
-    moments : (n, 3) array, A m², world frame
-        Fitted moments of the passes.
-    covariances : (n, 3, 3) array, A² m⁴
-        Covariances of the fits; the variance between passes is added.
-    headings : (n,) array, rad, world frame
-    field_strength : (3,) array, A/m, world frame
-        B0/mu0.
-
-    Returns
-    -------
-    EnrolledVehicle
-
-    Raises
-    ------
-    ValueError
-        If there is no pass, a value is not finite, or the headings neither agree nor differ by at
-        least `MIN_HEADING_SEPARATION`.
+    The variance between passes is added to `covariances`; `field_strength` is B0/mu0 [A/m, world].
+    Raises ValueError if there is no pass, a value is not finite, or the headings neither agree nor
+    differ by at least `MIN_HEADING_SEPARATION`.
     """
     moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
     if not len(moments):
@@ -138,25 +105,9 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
 
 def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance: FloatArray,
              heading: float, heading_std: float, field_strength: FloatArray) -> Identification:
-    """Identify the enrolled vehicle that made a pass.
+    """Identify the enrolled vehicle of a pass by its fitted moment (3,) [A m², world frame].
 
-    Parameters
-    ----------
-    vehicles : sequence of EnrolledVehicle
-        Enrolled vehicles to compare.
-    moment : (3,) array, A m², world frame
-        Fitted moment of the pass.
-    covariance : (3, 3) array, A² m⁴
-        Covariance of `moment`.
-    heading : float, rad, world frame
-    heading_std : float, rad
-        Standard deviation of the heading.
-    field_strength : (3,) array, A/m, world frame
-        B0/mu0.
-
-    Returns
-    -------
-    Identification
+    `heading` is in the world frame; `field_strength` is B0/mu0 [A/m, world frame].
     """
     log_p, distances, skipped = {}, {}, []
     for vehicle in vehicles:

@@ -14,10 +14,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 
 @dataclass
 class InitialBank:
-    """Hypotheses of a `FilterBank` at its start.
-
-    The hypothesis is the first axis of every array.
-    """
+    """Hypotheses of a `FilterBank` at its start, on the first axis of every array."""
 
     x: FloatArray
     """States of the target, then of the sensors, (n_hyp, n_x)."""
@@ -36,19 +33,8 @@ class InitialBank:
 
     @classmethod
     def of(cls, bank: FilterBank, n_target: int) -> 'InitialBank':
-        """Copy a bank at its start.
-
-        Parameters
-        ----------
-        bank : FilterBank
-            Bank before its first update.
-        n_target : int
-            Number of target states, which come first.
-
-        Returns
-        -------
-        InitialBank
-        """
+        """Copy a bank before its first update; its first `n_target` states are those of the
+        target."""
         return cls(bank.x.copy(), bank.P[:, :n_target, :n_target].copy(),
                    bank.P[0, n_target:, n_target:].copy(), bank.label, bank.kind, bank.origin,
                    bank.nis.shape[1])
@@ -58,18 +44,7 @@ class InitialBank:
         return len(self.x)
 
     def rows(self, rows: IntArray) -> FilterBank:
-        """Restore selected hypotheses with equal weights.
-
-        Parameters
-        ----------
-        rows : (n,) int array
-            Indices of the hypotheses to restore.
-
-        Returns
-        -------
-        FilterBank
-            Its arrays are copies.
-        """
+        """Restore the hypotheses of the given indices, as copies with equal weights."""
         n, n_t = len(rows), self.P.shape[1]
         P = np.zeros((n, self.x.shape[1], self.x.shape[1]))
         P[:, :n_t, :n_t], P[:, n_t:, n_t:] = self.P[rows], self.P_sensors
@@ -77,12 +52,6 @@ class InitialBank:
                           self.kind[rows], self.origin[rows], np.full((n, self.n_sensors), np.nan))
 
     def keep(self, mask: BoolArray) -> None:
-        """Remove all hypotheses except the selected ones.
-
-        Parameters
-        ----------
-        mask : (n_hyp,) bool array
-            True for the selected hypotheses.
-        """
+        """Keep the hypotheses selected by `mask` (n_hyp,)."""
         for name in ('x', 'P', 'label', 'kind', 'origin'):
             setattr(self, name, getattr(self, name)[mask])

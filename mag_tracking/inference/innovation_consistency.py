@@ -20,17 +20,7 @@ FALSE_ALARM_PROBABILITY = 1e-3
 
 
 class InnovationConsistency:
-    """Chi-square test of the innovations of a track.
-
-    Parameters
-    ----------
-    n_sensors : int
-        Number of sensors of the track.
-
-    References
-    ----------
-    [BarShalom01]_ section 5.4.2.
-    """
+    """Chi-square test of the innovations of a track ([BarShalom01]_ section 5.4.2)."""
 
     def __init__(self, n_sensors: int) -> None:
         self._n_sensors = n_sensors
@@ -39,17 +29,8 @@ class InnovationConsistency:
         self._recent_sum = SlidingSum(WINDOW_S)
 
     def add(self, nis: FloatArray, n_axes: FloatArray, stamp_ns: int) -> None:
-        """Add the innovations of a frame.
-
-        Parameters
-        ----------
-        nis : (n_sensors,) array
-            Normalised innovation squared of each sensor; NaN for a missing sensor.
-        n_axes : (n_sensors,) array
-            Number of axes measured by each sensor.
-        stamp_ns : int, ns
-            Timestamp of the frame.
-        """
+        """Add the NIS of each sensor in a frame (NaN if missing) and its number of measured
+        axes."""
         values = np.stack([np.nan_to_num(nis), np.where(np.isnan(nis), 0, n_axes)])
         values = np.column_stack([values, values.sum(axis=1)])
         self._total += values
@@ -57,10 +38,8 @@ class InnovationConsistency:
 
     @property
     def excess(self) -> float:
-        """Largest significant ratio of actual to predicted innovation variance in the window.
-
-        The value is 1 if the innovations of the network and of each sensor are consistent.
-        """
+        """Largest significant ratio of actual to predicted innovation variance in the window; 1 if
+        the innovations of the network and of each sensor are consistent."""
         recent = self._recent_sum.total
         fails = self._fails(recent)
         with np.errstate(invalid='ignore', divide='ignore'):
@@ -73,10 +52,8 @@ class InnovationConsistency:
         return bool(self._fails(self._total).any())
 
     def _fails(self, values: FloatArray) -> FloatArray:
-        """Flag the sums of NIS (n_sensors + 1,) that exceed the chi-square threshold.
-
-        `values` (2, n_sensors + 1) are the sums and their degrees of freedom.
-        """
+        """Flag the sums of NIS (n_sensors + 1,) above the threshold; `values` are sums and degrees
+        of freedom."""
         probability = np.append(np.full(self._n_sensors, FALSE_ALARM_PROBABILITY / self._n_sensors),
                                 FALSE_ALARM_PROBABILITY)
         nis, dof = values

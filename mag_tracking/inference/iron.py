@@ -29,32 +29,11 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, field_strength: 
                        covariances: ArrayLike | None = None) -> Iron:
     """Estimate m0 and D in m = Rz(heading) m0 + D field_strength by least squares.
 
-    Parameters
-    ----------
-    moments : (n, 3) array, A m², world frame
-        Fitted moments of the passes.
-    headings : (n,) array, rad, world frame
-        Angle from x, anticlockwise when viewed from above.
-    field_strength : (3,) array, A/m, world frame
-        B0/mu0. With 3 B0/mu0, the result is D as defined in T10.
-    covariances : (n, 3, 3) array, A² m⁴, optional
-        Covariances of the moments. Default: all moments have equal weight, and the covariance of
-        the result is estimated from the residuals.
-
-    Returns
-    -------
-    Iron
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match, a value is not finite, a covariance is not positive definite, or
-        hard and soft iron cannot be separated: for a single heading, equal headings, or a vertical
-        earth field.
-
-    References
-    ----------
-    [TSP14]_ section VI.E; [T10]_ eq. (6.16).
+    `moments` (n, 3) [A m²] and `field_strength` = B0/mu0 [A/m] are in the world frame; with 3
+    B0/mu0, D is as defined in T10. Without `covariances`, moments have equal weight and the
+    residuals determine the covariance. Raises ValueError for invalid input, or if hard and soft
+    iron cannot be separated: a single heading, equal headings, or a vertical earth field. TSP14
+    section VI.E; T10 eq. (6.16).
     """
     moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
     field_strength = np.asarray(field_strength, dtype=float)
@@ -90,10 +69,8 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, field_strength: 
 
 
 def _whitening_matrices(covariances: ArrayLike | None, n: int) -> FloatArray:
-    """Inverse Cholesky factors (n, 3, 3) of `n` covariances; identity matrices if None.
-
-    Raises ValueError for a wrong shape or a covariance that is not positive definite.
-    """
+    """Inverse Cholesky factors (n, 3, 3) of `n` covariances, identity matrices if None; raises
+    ValueError for a wrong shape or a covariance that is not positive definite."""
     if covariances is None:
         return np.tile(np.eye(3), (n, 1, 1))
     covariances = np.asarray(covariances, dtype=float)

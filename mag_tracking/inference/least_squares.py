@@ -21,37 +21,13 @@ CORRELATION_TIME_S = 0.2
 
 def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iterations: int = 40,
            tolerance: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Minimise a sum of squares by Levenberg-Marquardt from many starting points in parallel.
+    """Minimise sums of squares by Levenberg-Marquardt from many starting points `x` in parallel.
 
-    Each starting point has its own damping.
-
-    Parameters
-    ----------
-    residual_and_jacobian : callable
-        Function of points (n, n_x) that returns whitened residuals (n, n_y), measured minus
-        predicted, and the Jacobians (n, n_y, n_x) of the prediction.
-    x : (n, n_x) array
-        Starting points.
-    n_iterations : int
-        Maximum number of iterations.
-    tolerance : float
-        A search has converged if one step decreases the cost by at most this fraction.
-
-    Returns
-    -------
-    x : (n, n_x) array
-        Final points.
-    cost : (n,) array
-        Sum of squared whitened residuals; infinite if the model is not finite at a starting point.
-    covariance : (n, n_x, n_x) array
-        Pseudo-inverse of the information at `x`.
-    converged : (n,) bool array
-        Whether the step or the decrease of the cost became negligible within `n_iterations`. False
-        if no damping below `MAX_DAMPING` decreases the cost.
-
-    References
-    ----------
-    [T10]_ section 2.3, Alg. 1.
+    `residual_and_jacobian` returns whitened residuals, measured minus predicted, and the Jacobians
+    of the prediction. Returns the final points; their costs, infinite if the model is not finite at
+    the start; the pseudo-inverses of the information; and whether the step or the decrease of the
+    cost (at most the fraction `tolerance`) became negligible. Each start has its own damping; one
+    that reaches `MAX_DAMPING` has not converged. T10 section 2.3, Alg. 1.
     """
     x = np.array(x, dtype=float)
     residual, J, cost = _evaluate(residual_and_jacobian, x)
@@ -106,23 +82,11 @@ def _evaluate(residual_and_jacobian: ResidualAndJacobian, x: FloatArray
 
 def project_out_linear(A: FloatArray, y: FloatArray
                        ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Estimate the linear parameters p of several models y = A p + e, e ~ N(0, I).
+    """Linear parameters p (n, k) of models y = A p + e, e ~ N(0, I), by least squares.
 
-    Parameters
-    ----------
-    A : (n, n_y, k) array
-        Design matrices.
-    y : (n_y,) array
-        Whitened measurements.
-
-    Returns
-    -------
-    p : (n, k) array
-        Zero in nearly singular directions of `A` (`LINEAR_RANK_TOLERANCE`).
-    residual : (n, n_y) array
-        Residuals y - A p.
-    inverse : (n, k, k) array
-        Pseudo-inverse of A'A.
+    `A` is (n, n_y, k), and `y` (n_y,) is common to all. Returns p, zero in nearly singular
+    directions of A (`LINEAR_RANK_TOLERANCE`); the residuals (n, n_y); and the pseudo-inverses of
+    A'A.
     """
     At = np.swapaxes(A, 1, 2)
     inverse = pseudo_inverse(At @ A, LINEAR_RANK_TOLERANCE)
@@ -136,23 +100,10 @@ position would otherwise cancel each other with unbounded moments."""
 
 
 def score_sum_covariance(scores: FloatArray, lag: int) -> FloatArray:
-    """Covariance of a sum of correlated scores, by the Newey-West method with Bartlett weights.
+    """Covariance of a sum of correlated scores (n, n_x), chronological ([NeweyWest87]_, Bartlett).
 
-    Parameters
-    ----------
-    scores : (n, n_x) array
-        Gradient of the cost of each sample at the minimum, chronological.
-    lag : int
-        Samples further apart than this are treated as independent.
-
-    Returns
-    -------
-    (n_x, n_x) array
-        Positive semidefinite; approximately the information if model and noise are correct.
-
-    References
-    ----------
-    [NeweyWest87]_.
+    `scores` are the gradients of each sample's cost at the minimum; beyond `lag` samples they are
+    independent. Positive semidefinite; about the information if model and noise are correct.
     """
     S = scores.T @ scores
     for k in range(1, min(lag, len(scores) - 1) + 1):
@@ -163,27 +114,12 @@ def score_sum_covariance(scores: FloatArray, lag: int) -> FloatArray:
 
 def model_error_covariance(t: Sequence[FloatArray], derivatives: Sequence[FloatArray],
                            residuals: Sequence[FloatArray], covariance: FloatArray) -> FloatArray:
-    """Additional covariance of an estimate due to errors of the model.
+    """Additional covariance (n_x, n_x) of an estimate due to errors of the model.
 
-    Residuals caused by model errors are correlated over `CORRELATION_TIME_S`, so they contain less
-    information than their number suggests. The result is positive semidefinite, even if the
-    residuals are smaller than the noise by chance.
-
-    Parameters
-    ----------
-    t : sequence of (n,) array, s
-        Timestamps of each sensor, ascending.
-    derivatives : sequence of (n, k, n_x) array
-        Whitened derivatives of each sensor.
-    residuals : sequence of (n, k) array
-        Whitened residuals of each sensor.
-    covariance : (n_x, n_x) array
-        Covariance due to noise alone.
-
-    Returns
-    -------
-    (n_x, n_x) array
-        NaN if a variance is infinite.
+    Residuals of model errors are correlated over `CORRELATION_TIME_S` and contain less information
+    than their number suggests. For each sensor: ascending times [s], whitened derivatives
+    (n, k, n_x) and residuals (n, k). Positive semidefinite even if residuals are small by chance;
+    NaN if a variance in `covariance` (due to noise alone) is infinite.
     """
     scale = np.sqrt(np.diagonal(covariance))
     excess = np.zeros_like(covariance)

@@ -38,21 +38,7 @@ class ClassPosterior(NamedTuple):
 
 def class_posterior(names: Sequence[str], shares: Sequence[float],
                     features: Sequence[Feature]) -> ClassPosterior:
-    """Classify an object by independent features.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Names of the classes.
-    shares : sequence of float
-        Prior weight of each class.
-    features : sequence of Feature
-        Measured features.
-
-    Returns
-    -------
-    ClassPosterior
-    """
+    """Classify an object by independent features; `shares` are the prior weights of the classes."""
     measured = np.log([f.value for f in features])
     relative = np.array([f.std / f.value for f in features])
     variance = np.square(np.array([f.spreads for f in features])) + np.square(relative)[:, None]

@@ -10,12 +10,9 @@ from mag_tracking.arrays import FloatArray
 
 
 class MarginalWhitener:
-    """Whitening by the inverse root of the covariance I + C C'.
+    """Whitening by the inverse root of I + C C'.
 
-    Parameters
-    ----------
-    columns : (n_y, q) array
-        C: columns of the nuisance terms, each scaled by the standard deviation of its coefficient.
+    C, `columns` (n_y, q), contains the nuisance terms, each times the std of its coefficient.
     """
 
     def __init__(self, columns: FloatArray) -> None:
@@ -29,16 +26,7 @@ class MarginalWhitener:
         return whitened
 
     def correction_factor(self, A: FloatArray) -> FloatArray:
-        """Factor F(A) of the low-rank correction: A' inv(I + C C') B = A'B - F(A)' F(B).
-
-        Parameters
-        ----------
-        A : (n_y, k) array
-            Matrix A of the product; apply the same method to B.
-
-        Returns
-        -------
-        (q, k) array
-        """
+        """Factor F(A) (q, k) of the low-rank correction in A' inv(I + C C') B = A'B - F(A)'
+        F(B)."""
         gain: FloatArray = self._singular_values / np.sqrt(1.0 + self._singular_values**2)
         return gain[:, None] * (self._U.T @ A)

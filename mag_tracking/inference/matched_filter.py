@@ -21,32 +21,13 @@ _BAND_EDGE_TOLERANCE = 1e-9
 
 def noise_spectrum(frequency: ArrayLike, background: float, resolution: float,
                    bandwidth: float) -> FloatArray:
-    """Power spectral density of geomagnetic 1/f noise and sensor quantisation.
+    """Two-sided spectral density [T²/Hz] of geomagnetic 1/f noise and sensor quantisation.
 
-    Parameters
-    ----------
-    frequency : (...) array, Hz
-        Positive or negative.
-    background : float, T/sqrt(Hz)
-        Level of the geomagnetic noise at 1 Hz; 1e-12 in rural areas, 1e-10 in towns.
-    resolution : float, T
-        Quantisation step of the sensor.
-    bandwidth : float, Hz
-        Half the sampling rate, over which the quantisation noise is spread.
-
-    Returns
-    -------
-    (...) array, T²/Hz
-        Two-sided density. Infinite at zero frequency, unless `background` is zero.
-
-    Notes
-    -----
-    MITRE12 eq. (B.10) is two-sided; eq. (B.8) is assumed to be two-sided, too. The denominator of
-    eq. (B.8) is the frequency in Hz, as a pure number.
-
-    References
-    ----------
-    [MITRE12]_ eq. (B.8)-(B.10).
+    `background` [T/sqrt(Hz)] is the geomagnetic noise at 1 Hz: 1e-12 in rural areas, 1e-10 in
+    towns; unless it is zero, the density is infinite at zero frequency. The quantisation noise of
+    steps `resolution` [T] is spread over `bandwidth` [Hz], half the sampling rate.
+    MITRE12 eq. (B.8)-(B.10): (B.10) is two-sided, (B.8) is assumed to be; the denominator of (B.8)
+    is the frequency in Hz as a pure number.
     """
     f = np.abs(np.asarray(frequency, dtype=float))
     _raise_for_invalid('frequency', 'a number', f, np.isnan(f))
@@ -63,44 +44,19 @@ def noise_spectrum(frequency: ArrayLike, background: float, resolution: float,
 
 def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArray], ArrayLike],
                band: Sequence[float]) -> FloatArray:
-    """Deflection of the matched filter.
+    """Deflection: difference of the filter's means with and without the signal over its std.
 
-    This is the difference of its mean outputs with and without the signal, divided by the standard
-    deviation of the output.
+    `B` (..., n, n_axes) [T] is the noise-free signal; an axis that is all NaN is not measured. The
+    result combines the axes; NaN if none is measured. `spectrum` maps frequencies [Hz] in the
+    `band` (both edges included, inf allowed) to the two-sided noise density [T²/Hz], equal and
+    independent on all axes; an infinite density does not contribute. Raises ValueError if no
+    frequency of n samples is in the band.
 
-    Parameters
-    ----------
-    B : (..., n, n_axes) array, T
-        Signal without noise, n samples in time. An axis that is NaN at all times is not measured.
-    sampling_rate : float, Hz
-    spectrum : callable, (n_f,) array, Hz -> (n_f,) array, T²/Hz
-        Two-sided noise density, positive, equal and independent on all axes. The function is called
-        for frequencies in the band only. Frequencies with an infinite density do not contribute.
-    band : (2,) sequence, Hz
-        Lowest and highest frequency, both included; the highest may be infinite.
-
-    Returns
-    -------
-    (...) array
-        Root of the sum of the squared deflections of the axes. NaN if no axis is measured.
-
-    Raises
-    ------
-    ValueError
-        If a shape or value is invalid, or if n samples have no frequency in the band.
-
-    Notes
-    -----
-    The transform approximates the continuous transform: the DFT is divided by the sampling rate.
-    With the plain DFT, as printed, the deflection would be too large by a factor of the sampling
-    rate. The sum includes both signs of the frequency, as the density is two-sided. The paper does
-    not mention this; a one-sided sum would make the deflection smaller by a factor of sqrt(2). The
-    figures of the paper are reproduced if the DFT is divided by n instead, which makes the
-    deflection larger by a factor of `sampling_rate` / n [1/s]: see examples/mitre12.py.
-
-    References
-    ----------
-    [MITRE12]_ eq. (B.11)-(B.13).
+    MITRE12 eq. (B.11)-(B.13). The DFT is divided by the sampling rate to approximate the continuous
+    transform; the plain DFT, as printed, is too large by that factor. The sum includes both signs
+    of the frequency, which the paper does not mention; one sign gives 1/sqrt(2) of the deflection.
+    The figures of the paper result from a DFT divided by n, which makes the deflection larger by
+    `sampling_rate` / n [1/s]: see examples/mitre12.py.
     """
     B = np.asarray(B, dtype=float)
     if B.ndim < 2 or 0 in B.shape[-2:]:
@@ -132,32 +88,9 @@ def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArra
 
 def detection_probability(deflection: ArrayLike, false_alarm_probability: ArrayLike
                           ) -> FloatArray:
-    """Detection probability of the matched filter.
+    """Detection probability of the matched filter, NaN where the deflection is NaN.
 
-    Parameters
-    ----------
-    deflection : (...) array
-        Deflection; NaN where nothing is measured.
-    false_alarm_probability : (...) array
-        Above 0 and below 1; broadcasts against `deflection`.
-
-    Returns
-    -------
-    (...) array
-        NaN where the deflection is NaN.
-
-    Raises
-    ------
-    ValueError
-        If a deflection is negative or a probability is out of range.
-
-    Notes
-    -----
-    Phi in the paper is the complementary normal distribution.
-
-    References
-    ----------
-    [MITRE12]_ eq. (3), (4).
+    MITRE12 eq. (3), (4), where Phi is the complementary normal distribution.
     """
     deflection = np.asarray(deflection, dtype=float)
     p_fa = np.asarray(false_alarm_probability, dtype=float)
@@ -171,31 +104,10 @@ def any_detection_probability(probability: ArrayLike,
                               axis: int | tuple[int, ...] | None = None) -> FloatArray:
     """Probability that at least one of several independent detectors detects the signal.
 
-    Parameters
-    ----------
-    probability : (...) array
-        Detection probability of each sensor and period; NaN is treated as 0.
-    axis : int or tuple of int, optional
-        Axes to combine. Default: all axes.
-
-    Returns
-    -------
-    (...) array
-        Array without the combined axes. Probabilities far below the rounding error of 1 are
-        preserved: three detectors with 1e-30 give 3e-30.
-
-    Raises
-    ------
-    ValueError
-        If a probability is out of range.
-
-    Notes
-    -----
-    Noise that persists for more than one period, or affects several sensors, is not independent.
-
-    References
-    ----------
-    [MITRE12]_ eq. (5) over sensors, eq. (6) over sensors and periods.
+    NaN counts as 0; the default `axis` combines all axes. Probabilities far below the rounding
+    error of 1 are preserved: three of 1e-30 give 3e-30. MITRE12 eq. (5) over sensors, eq. (6) over
+    sensors and periods. Noise that persists over periods or affects several sensors is not
+    independent.
     """
     p = np.asarray(probability, dtype=float)
     _raise_for_invalid('probability', 'from 0 to 1', p, (p < 0.0) | (p > 1.0))

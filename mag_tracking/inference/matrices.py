@@ -11,25 +11,10 @@ from mag_tracking.inference import core
 
 
 def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
-    """Whiten the rows of measurement matrices.
+    """Whiten the rows of matrices `H` (..., n_y, n_x) to uncorrelated noise of variance 1.
 
-    Parameters
-    ----------
-    H : (..., n_y, n_x) array
-        Measurement matrices; a row of NaN is not measured.
-    C : (..., n_y, n_y) array or None
-        Noise covariances; leading axes broadcast against `H`. None if `H` is whitened already.
-
-    Returns
-    -------
-    (..., n_y, n_x) array
-        Rows with uncorrelated noise of variance 1; zero for missing rows.
-
-    Raises
-    ------
-    ValueError
-        If a shape does not match, or a matrix is not finite, not symmetric or not positive
-        definite.
+    A row of NaN is not measured and becomes zero. `C` (..., n_y, n_y) broadcasts against `H`; None
+    if `H` is whitened already. Raises ValueError if `C` is not symmetric positive definite.
     """
     H = np.asarray(H, dtype=float)
     if H.ndim < 2:
@@ -50,27 +35,8 @@ def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
 
 
 def leading_broadcast(name: str, A: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """Broadcast a matrix over leading axes.
-
-    Parameters
-    ----------
-    name : str
-        Name of the argument, for the error message.
-    A : (..., m, n) array
-        Matrix.
-    shape : tuple of int
-        Required shape; its last two lengths must be m and n.
-
-    Returns
-    -------
-    array of shape `shape`
-        Read-only.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not match.
-    """
+    """Broadcast `A` read-only over leading axes to `shape`; raises ValueError naming `name` if the
+    last two lengths differ."""
     A = np.asarray(A, dtype=float)
     try:
         if A.shape[-2:] == shape[-2:]:
@@ -82,51 +48,18 @@ def leading_broadcast(name: str, A: ArrayLike, shape: tuple[int, ...]) -> FloatA
 
 def raise_for_invalid(name: str, requirement: str, A: FloatArray,
                       is_invalid: BoolArray | np.bool_) -> None:
-    """Raise ValueError for the first invalid matrix.
-
-    Parameters
-    ----------
-    name : str
-        Name of the argument, for the error message.
-    requirement : str
-        Property that is required, such as 'symmetric'.
-    A : (..., n, n) array
-        Matrices.
-    is_invalid : (...) bool array
-        Flags of the invalid matrices.
-
-    Raises
-    ------
-    ValueError
-        If any flag is set.
-    """
+    """Raise ValueError for the first matrix flagged in `is_invalid`; `requirement` is a property
+    such as 'symmetric'."""
     for index in np.argwhere(is_invalid).tolist():
         raise ValueError(f'{name}{index or ""} is not {requirement}: {A[tuple(index)].tolist()}')
 
 
 def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scale symmetric matrices to unit diagonal and decompose them.
+    """Scale symmetric matrices `A` (..., n, n) to unit diagonal and decompose them.
 
-    Parameters
-    ----------
-    name : str
-        Name of the argument, for the error message.
-    A : (..., n, n) array
-        Symmetric positive semidefinite matrices.
-
-    Returns
-    -------
-    scale : (..., n) array
-        Roots of the diagonal; 1 where the diagonal is not positive.
-    w : (..., n) array
-        Eigenvalues of A / (scale scale'), ascending.
-    V : (..., n, n) array
-        Eigenvectors in columns.
-
-    Raises
-    ------
-    ValueError
-        If a matrix is not square, finite, symmetric and positive semidefinite.
+    Returns the scale, the roots of the diagonal (1 where it is not positive); the ascending
+    eigenvalues of A / (scale scale'); and the eigenvectors in columns. Raises ValueError if a
+    matrix is not finite, symmetric and positive semidefinite.
     """
     if A.ndim < 2 or A.shape[-1] != A.shape[-2]:
         raise ValueError(f'{name} must be square, got shape {A.shape}')
@@ -143,30 +76,13 @@ def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, Flo
 
 
 def triangular_factor(A: FloatArray) -> FloatArray:
-    """Triangular factor R of the QR decomposition A = Q R.
-
-    Parameters
-    ----------
-    A : (m, n) array
-
-    Returns
-    -------
-    (min(m, n), n) array
-        Upper triangular.
-    """
+    """Upper triangular factor R (min(m, n), n) of the QR decomposition A = Q R."""
     # The type stub of NumPy lists only the pair (Q, R).
     return cast(FloatArray, np.linalg.qr(A, mode='r'))
 
 
 def ignoring_overflow() -> AbstractContextManager[None]:
-    """Context manager that suppresses overflow and invalid-value warnings.
-
-    A diverging search may overflow; its cost is then infinite.
-
-    Returns
-    -------
-    context manager
-    """
+    """Suppress overflow and invalid-value warnings: a diverging search gets an infinite cost."""
     return np.errstate(over='ignore', invalid='ignore')
 
 
@@ -175,23 +91,11 @@ PSEUDO_INVERSE_TOLERANCE = 1e-15
 
 
 def pseudo_inverse(A: FloatArray, tolerance: float = PSEUDO_INVERSE_TOLERANCE) -> FloatArray:
-    """Pseudo-inverses of symmetric matrices.
+    """Pseudo-inverses of symmetric positive semidefinite matrices (n, k, k); NaN if not finite.
 
-    The matrices are scaled to unit diagonal first, because the units of the parameters differ by
-    decades.
-
-    Parameters
-    ----------
-    A : (n, k, k) array
-        Symmetric positive semidefinite matrices.
-    tolerance : float
-        Directions with an eigenvalue below this fraction of the largest are excluded.
-
-    Returns
-    -------
-    (n, k, k) array
-        NaN for a matrix that is not finite, as in a diverging search. For matrices of full rank
-        only the lower triangles are read.
+    The matrices are scaled to unit diagonal first, because units differ by decades; eigenvalues
+    below `tolerance` times the largest are excluded. At full rank only the lower triangles are
+    read.
     """
     A = np.ascontiguousarray(A, dtype=float)
     inverse: FloatArray = np.empty_like(A)

@@ -49,29 +49,17 @@ class SeparableModel(Protocol):
 class SeparableProblem:
     """Least-squares problem of a separable model, with p eliminated by variable projection.
 
+    The Jacobian is the approximation of [Kaufman75]_; TSP14 eq. (46).
+
     Parameters
     ----------
-    model : SeparableModel
-    y : (n_y,) array
-        Whitened measurements.
-    nuisance : (n_y, q) array, optional
-        Whitened linear terms that do not depend on theta, such as backgrounds.
-    prior : (mean, std), optional
-        Gaussian prior of theta, as (n_theta,) arrays. A parameter with an infinite standard
-        deviation has no prior.
+    y : (n_y,), whitened measurements
+    nuisance : (n_y, q), whitened linear terms that do not depend on theta, such as backgrounds
+    prior : mean and std (n_theta,) of theta; an infinite std means no prior
 
     Attributes
     ----------
-    energy : float
-        Sum of the squared residuals of a fit of the nuisance terms alone.
-
-    Notes
-    -----
-    The Jacobian is the approximation of Kaufman (1975).
-
-    References
-    ----------
-    [Kaufman75]_; [TSP14]_ eq. (46).
+    energy : sum of the squared residuals of a fit of the nuisance terms alone
     """
 
     def __init__(self, model: SeparableModel, y: FloatArray, nuisance: FloatArray | None = None,
@@ -88,19 +76,8 @@ class SeparableProblem:
         return A - self._Q @ (self._Q.T @ A)
 
     def cost(self, theta: FloatArray) -> FloatArray:
-        """Minimum of the cost over the linear parameters.
-
-        Parameters
-        ----------
-        theta : (n, n_theta) array
-            Non-linear parameters.
-
-        Returns
-        -------
-        (n,) array
-            Sum of squared whitened residuals, including the prior; infinite where the model is not
-            finite.
-        """
+        """Minimum over p of the squared whitened residuals including the prior, (n,) for each
+        theta; infinite where the model is not finite."""
         with ignoring_overflow():
             A = self._without_nuisance(self._model.basis(theta))
             p, _, _ = project_out_linear(A, self._y)
@@ -112,20 +89,8 @@ class SeparableProblem:
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals and Jacobians of the prediction; see `least_squares.refine`.
-
-        Parameters
-        ----------
-        theta : (n, n_theta) array
-            Non-linear parameters.
-
-        Returns
-        -------
-        residual : (n, n_y + n_known) array
-            Whitened residuals of the measurements, then of the n_known parameters with a prior.
-        jacobian : (n, n_y + n_known, n_theta) array
-            Derivative of the prediction with respect to theta.
-        """
+        """Whitened residuals (n, n_y + n_known) and Jacobians of the prediction, for `refine`; the
+        n_known parameters with a prior come last."""
         A = self._without_nuisance(self._model.basis(theta))
         p, residual, inverse = project_out_linear(A, self._y)
         D = self._without_nuisance(self._model.derivative(theta, p))
@@ -138,17 +103,7 @@ class SeparableProblem:
             axis=1))
 
     def linear(self, theta: FloatArray) -> FloatArray:
-        """Linear parameters that minimise the cost.
-
-        Parameters
-        ----------
-        theta : (n_theta,) array
-            Non-linear parameters.
-
-        Returns
-        -------
-        (k,) array
-        """
+        """Linear parameters (k,) that minimise the cost at one theta (n_theta,)."""
         p: FloatArray = project_out_linear(
             self._without_nuisance(self._model.basis(theta[None])), self._y)[0][0]
         return p
@@ -186,27 +141,11 @@ class Minimum:
 def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparableProblem,
            starts: FloatArray, min_difference: FloatArray,
            companions: Callable[[FloatArray], FloatArray] | None = None) -> Minimum:
-    """Search for the lowest minimum of a separable problem from many starting points.
+    """Search for the lowest minimum of `fine` from many starting points (n, n_theta).
 
-    Parameters
-    ----------
-    smooth : SeparableProblem
-        Reduced problem with nearly the same minima as `coarse`, but smoother; see `coarse_minima`.
-    coarse : SeparableProblem
-        Reduced problem with nearly the same minima as `fine`.
-    fine : SeparableProblem
-        Problem to be solved; see `fine_minimum`.
-    starts : (n, n_theta) array
-        Starting points.
-    min_difference : (n_theta,) array
-        Difference in any parameter beyond which points are distinct.
-    companions : callable, (n_theta,) array -> (n, n_theta) array, optional
-        Function that maps the best minimum of the coarse problem to points near minima with which
-        it is often confused. The search also starts from these points.
-
-    Returns
-    -------
-    Minimum
+    `coarse` is a reduced problem with nearly the same minima, and `smooth` a smoother one. Points
+    that differ by more than `min_difference` in any parameter are distinct. `companions` maps the
+    best coarse minimum to points near minima often confused with it, where the search also starts.
     """
     theta, cost = coarse_minima(smooth, coarse, starts, min_difference)
     if companions is not None:
@@ -219,35 +158,11 @@ def search(smooth: SeparableProblem, coarse: SeparableProblem, fine: SeparablePr
 def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: FloatArray,
                   min_difference: FloatArray, n_refined: int = 60, n_steps: int = 4,
                   n_distinct: int = 8) -> tuple[FloatArray, FloatArray]:
-    """Find the minima of a reduced separable problem.
+    """Minima (n, n_theta) of a reduced problem, and their costs.
 
-    All starting points are evaluated with the smooth problem, and the best `n_refined` are refined
-    by `n_steps` Levenberg-Marquardt steps. The best `n_distinct` distinct points are then refined
-    to minima of the coarse problem.
-
-    Parameters
-    ----------
-    smooth : SeparableProblem
-        Problem used to select starting points.
-    coarse : SeparableProblem
-        Problem whose minima are returned.
-    starts : (n, n_theta) array
-        Starting points.
-    min_difference : (n_theta,) array
-        Difference in any parameter beyond which points are distinct.
-    n_refined : int
-        Number of starting points to refine with the smooth problem.
-    n_steps : int
-        Number of Levenberg-Marquardt steps with the smooth problem.
-    n_distinct : int
-        Maximum number of minima to return.
-
-    Returns
-    -------
-    theta : (n, n_theta) array
-        Minima.
-    cost : (n,) array
-        Cost of each minimum.
+    All starting points are evaluated with `smooth`, and the best `n_refined` are refined by
+    `n_steps` Levenberg-Marquardt steps. The best `n_distinct` distinct ones (see `search`) are then
+    refined to minima of `coarse`.
     """
     theta, cost = starts, smooth.cost(starts)
     theta = theta[np.argsort(cost, kind='stable')[:n_refined]]
@@ -259,25 +174,8 @@ def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: Fl
 
 def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray,
                  min_difference: FloatArray, n_best: int = 4) -> Minimum:
-    """Find the lowest minimum of a separable problem from points near its minima.
-
-    Parameters
-    ----------
-    fine : SeparableProblem
-        Problem to be solved.
-    theta : (n, n_theta) array
-        Possible starting points.
-    cost : (n,) array
-        Costs by which they are ranked.
-    min_difference : (n_theta,) array
-        Difference in any parameter beyond which points are distinct.
-    n_best : int
-        Maximum number of distinct points from which the search starts.
-
-    Returns
-    -------
-    Minimum
-    """
+    """Find the lowest minimum of `fine` from the `n_best` distinct points (see `search`) of lowest
+    cost."""
     theta = theta[distinct(theta, cost, min_difference, n_best)]
     theta, cost, _, converged = refine(fine.residual_and_jacobian, theta, 100, 1e-8)
     order = np.argsort(cost, kind='stable')
@@ -292,24 +190,7 @@ def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray,
 
 def distinct(theta: FloatArray, cost: FloatArray, min_difference: FloatArray,
              max_points: int) -> IntArray:
-    """Select the distinct points of lowest cost.
-
-    Parameters
-    ----------
-    theta : (n, n_theta) array
-        Points.
-    cost : (n,) array
-        Costs by which the points are ranked.
-    min_difference : (n_theta,) array
-        Difference in any parameter beyond which points are distinct.
-    max_points : int
-        Maximum number of points.
-
-    Returns
-    -------
-    (k,) int array
-        Indices of the selected points, lowest cost first.
-    """
+    """Indices of the distinct points of lowest cost, ascending in cost, at most `max_points`."""
     selected: list[int] = []
     for i in np.argsort(cost, kind='stable').tolist():
         if all((np.abs(theta[i] - theta[other]) > min_difference).any() for other in selected):

@@ -10,28 +10,14 @@ from mag_tracking.units import NS
 
 
 class SlidingSum:
-    """Sum of the values in a sliding window that ends at the latest frame.
-
-    Parameters
-    ----------
-    window_s : float, s
-        Length of the window.
-    """
+    """Sum of the values in a sliding window that ends at the latest frame."""
 
     def __init__(self, window_s: float) -> None:
         self._window_ns = round(window_s * NS)
         self._frames: deque[tuple[int, FloatArray]] = deque()
 
     def add(self, stamp_ns: int, value: ArrayLike) -> None:
-        """Add the value of a frame.
-
-        Parameters
-        ----------
-        stamp_ns : int, ns
-            Timestamp of the frame.
-        value : (...) array
-            Value with the same shape for all frames.
-        """
+        """Add the value of a frame, with the same shape for all frames."""
         self._frames.append((stamp_ns, np.asarray(value, dtype=float)))
         while self._frames[0][0] < stamp_ns - self._window_ns:
             self._frames.popleft()

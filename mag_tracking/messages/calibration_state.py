@@ -41,18 +41,7 @@ class _Calibration(Protocol):
 def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> MessageDict:
     """Convert the calibration of sensor `j` to mag_tracking_msgs/SensorCalibration.
 
-    Parameters
-    ----------
-    calibrate : Calibrate
-        Calibration stage.
-    network : SensorNetwork
-    j : int
-        Index of the sensor in the network.
-
-    Returns
-    -------
-    dict (mag_tracking_msgs/SensorCalibration)
-        Unknown values are NaN.
+    Unknown values are NaN.
     """
     name = network.names[j]
     background, counts = calibrate.backgrounds()[name], calibrate.counts_of(name)
@@ -77,17 +66,7 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
 
 
 def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
-    """Return the latest doubtful interval of the background of each sensor.
-
-    Parameters
-    ----------
-    message : CalibrationState
-
-    Returns
-    -------
-    dict of str to DoubtfulTimes
-        At most one interval per sensor; empty for a sensor whose background was never doubtful.
-    """
+    """Latest doubtful interval of each sensor's background; empty if it was never doubtful."""
     times: dict[str, DoubtfulTimes] = {}
     for s in message.sensors:
         begin, end = stamp_ns(s.doubtful_since), stamp_ns(s.doubtful_until)
@@ -98,20 +77,8 @@ def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
 def with_orientations(network: SensorNetwork, message: CalibrationState) -> SensorNetwork:
     """Copy a network, with the sensor orientations of a CalibrationState.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-    message : CalibrationState
-
-    Returns
-    -------
-    SensorNetwork
-
-    Raises
-    ------
-    RecordingError
-        If the sensors or the frame of `message` differ from `network`, or an orientation or its
-        standard deviation is invalid.
+    Raises RecordingError if the sensors or the frame differ from the network's, or an orientation
+    or its std is invalid.
     """
     names = tuple(s.sensor for s in message.sensors)
     if names != network.names:

@@ -31,17 +31,8 @@ _FIELD_DOUBLES = 12
 def type_of(encoding: str, schema: Schema) -> str:
     """Message type of a channel.
 
-    Parameters
-    ----------
-    encoding : str
-        Encoding of the messages.
-    schema : Schema
-
-    Returns
-    -------
-    str
-        Name of the ROS 2 type, if messages in this encoding can be converted to it. Otherwise the
-        name of the schema and the encoding, such as 'std_msgs/msg/String (json)'.
+    It is the name of the ROS 2 type if messages can be converted to it, otherwise the name of the
+    schema with the encoding, such as 'std_msgs/msg/String (json)'.
     """
     name = _ros2_name(schema.name)
     if encoding == CDR:
@@ -60,23 +51,9 @@ def _ros2_name(name: str) -> str:
 
 
 def cdr_of(encoding: str, kind: str, schema: Schema, data: bytes) -> tuple[bytes, str]:
-    """Convert a message to plain CDR.
+    """Convert a message of a `kind` from `type_of` to plain CDR, or return the reason why not.
 
-    Parameters
-    ----------
-    encoding : str
-        Encoding of the message.
-    kind : str
-        Result of `type_of`.
-    schema : Schema
-    data : bytes
-
-    Returns
-    -------
-    data : bytes
-        Empty if the message cannot be converted.
-    fault : str
-        Why the message cannot be converted; empty if it can.
+    Of the two results, data and fault, one is empty.
     """
     if encoding in SELF_DESCRIBED and kind == MAGNETIC_FIELD:
         return cdr_of_self_described(encoding, schema, data)

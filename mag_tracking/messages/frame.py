@@ -26,17 +26,7 @@ class NamedSensors(Protocol):
 
 
 def frame_dict(frame: FieldFrame, network: SensorNetwork) -> MessageDict:
-    """Convert a `FieldFrame` to mag_tracking_msgs/NetworkFrame.
-
-    Parameters
-    ----------
-    frame : FieldFrame
-    network : SensorNetwork
-
-    Returns
-    -------
-    dict (mag_tracking_msgs/NetworkFrame)
-    """
+    """Convert a `FieldFrame` to mag_tracking_msgs/NetworkFrame."""
     return {'header': header_dict(frame.stamp_ns, network.frame), 'sensors': list(network.names),
             'field': float64_array(frame.field), 'covariance': float64_array(frame.covariance),
             'n_samples': frame.n_samples.tolist(), 'time_offset': float64_array(frame.time_offset),
@@ -45,24 +35,10 @@ def frame_dict(frame: FieldFrame, network: SensorNetwork) -> MessageDict:
 
 
 def frame_of(message: NetworkFrame, network: NamedSensors) -> FieldFrame:
-    """Convert a NetworkFrame to a `FieldFrame`.
+    """Convert a NetworkFrame, with the network's sensors in the same order, to a `FieldFrame`.
 
-    Parameters
-    ----------
-    message : NetworkFrame
-        ROS message or decoded message.
-    network : NamedSensors
-        Sensors that the frame must have, in the same order.
-
-    Returns
-    -------
-    FieldFrame
-
-    Raises
-    ------
-    RecordingError
-        If sensors or array lengths do not match the network, a value is out of range, or a
-        covariance is not positive definite.
+    Raises RecordingError if sensors or array lengths do not match the network, a value is out of
+    range, or a covariance is not positive definite.
     """
     n = len(network)
     if tuple(message.sensors) != network.names:

@@ -34,52 +34,22 @@ _GREY = {'r': 0.35, 'g': 0.35, 'b': 0.35, 'a': 1.0}
 
 
 def track_markers(track: Track, frame: str) -> dict[str, Any]:
-    """Markers of a `Track`: ellipsoid, moment arrow and label.
+    """Markers of a `Track`: ellipsoid, moment arrow and label, as a visualization_msgs/MarkerArray.
 
-    The ellipsoid shows the covariance of the pose topics. If the track is ambiguous, this
-    covariance covers all hypotheses.
-
-    Parameters
-    ----------
-    track : Track
-    frame : str
-        World frame.
-
-    Returns
-    -------
-    dict (visualization_msgs/MarkerArray)
+    The ellipsoid shows the covariance of the pose topics, which covers all hypotheses of an
+    ambiguous track.
     """
     return {'markers': [_ellipsoid(track, frame), _arrow(track, frame), _label(track, frame)]}
 
 
 def delete_markers(track: Track, frame: str) -> dict[str, Any]:
-    """Markers that delete the displayed markers of an ended `Track`.
-
-    Parameters
-    ----------
-    track : Track
-    frame : str
-        World frame.
-
-    Returns
-    -------
-    dict (visualization_msgs/MarkerArray)
-    """
+    """MarkerArray that deletes the displayed markers of an ended `Track`."""
     return {'markers': [_marker(track, frame, namespace, _SPHERE, action=_DELETE)
                         for namespace in TRACK_NAMESPACES]}
 
 
 def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
-    """Markers that show the sensors and their names.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-
-    Returns
-    -------
-    dict (visualization_msgs/MarkerArray)
-    """
+    """MarkerArray that shows the sensors and their names."""
     size = min(SENSOR_SIZE_M, 0.5 * _smallest_distance(network.positions))
     markers = []
     for j, name in enumerate(network.names):

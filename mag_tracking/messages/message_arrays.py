@@ -53,19 +53,7 @@ class PoseArrays(NamedTuple):
 
 
 def magnetic_fields(content: bytes, begins: IntArray, ends: IntArray) -> FieldArrays:
-    """Decode sensor_msgs/MagneticField messages.
-
-    Parameters
-    ----------
-    content : bytes
-        CDR bytes of all messages.
-    begins, ends : (n,) int array
-        Index of the first byte of each message in `content`, and of the byte after its last byte.
-
-    Returns
-    -------
-    FieldArrays
-    """
+    """Decode sensor_msgs/MagneticField messages, which are `content[begins[i]:ends[i]]` in CDR."""
     stamped = _StampedMessages(content, begins, ends, _FIELD_DOUBLES)
     rows = np.flatnonzero(stamped.is_decoded)
     frames = np.full(len(begins), -1, dtype=np.int64)
@@ -77,21 +65,7 @@ def magnetic_fields(content: bytes, begins: IntArray, ends: IntArray) -> FieldAr
 
 
 def poses(content: bytes, begins: IntArray, ends: IntArray, frame: str) -> PoseArrays:
-    """Decode geometry_msgs/PoseStamped messages in a given frame.
-
-    Parameters
-    ----------
-    content : bytes
-        CDR bytes of all messages.
-    begins, ends : (n,) int array
-        Index of the first byte of each message in `content`, and of the byte after its last byte.
-    frame : str
-        Messages in other frames are not decoded.
-
-    Returns
-    -------
-    PoseArrays
-    """
+    """Decode geometry_msgs/PoseStamped messages of a frame, `content[begins[i]:ends[i]]` in CDR."""
     stamped = _StampedMessages(content, begins, ends, _POSE_DOUBLES)
     rows = np.flatnonzero(stamped.is_decoded)
     stamped.is_decoded[rows] = stamped.have_frame(rows, frame)
@@ -101,12 +75,7 @@ def poses(content: bytes, begins: IntArray, ends: IntArray, frame: str) -> PoseA
 class _StampedMessages:
     """Messages that consist of a header and float64 values.
 
-    Attributes
-    ----------
-    is_decoded : (n,) bool array
-        False for a message that is truncated or not little-endian CDR.
-    stamp_ns : (n,) int array, ns
-        Timestamps.
+    `is_decoded` (n,) is False for a message that is truncated or not little-endian CDR.
     """
 
     def __init__(self, content: bytes, begins: IntArray, ends: IntArray, n_doubles: int) -> None:
@@ -129,8 +98,7 @@ class _StampedMessages:
         return self._data[(self._begins[rows] + _HEADER_TYPE.itemsize)[:, None] + np.arange(length)]
 
     def ascii_frames(self, rows: IntArray) -> IntArray:
-        """Number the frame names of the messages `rows` (k,) by a hash; -1 for a name that is not
-        zero-terminated ASCII."""
+        """Number frame names of messages `rows` (k,) by hash; -1 if not zero-terminated ASCII."""
         out = np.full(len(rows), -1, dtype=np.int64)
         for length in np.unique(self._name_length[rows]):
             same_length = np.flatnonzero(self._name_length[rows] == length)

@@ -15,18 +15,9 @@ if TYPE_CHECKING:
 
 
 def cdr_of_ros1(data: bytes, type_name: str) -> bytes:
-    """Convert a serialised ROS 1 message to CDR.
+    """Convert a serialised ROS 1 message to CDR; empty if damaged or of an unsupported type.
 
-    Parameters
-    ----------
-    data : bytes
-    type_name : str
-        Name of the type in ROS 2.
-
-    Returns
-    -------
-    bytes
-        Empty if the message is damaged or its type is not supported.
+    `type_name` is the name of the type in ROS 2.
     """
     if type_name not in DEFINITIONS:
         return b''

@@ -30,47 +30,19 @@ from mag_tracking.units import LATEST_NS
 
 
 def stamp_ns(stamp: Time) -> int:
-    """Convert builtin_interfaces/Time to nanoseconds.
-
-    Parameters
-    ----------
-    stamp : Time
-
-    Returns
-    -------
-    int, ns
-    """
+    """Convert builtin_interfaces/Time to nanoseconds."""
     return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
 def stamp_dict(ns: int) -> MessageDict:
-    """Convert nanoseconds to builtin_interfaces/Time.
-
-    Parameters
-    ----------
-    ns : int, ns
-
-    Returns
-    -------
-    dict (builtin_interfaces/Time)
-    """
+    """Convert nanoseconds to builtin_interfaces/Time."""
     return {'sec': ns // 1_000_000_000, 'nanosec': ns % 1_000_000_000}
 
 
 def reading_of(message: MagneticField, sensor: str) -> Readings:
     """Convert a MagneticField message to `Readings` with a single reading.
 
-    Parameters
-    ----------
-    message : MagneticField
-        ROS message or decoded message. A covariance that is all zero, or whose first element is -1,
-        is unknown.
-    sensor : str
-        Sensor name.
-
-    Returns
-    -------
-    Readings
+    A covariance that is all zero, or whose first element is -1, is unknown.
     """
     f = message.magnetic_field
     C = known_covariances(np.array(message.magnetic_field_covariance, dtype=float).reshape(1, 3, 3))
@@ -79,20 +51,10 @@ def reading_of(message: MagneticField, sensor: str) -> Readings:
 
 
 def known_covariances(C: FloatArray) -> FloatArray | None:
-    """Convert covariances of messages to the convention of `Readings`.
+    """Covariances (n, 3, 3) T² as in `Readings`: NaN where unknown, None if all are unknown.
 
-    In `Readings`, a NaN covariance is unknown. In a message, a NaN covariance is invalid: it is
-    replaced by zero, which the calibration stage rejects.
-
-    Parameters
-    ----------
-    C : (n, 3, 3) array, T²
-        Covariances of the messages; unknown if all zero or if the first element is -1.
-
-    Returns
-    -------
-    (n, 3, 3) array or None, T²
-        NaN where unknown; None if all are unknown.
+    In messages, a covariance is unknown if it is all zero or its first element is -1. A NaN
+    covariance of a message is invalid: it is replaced by zero, which the calibration stage rejects.
     """
     is_known = (C[:, 0, 0] != -1.0) & C.any(axis=(1, 2))
     if not is_known.any():
@@ -102,19 +64,9 @@ def known_covariances(C: FloatArray) -> FloatArray | None:
 
 
 def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
-    """Convert an Imu message to an `AccelerationSample`.
+    """Convert an Imu message to an `AccelerationSample`; NaN if it contains no acceleration.
 
-    Parameters
-    ----------
-    message : Imu
-        ROS message or decoded message.
-    sensor : str
-        Sensor name.
-
-    Returns
-    -------
-    AccelerationSample
-        NaN if the message contains no acceleration (its first covariance element is -1).
+    The first element of the covariance is then -1.
     """
     a = message.linear_acceleration
     is_present = message.linear_acceleration_covariance[0] != -1.0
@@ -123,68 +75,27 @@ def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
 
 
 def float64_array(values: ArrayLike) -> 'array[float]':
-    """Convert numbers to the array type of a float64[] field.
+    """Convert numbers of any shape to the array type of a float64[] field, in row-major order.
 
     ROS accepts this type without conversion; it would check the elements of a list individually.
-
-    Parameters
-    ----------
-    values : array
-        Any shape; flattened in row-major order.
-
-    Returns
-    -------
-    array.array
-        One-dimensional.
     """
     return array('d', np.ascontiguousarray(values, dtype=float).tobytes())
 
 
 def xyz(v: Sequence[float] | FloatArray) -> dict[str, float]:
-    """Convert a vector to a geometry_msgs/Vector3 or Point.
-
-    Parameters
-    ----------
-    v : (3,) array
-        Further elements are ignored.
-
-    Returns
-    -------
-    dict
-        Keys x, y and z.
-    """
+    """Convert the first three elements of a vector to a geometry_msgs/Vector3 or Point."""
     return {'x': float(v[0]), 'y': float(v[1]), 'z': float(v[2])}
 
 
 def header_dict(ns: int, frame: str) -> MessageDict:
-    """Build a std_msgs/Header.
-
-    Parameters
-    ----------
-    ns : int, ns
-        Timestamp.
-    frame : str
-
-    Returns
-    -------
-    dict (std_msgs/Header)
-    """
+    """Build a std_msgs/Header."""
     return {'stamp': stamp_dict(ns), 'frame_id': frame}
 
 
 def magnetic_field_dicts(readings: Readings, frame: str = '') -> list[tuple[str, MessageDict]]:
-    """Convert `Readings` to sensor_msgs/MagneticField messages, one per reading.
+    """Convert `Readings` to one sensor_msgs/MagneticField per reading, with the name of its sensor.
 
-    Parameters
-    ----------
-    readings : Readings
-    frame : str, optional
-        Frame of the messages; by default the name of the sensor.
-
-    Returns
-    -------
-    list of (str, dict)
-        Sensor name and sensor_msgs/MagneticField; an unknown covariance is all zero.
+    The frame is by default the name of the sensor. An unknown covariance is all zero.
     """
     C: FloatArray = np.zeros((len(readings), 9))
     if readings.covariance is not None:
@@ -200,19 +111,7 @@ def magnetic_field_dicts(readings: Readings, frame: str = '') -> list[tuple[str,
 def readings_dict(readings: Readings) -> MessageDict:
     """Convert `Readings` to mag_tracking_msgs/FieldReadings.
 
-    Parameters
-    ----------
-    readings : Readings
-        The covariances must be all known or all unknown.
-
-    Returns
-    -------
-    dict (mag_tracking_msgs/FieldReadings)
-
-    Raises
-    ------
-    RecordingError
-        If only some covariances are known, or `readings` is empty.
+    Raises RecordingError if only some covariances are known, or `readings` is empty.
     """
     C = readings.covariance
     if not len(readings) or C is not None and np.isnan(C).all(axis=(1, 2)).any():
@@ -229,19 +128,7 @@ def readings_dict(readings: Readings) -> MessageDict:
 def readings_of(message: FieldReadings) -> Readings:
     """Convert a FieldReadings message to `Readings`.
 
-    Parameters
-    ----------
-    message : FieldReadings
-        ROS message or decoded message.
-
-    Returns
-    -------
-    Readings
-
-    Raises
-    ------
-    RecordingError
-        If array lengths, sensor names, indices or timestamps are invalid.
+    Raises RecordingError if array lengths, sensor names, indices or timestamps are invalid.
     """
     n, names = len(message.sensor), tuple(message.sensors)
     lengths = len(message.stamp), len(message.field), len(message.covariance)
@@ -268,18 +155,8 @@ def readings_of(message: FieldReadings) -> Readings:
 def acceleration_dict(sample: AccelerationSample, frame: str) -> MessageDict:
     """Convert an `AccelerationSample` to sensor_msgs/Imu.
 
-    Orientation and angular velocity are marked as not provided. The covariance of the acceleration
+    Orientation and angular velocity are marked as not provided; the covariance of the acceleration
     is zero, which means unknown.
-
-    Parameters
-    ----------
-    sample : AccelerationSample
-    frame : str
-        Sensor frame.
-
-    Returns
-    -------
-    dict (sensor_msgs/Imu)
     """
     not_provided = [-1.0] + 8 * [0.0]
     return {'header': header_dict(sample.stamp_ns, frame),
@@ -288,21 +165,7 @@ def acceleration_dict(sample: AccelerationSample, frame: str) -> MessageDict:
 
 
 def pose_dict(ns: int, frame: str, position: FloatArray, quaternion: FloatArray) -> MessageDict:
-    """Build a geometry_msgs/PoseStamped.
-
-    Parameters
-    ----------
-    ns : int, ns
-        Timestamp.
-    frame : str
-    position : (3,) array, m
-    quaternion : (4,) array
-        Rotation xyzw from the body to `frame`.
-
-    Returns
-    -------
-    dict (geometry_msgs/PoseStamped)
-    """
+    """Build a geometry_msgs/PoseStamped; `quaternion` xyzw rotates from the body to `frame`."""
     return {'header': header_dict(ns, frame), 'pose': _pose(position, quaternion)}
 
 
@@ -313,16 +176,7 @@ def _pose(position: FloatArray, quaternion: FloatArray) -> MessageDict:
 
 
 def pose_covariance(uncertainty: Track | SmoothedPose | PoseUncertainty) -> FloatArray:
-    """Covariance of a pose in the order of ROS: position, then small rotations about fixed axes.
-
-    Parameters
-    ----------
-    uncertainty : Track, SmoothedPose or PoseUncertainty
-
-    Returns
-    -------
-    (6, 6) array, m² and rad², world frame
-    """
+    """Covariance (6, 6) of a pose as in ROS: position [m²], small rotations [rad²], world frame."""
     C = np.empty((6, 6))
     C[:3, :3] = uncertainty.covariance[:3, :3]
     C[:3, 3:] = uncertainty.position_orientation_covariance
@@ -333,36 +187,13 @@ def pose_covariance(uncertainty: Track | SmoothedPose | PoseUncertainty) -> Floa
 
 def pose_with_covariance_dict(track: Track | SmoothedPose,
                               uncertainty: PoseUncertainty | None = None) -> MessageDict:
-    """Convert a pose to geometry_msgs/PoseWithCovariance.
-
-    Parameters
-    ----------
-    track : Track or SmoothedPose
-    uncertainty : PoseUncertainty, optional
-        Replaces the covariance of `track`.
-
-    Returns
-    -------
-    dict (geometry_msgs/PoseWithCovariance)
-    """
+    """Convert a pose to geometry_msgs/PoseWithCovariance; `uncertainty` replaces its covariance."""
     return {'pose': _pose(track.position, track.orientation),
             'covariance': pose_covariance(uncertainty or track).ravel().tolist()}
 
 
 def pose_message_dict(track: Track, frame: str) -> MessageDict | None:
-    """Convert a `Track` to the geometry_msgs/PoseWithCovarianceStamped of the pose topic.
-
-    Parameters
-    ----------
-    track : Track
-    frame : str
-        World frame.
-
-    Returns
-    -------
-    dict (geometry_msgs/PoseWithCovarianceStamped) or None
-        None if the pose is withheld as ambiguous.
-    """
+    """Convert a `Track` to PoseWithCovarianceStamped; None if the pose is withheld as ambiguous."""
     if track.topic_uncertainty is None:
         return None
     return {'header': header_dict(track.stamp_ns, frame),
@@ -370,18 +201,7 @@ def pose_message_dict(track: Track, frame: str) -> MessageDict | None:
 
 
 def track_dict(track: Track, frame: str) -> MessageDict:
-    """Convert a `Track` to mag_tracking_msgs/Track.
-
-    Parameters
-    ----------
-    track : Track
-    frame : str
-        World frame.
-
-    Returns
-    -------
-    dict (mag_tracking_msgs/Track)
-    """
+    """Convert a `Track` to mag_tracking_msgs/Track."""
     return {'header': header_dict(track.stamp_ns, frame), 'id': track.id,
             'status': int(track.ended), 'pose': pose_with_covariance_dict(track),
             'velocity': xyz(track.velocity), 'covariance': track.covariance.ravel().tolist(),
@@ -401,18 +221,7 @@ def track_dict(track: Track, frame: str) -> MessageDict:
 
 
 def hypotheses_dict(track: Track, frame: str) -> MessageDict:
-    """Convert the hypotheses of a `Track` to mag_tracking_msgs/HypothesisArray.
-
-    Parameters
-    ----------
-    track : Track
-    frame : str
-        World frame.
-
-    Returns
-    -------
-    dict (mag_tracking_msgs/HypothesisArray)
-    """
+    """Convert the hypotheses of a `Track` to mag_tracking_msgs/HypothesisArray."""
     return {'header': header_dict(track.stamp_ns, frame), 'track_id': track.id,
             'hypotheses': [_hypothesis_dict(h) for h in track.hypotheses]}
 
@@ -425,35 +234,12 @@ def _hypothesis_dict(h: Hypothesis) -> MessageDict:
 
 
 def smoothed_pose_dict(pose: SmoothedPose, frame: str) -> MessageDict:
-    """Convert a `SmoothedPose` to geometry_msgs/PoseWithCovarianceStamped.
-
-    Parameters
-    ----------
-    pose : SmoothedPose
-    frame : str
-        World frame.
-
-    Returns
-    -------
-    dict (geometry_msgs/PoseWithCovarianceStamped)
-    """
+    """Convert a `SmoothedPose` to geometry_msgs/PoseWithCovarianceStamped."""
     return {'header': header_dict(pose.stamp_ns, frame), 'pose': pose_with_covariance_dict(pose)}
 
 
 def smoothed_track_dict(poses: Sequence[SmoothedPose], frame: str) -> MessageDict:
-    """Convert the smoothed poses of one track to mag_tracking_msgs/SmoothedTrack.
-
-    Parameters
-    ----------
-    poses : sequence of SmoothedPose
-        At least one pose, in chronological order.
-    frame : str
-        World frame.
-
-    Returns
-    -------
-    dict (mag_tracking_msgs/SmoothedTrack)
-    """
+    """Convert at least one pose of a track, chronological, to mag_tracking_msgs/SmoothedTrack."""
     last = poses[-1]
     return {'header': header_dict(last.stamp_ns, frame), 'track_id': last.id, 'kind': last.kind,
             'length': last.length, 'length_std': last.length_std,
@@ -464,18 +250,7 @@ def smoothed_track_dict(poses: Sequence[SmoothedPose], frame: str) -> MessageDic
 
 
 def detection_dict(d: Detection, frame: str) -> MessageDict:
-    """Convert a `Detection` to mag_tracking_msgs/Detection.
-
-    Parameters
-    ----------
-    d : Detection
-    frame : str
-        World frame.
-
-    Returns
-    -------
-    dict (mag_tracking_msgs/Detection)
-    """
+    """Convert a `Detection` to mag_tracking_msgs/Detection."""
     return {'header': header_dict(d.stamp_ns, frame), 'id': d.id, 'kind': int(not d.onset),
             'statistic': d.statistic, 'degrees_of_freedom': d.degrees_of_freedom,
             'threshold': d.threshold, 'false_alarm_probability': d.false_alarm_probability,
@@ -483,34 +258,14 @@ def detection_dict(d: Detection, frame: str) -> MessageDict:
 
 
 def disturbance_dict(d: Disturbance, frame: str) -> MessageDict:
-    """Convert a `Disturbance` to mag_tracking_msgs/Disturbance.
-
-    Parameters
-    ----------
-    d : Disturbance
-    frame : str
-        World frame.
-
-    Returns
-    -------
-    dict (mag_tracking_msgs/Disturbance)
-    """
+    """Convert a `Disturbance` to mag_tracking_msgs/Disturbance."""
     return {'header': header_dict(d.stamp_ns, frame), 'id': d.id, 'ended': d.ended,
             'begin': stamp_dict(d.begin_ns), 'largest': d.largest, 'sensors': list(d.sensors),
             'uniform': d.uniform, 'track_id': d.track_id}
 
 
 def pass_event_dict(e: PassEvent) -> MessageDict:
-    """Convert a `PassEvent` to mag_tracking_msgs/PassEvent.
-
-    Parameters
-    ----------
-    e : PassEvent
-
-    Returns
-    -------
-    dict (mag_tracking_msgs/PassEvent)
-    """
+    """Convert a `PassEvent` to mag_tracking_msgs/PassEvent."""
     return {'header': header_dict(e.release_ns, e.sensor), 'sensor': e.sensor, 'number': e.number,
             'ended': e.ended, 'onset': stamp_dict(e.onset_ns),
             'release': stamp_dict(e.release_ns), 'peak_time': stamp_dict(e.peak_ns),
@@ -522,20 +277,7 @@ def pass_event_dict(e: PassEvent) -> MessageDict:
 
 def vehicle_passage_dict(p: VehiclePassage, class_names: Sequence[str],
                          frame: str) -> MessageDict:
-    """Convert a `VehiclePassage` to mag_tracking_msgs/VehiclePassage.
-
-    Parameters
-    ----------
-    p : VehiclePassage
-    class_names : sequence of str
-        Class name of each entry of `p.class_probabilities`.
-    frame : str
-        World frame.
-
-    Returns
-    -------
-    dict (mag_tracking_msgs/VehiclePassage)
-    """
+    """Convert a `VehiclePassage` to mag_tracking_msgs/VehiclePassage, with its class names."""
     return {'header': header_dict(p.stamp_ns, frame), 'number': p.number, 'line': p.line,
             'track_id': p.track_id, 'forward': p.forward, 'direction_error': p.direction_error,
             'position': xyz(p.position), 'lateral': p.lateral, 'velocity': xyz(p.velocity),
@@ -548,18 +290,7 @@ def vehicle_passage_dict(p: VehiclePassage, class_names: Sequence[str],
 
 
 def traffic_summary_dict(s: TrafficSummary, frame: str) -> MessageDict:
-    """Convert a `TrafficSummary` to mag_tracking_msgs/TrafficSummary.
-
-    Parameters
-    ----------
-    s : TrafficSummary
-    frame : str
-        World frame.
-
-    Returns
-    -------
-    dict (mag_tracking_msgs/TrafficSummary)
-    """
+    """Convert a `TrafficSummary` to mag_tracking_msgs/TrafficSummary."""
     return {'header': header_dict(s.end_ns, frame), 'begin': stamp_dict(s.begin_ns),
             'line': s.line, 'observed_s': s.observed_s, 'counts': [
                 {'forward': c.forward, 'vehicle_class': c.vehicle_class, 'count': c.count,
@@ -568,23 +299,10 @@ def traffic_summary_dict(s: TrafficSummary, frame: str) -> MessageDict:
 
 
 def odometry_dict(track: Track, frame: str, child_frame: str) -> MessageDict | None:
-    """Convert a `Track` to nav_msgs/Odometry.
+    """Convert a `Track` to nav_msgs/Odometry; None if the pose is withheld as ambiguous.
 
     The twist is in the child frame, as REP-105 requires. The angular velocity is not estimated: it
     is zero with variance π².
-
-    Parameters
-    ----------
-    track : Track
-    frame : str
-        World frame.
-    child_frame : str
-        Frame of the target.
-
-    Returns
-    -------
-    dict (nav_msgs/Odometry) or None
-        None if the pose is withheld as ambiguous.
     """
     uncertainty = track.topic_uncertainty
     if uncertainty is None:

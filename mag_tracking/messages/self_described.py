@@ -33,21 +33,9 @@ class MissingPartError(ValueError):
 
 
 def cdr_of_self_described(encoding: str, schema: Schema, data: bytes) -> tuple[bytes, str]:
-    """Convert a message to the CDR bytes of sensor_msgs/MagneticField.
+    """Convert a message to the CDR of sensor_msgs/MagneticField, or return the reason why not.
 
-    Parameters
-    ----------
-    encoding : str
-        Encoding of the message, from `SELF_DESCRIBED`.
-    schema : Schema
-    data : bytes
-
-    Returns
-    -------
-    data : bytes
-        Empty if the message cannot be converted.
-    fault : str
-        Why the message cannot be converted; empty if it can.
+    Of the two results, data and fault, one is empty. The encoding is one of `SELF_DESCRIBED`.
     """
     try:
         return encoder(MAGNETIC_FIELD)(
@@ -60,12 +48,7 @@ def cdr_of_self_described(encoding: str, schema: Schema, data: bytes) -> tuple[b
 
 @functools.cache
 def decode_errors() -> tuple[type[Exception], ...]:
-    """Exceptions that the result of `field_decoder` raises for invalid message bytes.
-
-    Returns
-    -------
-    tuple of exception types
-    """
+    """Exceptions that the result of `field_decoder` raises for invalid message bytes."""
     # Imported here because most recordings are CDR and do not need protobuf.
     from google.protobuf.message import DecodeError
 
@@ -75,27 +58,11 @@ def decode_errors() -> tuple[type[Exception], ...]:
 
 @functools.cache
 def field_decoder(encoding: str, name: str, content: bytes) -> Callable[[bytes], MessageDict]:
-    """Create a decoder of magnetic fields for one schema.
+    """Create a decoder of magnetic fields for one schema, in an encoding of `SELF_DESCRIBED`.
 
-    Parameters
-    ----------
-    encoding : str
-        Encoding of the messages, from `SELF_DESCRIBED`.
-    name : str
-        Name of the schema.
-    content : bytes
-        Protobuf descriptor. Not needed for JSON.
-
-    Returns
-    -------
-    function
-        Converts the bytes of a message to sensor_msgs/MagneticField as nested dicts. It raises
-        ValueError if the message is not a magnetic field.
-
-    Raises
-    ------
-    ValueError
-        If a protobuf schema cannot be read.
+    `content` is the protobuf descriptor, not needed for JSON. The decoder returns
+    sensor_msgs/MagneticField as nested dicts, and raises ValueError for messages that are no
+    magnetic field. Raises ValueError if a protobuf schema cannot be read.
     """
     if encoding == 'json':
         return lambda data: _field(json.loads(data, object_hook=lambda d: SimpleNamespace(**d)))
@@ -160,10 +127,7 @@ def _time(stamp: Any) -> dict[str, int]:
 
 
 def _time_part(stamp: Any, names: tuple[str, ...], limit: int) -> int:
-    """Value of the first of the fields `names` of `stamp` that is an integer.
-
-    Raises ValueError if there is no such field, or its value is not in [0, limit).
-    """
+    """First integer among the fields `names` of `stamp`; raises ValueError if not in [0, limit)."""
     for name in names:
         value = _number(getattr(stamp, name, None))
         if isinstance(value, int) and not isinstance(value, bool):

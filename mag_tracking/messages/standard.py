@@ -10,20 +10,9 @@ from mag_tracking.records import Track
 
 
 def track_transform_dict(track: Track, frame: str, child_frame: str) -> MessageDict | None:
-    """Convert a `Track` to a transform from the world frame to the target.
+    """Convert a `Track` to a tf2_msgs/TFMessage from the world frame to the target.
 
-    Parameters
-    ----------
-    track : Track
-    frame : str
-        World frame.
-    child_frame : str
-        Frame of the target.
-
-    Returns
-    -------
-    dict (tf2_msgs/TFMessage) or None
-        None if the pose is ambiguous, because a transform has neither a flag nor a covariance.
+    None if the pose is ambiguous, because a transform has neither a flag nor a covariance.
     """
     if track.ambiguous:
         return None
@@ -34,19 +23,7 @@ def track_transform_dict(track: Track, frame: str, child_frame: str) -> MessageD
 
 
 def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[MessageDict]:
-    """Transforms from the world frame to each sensor.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    stamp_ns : int, ns
-        Timestamp of the transforms.
-
-    Returns
-    -------
-    list of dict (geometry_msgs/TransformStamped)
-        The child frames are the sensor names.
-    """
+    """geometry_msgs/TransformStamped from the world frame to each sensor, named after it."""
     quaternions = map(quaternion_from_rotation, network.R_ws)
     return [{'header': header_dict(stamp_ns, network.frame),
              'child_frame_id': name,
@@ -57,22 +34,11 @@ def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[Messag
 
 
 def detections_3d_dict(track: Track, frame: str) -> MessageDict:
-    """Convert a `Track` to vision_msgs/Detection3DArray.
+    """Convert a `Track` to vision_msgs/Detection3DArray, empty if it has ended or is withheld.
 
     Each result of a detection is a kind of target with its probability and the pose of the track.
-    The bounding box has the length of the line of dipoles. The width and height of the box are not
-    observable and are 0.
-
-    Parameters
-    ----------
-    track : Track
-    frame : str
-        World frame.
-
-    Returns
-    -------
-    dict (vision_msgs/Detection3DArray)
-        Without detections if the track has ended or its pose is withheld.
+    The bounding box has the length of the line of dipoles; its width and height are not observable
+    and are 0.
     """
     header = header_dict(track.stamp_ns, frame)
     if track.ended or track.topic_uncertainty is None:

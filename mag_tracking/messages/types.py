@@ -57,20 +57,7 @@ def _full_name(kind: str, package: str) -> str:
 
 
 def referenced_types(message_definition: str, package: str) -> list[str]:
-    """Message types that a definition references directly.
-
-    Parameters
-    ----------
-    message_definition : str
-        Definition of a message type.
-    package : str
-        Package of that type.
-
-    Returns
-    -------
-    list of str
-        Full names without duplicates, in order of appearance.
-    """
+    """Full names of the types that a definition references directly, in order of appearance."""
     out: list[str] = []
     for line in message_definition.splitlines():
         field = _FIELD.match(line.partition('#')[0])
@@ -96,19 +83,7 @@ def _dependencies(type_name: str) -> list[str]:
 def definition(type_name: str) -> str:
     """Definition of a type and of all types it contains, in the format of a `ros2msg` schema.
 
-    Parameters
-    ----------
-    type_name : str
-        For example `std_msgs/msg/Header`.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    RecordingError
-        If `definitions` does not contain the type.
+    Raises RecordingError if `definitions` does not contain the type.
     """
     if type_name not in DEFINITIONS:
         raise RecordingError(f'cannot encode {type_name}: no definition of this type is available')
@@ -121,17 +96,7 @@ def definition(type_name: str) -> str:
 
 @functools.cache
 def schema_of(type_name: str) -> Schema:
-    """MCAP schema of a message type.
-
-    Parameters
-    ----------
-    type_name : str
-
-    Returns
-    -------
-    Schema
-        Empty if `definitions` does not contain the type.
-    """
+    """MCAP schema of a message type; empty if `definitions` does not contain it."""
     is_defined = type_name in DEFINITIONS
     return Schema(1, definition(type_name).encode() if is_defined else b'',
                   ROS_SCHEMA if is_defined else '', type_name)
@@ -139,21 +104,7 @@ def schema_of(type_name: str) -> Schema:
 
 @functools.cache
 def encoder(type_name: str) -> core.Encoder:
-    """Encoder from nested dicts to the CDR bytes of a message type.
-
-    Parameters
-    ----------
-    type_name : str
-
-    Returns
-    -------
-    Encoder
-
-    Raises
-    ------
-    RecordingError
-        If `definitions` does not contain the type.
-    """
+    """Encoder from nested dicts to CDR; raises RecordingError if `definitions` lacks the type."""
     if type_name not in DEFINITIONS:
         raise RecordingError(f'cannot encode {type_name}: no definition of this type is available')
     package, fields = type_name.partition('/')[0], []
@@ -189,21 +140,9 @@ _DECODE_ERRORS = (ValueError, TypeError, IndexError, KeyError, OverflowError, st
 
 
 def decode(message: _RawMessage) -> SimpleNamespace:
-    """Decode the CDR bytes of a message.
+    """Decode the CDR bytes of a message to the fields of its type.
 
-    Parameters
-    ----------
-    message : RawMessage
-
-    Returns
-    -------
-    SimpleNamespace
-        The attributes are the fields of the message type.
-
-    Raises
-    ------
-    RecordingError
-        If the bytes do not match the type, or the schema is not supported.
+    Raises RecordingError if the bytes do not match the type, or the schema is not supported.
     """
     key = message.schema.name, message.schema.data
     try:

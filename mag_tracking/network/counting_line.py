@@ -34,31 +34,11 @@ class CountingLine:
     """Half of the length of the line, m."""
 
     def forward_distance(self, position: FloatArray) -> float:
-        """Signed distance of a position from the line, along the forward direction of the line.
-
-        Parameters
-        ----------
-        position : (2,) or (3,) array, m, world frame
-
-        Returns
-        -------
-        float, m
-            Positive beyond the line, negative before it.
-        """
+        """Signed distance [m] of a world position (2,) or (3,); positive beyond the line."""
         return float((position[:2] - self.point) @ self.direction)
 
     def lateral_offset(self, position: FloatArray) -> float:
-        """Lateral offset of a position from the midpoint of the line.
-
-        Parameters
-        ----------
-        position : (2,) or (3,) array, m, world frame
-
-        Returns
-        -------
-        float, m
-            Positive to the left, facing forward.
-        """
+        """Offset [m] of a world position from the midpoint; positive left, facing forward."""
         r = position[:2] - self.point
         return float(self.direction[0] * r[1] - self.direction[1] * r[0])
 
@@ -67,22 +47,8 @@ def counting_lines(names: Sequence[str], headings_deg: Sequence[float], offsets:
                    half_widths: Sequence[float], centre: FloatArray) -> list[CountingLine]:
     """Create counting lines from lists of their parameters.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Name of each line.
-    headings_deg : sequence of float, deg
-        Forward direction of each line, anticlockwise from x.
-    offsets : sequence of float, m
-        Distance of each line from the centre, in its forward direction.
-    half_widths : sequence of float, m
-        Half of the length of each line.
-    centre : (2,) or (3,) array, m, world frame
-        Centre of the network.
-
-    Returns
-    -------
-    list of CountingLine
+    Headings are forward directions, anticlockwise from x; offsets in m are distances from the
+    centre of the network (world frame) in the forward direction.
     """
     out = []
     for name, heading, offset, half_width in zip(names, np.deg2rad(headings_deg), offsets,
@@ -108,16 +74,7 @@ class Crossing(NamedTuple):
 
 
 class CrossingDetector:
-    """Detects the crossing of a line by one track.
-
-    Parameters
-    ----------
-    line : CountingLine
-
-    Attributes
-    ----------
-    line : CountingLine
-    """
+    """Detects the crossing of a line by one track."""
 
     def __init__(self, line: CountingLine) -> None:
         self.line = line
@@ -131,12 +88,7 @@ class CrossingDetector:
         return self._first_pose is not None
 
     def add(self, pose: Pose) -> None:
-        """Add the next pose of the track, in chronological order.
-
-        Parameters
-        ----------
-        pose : Track or SmoothedPose
-        """
+        """Add the next pose of the track, in chronological order."""
         if self._first_pose is None:
             self._first_pose = pose
         if self._last_pose is not None \
@@ -149,15 +101,10 @@ class CrossingDetector:
         return self.line.forward_distance(pose.position) >= 0.0
 
     def crossing(self) -> Crossing | None:
-        """Return the last crossing of the line.
+        """Last crossing of the line; None without one, or if it is beside the line segment.
 
         If the track begins and ends on the same side, a crossing is extrapolated from its first or
         last pose within `MAX_EXTRAPOLATION_S`.
-
-        Returns
-        -------
-        Crossing or None
-            None without a crossing, or if the crossing is beside the line segment.
         """
         if self._first_pose is None or self._last_pose is None:
             return None
@@ -179,11 +126,7 @@ class CrossingDetector:
                         distances[1] > distances[0], before if fraction < 0.5 else after, False)
 
     def _extrapolate(self, first: Pose, last: Pose) -> Crossing | None:
-        """Extrapolate a crossing from the first or the last pose.
-
-        The result is None if the speed is below `MIN_SPEED` or the time exceeds
-        `MAX_EXTRAPOLATION_S`.
-        """
+        """Extrapolate a crossing; None below `MIN_SPEED` or beyond `MAX_EXTRAPOLATION_S`."""
         for pose, sign in ((first, -1.0), (last, 1.0)):
             speed = float(pose.velocity[:2] @ self.line.direction)
             if abs(speed) < MIN_SPEED:

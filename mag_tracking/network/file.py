@@ -237,10 +237,7 @@ def _parse_network(content: Any) -> SensorNetwork:
 
 
 def _parse_earth_field(content: dict[str, Any]) -> FloatArray | None:
-    """Parse the field of the Earth (3,) [T], or compute it by the World Magnetic Model.
-
-    None if the file contains neither a field nor a site.
-    """
+    """Earth's field (3,) [T], given or by the World Magnetic Model; None without either."""
     earth, site = content.get('earth_field'), content.get('site')
     if earth is not None and site is not None:
         raise NetworkError('earth_field and site both define the field of the Earth: remove one '
@@ -317,20 +314,7 @@ def _yaml_string(text: str) -> str:
 
 
 def write_network(path: str | PathLike[str], network: SensorNetwork, comment: str = '') -> None:
-    """Write a network file atomically.
-
-    Parameters
-    ----------
-    path : path_like
-    network : SensorNetwork
-    comment : str, optional
-        Comment at the beginning of the file; may contain several lines.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write a network file atomically, with a comment at its beginning; raises OutputError."""
     lines = [f'# {line}' for line in comment.splitlines()] \
         + [f'frame: {_yaml_string(network.frame)}']
     if network.earth_field is not None:

@@ -35,37 +35,16 @@ class Site:
 
 
 def decimal_year(day: datetime.date) -> float:
-    """Convert a date to a decimal year.
-
-    Parameters
-    ----------
-    day : datetime.date
-
-    Returns
-    -------
-    float
-    """
+    """Convert a date to a decimal year."""
     first = datetime.date(day.year, 1, 1)
     return day.year + (day - first).days / (datetime.date(day.year + 1, 1, 1) - first).days
 
 
 def earth_field(site: Site) -> FloatArray:
-    """Magnetic flux density of the Earth at a site.
+    """Magnetic flux density (3,) of the Earth at a site, T, world frame (z up).
 
-    Parameters
-    ----------
-    site : Site
-
-    Returns
-    -------
-    (3,) array, T, world frame (z up)
-
-    Raises
-    ------
-    ValueError
-        If the model does not cover the place or the year.
-    ModuleNotFoundError
-        If pygeomag is not installed.
+    Raises ValueError if the model does not cover the place or the year, and ModuleNotFoundError
+    without pygeomag.
     """
     # Optional dependency, required only for networks that define a site instead of a field.
     from pygeomag import GeoMag

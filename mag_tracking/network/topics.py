@@ -11,36 +11,14 @@ _NAMESPACE_PATTERN = re.compile(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 
 def absolute(topic: str, namespace: str = '/') -> str:
-    """Resolve a topic name in a namespace.
-
-    Parameters
-    ----------
-    topic : str
-        Relative or absolute name.
-    namespace : str, optional
-
-    Returns
-    -------
-    str
-        Absolute name. A `topic` that begins with / is returned unchanged.
-    """
+    """Resolve a topic name in a namespace; an absolute name is returned unchanged."""
     return topic if topic.startswith('/') else f'{namespace.rstrip("/")}/{topic}'
 
 
 def namespaces_of(topics: Iterable[str], recorded: Collection[str]) -> list[str]:
-    """Find the namespaces in which at least one relative topic was recorded.
+    """Namespaces, in alphabetical order, in which at least one relative topic was recorded.
 
-    Parameters
-    ----------
-    topics : iterable of str
-        Topic names; absolute names are ignored.
-    recorded : collection of str
-        Absolute names of the recorded topics.
-
-    Returns
-    -------
-    list of str
-        Namespaces in alphabetical order; only the root namespace '/' if it is among them.
+    Absolute `topics` are ignored. If the root namespace '/' is among them, it is the only one.
     """
     namespaces = {name.removesuffix(f'/{topic}') or '/'
                   for topic in topics if not topic.startswith('/')
@@ -49,22 +27,7 @@ def namespaces_of(topics: Iterable[str], recorded: Collection[str]) -> list[str]
 
 
 def checked_namespace(namespace: str) -> str:
-    """Validate an absolute namespace.
-
-    Parameters
-    ----------
-    namespace : str
-
-    Returns
-    -------
-    str
-        `namespace`, unchanged.
-
-    Raises
-    ------
-    NetworkError
-        If `namespace` is not a valid absolute namespace.
-    """
+    """Return a valid absolute namespace unchanged; raises NetworkError for any other."""
     if not _NAMESPACE_PATTERN.fullmatch(namespace):
         raise NetworkError(f'{namespace!r} is not a valid namespace: it must begin with / and '
                            'contain only letters, digits and _; no part may begin with a digit')

@@ -21,17 +21,7 @@ WRITE_INTERVAL_S = 5.0
 
 
 class BackgroundStore:
-    """Stores the current background of each sensor in a file.
-
-    Parameters
-    ----------
-    path : Path or None
-        File of the backgrounds; None disables storage.
-    stage : Calibrate
-        Calibration stage.
-    settings : CalibrateSettings
-    logger : RcutilsLogger
-    """
+    """Stores the current background of each sensor in a file; a `path` of None disables storage."""
 
     def __init__(self, path: Path | None, stage: Calibrate, settings: CalibrateSettings,
                  logger: RcutilsLogger) -> None:
@@ -45,10 +35,6 @@ class BackgroundStore:
         """Pass the stored backgrounds to the stage, to be used from each sensor's first reading.
 
         Outdated backgrounds are not restored; invalid backgrounds are logged.
-
-        Parameters
-        ----------
-        network : SensorNetwork
         """
         if self._path is None:
             return
@@ -67,15 +53,9 @@ class BackgroundStore:
                 'the backgrounds again')
 
     def update(self, network: SensorNetwork, j: int) -> None:
-        """Update the stored background of a sensor; remove it if it is unknown or doubtful.
+        """Update the stored background of sensor `j`; remove it if it is unknown or doubtful.
 
         The file is not written until the next `write_if_due`.
-
-        Parameters
-        ----------
-        network : SensorNetwork
-        j : int
-            Index of the sensor.
         """
         name = network.names[j]
         background = None if self._path is None else self._stage.stored(name)
@@ -85,12 +65,9 @@ class BackgroundStore:
             self._entries[name] = background_text(background, network, j, self._settings)
 
     def write_if_due(self, is_live: bool) -> None:
-        """Write the file if the interval has elapsed or the file lacks a sensor; log a failure.
+        """Write the file if the interval has elapsed or it lacks a sensor; log a failure.
 
-        Parameters
-        ----------
-        is_live : bool
-            Whether the readings are live. During a replay, nothing is written.
+        During a replay, nothing is written.
         """
         now = time.monotonic()
         has_new_sensor = not self._entries.keys() <= self._written_sensors
@@ -105,15 +82,7 @@ class BackgroundStore:
                                  throttle_duration_sec=60.0)
 
     def drop(self, sensors: Iterable[str], is_live: bool) -> None:
-        """Remove the backgrounds of sensors, and write the file immediately.
-
-        Parameters
-        ----------
-        sensors : iterable of str
-            Names of the sensors.
-        is_live : bool
-            Whether the readings are live. During a replay, the file is not changed.
-        """
+        """Remove the backgrounds of sensors; write the file at once unless during a replay."""
         for name in sensors:
             self._entries.pop(name, None)
         self._next_write = 0.0

@@ -67,13 +67,8 @@ cores to the tracker until the tracker has computed a pose, even with a hundred 
 class CalibrationNode(StageNode):
     """Calibrates the readings of each sensor; topics of calibrated fields end in `_calibrated`.
 
-    Parameters
-    ----------
-    next_steps : tuple of DetectionNode and TrackerNode, optional
-        Nodes in the same process. The detection node receives the calibrated readings directly; the
-        tracker node receives the intervals in which backgrounds are doubtful.
-    **node_arguments
-        Arguments of `StageNode`.
+    Of `next_steps`, nodes in the same process, the detection node receives the calibrated readings
+    directly and the tracker node the intervals in which backgrounds are doubtful.
     """
 
     def __init__(self, next_steps: tuple[DetectionNode, TrackerNode] | None = None,
@@ -170,21 +165,11 @@ class CalibrationNode(StageNode):
         return self._output_path('save_as', save_as or f'{path.stem}_calibrated.yaml')
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
-        """Stages whose counts are published in diagnostics, by name.
-
-        Returns
-        -------
-        dict of str to Stage
-        """
+        """Stages whose counts are published in diagnostics, by name."""
         return {'calibrate': self._stage, 'survey': self._survey}
 
     def state(self) -> str:
-        """State of the node: waiting for sensors, learning backgrounds, ready, or a combination.
-
-        Returns
-        -------
-        str
-        """
+        """State of the node: waiting for sensors, learning backgrounds, ready, or a combination."""
         waiting = [topic for name, topic in zip(self.network.names, self.sensor_topics,
                                                 strict=True) if self._health.is_awaited(name)]
         learning = [name for name in self._stage.unready()
@@ -197,13 +182,7 @@ class CalibrationNode(StageNode):
         return ', '.join(parts)
 
     def queues(self) -> dict[str, int]:
-        """Number of queued readings of each stage.
-
-        Returns
-        -------
-        dict of str to int
-            {name of the stage: number}.
-        """
+        """Number of queued readings of each stage, by name."""
         return {'calibrate': self._stage.n_held}
 
     def _is_live(self) -> bool:
@@ -245,10 +224,7 @@ class CalibrationNode(StageNode):
         return calibrated
 
     def _do_deferred_work(self) -> None:
-        """Run the deferred work of the stages, the health checks and a due step of the rounds.
-
-        Also report changed doubts about backgrounds.
-        """
+        """Run deferred work, health checks and a due step of the rounds; report changed doubts."""
         self._stage.idle()
         if self._next_steps is not None:
             self._next_steps[1].idle()
@@ -302,16 +278,5 @@ class CalibrationNode(StageNode):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process.
-
-    Parameters
-    ----------
-    arguments : list of str, optional
-        Command line; `sys.argv` by default.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
+    """Run the node as a process; return its exit status."""
     return stage_node.main(CalibrationNode, arguments)

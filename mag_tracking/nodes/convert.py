@@ -1,8 +1,8 @@
 """Conversion of records to and from ROS messages.
 
-The content of each message is defined once, in `messages.schema`, as nested dicts. This module
-converts the dicts to message objects. ROS messages have the same attributes as decoded messages of
-a recording, so the functions that read a recording also read ROS messages.
+The content of each message is defined once, in `messages.schema`, as nested dicts, which this
+module converts to message objects. ROS messages have the same attributes as decoded messages of a
+recording, so the functions that read a recording also read ROS messages.
 """
 
 import functools
@@ -22,18 +22,7 @@ _TYPE_NAME = re.compile(r'[A-Za-z]\w*/msg/[A-Za-z]\w*')
 
 
 def message_class(type_name: str) -> Any:
-    """Return the Python class of a message type.
-
-    Parameters
-    ----------
-    type_name : str
-        For example `std_msgs/msg/Header`.
-
-    Returns
-    -------
-    type or None
-        None if the type is not installed, or the name is not that of a ROS type.
-    """
+    """Python class of a type such as `std_msgs/msg/Header`; None if it is not an installed type."""
     if not _TYPE_NAME.fullmatch(type_name):
         return None
     package, _, name = type_name.split('/')
@@ -44,24 +33,9 @@ def message_class(type_name: str) -> Any:
 
 
 def to_message(cls: Any, content: Mapping[str, Any]) -> Any:
-    """Convert nested dicts to a ROS message.
+    """Convert nested dicts to a ROS message; a missing field keeps its default.
 
-    Parameters
-    ----------
-    cls : type
-        Class of the message.
-    content : mapping of str to object
-        Fields; a missing field keeps its default.
-
-    Returns
-    -------
-    object
-        Message of class `cls`.
-
-    Raises
-    ------
-    AttributeError
-        If `content` has a field that the message does not have.
+    Raises AttributeError if `content` has a field that the message does not have.
     """
     message = cls()
     for name, value in content.items():
@@ -90,24 +64,10 @@ def _vector(v: Any) -> FloatArray:
 def track_of(message: Any, hypotheses: Any = None, n_sensors: int | None = None) -> Track:
     """Convert mag_tracking_msgs/Track to a `Track`.
 
-    Parameters
-    ----------
-    message : Track message
-    hypotheses : HypothesisArray message, optional
-        Hypotheses of the track; by default the best hypothesis of each arrival direction, from
-        `message`.
-    n_sensors : int, optional
-        Number of sensors of the network; by default that of `innovation_by_sensor`.
-
-    Returns
-    -------
-    Track
-
-    Raises
-    ------
-    RecordingError
-        If array lengths do not match the number of sensors, a position, velocity or covariance is
-        not finite, or an active track has no hypothesis.
+    `hypotheses` is a HypothesisArray; by default the message yields the best hypothesis of each
+    arrival direction. `n_sensors` is by default that of `innovation_by_sensor`. Raises
+    RecordingError if array lengths do not match the number of sensors, a position, velocity or
+    covariance is not finite, or an active track has no hypothesis.
     """
     _check_lengths(message, len(message.innovation_by_sensor) if n_sensors is None else n_sensors)
     pose = np.array(message.pose.covariance).reshape(6, 6)
@@ -155,20 +115,9 @@ def _check_finite(subject: str, **arrays: FloatArray) -> None:
 
 
 def smoothed_path_of(message: Any) -> FloatArray:
-    """Return the positions of a mag_tracking_msgs/SmoothedTrack.
+    """Positions (n, 3) of a mag_tracking_msgs/SmoothedTrack, m, world frame.
 
-    Parameters
-    ----------
-    message : SmoothedTrack message
-
-    Returns
-    -------
-    (n, 3) array, m, world frame
-
-    Raises
-    ------
-    RecordingError
-        If the message has no pose, its array lengths differ, or a position is not finite.
+    Raises RecordingError if it has no pose, its array lengths differ, or a position is not finite.
     """
     lengths = {name: len(getattr(message, name)) for name in (
         'poses', 'velocities', 'pose_ambiguous')}

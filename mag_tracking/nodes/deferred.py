@@ -8,17 +8,10 @@ from mag_tracking.nodes.steady_timer import steady_timer
 
 
 class Deferred:
-    """Calls a function a fixed time after a request; requests in the meantime have no effect.
+    """Calls a function `delay_s` after a request; requests in the meantime have no effect.
 
     On a computer with few cores, work immediately after publishing would compete with the processes
     that receive the messages.
-
-    Parameters
-    ----------
-    node : Node
-    delay_s : float, s
-    call : function
-        Called without arguments.
     """
 
     def __init__(self, node: Node, delay_s: float, call: Callable[[], None]) -> None:

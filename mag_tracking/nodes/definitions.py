@@ -13,15 +13,7 @@ from mag_tracking.messages.types import definition, referenced_types
 def definition_of(type_name: str) -> str | None:
     """Definition of a message type and all nested types, in the format of a `ros2msg` schema.
 
-    Parameters
-    ----------
-    type_name : str
-        For example `std_msgs/msg/Header`.
-
-    Returns
-    -------
-    str or None
-        None if the .msg file of a type is not installed.
+    None if the .msg file of a type is not installed.
     """
     try:
         return definition(type_name)

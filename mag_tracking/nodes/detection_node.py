@@ -48,13 +48,8 @@ do not, because a search takes as long as the processing of many readings."""
 class DetectionNode(StageNode):
     """Aligns the readings of all sensors into frames and tests each frame for a target.
 
-    Parameters
-    ----------
-    tracker : TrackerNode, optional
-        Tracker in the same process, which receives the frames directly. Calibrated readings are
-        then passed to `receive_readings`.
-    **node_arguments
-        Arguments of `StageNode`.
+    A `tracker` in the same process receives the frames directly; calibrated readings are then
+    passed to `receive_readings`.
     """
 
     def __init__(self, tracker: TrackerNode | None = None, **node_arguments: Any) -> None:
@@ -95,24 +90,13 @@ class DetectionNode(StageNode):
         self.monitor_subscriber('tracker', NETWORK_FRAME, TRACK_ARRAY)
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
-        """Stages whose counts are published in diagnostics, by name.
-
-        Returns
-        -------
-        dict of str to Stage
-        """
+        """Stages whose counts are published in diagnostics, by name."""
         events: dict[str, Stage[Any, Any]] = \
             {} if self._events is None else {'events': self._events}
         return {'align': self._align, 'detect': self._detect, **events}
 
     def queues(self) -> dict[str, int]:
-        """Number of queued readings of each stage.
-
-        Returns
-        -------
-        dict of str to int
-            {name of the stage: number}.
-        """
+        """Number of queued readings of each stage, by name."""
         events = {} if self._events is None else {'events': sum(map(len, self._event_backlog))}
         return {'align': self._align.n_held, **events}
 
@@ -136,13 +120,7 @@ class DetectionNode(StageNode):
                 self._publish_events()
 
     def set_relearnt(self, backgrounds: Mapping[str, RunningBackground]) -> None:
-        """Set the changes of the backgrounds, so that the event of a parked vehicle is not split.
-
-        Parameters
-        ----------
-        backgrounds : mapping of str to RunningBackground
-            Background of each sensor.
-        """
+        """Set the changes of the backgrounds, so that a parked vehicle's event is not split."""
         if self._events is not None:
             self._events.set_relearnt(backgrounds)
 
@@ -168,7 +146,7 @@ class DetectionNode(StageNode):
                     self._publish_pending_frame()
 
     def _publish_pending_frame(self) -> None:
-        """Publish the pending frame, if there is one and its topic has subscribers.
+        """Publish the pending frame to subscribers, if any.
 
         Called when the tracker has published a pose or has processed the frame.
         """
@@ -182,16 +160,5 @@ class DetectionNode(StageNode):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process.
-
-    Parameters
-    ----------
-    arguments : list of str, optional
-        Command line; `sys.argv` by default.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
+    """Run the node as a process; return its exit status."""
     return stage_node.main(DetectionNode, arguments)

@@ -29,17 +29,7 @@ from mag_tracking.stages.health.diagnosis import Cause, Finding
 
 
 class DoctorNode(Node):
-    """Passes the readings of a network, with their times of arrival, to a `Doctor`.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : Settings
-
-    Attributes
-    ----------
-    doctor : Doctor
-    """
+    """Passes the readings of a network, with their times of arrival, to a `Doctor`."""
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         super().__init__('doctor', namespace=network.namespace)
@@ -70,12 +60,7 @@ class DoctorNode(Node):
         self.doctor.feed(readings, time.time_ns())
 
     def findings(self) -> list[Finding]:
-        """Faults found in the ROS graph and in the contents of messages.
-
-        Returns
-        -------
-        list of Finding
-        """
+        """Faults found in the ROS graph and in the contents of messages."""
         topic = self.resolve_topic_name(RAW_READINGS)
         found = [Finding(True, topic, f'{quantity(n, "invalid message")}: {error}',
                          'check the driver that publishes this topic', Cause.UNDECODABLE)
@@ -105,24 +90,10 @@ class DoctorResult:
 def listening(network: SensorNetwork, settings: Settings, seconds: float,
               stopped: Callable[[], bool], ros_arguments: Sequence[str] = ()
               ) -> Iterator[DoctorResult]:
-    """Receive readings for a limited time; the node is shut down when the context ends.
+    """Receive readings for at most `seconds`; the node is shut down when the context ends.
 
-    If the middleware hangs, `shut_down` ends the process.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : Settings
-    seconds : float, s
-        Maximum duration.
-    stopped : function
-        Returns True to stop earlier.
-    ros_arguments : sequence of str, optional
-        ROS arguments; the first is `--ros-args`.
-
-    Yields
-    ------
-    DoctorResult
+    `stopped` returns True to stop earlier; the first of `ros_arguments` is `--ros-args`. If the
+    middleware hangs, `shut_down` ends the process.
     """
     init_ros(list(ros_arguments))
     executor = make_executor()

@@ -16,12 +16,7 @@ EXPECTED_COUNTS = ('samples: ', 'late arrivals: ', 'other messages: ', 'lines th
 
 
 class DriverDiagnostics:
-    """Reports the state of each device and logs changes.
-
-    Parameters
-    ----------
-    node : Node
-    """
+    """Reports the state of each device and logs changes."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -30,21 +25,7 @@ class DriverDiagnostics:
 
     def statuses(self, drivers: Sequence[Driver], running: Collection[str],
                  active: bool) -> list[DiagnosticStatus]:
-        """Return the diagnostics of all devices, and log changes.
-
-        Parameters
-        ----------
-        drivers : sequence of Driver
-        running : collection of str
-            Names of the drivers whose thread is running.
-        active : bool
-            Whether the node is active.
-
-        Returns
-        -------
-        list of DiagnosticStatus
-            One per driver.
-        """
+        """Return one status per driver and log changes; `running` are those with a live thread."""
         return [self._status(driver, driver.name in running, active) for driver in drivers]
 
     def _status(self, driver: Driver, running: bool, active: bool) -> DiagnosticStatus:

@@ -44,15 +44,7 @@ takes several seconds."""
 class DriverNode(ManagedNode):
     """Runs one thread per device, which publishes the readings of the device.
 
-    Parameters
-    ----------
-    **node_arguments
-        Arguments of `Node`.
-
-    Raises
-    ------
-    MagTrackingError
-        If `autostart` is set and the settings are invalid.
+    Raises MagTrackingError if `autostart` is set and the settings are invalid.
     """
 
     def __init__(self, **node_arguments: Any) -> None:
@@ -76,12 +68,8 @@ class DriverNode(ManagedNode):
     def prepare(self) -> None:
         """Read the drivers file and advertise the topics of the sensors.
 
-        Raises
-        ------
-        SettingsError
-            If parameter `drivers` is empty or the drivers file is invalid.
-        NetworkError
-            If the network file is invalid.
+        Raises SettingsError if parameter `drivers` is empty or the drivers file is invalid, and
+        NetworkError if the network file is invalid.
         """
         if not self._path:
             raise SettingsError('driver_node: parameter drivers is empty; set it to the path of a '
@@ -93,18 +81,7 @@ class DriverNode(ManagedNode):
                 self._publishers_by_sensor[sensor] = self._advertise(sensor, network)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
-        """Open each device in its own thread.
-
-        Parameters
-        ----------
-        state : State
-            Previous state.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-            FAILURE if a thread of a previous activation is still running.
-        """
+        """Open each device in a thread; fail if one of a previous activation still runs."""
         if self._threads:
             self.get_logger().error(f'driver {self._threads[0].name} is still stopping; activate '
                                     'the node again later')
@@ -119,47 +96,17 @@ class DriverNode(ManagedNode):
         return super().on_activate(state)
 
     def on_deactivate(self, state: State) -> TransitionCallbackReturn:
-        """Close the devices.
-
-        Parameters
-        ----------
-        state : State
-            Previous state.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-        """
+        """Close the devices."""
         self._stop()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: State) -> TransitionCallbackReturn:
-        """Release the drivers and withdraw the topics.
-
-        Parameters
-        ----------
-        state : State
-            Previous state.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-        """
+        """Release the drivers and withdraw the topics."""
         self._release()
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: State) -> TransitionCallbackReturn:
-        """Close the devices, release the drivers and withdraw the topics.
-
-        Parameters
-        ----------
-        state : State
-            Previous state.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-        """
+        """Close the devices, release the drivers and withdraw the topics."""
         self._stop()
         self._release()
         return TransitionCallbackReturn.SUCCESS
@@ -225,16 +172,5 @@ class DriverNode(ManagedNode):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process.
-
-    Parameters
-    ----------
-    arguments : list of str, optional
-        Command line; `sys.argv` by default.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
+    """Run the node as a process; return its exit status."""
     return stage_node.main(DriverNode, arguments)

@@ -24,24 +24,14 @@ MAX_LATENCIES = 10_000
 
 
 class Flow:
-    """Statistics of the messages that a node receives from one source.
-
-    Parameters
-    ----------
-    source : str
-        Name of the source: the sensors or the preceding node.
+    """Statistics of the messages that a node receives from one source: the sensors or a node.
 
     Attributes
     ----------
-    source : str
-    topics : list of str
-        Absolute topic names, after remapping.
-    batches : list of str
-        Topics of batches of readings, which may be used instead of `topics`.
-    last_received : float or None, s
-        Time of the latest message, by `time.monotonic()`.
-    n_lost : int
-        Number of messages lost because the input queue was full.
+    topics : absolute names, after remapping
+    batches : topics of batches of readings, which may be used instead of `topics`
+    last_received : s, by `time.monotonic()`
+    n_lost : number of messages lost because the input queue was full
     """
 
     def __init__(self, source: str) -> None:
@@ -57,16 +47,9 @@ class Flow:
         self._busy_s, self._report_time = 0.0, time.monotonic()
 
     def add(self, stamp_ns: int, arrival_ns: int, start_s: float) -> None:
-        """Add the latency and processing time of a message to the statistics.
+        """Add a message's latency and processing time, from `start_s` of `time.monotonic()`.
 
-        Parameters
-        ----------
-        stamp_ns : int, ns
-            Timestamp of the message.
-        arrival_ns : int, ns
-            Time of arrival, by the clock of the node.
-        start_s : float, s
-            Start of processing, by `time.monotonic()`.
+        The arrival time is by the clock of the node.
         """
         self._n_messages += 1
         self.last_received = time.monotonic()
@@ -87,18 +70,9 @@ class Flow:
         return self._latest_latency_s is not None and abs(self._latest_latency_s) < MAX_LIVE_DELAY_S
 
     def status(self, node: str, has_publisher: Callable[[], bool]) -> DiagnosticStatus:
-        """Diagnostics of the messages received since the last call.
+        """Diagnostics of the messages received since the last call, under the title of the `node`.
 
-        Parameters
-        ----------
-        node : str
-            Title of the node that reports.
-        has_publisher : function
-            Returns whether a publisher of the topics still exists.
-
-        Returns
-        -------
-        DiagnosticStatus
+        `has_publisher` returns whether a publisher of the topics still exists.
         """
         now = time.monotonic()
         elapsed, self._report_time = max(now - self._report_time, 1e-9), now
@@ -142,19 +116,11 @@ class Flow:
 
 
 class SubscriberMonitor:
-    """Checks that the node of the next processing step still subscribes to a topic.
+    """Checks that the node of the next processing step still subscribes to an absolute topic.
 
-    The node may have any name; it is identified by the message type that it publishes. Other
-    subscribers, such as recorders, are ignored.
-
-    Parameters
-    ----------
-    role : str
-        Role of the next step, such as `tracker`; used in messages.
-    topic : str
-        Absolute topic name.
-    publishes : str
-        Message type that the node of the next step publishes.
+    The node may have any name; it is identified by `publishes`, the message type that it publishes.
+    Other subscribers, such as recorders, are ignored. Messages call it by its `role`, such as
+    `tracker`.
     """
 
     def __init__(self, role: str, topic: str, publishes: str) -> None:
@@ -163,20 +129,10 @@ class SubscriberMonitor:
 
     def status(self, node: str, names: Collection[str],
                types_of: Callable[[str], Collection[str]]) -> DiagnosticStatus:
-        """Diagnostics of the connection to the next step.
+        """Diagnostics of the connection to the next step, under the title of the `node`.
 
-        Parameters
-        ----------
-        node : str
-            Title of the node that reports.
-        names : collection of str
-            Names of the nodes that currently subscribe to the topic.
-        types_of : function
-            Returns the types of the messages that a node publishes.
-
-        Returns
-        -------
-        DiagnosticStatus
+        `names` are the nodes that now subscribe; `types_of` returns the message types that a node
+        publishes.
         """
         self._known_nodes |= {name for name in set(names) - self._known_nodes
                               if self._publishes in types_of(name)}

@@ -38,66 +38,23 @@ CHANGE_TIMEOUT_S = 60.0
 
 
 class Observer:
-    """Examines the graph, calls services and receives messages through a node.
-
-    Parameters
-    ----------
-    node : Node
-    executor : Executor
-        Executor of the node.
-
-    Attributes
-    ----------
-    node : Node
-    """
+    """Examines the graph, calls services and receives messages through a node."""
 
     def __init__(self, node: Node, executor: Executor) -> None:
         self.node, self._executor = node, executor
 
     def wait(self, condition: Callable[[], bool], seconds: float) -> bool:
-        """Spin until a condition holds or the timeout expires.
-
-        Parameters
-        ----------
-        condition : function
-            Returns whether the condition holds.
-        seconds : float, s
-            Timeout.
-
-        Returns
-        -------
-        bool
-            Whether the condition holds at the end.
-        """
+        """Spin until a condition holds or a timeout in s expires; return whether it holds."""
         end = time.monotonic() + seconds
         spin(self._executor, lambda: condition() or time.monotonic() > end)
         return condition()
 
     def call(self, service_type: Any, name: str, request: Any, once: bool = False) -> Any:
-        """Call a service.
+        """Call a service; raises GraphError if it does not exist or does not respond in time.
 
         A query is repeated, because the response of a server that has not yet discovered the client
-        is lost. A change is requested only once, after a wait for discovery.
-
-        Parameters
-        ----------
-        service_type : type
-        name : str
-            Name of the service.
-        request : object
-            Request of type `service_type.Request`.
-        once : bool
-            Whether the call must not be repeated, because it changes the server.
-
-        Returns
-        -------
-        object
-            Response of the service.
-
-        Raises
-        ------
-        GraphError
-            If the service does not exist or does not respond in time.
+        is lost. With `once`, for a change of the server, it is requested only once, after a wait
+        for discovery.
         """
         with valid_names():
             client = self.node.create_client(service_type, name)
@@ -120,17 +77,7 @@ class Observer:
 
 @contextmanager
 def valid_names() -> Iterator[None]:
-    """Convert the exceptions for invalid ROS names to GraphError.
-
-    Yields
-    ------
-    None
-
-    Raises
-    ------
-    GraphError
-        If code in the context uses an invalid name.
-    """
+    """Convert the exceptions for invalid ROS names in the context to GraphError."""
     try:
         yield
     except (NameValidationException, RCLError) as error:
@@ -141,16 +88,8 @@ def valid_names() -> Iterator[None]:
 def observer(ros_arguments: Sequence[str] = ()) -> Iterator[Observer]:
     """Create an `Observer` that is shut down when the context ends.
 
-    If the middleware hangs, `shut_down` ends the process.
-
-    Parameters
-    ----------
-    ros_arguments : sequence of str, optional
-        ROS arguments; the first is `--ros-args`.
-
-    Yields
-    ------
-    Observer
+    The first of `ros_arguments` is `--ros-args`. If the middleware hangs, `shut_down` ends the
+    process.
     """
     init_ros(list(ros_arguments))
     executor, node = make_executor(), Node('mag_tracking_observer', start_parameter_services=False)
@@ -164,17 +103,7 @@ def observer(ros_arguments: Sequence[str] = ()) -> Iterator[Observer]:
 
 
 def topics(graph: Observer) -> list[tuple[str, str, int, int]]:
-    """List the topics of the graph.
-
-    Parameters
-    ----------
-    graph : Observer
-
-    Returns
-    -------
-    list of (str, str, int, int)
-        Topic, type, number of publishers and number of subscribers.
-    """
+    """Topics of the graph: name, type, number of publishers and number of subscribers."""
     graph.wait(lambda: False, DISCOVERY_S)
     node = graph.node
     return [(name, ', '.join(kinds), node.count_publishers(name), node.count_subscribers(name))
@@ -183,24 +112,10 @@ def topics(graph: Observer) -> list[tuple[str, str, int, int]]:
 
 def receive_messages(graph: Observer, topic: str, handle: Callable[[Any], bool],
                      stopped: Callable[[], bool]) -> None:
-    """Receive the messages of a topic until `handle` or `stopped` requests the end.
+    """Receive messages until `handle` returns False or `stopped` returns True; resolves the name.
 
-    Messages published earlier are received only if all publishers of the topic are latched.
-
-    Parameters
-    ----------
-    graph : Observer
-    topic : str
-        Topic name; relative names are resolved.
-    handle : function
-        Called with each message; returns False to stop.
-    stopped : function
-        Returns True to stop.
-
-    Raises
-    ------
-    GraphError
-        If the name is invalid, the topic has no publisher, or its type is not installed.
+    Messages published earlier are received only if all publishers of the topic are latched. Raises
+    GraphError if the name is invalid, the topic has no publisher, or its type is not installed.
     """
     with valid_names():
         name = graph.node.resolve_topic_name(topic)
@@ -232,16 +147,7 @@ def receive_messages(graph: Observer, topic: str, handle: Callable[[Any], bool],
 
 
 def as_dict(message: Any) -> Any:
-    """Convert a message to nested dicts and lists.
-
-    Parameters
-    ----------
-    message : object
-
-    Returns
-    -------
-    object
-    """
+    """Convert a message to nested dicts and lists."""
     if hasattr(message, 'get_fields_and_field_types'):
         return {name: as_dict(getattr(message, name))
                 for name in message.get_fields_and_field_types()}
@@ -254,38 +160,15 @@ def as_dict(message: Any) -> Any:
 
 
 def as_text(message: Any) -> str:
-    """Convert a message to YAML.
-
-    Parameters
-    ----------
-    message : object
-
-    Returns
-    -------
-    str
-    """
+    """Convert a message to YAML."""
     return str(yaml.safe_dump(as_dict(message), sort_keys=False, default_flow_style=None,
                               width=100, allow_unicode=True))
 
 
 def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list[str]:
-    """List parameters of a node with their values and descriptions.
+    """Parameters of a node, or the named one, with values and descriptions.
 
-    Parameters
-    ----------
-    graph : Observer
-    node : str
-    name : str, optional
-        Name of a parameter; by default, all parameters are listed.
-
-    Returns
-    -------
-    list of str
-
-    Raises
-    ------
-    GraphError
-        If the node or the parameter does not exist.
+    Raises GraphError if the node or the parameter does not exist.
     """
     names = [name] if name is not None else list(graph.call(
         ListParameters, f'{node}/list_parameters', ListParameters.Request()).result.names)
@@ -303,21 +186,9 @@ def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list
 
 
 def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
-    """Set a parameter of a node.
+    """Set a parameter of a node to a value in YAML; an integer is accepted for a float.
 
-    Parameters
-    ----------
-    graph : Observer
-    node : str
-    name : str
-        Name of the parameter.
-    text : str
-        Value as YAML; an integer is accepted for a float.
-
-    Raises
-    ------
-    GraphError
-        If the value is invalid, the node does not exist, or the node rejects the value.
+    Raises GraphError if the value is invalid, the node does not exist, or the node rejects it.
     """
     try:
         value = yaml.safe_load(text)
@@ -335,24 +206,9 @@ def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
 
 
 def lifecycle_state(graph: Observer, node: str) -> tuple[str, list[str]]:
-    """Request the state of a lifecycle node.
+    """Label of a lifecycle node's state, and labels of the transitions that are now possible.
 
-    Parameters
-    ----------
-    graph : Observer
-    node : str
-
-    Returns
-    -------
-    state : str
-        Label of the state.
-    transitions : list of str
-        Labels of the transitions that are currently possible.
-
-    Raises
-    ------
-    GraphError
-        If the node does not exist or is not a lifecycle node.
+    Raises GraphError if the node does not exist or is not a lifecycle node.
     """
     state = graph.call(GetState, f'{node}/get_state', GetState.Request()).current_state.label
     possible = graph.call(GetAvailableTransitions, f'{node}/get_available_transitions',
@@ -361,19 +217,9 @@ def lifecycle_state(graph: Observer, node: str) -> tuple[str, list[str]]:
 
 
 def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
-    """Request a transition of a lifecycle node.
+    """Request a transition of a lifecycle node by its label.
 
-    Parameters
-    ----------
-    graph : Observer
-    node : str
-    transition : str
-        Label of the transition.
-
-    Raises
-    ------
-    GraphError
-        If the node does not exist, or the transition is not possible or fails.
+    Raises GraphError if the node does not exist, or the transition is not possible or fails.
     """
     possible = graph.call(GetAvailableTransitions, f'{node}/get_available_transitions',
                           GetAvailableTransitions.Request()).available_transitions

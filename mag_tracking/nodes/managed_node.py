@@ -9,28 +9,14 @@ from mag_tracking.nodes.ros_params import fixed_parameter
 
 
 class ManagedNode(LifecycleNode):
-    """Lifecycle node that configures and activates itself unless `autostart` is false.
-
-    Parameters
-    ----------
-    name : str
-        Default name of the node.
-    **node_arguments
-        Arguments of `Node`.
-    """
+    """Lifecycle node that configures and activates itself unless `autostart` is false."""
 
     def __init__(self, name: str, **node_arguments: Any) -> None:
         super().__init__(name, **node_arguments)
         self._configuration_error: MagTrackingError | None = None
 
     def start_automatically(self) -> None:
-        """Configure and activate the node if `autostart` is true.
-
-        Raises
-        ------
-        MagTrackingError
-            If `prepare` fails.
-        """
+        """Configure and activate the node if `autostart` is true; raises the error of `prepare`."""
         if not fixed_parameter(self, 'autostart', True,
                                'Configure and activate the node at startup.'):
             return
@@ -41,30 +27,14 @@ class ManagedNode(LifecycleNode):
             self.trigger_activate()
 
     def prepare(self) -> None:
-        """Read files and advertise topics; called on configuration.
-
-        Raises
-        ------
-        MagTrackingError
-            If a file or setting is invalid.
-        """
+        """Read files and advertise topics on configuration; raises MagTrackingError if invalid."""
         raise NotImplementedError
 
     def close(self) -> None:
         """Stop the threads of the node; called before the node is destroyed."""
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
-        """Call `prepare`; if it fails, log the error and leave the node unconfigured.
-
-        Parameters
-        ----------
-        state : State
-            Previous state.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-        """
+        """Call `prepare`; if it fails, log the error and leave the node unconfigured."""
         try:
             self.prepare()
         except MagTrackingError as error:

@@ -28,19 +28,10 @@ ROS_ARGUMENTS, PARAMETER_FILE = '--ros-args', '--params-file'
 def init_ros(arguments: list[str] | None = None) -> None:
     """Call `rclpy.init` with the Fast DDS profile of this package, unless the user selects another.
 
-    Other middlewares ignore the profile. No signal handlers are installed, because the handlers of
-    rclpy raise KeyboardInterrupt at any point, even within C++ code of rclpy. Parameter files
-    (`--params-file`) may also have the plain format of `--params`.
-
-    Parameters
-    ----------
-    arguments : list of str, optional
-        Command line; `sys.argv` by default.
-
-    Raises
-    ------
-    SettingsError
-        If the ROS arguments or a parameter file are invalid.
+    Other middlewares ignore the profile. No signal handlers are installed, because those of rclpy
+    raise KeyboardInterrupt at any point, even within C++ code of rclpy. Parameter files
+    (`--params-file`) may also have the plain format of `--params`. Raises SettingsError if the ROS
+    arguments or a parameter file are invalid.
     """
     profile = os.environ.get(PROFILE_VARIABLE)
     if profile is None and not Path(WORKING_FOLDER_PROFILE).exists():
@@ -64,10 +55,10 @@ def _init(arguments: list[str] | None) -> None:
 
 
 def _with_ros_parameter_files(arguments: list[str] | None, folder: Path) -> list[str] | None:
-    """Return the arguments, with plain parameter files replaced by converted copies in `folder`.
+    """Arguments (None: `sys.argv`), with plain parameter files replaced by copies in `folder`.
 
-    `arguments` is None for `sys.argv`. The copies are only needed until `rclpy.init` has returned.
-    Raises SettingsError for an invalid file.
+    The copies are only needed until `rclpy.init` has returned. Raises SettingsError for an invalid
+    file.
     """
     converted = list(sys.argv if arguments is None else arguments)
     for k, argument in enumerate(converted[:-1]):

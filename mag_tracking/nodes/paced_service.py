@@ -20,21 +20,9 @@ def paced_service(node: Node, service_type: Any, name: str,
                   callback: Callable[[Any, Any], Any]) -> Service:
     """Create a service whose responses do not overflow the queues of its clients.
 
-    Each client of a service receives the responses to all clients. By default, a client stores the
-    latest ten responses that it has not yet read. Without pacing, about half of forty simultaneous
-    calls would get no response.
-
-    Parameters
-    ----------
-    node : Node
-    service_type : type
-    name : str
-    callback : function
-        Service callback, as for `Node.create_service`.
-
-    Returns
-    -------
-    Service
+    Each client of a service receives the responses to all clients and by default stores the latest
+    ten that it has not yet read. Without pacing, about half of forty simultaneous calls would get
+    no response.
     """
     service = node.create_service(service_type, name, callback, qos_profile=SERVICE_QOS)
     send, queue = service.send_response, deque[tuple[Any, Any]]()

@@ -69,10 +69,6 @@ class PageNode(Node):
     The topics `tracker_node/tracks` and `network_frame` are relative and can be remapped; the other
     topics of the tracker are in the same namespace as its tracks. A tracker with another name is
     found by the message type of its tracks, if it is the only tracker in the namespace.
-
-    Parameters
-    ----------
-    scene : LiveScene
     """
 
     def __init__(self, scene: LiveScene) -> None:
@@ -208,8 +204,7 @@ class PageNode(Node):
                                [Table('Health', ['node', 'level', 'message'], rows)])
 
     def _missing_topics(self) -> Iterator[Note]:
-        """Yield notes if a topic, the sensor positions or the selection of a tracker is missing, or
-        if messages are invalid."""
+        """Notes on missing topics, positions or tracker selection, and on invalid messages."""
         topics = self._find_tracker()
         if len(topics) > 1 and self._tracks_topic not in topics:
             yield Note(WARNING, f'several trackers: {", ".join(topics)}; select one (--ros-args -r '
@@ -227,32 +222,11 @@ class PageNode(Node):
 
 def watch(host: str, port: int, report: Callable[[str], object],
           ros_arguments: Sequence[str] = (), ended: Callable[[], bool] = lambda: False) -> int:
-    """Serve the page of running nodes until SIGINT or SIGTERM.
+    """Serve the page of running nodes until SIGINT, SIGTERM or `ended`; return the exit status.
 
+    Host and port are those of `PageServer`. `report` receives a line with the address of the page;
+    the first of `ros_arguments` is `--ros-args`. Raises DeviceError if the port cannot be opened.
     If the middleware hangs at the end, `shut_down` ends the process.
-
-    Parameters
-    ----------
-    host : str
-        Address of the page, see `PageServer`.
-    port : int
-        Port of the page, see `PageServer`.
-    report : function
-        Called with a line that contains the address of the page.
-    ros_arguments : sequence of str, optional
-        ROS arguments; the first is `--ros-args`.
-    ended : function, optional
-        Returns True to close the page.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    Raises
-    ------
-    DeviceError
-        If the port cannot be opened.
     """
     os.nice(NICENESS)
     scene = LiveScene('mag_tracking', EMPTY_LAYOUT)

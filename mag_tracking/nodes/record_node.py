@@ -73,10 +73,7 @@ class _PolledSubscription:
         return out
 
     def _count_lost(self, number: int | None) -> None:
-        """Count the messages lost before sequence number `number`.
-
-        Nothing is counted if the topic has several publishers.
-        """
+        """Count messages lost before a sequence number; none with several publishers."""
         if number is None or len(self.publishers) > 1:
             self.last_number = None
             return
@@ -95,23 +92,10 @@ class _PolledSubscription:
 class RecordNode(Node):
     """Subscribes to the selected topics and passes their messages to a `Recorder`.
 
-    The node is polled instead of being spun by an executor. The events executor of the Jazzy wheels
-    fails in callbacks that request time and sequence number of a message. The single-threaded
-    executor uses most of a processor core for twenty sensors.
-
-    Parameters
-    ----------
-    recorder : Recorder
-    selection : Selection
-        Topics to record.
-    report : function
-        Called with lines for the user.
-
-    Attributes
-    ----------
-    recorder : Recorder
-    selection : Selection
-        Topics to record, with absolute names.
+    The node is polled instead of being spun by an executor: the events executor of the Jazzy wheels
+    fails in callbacks that request time and sequence number of a message, and the single-threaded
+    executor uses most of a processor core for twenty sensors. `report` is called with lines for the
+    user; `selection` has absolute names after construction.
     """
 
     def __init__(self, recorder: Recorder, selection: Selection,
@@ -141,15 +125,7 @@ class RecordNode(Node):
         return self._refused
 
     def topic_counts(self) -> tuple[int, int]:
-        """Count the subscribed topics.
-
-        Returns
-        -------
-        n_published : int
-            Number of subscribed topics that have a publisher.
-        n_subscribed : int
-            Number of subscribed topics.
-        """
+        """Number of subscribed topics that have a publisher, and number of subscribed topics."""
         return (sum(s.subscription.get_publisher_count() > 0
                     for s in self._polled_subscriptions.values()),
                 len(self._polled_subscriptions))
@@ -214,13 +190,7 @@ class RecordNode(Node):
             self.recorder.add_topic(topic, polled.type, latched=len(infos))
 
     def poll(self) -> int:
-        """Record the messages that have arrived.
-
-        Returns
-        -------
-        int
-            Number of messages.
-        """
+        """Record the messages that have arrived; return their number."""
         records = []
         for topic, polled in self._polled_subscriptions.items():
             messages = polled.fetch()
@@ -238,46 +208,18 @@ def _is_latched(info: TopicEndpointInfo) -> bool:
 
 
 def log(text: str) -> None:
-    """Print a line for the user without disturbing a progress bar; a closed terminal is ignored.
-
-    Parameters
-    ----------
-    text : str
-        Line to print.
-    """
+    """Print a line for the user without disturbing a progress bar; a closed terminal is ignored."""
     with suppress(OSError):
         tqdm.write(f'record: {text}', file=sys.stderr)
 
 
 def run(selection: Selection, out: Path, split_bytes: int = 10**9,
         split_ns: int = 3600 * 10**9, ros_arguments: Sequence[str] = ()) -> int:
-    """Record until SIGINT, SIGTERM or SIGHUP.
+    """Record into folder `out` until SIGINT, SIGTERM or SIGHUP; return the exit status.
 
-    If the middleware hangs at the end, `shut_down` ends the process, after the recording has been
-    closed.
-
-    Parameters
-    ----------
-    selection : Selection
-        Topics to record.
-    out : Path
-        Folder of the recording.
-    split_bytes : int
-        File size [bytes] at which a new file begins.
-    split_ns : int, ns
-        Duration after which a new file begins.
-    ros_arguments : sequence of str, optional
-        ROS arguments; the first is `--ros-args`.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    Raises
-    ------
-    OutputError
-        If the recording cannot be written to `out`.
+    A new file begins at `split_bytes` or `split_ns`; the first of `ros_arguments` is `--ros-args`.
+    Raises OutputError if the recording cannot be written. If the middleware hangs at the end,
+    `shut_down` ends the process, after the recording has been closed.
     """
     node, status = None, 1
     with recorded_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as signals:

@@ -45,26 +45,9 @@ MAX_MESSAGES_PER_TICK = 200
 class ReplayNode(ManagedNode):
     """Publishes the messages of a recording at the recorded rate or a multiple of it.
 
-    Parameters
-    ----------
-    **node_arguments
-        Arguments of `Node`.
-
-    Attributes
-    ----------
-    counts : Counter of str
-        Numbers of messages played and rejected.
-    publishers_by_topic : dict of str to Publisher
-        Publisher of each topic that is played.
-    finished : bool
-        Whether playback has reached the end of the recording.
-
-    Raises
-    ------
-    RecordingError
-        If `autostart` is set and the recording cannot be played.
-    SettingsError
-        If `autostart` is set and a parameter is invalid.
+    With `autostart`, raises RecordingError if the recording cannot be played, and SettingsError for
+    an invalid parameter. `finished` means that playback has reached the end; `counts` are the
+    messages played and rejected.
     """
 
     def __init__(self, **node_arguments: Any) -> None:
@@ -99,12 +82,8 @@ class ReplayNode(ManagedNode):
     def prepare(self) -> None:
         """Open the recording and advertise its topics.
 
-        Raises
-        ------
-        SettingsError
-            If a parameter is invalid.
-        RecordingError
-            If the recording cannot be read, is empty, or lacks a selected topic.
+        Raises SettingsError for an invalid parameter, and RecordingError if the recording cannot be
+        read, is empty, or lacks a selected topic.
         """
         if not self._path:
             raise SettingsError('replay_node: parameter recording is empty; set it to the path of '
@@ -127,64 +106,24 @@ class ReplayNode(ManagedNode):
         self._seek(self._start_offset_s)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
-        """Start playback at the current position.
-
-        Parameters
-        ----------
-        state : State
-            Previous state.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-        """
+        """Start playback at the current position."""
         # Messages published before discovery is complete are lost.
         self._start_time = time.monotonic() + self._start_delay_s
         self._is_active, self._last_tick = True, None
         return super().on_activate(state)
 
     def on_deactivate(self, state: State) -> TransitionCallbackReturn:
-        """Stop playback; the position is kept.
-
-        Parameters
-        ----------
-        state : State
-            Previous state.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-        """
+        """Stop playback; the position is kept."""
         self._is_active = False
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: State) -> TransitionCallbackReturn:
-        """Close the recording and withdraw its topics.
-
-        Parameters
-        ----------
-        state : State
-            Previous state.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-        """
+        """Close the recording and withdraw its topics."""
         self._release()
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: State) -> TransitionCallbackReturn:
-        """Stop playback, close the recording and withdraw its topics.
-
-        Parameters
-        ----------
-        state : State
-            Previous state.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-        """
+        """Stop playback, close the recording and withdraw its topics."""
         self._release()
         return TransitionCallbackReturn.SUCCESS
 
@@ -330,16 +269,5 @@ def _selected_topics(recording: Recording, topics: Sequence[str]) -> set[str] | 
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process.
-
-    Parameters
-    ----------
-    arguments : list of str, optional
-        Command line; `sys.argv` by default.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
+    """Run the node as a process; return its exit status."""
     return stage_node.main(ReplayNode, arguments)

@@ -26,21 +26,7 @@ a parameter file and the arguments of a process."""
 
 
 def fixed_parameter(node: Node, name: str, default: Any, description: str) -> Any:
-    """Declare a read-only parameter.
-
-    Parameters
-    ----------
-    node : Node
-    name : str
-        One of `NODE_PARAMETERS`.
-    default : object
-    description : str
-
-    Returns
-    -------
-    object
-        Value of the parameter.
-    """
+    """Declare a read-only parameter, one of `NODE_PARAMETERS`; return its value."""
     assert name in NODE_PARAMETERS, name
     return node.declare_parameter(name, default, ParameterDescriptor(
         description=description, read_only=True)).value
@@ -60,25 +46,10 @@ def _descriptor(p: Parameter) -> ParameterDescriptor:
 
 
 def declare_settings(node: Node, settings: Settings, group: str) -> Settings:
-    """Declare the settings of one group as parameters of a node.
+    """Declare the settings of a group as parameters of a node; return all, with its overrides.
 
-    Parameters
-    ----------
-    node : Node
-    settings : Settings
-        All settings, with the defaults of the target.
-    group : str
-        Only settings of this group become parameters; a parameter file may contain others.
-
-    Returns
-    -------
-    Settings
-        Settings including the overrides of the node.
-
-    Raises
-    ------
-    SettingsError
-        If an override does not name a setting, or has a wrong type, length or range.
+    A parameter file may contain settings of other groups. Raises SettingsError if an override does
+    not name a setting, or has a wrong type, length or range.
     """
     overrides = node._parameter_overrides  # rclpy has no public accessor
     current = replace(settings, {
@@ -97,16 +68,7 @@ def _without_array(value: Any) -> Any:
 
 
 def follow_changes(node: Node, settings: Settings, apply: Callable[[Settings], None]) -> None:
-    """Register callbacks that reject invalid changes of parameters and apply valid changes.
-
-    Parameters
-    ----------
-    node : Node
-    settings : Settings
-        Initial settings.
-    apply : function
-        Called with the new settings after each valid change.
-    """
+    """Reject invalid parameter changes; call `apply` with the settings after valid ones."""
     state = {'settings': settings}
 
     def reject_invalid(parameters: list[RosParameter]) -> SetParametersResult:

@@ -38,15 +38,7 @@ MAX_DISCOVERY_S = 60.0
 
 
 class TrackPrinter(Node):
-    """Prints the poses of tracks.
-
-    Parameters
-    ----------
-    topic : str
-        Topic of the tracks.
-    out : text stream
-        Output stream.
-    """
+    """Prints the poses of the tracks of a topic."""
 
     def __init__(self, topic: str = 'tracker_node/tracks', out: TextIO = sys.stdout) -> None:
         super().__init__('track_printer')
@@ -66,16 +58,7 @@ class TrackPrinter(Node):
 
 
 def pose_line(track: Track) -> str:
-    """Format a pose as a line: position with standard deviations, speed, moment, arrival, kind.
-
-    Parameters
-    ----------
-    track : Track
-
-    Returns
-    -------
-    str
-    """
+    """Format a pose as a line: position with standard deviations, speed, moment, arrival, kind."""
     x, y, z = track.position
     sx, sy, sz = (float(v) ** 0.5 for v in track.covariance.diagonal()[:3])
     unit, f = ('m', 1.0) if max(sx, sy) > 0.02 or max(abs(x), abs(y)) > 2.0 else ('mm', 1e3)
@@ -92,17 +75,7 @@ def parameters(network_path: PathLike, settings: Settings, reliable: bool) -> li
     """ROS parameters of the nodes for the given settings.
 
     Settings with their default values are omitted, so that ROS arguments can change them.
-
-    Parameters
-    ----------
-    network_path : path
-    settings : Settings
-    reliable : bool
-        Whether to subscribe to the sensors with reliable QoS, for a replay.
-
-    Returns
-    -------
-    list of Parameter
+    `reliable` is the QoS of subscriptions to the sensors, needed for a replay.
     """
     out = [Parameter('network', value=str(network_path)),
            Parameter('target', value=settings.track.target),
@@ -113,19 +86,7 @@ def parameters(network_path: PathLike, settings: Settings, reliable: bool) -> li
 
 
 def driver_node(drivers_path: PathLike, network_path: PathLike, batches: bool) -> DriverNode:
-    """Create the driver node, which starts immediately.
-
-    Parameters
-    ----------
-    drivers_path : path
-    network_path : path
-    batches : bool
-        Publish the readings of many sensors in one message.
-
-    Returns
-    -------
-    DriverNode
-    """
+    """Create the driver node, which starts at once; `batches` puts many sensors in one message."""
     return DriverNode(parameter_overrides=[
         Parameter('drivers', value=str(drivers_path)),
         Parameter('network', value=str(network_path)), Parameter('batches', value=batches)])
@@ -134,28 +95,11 @@ def driver_node(drivers_path: PathLike, network_path: PathLike, batches: bool) -
 def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike | None = None,
                rate: float = 1.0, loop: bool = False
                ) -> tuple[list[StageNode], ReplayNode | None]:
-    """Create the nodes, ready to be added to an executor.
+    """Create the calibration, detection and tracker nodes, and the replay node of a recording.
 
-    Each stage passes its results to the next one directly and publishes them once the pose has been
-    published. The replay node is paused.
-
-    Parameters
-    ----------
-    network_path : path
-    settings : Settings
-    recording : path, optional
-        Recording to play.
-    rate : float
-        Playback rate.
-    loop : bool
-        Restart the recording at its end.
-
-    Returns
-    -------
-    stages : list of StageNode
-        Calibration, detection and tracker nodes.
-    replay : ReplayNode or None
-        None without a recording.
+    They are ready for an executor; the replay node is None without a recording, else paused, and
+    `loop` restarts it at the end. Each stage passes its results to the next directly and publishes
+    them after the pose.
     """
     overrides = parameters(network_path, settings, reliable=recording is not None)
     tracker = TrackerNode(has_direct_input=True, parameter_overrides=overrides)
@@ -171,18 +115,7 @@ def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike |
 
 
 def all_connected(stages: list[StageNode], replay: ReplayNode) -> bool:
-    """Whether each sensor topic that is replayed has a subscriber.
-
-    Parameters
-    ----------
-    stages : list of StageNode
-        As returned by `make_nodes`.
-    replay : ReplayNode
-
-    Returns
-    -------
-    bool
-    """
+    """Whether each sensor topic that is replayed has a subscriber."""
     sensor_publishers = [p for p in replay.publishers_by_topic.values()
                          if p.topic_name in stages[0].sensor_topics]
     return all(p.get_subscription_count() > 0 for p in sensor_publishers)
@@ -194,32 +127,10 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
         batches: bool = False, ros_arguments: Sequence[str] = ()) -> int:
     """Run the nodes until Ctrl-C, or until a recording has been played and processed.
 
-    If the middleware hangs at the end, `shut_down` ends the process.
-
-    Parameters
-    ----------
-    network_path : path
-    settings : Settings
-    recording : path, optional
-        Recording to play.
-    rate : float
-        Playback rate.
-    loop : bool
-        Restart the recording at its end.
-    observers : sequence of functions, optional
-        Functions that create additional nodes; called after `rclpy.init`. By default, one function
-        that creates a `TrackPrinter`.
-    drivers : path, optional
-        Drivers file; if given, a driver node is also run.
-    batches : bool
-        Publish the readings of many sensors in one message.
-    ros_arguments : sequence of str, optional
-        ROS arguments for all nodes; the first is `--ros-args`.
-
-    Returns
-    -------
-    int
-        Exit status.
+    `drivers` is a drivers file, with which a driver node also runs; `batches` puts many sensors in
+    one message. `observers` create additional nodes after `rclpy.init`, by default a
+    `TrackPrinter`. The first of `ros_arguments` is `--ros-args`. Returns the exit status. If the
+    middleware hangs at the end, `shut_down` ends the process.
     """
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
         # The driver node is created last, so that its first messages have subscribers.

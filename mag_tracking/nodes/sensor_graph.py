@@ -14,20 +14,7 @@ MAX_NAMED = 4
 
 
 def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
-    """Faults of the publishers of a sensor topic: wrong type, several publishers.
-
-    Parameters
-    ----------
-    node : Node
-        Node whose graph is examined.
-    sensor : str
-    topic : str
-        Absolute topic name.
-
-    Returns
-    -------
-    list of Finding
-    """
+    """Faults of the publishers of an absolute sensor topic: wrong type, several publishers."""
     publishers = node.get_publishers_info_by_topic(topic)
     found = [Finding(True, sensor, f'{p.node_name} publishes {p.topic_type} on {topic}',
                      f'the type must be {MAGNETIC_FIELD}', Cause.WRONG_TYPE)
@@ -40,19 +27,10 @@ def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
 
 
 def node_of(endpoint: TopicEndpointInfo) -> str | None:
-    """Absolute name of the node of an endpoint.
+    """Absolute name of the node of an endpoint; None if the node has not yet been announced.
 
     The middleware announces endpoints and nodes separately. Until the node is announced, its name
     is a placeholder.
-
-    Parameters
-    ----------
-    endpoint : TopicEndpointInfo
-
-    Returns
-    -------
-    str or None
-        None if the node has not yet been announced.
     """
     namespace = endpoint.node_namespace
     return absolute(endpoint.node_name, namespace) if namespace.startswith('/') else None
@@ -61,21 +39,8 @@ def node_of(endpoint: TopicEndpointInfo) -> str | None:
 def no_message_finding(node: Node, sensor: str, topic: str, known: Mapping[str, str]) -> Finding:
     """Fault of a sensor from which no message has been received.
 
-    If the topic has no publisher, the advice names other topics with magnetic fields.
-
-    Parameters
-    ----------
-    node : Node
-        Node whose graph is examined.
-    sensor : str
-    topic : str
-        Absolute topic name.
-    known : mapping of str to str
-        Topic of each sensor of the network; these topics are not suggested.
-
-    Returns
-    -------
-    Finding
+    If the topic has no publisher, the advice names other topics with magnetic fields, except those
+    of `known`, the topic of each sensor.
     """
     if node.count_publishers(topic):
         return Finding(True, sensor, f'no message received on {topic}, although it has a '
@@ -93,15 +58,6 @@ def no_message_finding(node: Node, sensor: str, topic: str, known: Mapping[str, 
 
 
 def shortened(names: list[str]) -> str:
-    """Join names with commas; after `MAX_NAMED` names, only count the remaining names.
-
-    Parameters
-    ----------
-    names : list of str
-
-    Returns
-    -------
-    str
-    """
+    """Join names with commas; after `MAX_NAMED` names, only count the remaining names."""
     n_more = len(names) - MAX_NAMED
     return ', '.join(names[:MAX_NAMED]) + (f' and {n_more} more' if n_more > 0 else '')

@@ -38,14 +38,8 @@ LEARNING_TIMEOUT_FACTOR = 3.0
 class HealthDiagnostics:
     """Monitors the raw readings of a network.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : Settings
-    node : Node, optional
-        Node that resolves the sensor topics and whose graph is examined for their publishers.
-    is_replayed : bool
-        Whether the readings come from a recording, so that old timestamps are not a fault.
+    `node` resolves the sensor topics, and its graph is examined for their publishers. With
+    `is_replayed`, old timestamps are not a fault.
     """
 
     def __init__(self, network: SensorNetwork, settings: Settings, node: Node | None = None,
@@ -81,23 +75,11 @@ class HealthDiagnostics:
         self._window_end = self._start_time + WINDOW_S
 
     def use_network(self, network: SensorNetwork) -> None:
-        """Replace the network by another calibration of the same sensors; restart the windows.
-
-        Parameters
-        ----------
-        network : SensorNetwork
-        """
+        """Replace the network by another calibration of the same sensors; restart the windows."""
         self._begin(network)
 
     def add(self, readings: Readings, now_ns: int) -> None:
-        """Add raw readings; readings of sensors outside the network are ignored.
-
-        Parameters
-        ----------
-        readings : Readings
-        now_ns : int, ns
-            Time of arrival.
-        """
+        """Add raw readings and their arrival time; sensors outside the network are ignored."""
         indices = readings.rows(self._index)
         self._stalls.add(now_ns, readings.names)
         self._last_received[indices[indices >= 0]] = time.monotonic()
@@ -107,30 +89,11 @@ class HealthDiagnostics:
             self.update(indices[i])
 
     def update(self, j: int) -> None:
-        """Evaluate the buffered readings of a sensor.
-
-        Parameters
-        ----------
-        j : int
-            Index of the sensor.
-        """
+        """Evaluate the buffered readings of sensor `j`."""
         self._current_window[self._network.names[j]].add_batch(*self._buffer.pop(j))
 
     def statuses(self, node: str, calibrate: Calibrate) -> list[DiagnosticStatus]:
-        """Evaluate all buffered readings and return the diagnostics of all sensors.
-
-        Parameters
-        ----------
-        node : str
-            Title of the node that reports.
-        calibrate : Calibrate
-            Calibration stage.
-
-        Returns
-        -------
-        list of DiagnosticStatus
-            One per sensor.
-        """
+        """Evaluate all buffered readings; return one status per sensor, titled by the `node`."""
         self.begin_round(calibrate)
         for j in range(len(self._network)):
             self.update(j)
@@ -140,11 +103,6 @@ class HealthDiagnostics:
         """Compare the sensors with each other; begin a new window if the current window is over.
 
         Must be called before `status` is called for each sensor.
-
-        Parameters
-        ----------
-        calibrate : Calibrate
-            Calibration stage.
         """
         for name, health in self._current_window.items():
             if health.faults != (faults := calibrate.driver_faults.of(name)):
@@ -162,10 +120,7 @@ class HealthDiagnostics:
                 name: b.n_relearnt for name, b in calibrate.backgrounds().items()}]
 
     def _compare(self, calibrate: Calibrate) -> None:
-        """Compare the sensors with each other and with the Earth's field.
-
-        Also records the time at which each frozen background was frozen.
-        """
+        """Compare the sensors and the Earth's field; note when backgrounds were frozen."""
         for name, background in calibrate.backgrounds().items():
             if not background.frozen:
                 self._frozen_since_ns.pop(name, None)
@@ -251,35 +206,11 @@ class HealthDiagnostics:
                         Cause.CLOCK_DIFFERS)]
 
     def is_awaited(self, name: str) -> bool:
-        """Whether no reading of a sensor has been received yet.
-
-        Parameters
-        ----------
-        name : str
-            Name of the sensor.
-
-        Returns
-        -------
-        bool
-        """
+        """Whether no reading of a sensor has been received yet."""
         return bool(np.isnan(self._last_received[self._index[name]]))
 
     def status(self, node: str, j: int, calibrate: Calibrate) -> DiagnosticStatus:
-        """Diagnostics of a sensor, as of its latest `update`.
-
-        Parameters
-        ----------
-        node : str
-            Title of the node that reports.
-        j : int
-            Index of the sensor.
-        calibrate : Calibrate
-            Calibration stage.
-
-        Returns
-        -------
-        DiagnosticStatus
-        """
+        """Diagnostics of sensor `j`, as of its latest `update`, under the title of the `node`."""
         name = self._network.names[j]
         diagnoses = self._diagnoses(j, name, calibrate)
         level = DiagnosticStatus.OK

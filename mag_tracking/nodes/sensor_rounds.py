@@ -19,20 +19,9 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 class SensorRounds:
     """Processes the sensors of a network one after another, in steps of similar duration.
 
-    Parameters
-    ----------
-    node : str
-        Title of the node, for diagnostics.
-    network : SensorNetwork
-    stage : Calibrate
-    health : HealthDiagnostics
-    store : BackgroundStore
-    is_live : function
-        Returns whether the readings are live and not replayed from a recording.
-    publish_status : function
-        Called with the `DiagnosticStatus` of a sensor.
-    publish_states : function
-        Called with the list of `SensorCalibration` of all sensors; the list is reused.
+    `is_live` returns whether the readings are live and not replayed. `publish_status` is called
+    with the status of a sensor, `publish_states` with the list of all sensors' `SensorCalibration`,
+    which is reused.
     """
 
     def __init__(self, node: str, network: SensorNetwork, stage: Calibrate,
@@ -47,13 +36,7 @@ class SensorRounds:
         self.begin(network)
 
     def begin(self, network: SensorNetwork) -> None:
-        """Begin a new round.
-
-        Parameters
-        ----------
-        network : SensorNetwork
-            Replaces the previous network.
-        """
+        """Begin a new round with a network, which replaces the previous one."""
         self._network = network
         self._steps = self._rounds()
         self._states = [self._state(j) for j in range(len(network))]
@@ -70,7 +53,7 @@ class SensorRounds:
             self._step()
 
     def report_doubts(self) -> None:
-        """Publish the calibration immediately if a background becomes or ceases to be doubtful.
+        """Publish the calibration at once if a background becomes or ceases to be doubtful.
 
         The tracker flags tracks as ambiguous only after it has received the new calibration.
         """

@@ -14,10 +14,6 @@ class SensorTransforms:
 
     The `frame_id` of the sensor messages is not used: it may name a robot link that another node
     publishes, and a frame with two parents would break the transform tree.
-
-    Parameters
-    ----------
-    node : Node
     """
 
     def __init__(self, node: Node) -> None:
@@ -25,11 +21,6 @@ class SensorTransforms:
         self._publisher = node.create_publisher(TFMessage, '/tf_static', LATCHED_QOS)
 
     def publish(self, network: SensorNetwork) -> None:
-        """Publish the transforms of a network.
-
-        Parameters
-        ----------
-        network : SensorNetwork
-        """
+        """Publish the transforms of a network."""
         self._publisher.publish(to_message(TFMessage, {'transforms': sensor_transform_dicts(
             network, self._node.get_clock().now().nanoseconds)}))

@@ -26,14 +26,7 @@ def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: i
     Workaround: Fast DDS 2.14 blocks forever, while it holds the interpreter lock, if a participant
     is destroyed while another one leaves (eProsima/Fast-DDS 6513). This happened to 1 of 1165 nodes
     when five nodes were signalled at once. The deadline can be removed once Fast DDS is fixed.
-
-    Parameters
-    ----------
-    nodes : sequence of Node
-    executor : Executor, optional
-        Executor of the nodes.
-    status : int
-        Exit status of the process if it is ended by the deadline.
+    `status` is the exit status if the deadline ends the process.
     """
     try:
         for node in nodes:
@@ -54,14 +47,9 @@ def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: i
 
 
 def limit_exit_time(status: int) -> None:
-    """Limit the time until the process ends, with the same timeout as `shut_down`.
+    """Limit the time until the process ends with `status`, with the same timeout as `shut_down`.
 
     If the constructor of a node fails, the node is destroyed with the interpreter, which may hang.
-
-    Parameters
-    ----------
-    status : int
-        Exit status of the process if it is ended by the timeout.
     """
     flush()
     end_within(SHUTDOWN_TIMEOUT_S, status, HUNG_MESSAGE.encode())

@@ -62,39 +62,16 @@ _Record = TypeVar('_Record')
 class StageNode(Node):
     """Node that reads the network file and the settings of one group of stages.
 
-    Parameters
-    ----------
-    name : str
-        Default name of the node.
-    group : str
-        Group of settings that become parameters.
-    **node_arguments
-        Arguments of `Node`.
+    Raises SettingsError for an invalid parameter, and NetworkError for an invalid network file.
 
     Attributes
     ----------
-    network_path : Path
-        Network file.
-    network : SensorNetwork
-    settings : Settings
-        Defaults of the target, overridden by parameters.
-    title : str
-        Name of the node in diagnostics.
-    input_qos : QoSProfile
-        QoS of subscriptions to sensors.
-    is_replayed : bool
-        Whether the input is replayed from a recording.
-    flows : dict of str to Flow
-        Statistics of the inputs, by source.
-    now_ns : int, ns
-        Arrival time of the message that is being processed, by the ROS clock.
-
-    Raises
-    ------
-    SettingsError
-        If a parameter is invalid.
-    NetworkError
-        If the network file is invalid.
+    settings : defaults of the target, overridden by parameters
+    title : name of the node in diagnostics
+    input_qos : QoS of subscriptions to sensors
+    is_replayed : whether the input is replayed from a recording
+    flows : statistics of the inputs, by source
+    now_ns : ns, arrival time of the message being processed, by the ROS clock
     """
 
     def __init__(self, name: str, group: str, **node_arguments: Any) -> None:
@@ -127,12 +104,7 @@ class StageNode(Node):
         steady_timer(self, 1.0, self._publish_diagnostics)
 
     def state(self) -> str:
-        """State of the node: waiting for input, or ready.
-
-        Returns
-        -------
-        str
-        """
+        """State of the node: waiting for input, or ready."""
         silent_topics = [topic for flow in self.flows.values() if flow.last_received is None
                          for topic in flow.topics]
         return f'waiting for {shortened(silent_topics)}' if silent_topics else READY
@@ -150,51 +122,24 @@ class StageNode(Node):
         return tuple(map(self.resolve_topic_name, self.network.topics))
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
-        """Stages whose counts are published in diagnostics, by name.
-
-        Returns
-        -------
-        dict of str to Stage
-        """
+        """Stages whose counts are published in diagnostics, by name."""
         raise NotImplementedError
 
     def queues(self) -> dict[str, int]:
-        """Number of queued records of each stage.
-
-        Returns
-        -------
-        dict of str to int
-            {name of the stage: number}.
-        """
+        """Number of queued records of each stage, by name."""
         return {}
 
     def monitor_subscriber(self, role: str, topic: str, publishes: str) -> None:
         """Report in diagnostics if the node of the next step no longer subscribes to a topic.
 
-        Parameters
-        ----------
-        role : str
-            Role of the next step, such as `tracker`; used in messages.
-        topic : str
-        publishes : str
-            Message type that identifies the node of the next step among the subscribers.
+        Messages call that node by its `role`; it is identified among the subscribers by
+        `publishes`, a message type.
         """
         self._subscriber_monitors.append(
             SubscriberMonitor(role, self.resolve_topic_name(topic), publishes))
 
     def publisher(self, message_type: Any, topic: str, qos: QoSProfile) -> Publisher:
-        """Create a publisher that logs subscribers with incompatible QoS.
-
-        Parameters
-        ----------
-        message_type : type
-        topic : str
-        qos : QoSProfile
-
-        Returns
-        -------
-        Publisher
-        """
+        """Create a publisher that logs subscribers with incompatible QoS."""
         def incompatible(event: Any) -> None:
             self.get_logger().warning(
                 f'a subscriber of {topic} requests incompatible QoS (policy '
@@ -207,21 +152,8 @@ class StageNode(Node):
                      qos: QoSProfile, source: str = '', batches: bool = False) -> Subscription:
         """Create a subscription that logs publishers with incompatible QoS.
 
-        Parameters
-        ----------
-        message_type : type
-        topic : str
-        callback : function
-            Called with each message.
-        qos : QoSProfile
-        source : str, optional
-            Sender; diagnostics report throughput and latency of its messages.
-        batches : bool
-            Whether `topic` carries batches, as an alternative to the other topics of `source`.
-
-        Returns
-        -------
-        Subscription
+        Diagnostics report throughput and latency of the messages of a `source`; with `batches`, the
+        topic is an alternative to its other topics.
         """
         flow = self.flows.setdefault(source, Flow(source)) if source else None
         if flow is not None:
@@ -252,21 +184,8 @@ class StageNode(Node):
                      stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
         """Create a function that receives records of the preceding step without a topic.
 
-        Parameters
-        ----------
-        source : str
-            Preceding step; diagnostics report throughput and latency of its records.
-        topics : sequence of str
-            Topics on which the preceding step publishes.
-        callback : function
-            Called with each record.
-        stamp_of : function
-            Returns the timestamp of a record [ns].
-
-        Returns
-        -------
-        function
-            Processes a record.
+        Diagnostics report throughput and latency of `source`, the step, and the `topics` on which
+        it publishes. `stamp_of` returns the timestamp of a record in ns.
         """
         flow = self.flows.setdefault(source, Flow(source))
         flow.topics += map(self.resolve_topic_name, topics)
@@ -280,19 +199,7 @@ class StageNode(Node):
         return receive
 
     def readings_of(self, message: FieldReadings, stage: Stage[Any, Any]) -> Readings | None:
-        """Convert a FieldReadings message; log an invalid message and count the rejection.
-
-        Parameters
-        ----------
-        message : FieldReadings
-        stage : Stage
-            Stage that counts the rejection.
-
-        Returns
-        -------
-        Readings or None
-            None if the message is invalid.
-        """
+        """Convert a FieldReadings message; log and count an invalid one and return None."""
         try:
             return readings_of(message)
         except RecordingError as error:
@@ -355,13 +262,7 @@ class StageNode(Node):
         return any(map(self.count_publishers, (*flow.topics, *flow.batches)))
 
     def publish_statuses(self, statuses: list[DiagnosticStatus]) -> None:
-        """Publish statuses on /diagnostics and log faults.
-
-        Parameters
-        ----------
-        statuses : list of DiagnosticStatus
-            Nothing is published if it is empty.
-        """
+        """Publish statuses, unless there are none, on /diagnostics and log faults."""
         for status in statuses:
             self._log.add(status)
         if statuses:
@@ -371,41 +272,17 @@ class StageNode(Node):
 
 
 def has_subscribers(publisher: Publisher) -> bool:
-    """Whether a publisher has subscribers.
-
-    Parameters
-    ----------
-    publisher : Publisher
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a publisher has subscribers."""
     return publisher.get_subscription_count() > 0
 
 
 def title_of(node: Node) -> str:
-    """Name of a node in diagnostics, including its namespace.
-
-    Parameters
-    ----------
-    node : Node
-
-    Returns
-    -------
-    str
-    """
+    """Name of a node in diagnostics, including its namespace."""
     return node.get_fully_qualified_name().removeprefix('/')
 
 
 def make_executor() -> Executor:
-    """Create an executor: the events executor, which has a low overhead, if it is available.
-
-    Returns
-    -------
-    Executor
-        `EventsExecutor`, or else `SingleThreadedExecutor`.
-    """
+    """Create the events executor, which has little overhead, or else the single-threaded one."""
     try:
         from rclpy.experimental import EventsExecutor
     except ImportError:
@@ -414,23 +291,13 @@ def make_executor() -> Executor:
 
 
 def freeze() -> None:
-    """Exclude all existing objects from garbage collection.
-
-    Repeated scans of these objects would delay the readings too much.
-    """
+    """Exclude all existing objects from garbage collection: scans would delay the readings."""
     gc.collect()
     gc.freeze()
 
 
 def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
-    """Run an executor until ROS shuts down or a condition holds.
-
-    Parameters
-    ----------
-    executor : Executor
-    until : function
-        Returns True to stop; called a few times per second.
-    """
+    """Run an executor until ROS shuts down or `until`, polled a few times per s, is True."""
     try:
         while rclpy.ok() and not until():
             # EventsExecutor.spin() of the Jazzy wheels hangs because a timeout overflows. Waiting
@@ -441,20 +308,7 @@ def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
 
 
 def main(node_class: Callable[[], Node], arguments: list[str] | None = None) -> int:
-    """Run a node as a process until SIGINT or SIGTERM.
-
-    Parameters
-    ----------
-    node_class : function
-        Creates the node.
-    arguments : list of str, optional
-        Command line; `sys.argv` by default.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
+    """Run a node as a process until SIGINT or SIGTERM; return its exit status."""
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
         return _run_until(signals, node_class, arguments)
 

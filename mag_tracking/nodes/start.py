@@ -18,13 +18,7 @@ END_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def run_node(name: str) -> NoReturn:
-    """Run a node as a process; does not return.
-
-    Parameters
-    ----------
-    name : str
-        Module of the node.
-    """
+    """Run a node, named by its module, as a process; does not return."""
     status = 1
     try:
         with exit_on_signals(0, *END_SIGNALS):
@@ -40,13 +34,7 @@ def run_node(name: str) -> NoReturn:
 
 
 def limit_exit_time(status: int) -> None:
-    """Limit the time until the process ends, if the process has imported rclpy.
-
-    Parameters
-    ----------
-    status : int
-        Exit status of the process if it is ended by the timeout.
-    """
+    """Limit the time until the process ends with `status`, if the process has imported rclpy."""
     if 'rclpy' in sys.modules:
         import_module('mag_tracking.nodes.shutdown').limit_exit_time(status)
 

@@ -21,12 +21,7 @@ _NUMBER = re.compile(r'[\d.]+')
 
 
 class StatusLog:
-    """Logs the beginning and the end of faults in `DiagnosticStatus` messages.
-
-    Parameters
-    ----------
-    logger : RcutilsLogger
-    """
+    """Logs the beginning and the end of faults in `DiagnosticStatus` messages."""
 
     def __init__(self, logger: RcutilsLogger) -> None:
         self._logger = logger
@@ -43,12 +38,7 @@ class StatusLog:
         return len(self._last_logged) + len(self._current_faults) + len(self._similar)
 
     def add(self, status: DiagnosticStatus) -> None:
-        """Log a status if its fault is new or has ended, or if an error is due to be repeated.
-
-        Parameters
-        ----------
-        status : DiagnosticStatus
-        """
+        """Log a status if its fault is new or has ended, or if an error is due to be repeated."""
         subject = str(status.name.rpartition(': ')[2])
         if status.level == DiagnosticStatus.OK:
             self._current_faults.pop(status.name, None)
@@ -72,12 +62,7 @@ class StatusLog:
         self._log(status.level, f'{subject}: {status.message}')
 
     def info(self, text: str) -> None:
-        """Log a line at level INFO.
-
-        Parameters
-        ----------
-        text : str
-        """
+        """Log a line at level INFO."""
         self._log(DiagnosticStatus.OK, text)
 
     def _log(self, level: bytes, text: str) -> None:

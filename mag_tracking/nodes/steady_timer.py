@@ -10,21 +10,6 @@ from rclpy.timer import Timer
 
 def steady_timer(node: Node, seconds: float, call: Callable[[], None],
                  autostart: bool = True) -> Timer:
-    """Create a timer that is independent of simulated time.
-
-    Parameters
-    ----------
-    node : Node
-    seconds : float, s
-        Period.
-    call : function
-        Called without arguments.
-    autostart : bool
-        Whether the timer starts immediately.
-
-    Returns
-    -------
-    Timer
-    """
+    """Create a timer, with a period in s, that is independent of simulated time."""
     return node.create_timer(seconds, call, autostart=autostart,
                              clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -18,18 +18,9 @@ MIN_INTERVAL_S = 0.5
 
 
 class SurveyService:
-    """Solves a survey and saves the resulting network.
+    """Solves a survey and saves the resulting network to `save_as` on request.
 
-    Parameters
-    ----------
-    survey : Survey
-        Survey stage.
-    stage : Calibrate
-        Calibration stage.
-    save_as : Path
-        File to which the network is saved on request.
-    imu_topics : sequence of str
-        Absolute topics of the accelerometers, for messages.
+    `imu_topics` are absolute names, for messages.
     """
 
     def __init__(self, survey: Survey, stage: Calibrate, save_as: Path,
@@ -40,21 +31,9 @@ class SurveyService:
 
     def solve(self, network: SensorNetwork, save: bool,
               response: SurveyMessage.Response) -> SensorNetwork | None:
-        """Solve a survey and save the result if requested; fail if a survey has just ended.
+        """Solve a survey, save it on request and fill in the `response`; None if it failed.
 
-        Parameters
-        ----------
-        network : SensorNetwork
-            Current network.
-        save : bool
-            Whether to write the resulting network file.
-        response : Survey.Response
-            Receives the result.
-
-        Returns
-        -------
-        SensorNetwork or None
-            None if the survey failed; `response` contains the reason.
+        It also fails if a survey has just ended.
         """
         if time.monotonic() - self._end_time < MIN_INTERVAL_S:
             response.message = f'a survey has just been run; try again in {MIN_INTERVAL_S:g} s'

@@ -83,18 +83,9 @@ MAX_PATH_POSES = 2000
 class TrackerNode(StageNode):
     """Tracks targets with a bank of filters and publishes the results.
 
-    Parameters
-    ----------
-    has_direct_input : bool
-        Whether frames are passed to `receive_frame` directly and not received on a topic.
-    **node_arguments
-        Arguments of `StageNode`.
-
-    Attributes
-    ----------
-    after_pose : function or None
-        Publishes the frame from which a pose was computed; called after the pose and before the
-        track are published.
+    With `has_direct_input`, frames are passed to `receive_frame` and not received on a topic.
+    `after_pose` publishes the frame from which a pose was computed; it is called after the pose and
+    before the track are published.
     """
 
     def __init__(self, has_direct_input: bool = False, **node_arguments: Any) -> None:
@@ -146,12 +137,7 @@ class TrackerNode(StageNode):
             self.get_logger().info(note)
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
-        """Stages whose counts are published in diagnostics, by name.
-
-        Returns
-        -------
-        dict of str to Stage
-        """
+        """Stages whose counts are published in diagnostics, by name."""
         return {'track': self._stage, 'traffic': self._traffic.stage}
 
     def end_tracks_on_timeout(self) -> None:
@@ -204,12 +190,8 @@ class TrackerNode(StageNode):
         self._stage.idle()
 
     def set_input_doubts(self, doubts: InputDoubts) -> None:
-        """Set the intervals with doubtful readings, in which tracks are ambiguous.
-
-        Parameters
-        ----------
-        doubts : {reason: {sensor: DoubtfulTimes}}
-        """
+        """Set the intervals of doubtful readings by reason and sensor; tracks are ambiguous
+        there."""
         self._stage.set_input_doubts(doubts)
 
     def idle(self) -> None:
@@ -305,16 +287,7 @@ class TrackerNode(StageNode):
 
 
 def publish_if_any(publisher: Publisher, cls: Any, content: MessageDict | None) -> None:
-    """Publish a message unless its content is None.
-
-    Parameters
-    ----------
-    publisher : Publisher
-    cls : type
-        Class of the message.
-    content : dict or None
-        Fields of the message.
-    """
+    """Publish a message with the given fields unless they are None."""
     if content is not None:
         publisher.publish(to_message(cls, content))
 
@@ -327,16 +300,5 @@ def _same_orientations(one: SensorNetwork, other: SensorNetwork) -> bool:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process.
-
-    Parameters
-    ----------
-    arguments : list of str, optional
-        Command line; `sys.argv` by default.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
+    """Run the node as a process; return its exit status."""
     return stage_node.main(TrackerNode, arguments)

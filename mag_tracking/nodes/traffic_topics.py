@@ -12,17 +12,7 @@ from mag_tracking.stages.traffic.stage import TrackedFrame, Traffic
 
 
 class TrafficTopics:
-    """Counts the vehicles of a tracker node, and publishes passages and summaries.
-
-    Parameters
-    ----------
-    node : StageNode
-
-    Attributes
-    ----------
-    stage : Traffic
-        Traffic stage.
-    """
+    """Counts the vehicles of a tracker node, and publishes passages and summaries."""
 
     def __init__(self, node: StageNode) -> None:
         node.settings = declare_settings(node, node.settings, 'traffic')
@@ -34,12 +24,7 @@ class TrafficTopics:
         self._summary_publisher = node.publisher(TrafficSummaryMessage, '~/traffic', RESULT_QOS)
 
     def add(self, item: TrackedFrame) -> None:
-        """Process the records of a frame; publish completed passages and summaries.
-
-        Parameters
-        ----------
-        item : TrackedFrame
-        """
+        """Process the records of a frame; publish completed passages and summaries."""
         for record in self.stage.feed(item):
             if isinstance(record, VehiclePassage):
                 self._passage_publisher.publish(to_message(

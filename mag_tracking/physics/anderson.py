@@ -13,28 +13,11 @@ from mag_tracking.physics.dipole import K_DIPOLE
 
 
 def anderson_functions(tau: ArrayLike) -> FloatArray:
-    """Anderson functions tau^n / (tau^2 + 1)^(5/2) for n = 0, 1, 2.
+    """Anderson functions tau^n / (tau^2 + 1)^(5/2), n = 0, 1, 2, (..., 3); TSP14 eq. (23).
 
-    Parameters
-    ----------
-    tau : (...) array
-        Dimensionless time from the closest point of approach (CPA): (t - t_cpa) times speed over
-        CPA range.
-
-    Returns
-    -------
-    (..., 3) array
-        Functions in ascending order of n. The function of n = 1 is odd and orthogonal to the other
-        two functions. Contrary to TSP14, the functions of n = 0 and n = 2 are not orthogonal to
-        each other.
-
-    Notes
-    -----
-    The exponent is 5/2; TSP14 prints n/2.
-
-    References
-    ----------
-    [TSP14]_ eq. (23).
+    `tau` is (t - t_cpa) times speed over range at the closest point of approach (CPA). TSP14 prints
+    the exponent n/2. The odd function n = 1 is orthogonal to the others; contrary to TSP14, n = 0
+    and n = 2 are not orthogonal to each other.
     """
     tau = np.asarray(tau, dtype=float)
     # Powers of 1/(tau^2 + 1) and of tau/sqrt(tau^2 + 1) cannot overflow.
@@ -45,32 +28,11 @@ def anderson_functions(tau: ArrayLike) -> FloatArray:
 
 
 def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatArray]:
-    """Closest point of approach (CPA) of a straight pass at constant velocity.
+    """Time, range and relative position of the closest point of approach (CPA) of a pass.
 
-    Parameters
-    ----------
-    r0 : (3,) array, m
-        Position of the target relative to the sensor at time zero.
-    v0 : (3,) array, m/s
-        Velocity of the target.
-
-    Returns
-    -------
-    t_cpa : float, s
-        Time of the CPA, relative to time zero.
-    distance : float, m
-        Range at the CPA. Zero if r0 is parallel to v0; a range below 1e-15 ‖r0‖ is rounded to zero.
-    r_cpa : (3,) array, m
-        Position of the target relative to the sensor at the CPA, perpendicular to v0.
-
-    Raises
-    ------
-    ValueError
-        If `v0` is zero or not finite, or if a shape is not (3,).
-
-    References
-    ----------
-    [TSP14]_ eq. (24).
+    `r0` [m] is the position relative to the sensor at time zero, `v0` [m/s] the velocity. The range
+    is zero if they are parallel (below 1e-15 ‖r0‖). Raises ValueError if `v0` is zero or not
+    finite. TSP14 eq. (24).
     """
     r0, v0 = _checked_vector('r0', r0), _checked_vector('v0', v0)
     speed = np.linalg.norm(v0)
@@ -88,36 +50,12 @@ def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatA
 
 
 def anderson_coefficients(r_cpa: ArrayLike, v0: ArrayLike, m: ArrayLike) -> FloatArray:
-    """Coefficients of the Anderson functions of a straight pass.
+    """Coefficients C (3, 3) [T] of the field B = C f(tau), with f of `anderson_functions`.
 
-    Parameters
-    ----------
-    r_cpa : (3,) array, m
-        Position of the target relative to the sensor at the closest point of approach.
-    v0 : (3,) array, m/s
-        Velocity of the target. Only its direction is used.
-    m : (3,) array, A m²
-        Dipole moment.
-
-    Returns
-    -------
-    (3, 3) array, T
-        Matrix C of the field B = C f(tau), with the functions f of `anderson_functions`. NaN if
-        `r_cpa` is zero.
-
-    Raises
-    ------
-    ValueError
-        If `v0` is zero or not finite, if the magnitude of the cosine between `r_cpa` and `v0`
-        exceeds 1e-6, or if a shape is not (3,).
-
-    Notes
-    -----
-    The two terms of TSP14 eq. (25c) are added; the printed sign is wrong.
-
-    References
-    ----------
-    [TSP14]_ eq. (25), (26).
+    `r_cpa` [m] is the position relative to the sensor at the CPA; of `v0` only the direction is
+    used. NaN if `r_cpa` is zero. Raises ValueError if `v0` is zero or not finite, or not
+    perpendicular to `r_cpa` (cosine above 1e-6). TSP14 eq. (25), (26); the two terms of (25c) are
+    added, the printed sign is wrong.
     """
     r_cpa, v0, m = (_checked_vector('r_cpa', r_cpa), _checked_vector('v0', v0),
                     _checked_vector('m', m))
@@ -137,33 +75,11 @@ def anderson_coefficients(r_cpa: ArrayLike, v0: ArrayLike, m: ArrayLike) -> Floa
 
 
 def anderson_field(t: ArrayLike, r0: ArrayLike, v0: ArrayLike, m: ArrayLike) -> FloatArray:
-    """Flux density of a dipole on a straight pass, at the sensor.
+    """Flux density (..., 3) [T] of a dipole on a straight pass; TSP14 eq. (22) without B0.
 
-    Parameters
-    ----------
-    t : (...) array, s
-        Time; the target is at `r0` at t = 0.
-    r0 : (3,) array, m
-        Position of the target relative to the sensor at time zero.
-    v0 : (3,) array, m/s
-        Velocity of the target.
-    m : (3,) array, A m²
-        Dipole moment, constant.
-
-    Returns
-    -------
-    (..., 3) array, T
-        Equal to the result of `dipole.dipole_field`. NaN at all times if the path passes through
-        the sensor, because the expansion is then not defined.
-
-    Raises
-    ------
-    ValueError
-        If `v0` is zero or not finite, or if a shape is not (3,).
-
-    References
-    ----------
-    [TSP14]_ eq. (22), without the background B0.
+    The target is at `r0` [m] relative to the sensor at t = 0. Equal to `dipole.dipole_field`, but
+    NaN at all times if the path passes through the sensor. Raises ValueError if `v0` is zero or not
+    finite.
     """
     t_cpa, distance, r_cpa = closest_approach(r0, v0)
     C = anderson_coefficients(r_cpa, v0, m)
@@ -174,27 +90,10 @@ def anderson_field(t: ArrayLike, r0: ArrayLike, v0: ArrayLike, m: ArrayLike) -> 
 
 
 def anderson_residual(t: FloatArray, y: FloatArray, time: float, scale: float) -> float:
-    """Residual sum of squares after a fit of Anderson functions and a constant.
+    """Residual sum of squares of a fit of Anderson functions and a constant to each column of `y`.
 
-    Parameters
-    ----------
-    t : (n,) array, s
-        Timestamps.
-    y : (n, k) array
-        Whitened field, contiguous.
-    time : float, s
-        Time of the closest point of approach (CPA).
-    scale : float, s
-        Range at the CPA divided by the speed.
-
-    Returns
-    -------
-    float
-        Sum over the columns of `y`, which are fitted separately.
-
-    References
-    ----------
-    [TSP14]_ eq. (22), (23), with the exponent 5/2.
+    `t` (n,) is in s, `y` (n, k) whitened and contiguous; `time` is that of the CPA and `scale` [s]
+    its range over the speed. TSP14 eq. (22), (23), with the exponent 5/2.
     """
     return core.anderson_residual(t, y, time, scale)
 

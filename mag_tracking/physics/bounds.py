@@ -28,17 +28,8 @@ ADVICE = 'check the unit of the readings, their timestamps, and the positions in
 
 
 def are_possible(velocities: FloatArray, moments: FloatArray) -> BoolArray:
-    """Whether states of targets are within the bounds.
-
-    Parameters
-    ----------
-    velocities : (..., 3) array, m/s
-    moments : (..., 3) array, A m²
-
-    Returns
-    -------
-    (...) bool array
-    """
+    """Whether velocities (..., 3) [m/s] and moments (..., 3) [A m²] are within the bounds; False
+    for NaN."""
     # A comparison with NaN is false.
     are_within: BoolArray = (np.linalg.norm(velocities, axis=-1) <= MAX_SPEED) \
         & (np.linalg.norm(moments, axis=-1) <= MAX_MOMENT)
@@ -47,19 +38,10 @@ def are_possible(velocities: FloatArray, moments: FloatArray) -> BoolArray:
 
 def impossible_reason(velocity: FloatArray, moment: FloatArray,
                       mounting: FloatArray | None = None) -> str:
-    """Reason why the state of a target is impossible.
+    """Element of `REASONS` why the state of a target is impossible; empty if it is possible.
 
-    Parameters
-    ----------
-    velocity : (3,) array, m/s
-    moment : (3,) array, A m²
-    mounting : (n_sensors, 3) array, rad, optional
-        Mounting angles of the sensors; NaN for an unused sensor.
-
-    Returns
-    -------
-    str
-        Element of `REASONS`; empty if the state is possible.
+    `velocity` is in m/s, `moment` in A m², `mounting` (n_sensors, 3) in rad with NaN for an unused
+    sensor.
     """
     if not np.linalg.norm(velocity) <= MAX_SPEED:
         return TOO_FAST

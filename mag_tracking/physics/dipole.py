@@ -18,42 +18,16 @@ K_DIPOLE = core.K_DIPOLE
 def sensor_fields(positions: FloatArray, R_sw: FloatArray, r: FloatArray, m: FloatArray,
                   dr_dx: FloatArray, dm_dx: FloatArray
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Field of moving dipoles at fixed sensors, and its derivative with respect to the state.
+    """Field (n_hyp, n_sensors, 3) [T, sensor frame] of dipoles, its derivative and its gradient.
 
-    Parameters
-    ----------
-    positions : (n_sensors, 3) array, m, world frame
-        Sensor positions.
-    R_sw : (n_sensors, 3, 3) array
-        Rotation from the world frame to each sensor frame.
-    r : (n_hyp, n_dipoles, 3) array, m, world frame
-        Dipole positions.
-    m : (n_hyp, n_dipoles, 3) array, A m², world frame
-        Dipole moments.
-    dr_dx : (n_hyp, n_dipoles, 3, n_t) array
-        Derivative of `r` with respect to the target state.
-    dm_dx : (n_hyp, n_dipoles, 3, n_t) array
-        Derivative of `m` with respect to the target state.
+    `r` [m] and `m` [A m²] (n_hyp, n_dipoles, 3) are in the world frame; `dr_dx` and `dm_dx`
+    (n_hyp, n_dipoles, 3, n_t) are their derivatives with respect to the target state. Returns the
+    summed field of ICASSP11 eq. (9), its derivative (..., n_t), and the gradient (n_hyp, n_sensors)
+    [T/m], all NaN or infinite at the position of a sensor.
 
-    Returns
-    -------
-    h : (n_hyp, n_sensors, 3) array, T, sensor frame
-        Sum of the fields of the dipoles.
-    H : (n_hyp, n_sensors, 3, n_t) array
-        Derivative of `h` with respect to the target state.
-    gradient : (n_hyp, n_sensors) array, T/m
-        Sum of mu0/(4 pi) ‖m‖ / ‖d‖^4 over the dipoles, where d is the vector from dipole to sensor.
-        A term times the extent [m] of the body that the dipole represents is the magnitude of the
-        first neglected multipole order. Magnitudes are added instead of squares, because the errors
-        of adjacent dipoles of a body are correlated.
-
-    Notes
-    -----
-    All three outputs are NaN or infinite if a dipole is at the position of a sensor.
-
-    References
-    ----------
-    [ICASSP11]_ eq. (9).
+    The gradient is the sum of mu0/(4 pi) ‖m‖ / ‖d‖^4 over the dipoles at distance d. A term times
+    the extent [m] of a body is the magnitude of the first neglected multipole order. Magnitudes are
+    added, not squares, because errors of adjacent dipoles of a body are correlated.
     """
     return core.sensor_fields(positions, R_sw, r, m, dr_dx, dm_dx)
 
@@ -67,56 +41,17 @@ def _broadcast_pair(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray]
 
 
 def dipole_field(r: ArrayLike, m: ArrayLike) -> FloatArray:
-    """Flux density of a point dipole.
+    """Flux density (..., 3) [T] of a point dipole `m` [A m²], NaN at r = 0; TSP14 eq. (2).
 
-    Parameters
-    ----------
-    r : (..., 3) array, m, world frame
-        Position of the sensor relative to the source.
-    m : (..., 3) array, A m², world frame
-        Dipole moment; broadcasts against `r`.
-
-    Returns
-    -------
-    (..., 3) array, T, world frame
-        NaN at r = 0.
-
-    Raises
-    ------
-    ValueError
-        If the last axis is not of length 3, or if `r` and `m` do not broadcast.
-
-    References
-    ----------
-    [TSP14]_ eq. (2).
+    `r` [m] points from the source to the sensor; `r` and `m` broadcast.
     """
     return core.dipole_field(*_broadcast_pair(r, m))
 
 
 def dipole_jacobians(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of the flux density of a point dipole.
+    """Derivatives of `dipole_field` by `r` (..., 3, 3) [T/m] and by `m` [T/(A m²)], NaN at r = 0.
 
-    Parameters
-    ----------
-    r : (..., 3) array, m, world frame
-        Position of the sensor relative to the source.
-    m : (..., 3) array, A m², world frame
-        Dipole moment; broadcasts against `r`.
-
-    Returns
-    -------
-    dB_dr : (..., 3, 3) array, T/m
-        Symmetric. The derivative with respect to the source position is -dB_dr. NaN at r = 0.
-    dB_dm : (..., 3, 3) array, T/(A m²)
-        Symmetric. NaN at r = 0.
-
-    Raises
-    ------
-    ValueError
-        If the last axis is not of length 3, or if `r` and `m` do not broadcast.
-
-    References
-    ----------
-    [TSP14]_ eq. (30a), (30b), with the factor mu0/(4 pi).
+    Both are symmetric; the derivative by the source position is minus the first. TSP14 eq. (30a),
+    (30b), with the factor mu0/(4 pi).
     """
     return core.dipole_jacobians(*_broadcast_pair(r, m))

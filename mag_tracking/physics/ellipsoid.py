@@ -12,37 +12,15 @@ from mag_tracking.physics.dipole import MU0
 
 
 def demagnetisation_factors(aspect: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Demagnetisation factors of an ellipsoid of revolution.
+    """Demagnetisation factors L1 along and L2 = (1 - L1)/2 across the axis of an ellipsoid.
 
-    Parameters
-    ----------
-    aspect : (...) array
-        Semi-axis of revolution over the transverse semi-axis: above 1 for a prolate ellipsoid
-        (needle), 1 for a sphere, below 1 for an oblate ellipsoid (disk).
+    `aspect` is the semi-axis of revolution over the transverse one. L1 is 1/3 for a sphere; it
+    approaches 0 for a needle (`aspect` above 1) and 1 for a disk. Raises ValueError for an `aspect`
+    outside 1e-100 to 1e100.
 
-    Returns
-    -------
-    L1 : (...) array
-        Factor along the axis of revolution: 1/3 for a sphere, 0 for a needle, 1 for a disk.
-    L2 : (...) array
-        Factor across the axis, (1 - L1)/2: 1/3 for a sphere, 1/2 for a needle, 0 for a disk.
-
-    Raises
-    ------
-    ValueError
-        If `aspect` is not between 1e-100 and 1e100.
-
-    Notes
-    -----
-    The closed form is 0/0 for a sphere. Instead, the underlying integral, a b c/2 times the
-    integral of ds/((s + a^2) sqrt(...)), is evaluated as Carlson's R_D. The integral is also valid
-    for oblate ellipsoids and is accurate near the sphere. The closed form in MITRE12 contains an
-    error: t2 must be m - (t1 + 1)/m. With the printed t2 = m - t1 - 1, the sum L1 + 2 L2 is 0.49 at
-    m = 2 instead of 1.
-
-    References
-    ----------
-    [MITRE12]_ eq. (A.2)-(A.4).
+    Instead of the closed form, 0/0 for a sphere, the underlying integral a b c/2 ∫ ds/((s + a^2)
+    sqrt(...)) is evaluated as Carlson's R_D. MITRE12 eq. (A.2)-(A.4) with an error: t2 must be m -
+    (t1 + 1)/m; the printed m - t1 - 1 gives L1 + 2 L2 = 0.49 at m = 2 instead of 1.
     """
     aspect = np.asarray(aspect, dtype=float)
     if not np.all((aspect >= 1e-100) & (aspect <= 1e100)):
@@ -54,41 +32,16 @@ def demagnetisation_factors(aspect: ArrayLike) -> tuple[FloatArray, FloatArray]:
 
 def ellipsoid_moment(semi_axes: Sequence[float] | FloatArray, mu_r: float, heading: ArrayLike,
                      earth_field: ArrayLike) -> FloatArray:
-    """Moment induced by the Earth's field in a permeable ellipsoid of revolution.
+    """Moment (..., 3) [A m²] that the Earth's field induces in a permeable ellipsoid of revolution.
 
-    The axis of revolution is horizontal and points along the heading.
+    The semi-axes (revolution, transverse) [m] are half the length and width of a vehicle; the axis
+    of revolution is horizontal along `heading` [rad, from x to y]. `mu_r` is 11 in MITRE12 Table 1;
+    `earth_field` is B0 [T], and vectors are in the world frame. Raises ValueError unless the
+    semi-axes are positive and `mu_r` at least 1.
 
-    Parameters
-    ----------
-    semi_axes : (2,) array, m
-        Semi-axis of revolution and transverse semi-axis: half the length and half the width of a
-        vehicle.
-    mu_r : float
-        Relative permeability, 1 + susceptibility; 11 in MITRE12 Table 1.
-    heading : (...) array, rad, world frame
-        Measured from x towards y, which is from east towards north in ENU.
-    earth_field : (..., 3) array, T, world frame
-        Flux density B0; all axes but the last broadcast against `heading`.
-
-    Returns
-    -------
-    (..., 3) array, A m², world frame
-
-    Raises
-    ------
-    ValueError
-        If a semi-axis is not positive and finite, `mu_r` is below 1 or not finite, or the last axis
-        of `earth_field` is not of length 3.
-
-    Notes
-    -----
-    The factor B0/mu0 is printed as 2.5 B0/pi in MITRE12, which is equal for B0 in microtesla. In
-    MITRE12, the moment is in the vehicle frame, and the course is clockwise from north. In MITRE12
-    eq. (A.6), the vertical field is positive downwards although the third axis points up.
-
-    References
-    ----------
-    [MITRE12]_ eq. (A.1), (A.5)-(A.7).
+    MITRE12 eq. (A.1), (A.5)-(A.7). There, B0/mu0 is printed as 2.5 B0/pi for B0 in microtesla, the
+    moment is in the vehicle frame, the course is clockwise from north, and the vertical field in
+    (A.6) is positive downwards although the third axis points up.
     """
     a, b = semi_axes
     if not (0.0 < a < math.inf and 0.0 < b < math.inf):

@@ -41,101 +41,31 @@ def _field_and_jacobians(r: ArrayLike,
 
 
 def multipole_field(r: ArrayLike, moments: ArrayLike) -> FloatArray:
-    """Flux density of a multipole expansion, summed over its orders.
+    """Flux density (..., 3) [T] of a multipole expansion, summed over its orders; NaN at r = 0.
 
-    Parameters
-    ----------
-    r : (..., 3) array, m, world frame
-        Position of the sensor relative to the source.
-    moments : (..., 3 | 8 | 15) array, A m² | A m³ | A m⁴, world frame
-        Components of the orders up to 1, 2 or 3, in the order given in the module docstring;
-        broadcasts against `r`.
-
-    Returns
-    -------
-    (..., 3) array, T, world frame
-        NaN at r = 0.
-
-    Raises
-    ------
-    ValueError
-        If the last axis of `r` does not have length 3, or the last axis of `moments` does not have
-        length 3, 8 or 15.
-
-    Notes
-    -----
-    In T10 eq. (4.17), r points from the sensor to the source, so moments of even order have the
-    opposite sign.
-
-    References
-    ----------
-    [T10]_ eq. (3.39)-(3.41).
+    `r` [m] points from the source to the sensor; `moments` (..., 3 | 8 | 15) are as in the module
+    docstring. T10 eq. (3.39)-(3.41); in T10 eq. (4.17), r points from the sensor to the source, so
+    moments of even order have the opposite sign.
     """
     return _field_and_jacobians(r, moments)[0]
 
 
 def multipole_jacobians(r: ArrayLike, moments: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of the flux density of a multipole expansion.
+    """Derivatives of `multipole_field` by `r` (..., 3, 3) and by `moments` (..., 3, k).
 
-    Parameters
-    ----------
-    r : (..., 3) array, m, world frame
-        Position of the sensor relative to the source.
-    moments : (..., k) array, A m² | A m³ | A m⁴, world frame
-        As for `multipole_field`; k = 3, 8 or 15.
-
-    Returns
-    -------
-    dB_dr : (..., 3, 3) array, T/m
-        Symmetric. The derivative with respect to the source position is -dB_dr. NaN at r = 0.
-    dB_dm : (..., 3, k) array, T per unit of the component
-        The field is dB_dm @ moments. NaN at r = 0.
-
-    Raises
-    ------
-    ValueError
-        If the last axis of `r` does not have length 3, or the last axis of `moments` does not have
-        length 3, 8 or 15.
-
-    References
-    ----------
-    [T10]_ eq. (3.39)-(3.41), differentiated.
+    Both are NaN at r = 0. The first is symmetric, and minus the derivative by the source position;
+    the second times the moments is the field. T10 eq. (3.39)-(3.41), differentiated.
     """
     return _field_and_jacobians(r, moments)[1:]
 
 
 def multipole_moments(points: ArrayLike, dipoles: ArrayLike, order: int) -> FloatArray:
-    """Multipole moments of a cloud of dipoles about the origin.
+    """Multipole moments (..., 3 | 8 | 15) about the origin of dipoles [A m²] at `points` [m].
 
-    The dipole moment is the sum of the dipoles; higher moments depend on the origin.
-
-    Parameters
-    ----------
-    points : (..., n, 3) array, m
-        Dipole positions relative to the origin of the expansion.
-    dipoles : (..., n, 3) array, A m²
-        Dipole moments; broadcasts against `points`.
-    order : int
-        Highest order: 1, 2 or 3.
-
-    Returns
-    -------
-    (..., 3 | 8 | 15) array, A m² | A m³ | A m⁴
-        Moments as for `multipole_field`, in the axes of `points`.
-
-    Raises
-    ------
-    ValueError
-        If `order` is not 1, 2 or 3, or if the arrays do not have the shape (..., n, 3).
-
-    Notes
-    -----
-    The moments follow from the Taylor series of the dipole potentials, scaled as in T10. The moment
-    of order l is l (2l-1)!! times the symmetric traceless part of m x x .., with l - 1 factors x.
-
-    References
-    ----------
-    [T10]_ eq. (3.40).
+    `points` and `dipoles` are (..., n, 3). `order` is 1, 2 or 3, otherwise ValueError; orders above
+    1 depend on the origin. The moment of order l is l (2l-1)!! times the symmetric traceless part
+    of m x x .., with l - 1 factors x, from the Taylor series of the potentials; scaled as in
+    T10 eq. (3.40).
     """
     if order not in (1, 2, 3):
         raise ValueError(f'order must be 1, 2 or 3, got {order!r}')

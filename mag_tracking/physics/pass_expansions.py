@@ -18,15 +18,11 @@ _N_MOMENTS = {1: 3, 2: 8, 3: 15}
 
 @dataclass(frozen=True)
 class MultipolePass:
-    """Multipole expansion about a point that moves on a straight path at constant velocity.
+    """Multipoles on a straight path at constant velocity, T10 eq. (4.17), (4.18).
 
-    Path parameters (6): position r0 at time zero [m], velocity v0 [m/s]. Linear parameters (3, 8 or
-    15): the moments of `multipole.multipole_field`, world frame. The model describes bodies of any
-    shape, but is valid only outside the sphere that encloses the body.
-
-    References
-    ----------
-    [T10]_ eq. (4.17), (4.18).
+    Path parameters (6): position at time zero [m], velocity [m/s]. Linear parameters (3, 8 or 15):
+    the moments of `multipole.multipole_field`, world frame. Valid for bodies of any shape, but only
+    outside the sphere that encloses the body.
     """
 
     t: FloatArray
@@ -47,37 +43,14 @@ class MultipolePass:
                 - self.t[:, None] * theta[:, None, 3:])
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Whitened design matrices of the moments.
-
-        Parameters
-        ----------
-        theta : (n_paths, 6) array
-            Path parameters.
-
-        Returns
-        -------
-        (n_paths, 3 n, 3 | 8 | 15) array
-            NaN where the target is at a sensor.
-        """
+        """Whitened design matrices (n_paths, 3 n, 3 | 8 | 15) of the moments; NaN for a target at a
+        sensor."""
         _, A = multipole_jacobians(self._relative_positions(theta),
                                    np.zeros(_N_MOMENTS[self.order]))
         return (self.M @ A).reshape(len(theta), 3 * len(self.t), -1)
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """Derivative of the whitened field with respect to the path parameters.
-
-        Parameters
-        ----------
-        theta : (n_paths, 6) array
-            Path parameters.
-        p : (n_paths, 3 | 8 | 15) array
-            Moments.
-
-        Returns
-        -------
-        (n_paths, 3 n, 6) array
-            Derivative of basis(theta) p with respect to theta.
-        """
+        """Derivative (n_paths, 3 n, 6) of basis(theta) p with respect to theta."""
         gradient, _ = multipole_jacobians(self._relative_positions(theta), p[:, None])
         D = -(self.M @ gradient)
         return np.concatenate([D, self.t[:, None, None] * D], axis=-1).reshape(
@@ -86,16 +59,12 @@ class MultipolePass:
 
 @dataclass(frozen=True)
 class AndersonPass:
-    """Field of a dipole that passes one sensor on a straight path, expanded in Anderson functions.
+    """Field of a dipole on a straight path past one sensor, expanded in Anderson functions.
 
-    Path parameters (2): time of the closest point of approach (CPA) [s], speed over range at the
-    CPA [1/s]. Linear parameters (9): coefficients of the three functions on each axis of the sensor
-    [T], axis by axis. A dipole has only six independent coefficients; nine free
-    coefficients keep the model linear.
-
-    References
-    ----------
-    [TSP14]_ eq. (22), (23), corrected as in `anderson`.
+    Path parameters (2): time of the CPA [s], speed over range at the CPA [1/s]. Linear parameters
+    (9): coefficients of the three functions on each axis of the sensor [T], axis by axis. A dipole
+    has only six independent coefficients; nine free ones keep the model linear. TSP14 eq. (22),
+    (23), corrected as in `anderson`.
     """
 
     t: FloatArray
@@ -112,34 +81,11 @@ class AndersonPass:
         return columns.reshape(len(f), 3 * len(self.t), 9)
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Whitened design matrices of the coefficients.
-
-        Parameters
-        ----------
-        theta : (n_paths, 2) array
-            Path parameters.
-
-        Returns
-        -------
-        (n_paths, 3 n, 9) array
-        """
+        """Whitened design matrices (n_paths, 3 n, 9) of the coefficients."""
         return self._design_matrix(anderson_functions(theta[:, 1:] * (self.t - theta[:, :1])))
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """Derivative of the whitened field with respect to the path parameters.
-
-        Parameters
-        ----------
-        theta : (n_paths, 2) array
-            Path parameters.
-        p : (n_paths, 9) array
-            Coefficients.
-
-        Returns
-        -------
-        (n_paths, 3 n, 2) array
-            Derivative of basis(theta) p with respect to theta.
-        """
+        """Derivative (n_paths, 3 n, 2) of basis(theta) p with respect to theta."""
         tau = theta[:, 1:] * (self.t - theta[:, :1])
         f0, f1, f2 = np.moveaxis(anderson_functions(tau), -1, 0)
         # f_n = tau^n (tau^2 + 1)^(-5/2), so f_n' = n f_{n-1} - 5 tau/(tau^2 + 1) f_n.

@@ -19,17 +19,14 @@ from mag_tracking.physics import core
 class RowPass:
     """A row of `n_dipoles` equidistant dipoles on a straight path at constant velocity.
 
-    Path parameters (6, or 7 for two or more dipoles): position r0 of the centre of the row at time
-    zero [m], velocity v0 [m/s], length L from the first to the last dipole [m]. Linear parameters
-    (3 n_dipoles): coefficients of orthogonal combinations of the moments [A m², world frame]. The
-    dipoles are ordered from tail to head.
+    Path parameters (6, or 7 for two or more dipoles): centre r0 of the row at time zero [m],
+    velocity v0 [m/s], length L from the first to the last dipole [m]. Linear parameters
+    (3 n_dipoles): coefficients of orthogonal combinations of the moments [A m², world frame], from
+    tail to head.
 
-    The row is parallel to v0, as in TSP14, whereas the row of `vehicles.RowVehicle` is horizontal.
-    If v0 is zero, a row of two or more dipoles has no direction, and the field is NaN.
-
-    References
-    ----------
-    [TSP14]_ eq. (18)-(21).
+    The row is parallel to v0, as in TSP14 eq. (18)-(21), whereas the row of `vehicles.RowVehicle`
+    is horizontal. If v0 is zero, a row of two or more dipoles has no direction, and the field is
+    NaN.
     """
 
     t: FloatArray
@@ -65,61 +62,22 @@ class RowPass:
 
     def with_nonnegative_length(self, theta: FloatArray,
                                 p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Convert to the equivalent parameters with a non-negative length.
-
-        A row of negative length equals a row of positive length with the opposite order of dipoles.
-
-        Parameters
-        ----------
-        theta : (6 or 7,) array
-            Path parameters.
-        p : (3 n_dipoles,) array
-            Linear parameters.
-
-        Returns
-        -------
-        theta : (6 or 7,) array
-            Path parameters with a non-negative length.
-        p : (3 n_dipoles,) array
-            Linear parameters; the dipoles are in reversed order if the length was negative.
-        """
+        """Equivalent parameters with a non-negative length: a row of negative length has reversed
+        dipoles."""
         if self.n_dipoles == 1 or theta[6] >= 0.0:
             return theta, p
         moments = (self.combinations @ p).reshape(-1, 3)[::-1]
         return np.append(theta[:6], -theta[6]), self.combinations.T @ moments.ravel()
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Whitened design matrices of the linear parameters.
-
-        Parameters
-        ----------
-        theta : (n_paths, 6 or 7) array
-            Path parameters.
-
-        Returns
-        -------
-        (n_paths, 3 n, 3 n_dipoles) array
-            NaN where a dipole is at a sensor.
-        """
+        """Whitened design matrices (n_paths, 3 n, 3 n_dipoles); NaN where a dipole is at a
+        sensor."""
         A = core.row_bases(np.ascontiguousarray(theta), self._dipole_offsets, self.t,
                            self.positions, self.M)
         return A @ self.combinations if self.n_dipoles > 1 else A
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """Derivative of the whitened field with respect to the path parameters.
-
-        Parameters
-        ----------
-        theta : (n_paths, 6 or 7) array
-            Path parameters.
-        p : (n_paths, 3 n_dipoles) array
-            Linear parameters.
-
-        Returns
-        -------
-        (n_paths, 3 n, 6 or 7) array
-            Derivative of basis(theta) p with respect to theta.
-        """
+        """Derivative (n_paths, 3 n, 6 or 7) of basis(theta) p with respect to theta."""
         return core.row_derivatives(
             np.ascontiguousarray(theta), np.ascontiguousarray(p @ self.combinations.T),
             self._dipole_offsets, self.t, self.positions, self.M)
@@ -127,10 +85,8 @@ class RowPass:
 
 @dataclass(frozen=True)
 class SuperposedPasses:
-    """Simultaneous passes of several rows, whose fields are added.
-
-    The path and linear parameters of the rows are concatenated.
-    """
+    """Simultaneous passes of several rows whose fields are added; their parameters are
+    concatenated."""
 
     rows: tuple[RowPass, ...]
     """Pass of each row. All passes have the same samples."""
@@ -138,23 +94,8 @@ class SuperposedPasses:
     @classmethod
     def from_orders(cls, orders: Sequence[int], t: FloatArray, positions: FloatArray,
                     M: FloatArray) -> 'SuperposedPasses':
-        """Create the passes of several rows with the same samples.
-
-        Parameters
-        ----------
-        orders : sequence of int
-            Number of dipoles of each row.
-        t : (n,) array, s
-            As for `RowPass`.
-        positions : (n, 3) array, m, world frame
-            As for `RowPass`.
-        M : (n, 3, 3) array
-            As for `RowPass`.
-
-        Returns
-        -------
-        SuperposedPasses
-        """
+        """Create the passes of rows with `orders` dipoles and the same samples, as for
+        `RowPass`."""
         return cls(tuple(RowPass(t, positions, M, n_dipoles) for n_dipoles in orders))
 
     @cached_property
@@ -168,38 +109,13 @@ class SuperposedPasses:
         return _consecutive_slices([3 * row.n_dipoles for row in self.rows])
 
     def split(self, theta: FloatArray) -> list[FloatArray]:
-        """Split path parameters by row.
-
-        Parameters
-        ----------
-        theta : (n_theta,) array
-            Path parameters of all rows.
-
-        Returns
-        -------
-        list of (6 or 7,) array
-            Path parameters of each row.
-        """
+        """Split path parameters (n_theta,) into those of each row."""
         return [theta[path_slice] for path_slice in self.path_slices]
 
     def with_nonnegative_length(self, theta: FloatArray,
                                 p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Convert to the equivalent parameters with non-negative lengths.
-
-        Parameters
-        ----------
-        theta : (n_theta,) array
-            Path parameters of all rows.
-        p : (k,) array
-            Linear parameters of all rows.
-
-        Returns
-        -------
-        theta : (n_theta,) array
-            Path parameters with non-negative lengths.
-        p : (k,) array
-            Linear parameters; the dipoles of rows with a negative length are in reversed order.
-        """
+        """Equivalent parameters with non-negative lengths; see
+        `RowPass.with_nonnegative_length`."""
         converted = [row.with_nonnegative_length(path, p[moment_slice])
                      for row, path, moment_slice in zip(self.rows, self.split(theta),
                                                         self.moment_slices, strict=True)]
@@ -207,37 +123,13 @@ class SuperposedPasses:
                 np.concatenate([moments for _, moments in converted]))
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Whitened design matrices of the linear parameters.
-
-        Parameters
-        ----------
-        theta : (n_paths, n_theta) array
-            Path parameters of all rows.
-
-        Returns
-        -------
-        (n_paths, 3 n, k) array
-            NaN where a dipole is at a sensor.
-        """
+        """Whitened design matrices (n_paths, 3 n, k); NaN where a dipole is at a sensor."""
         return np.concatenate([
             row.basis(theta[:, path_slice])
             for row, path_slice in zip(self.rows, self.path_slices, strict=True)], axis=2)
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """Derivative of the whitened field with respect to the path parameters.
-
-        Parameters
-        ----------
-        theta : (n_paths, n_theta) array
-            Path parameters of all rows.
-        p : (n_paths, k) array
-            Linear parameters of all rows.
-
-        Returns
-        -------
-        (n_paths, 3 n, n_theta) array
-            Derivative of basis(theta) p with respect to theta.
-        """
+        """Derivative (n_paths, 3 n, n_theta) of basis(theta) p with respect to theta."""
         return np.concatenate([
             row.derivative(theta[:, path_slice], p[:, moment_slice])
             for row, path_slice, moment_slice in zip(self.rows, self.path_slices,

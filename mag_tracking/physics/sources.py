@@ -83,11 +83,8 @@ class Magnet:
     """Source model of a small magnet: one dipole that moves and rotates.
 
     State (12): position r [m], velocity v [m/s], moment m [A m²], angular velocity w [rad/s], all
-    in the world frame. The moment rotates with w. The roll about m is not observable.
-
-    References
-    ----------
-    [PHD15]_ Paper A section 3.1 and eq. (19)-(24).
+    in the world frame. The moment rotates with w. The roll about m is not observable. PHD15 Paper A
+    section 3.1 and eq. (19)-(24).
     """
 
     acceleration_density: FloatArray
@@ -99,17 +96,7 @@ class Magnet:
     """Names of the states in their order."""
 
     def dipoles(self, x: FloatArray) -> Dipoles:
-        """Compute the dipole of each target state.
-
-        Parameters
-        ----------
-        x : (n_hyp, 12) array
-            Target states.
-
-        Returns
-        -------
-        Dipoles
-        """
+        """Compute the dipole of each target state (n_hyp, 12)."""
         dr_dx = np.zeros((len(x), 1, 3, 12))
         dr_dx[:, 0, [0, 1, 2], [0, 1, 2]] = 1.0
         dm_dx = np.zeros((len(x), 1, 3, 12))
@@ -120,30 +107,11 @@ class Magnet:
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Predict target states at constant velocity and constant angular velocity.
 
-        Parameters
-        ----------
-        x : (n_hyp, 12) array
-            Target states.
-        dt : float, s
-            Prediction interval.
-        P : (n_hyp, 12, 12) array, optional
-            Covariances of `x`; see `SourceModel.propagate`.
-
-        Returns
-        -------
-        x : (n_hyp, 12) array
-            States after `dt`.
-        F : (n_hyp, 12, 12) array
-            Jacobian of the prediction.
-        Q : (n_hyp, 12, 12) array
-            Process noise of a double integrator, whose rotational part is mapped to the moment by
-            w -> w x m. With `P`, the second-order noise of the rotation is added.
-
-        Notes
-        -----
-        The moment is rotated by the full angle w dt. The first-order rotation m + dt (w x m) of
-        PHD15 Paper A eq. (24) lengthens the moment by half the squared angle in each step. In a
-        filter with a known moment magnitude, this leads to an overestimated distance.
+        The process noise of a double integrator is mapped to the moment by w -> w x m; with `P`,
+        the second-order noise of the rotation is added. The moment is rotated by the full angle w
+        dt: the first-order m + dt (w x m) of PHD15 Paper A eq. (24) lengthens it by half the
+        squared angle in each step, and a filter with a known moment magnitude would overestimate
+        the distance.
         """
         n, rotation_vector = len(x), dt * x[:, 9:12]
         R = rotation_from_quaternion(quaternion_from_rotation_vector(rotation_vector))
@@ -175,10 +143,9 @@ def _second_order_noise(m: FloatArray, P_before: FloatArray, P_after: FloatArray
     """Process noise (n, 3, 3) due to the shortening of the moment m by an uncertain rotation.
 
     A rotation by small angles (a, b) about axes perpendicular to `m` (n, 3) shortens the component
-    along m by (a^2 + b^2)/2 |m|, which the Jacobian neglects. With the variances p, q of a, b, the
-    second moment of the shortening is (3 p^2 + 3 q^2 + 2 p q)/4 |m|^2. The noise is along m. Its
-    variance is the increase of this second moment from the covariance `P_before` (n, 3, 3) to the
-    covariance `P_after` (n, 3, 3) of the rotated moment, at most |m|^2.
+    along m by (a^2 + b^2)/2 |m|, which the Jacobian neglects. With variances p, q of a, b, its
+    second moment is (3 p^2 + 3 q^2 + 2 p q)/4 |m|^2. The noise is along m; its variance is the
+    increase of this moment from `P_before` to `P_after` (n, 3, 3), at most |m|^2.
     """
     squared_norm = np.einsum('ni,ni->n', m, m)
     outer_product = np.einsum('ni,nj->nij', m, m)

@@ -28,12 +28,11 @@ N_STRAIGHT = PATH.index('acceleration')
 class SteadyPass:
     """A row of `n_dipoles` dipoles on a path with constant acceleration and turn acceleration.
 
-    The path parameters `PATH` and the clock offsets are concatenated. The entries with the indices
-    `free` form the non-linear parameters theta; all other entries are constants from `fixed`. The
-    linear parameters (3 n_dipoles) are coefficients of orthogonal combinations of the moments.
-
-    The tracker fits this model in compiled code (`stages/track/steady_fit.hpp`). `basis` and
-    `derivative` are for searches with a prior and for simulations.
+    The path parameters `PATH` and the clock offsets are concatenated; the entries `free` are the
+    non-linear parameters theta, all others are constants from `fixed`. The linear parameters
+    (3 n_dipoles) are coefficients of orthogonal combinations of the moments. The tracker fits this
+    model in compiled code (`stages/track/steady_fit.hpp`); `basis` and `derivative` are for
+    searches with a prior and for simulations.
     """
 
     t: FloatArray
@@ -70,54 +69,21 @@ class SteadyPass:
         return np.kron(self.combinations, np.eye(3)).astype(np.float64)
 
     def all_parameters(self, theta: FloatArray) -> FloatArray:
-        """Combine free and fixed parameters.
-
-        Parameters
-        ----------
-        theta : (n_paths, n_free) array
-            Free parameters.
-
-        Returns
-        -------
-        (n_paths, N_PATH + n_clocks) array
-            Path parameters and clock offsets [s].
-        """
+        """Path parameters and clock offsets (n_paths, N_PATH + n_clocks) with free parameters
+        `theta`."""
         out = np.tile(self.fixed, (len(theta), 1))
         out[:, self.free] = theta
         return out
 
     def basis(self, theta: FloatArray) -> FloatArray:
-        """Whitened design matrices of the linear parameters.
-
-        Parameters
-        ----------
-        theta : (n_paths, n_free) array
-            Free parameters.
-
-        Returns
-        -------
-        (n_paths, 3 n, 3 n_dipoles) array
-            NaN where a dipole is at a sensor.
-        """
+        """Whitened design matrices (n_paths, 3 n, 3 n_dipoles); NaN where a dipole is at a
+        sensor."""
         A = core.steady_bases(self.all_parameters(theta), self.offsets, self.t, self.positions,
                               self.M, self.clock)
         return A @ self._moment_transform
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
-        """Derivative of the whitened field with respect to the free parameters.
-
-        Parameters
-        ----------
-        theta : (n_paths, n_free) array
-            Free parameters.
-        p : (n_paths, 3 n_dipoles) array
-            Linear parameters.
-
-        Returns
-        -------
-        (n_paths, 3 n, n_free) array
-            Derivative of basis(theta) p with respect to theta.
-        """
+        """Derivative (n_paths, 3 n, n_free) of basis(theta) p with respect to theta."""
         D = core.steady_derivatives(
             self.all_parameters(theta), p @ self._moment_transform.T, self.offsets, self.t,
             self.positions, self.M, self.clock)

@@ -22,30 +22,21 @@ class RowVehicle:
 
     State: position r of the centre of the row [m], velocity v [m/s], hard iron moment m0 of each
     dipole [A m²] from tail to head in the vehicle frame (x forward, z up), diagonal of the soft
-    iron tensor D of the whole vehicle [m³] in the vehicle frame, length L [m], turn rate w [rad/s].
-    The length is omitted for a single dipole, and the turn rate is optional. Without a turn rate,
-    the state has 10 + 3 d components for d > 1 dipoles, and 12 for a single dipole. Moment and
-    position of dipole i = 1 .. d are::
+    iron tensor D of the whole vehicle [m³] in the vehicle frame, length L [m]
+    (not for a single dipole), optional turn rate w [rad/s]. Without w there are 10 + 3 d components
+    for d > 1 dipoles, and 12 for a single dipole. Moment and position of dipole i = 1 .. d are::
 
         m_i = R (m0_i + D R^T B0/(d mu0)) with R = Rz(heading),
         r_i = r + (i - (d+1)/2) L/(d-1) heading
 
     D depends on the axis because sheets and axles are easier to magnetise along their length than
-    across. If all components of D are equal, D is the scalar of TSP14.
+    across (MITRE12 eq. (A.5)); with equal components it is the scalar of TSP14 eq. (10), (16). The
+    induced moment is (D/mu0) B0 as in ICASSP11 eq. (8), not (3D/mu0) B0 as in T10.
 
     The heading is the direction of the horizontal velocity; roll, pitch and slip are zero. At zero
     speed, the heading is atan2(0, 0) = 0, and its derivative is set to zero. With one dipole, or
-    with L = 0, the model is the point target of ICASSP11 eq. (4)-(8). A row of negative length
-    equals a row of positive length with the opposite order of dipoles.
-
-    Notes
-    -----
-    The induced moment is (D/mu0) B0 as in ICASSP11 eq. (8), not (3D/mu0) B0 as in T10. The
-    dependence of D on the axis follows MITRE12 eq. (A.5).
-
-    References
-    ----------
-    [TSP14]_ eq. (10), (16); [ICASSP11]_ eq. (4)-(8); [MITRE12]_ eq. (A.5).
+    L = 0, this is the point target of ICASSP11 eq. (4)-(8). A row of negative length equals a row
+    of positive length with the opposite order of dipoles.
     """
 
     earth_field: FloatArray
@@ -82,32 +73,16 @@ class RowVehicle:
 
     @cached_property
     def _moment_walk(self) -> FloatArray:
-        """Random walk covariance of the hard iron moments, (3 d, 3 d) 1/s.
-
-        The covariance is normalised by the squared magnitude of the hard and soft iron moments.
-        """
+        """Random walk covariance (3 d, 3 d) [1/s] of the hard iron moments, normalised by the
+        squared magnitude of the hard and soft iron moments."""
         d = self.n_dipoles
         averaging = np.full((d, d), 1.0 / d)
         return np.kron(self.moment_drift**2 / d * averaging
                        + self.difference_drift**2 * (np.eye(d) - averaging), np.eye(3))
 
     def dipoles(self, x: FloatArray) -> Dipoles:
-        """Compute the `n_dipoles` dipoles of each target state.
-
-        Parameters
-        ----------
-        x : (n_hyp, n_t) array
-            Target states.
-
-        Returns
-        -------
-        Dipoles
-
-        Raises
-        ------
-        ValueError
-            If the number of states differs from the length of `state_names`.
-        """
+        """Compute the dipoles of target states; raises ValueError unless states match
+        `state_names`."""
         if x.shape[1:] != (len(self.state_names),):
             raise ValueError(f'{self.n_dipoles} dipoles need {len(self.state_names)} states, '
                              f'got an array of shape {x.shape}')
@@ -116,29 +91,13 @@ class RowVehicle:
 
     def propagate(self, x: FloatArray, dt: float, P: FloatArray | None = None
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Predict target states at constant velocity, or along an arc if the state has a turn rate.
+        """Predict states at constant velocity, or along an arc if the state has a turn rate.
 
-        Parameters
-        ----------
-        x : (n_hyp, n_t) array
-            Target states.
-        dt : float, s
-            Prediction interval; negative to propagate backwards. In backward propagation, the turn
-            rate has no process noise.
-        P : (n_hyp, n_t, n_t) array, optional
-            Covariances of `x`. A turn rate of zero variance has no process noise, so that straight
-            paths remain straight.
-
-        Returns
-        -------
-        x : (n_hyp, n_t) array
-            States after `dt`.
-        F : (n_t, n_t) or (n_hyp, n_t, n_t) array
-            Jacobian of the prediction. Without a turn rate, it is common to all hypotheses.
-        Q : (n_hyp, n_t, n_t) array
-            Covariance of the process noise. The drift of the moments is proportional to the
-            magnitude of the hard and soft iron moments. The effect of the turn rate noise on
-            position and velocity during `dt` is neglected.
+        See `SourceModel.propagate`. Backwards, or with zero variance in `P` so that straight paths
+        remain straight, the turn rate has no process noise. Without a turn rate, `F` (n_t, n_t) is
+        common to all hypotheses. The drift of the moments in `Q` is proportional to the magnitude
+        of the hard and soft iron moments; the effect of the turn rate noise on position and
+        velocity is neglected.
         """
         n = x.shape[1]
         Q = np.zeros((len(x), n, n))
@@ -159,17 +118,8 @@ class RowVehicle:
         return predicted, F_turn, Q
 
     def turn_variance(self, speed: FloatArray) -> FloatArray:
-        """Stationary variance of the turn rate at a speed, at most `MAX_TURN_RATE` squared.
-
-        Parameters
-        ----------
-        speed : (...) array, m/s
-            Horizontal speed.
-
-        Returns
-        -------
-        (...) array, rad²/s²
-        """
+        """Stationary variance [rad²/s²] of the turn rate at a horizontal speed, at most
+        `MAX_TURN_RATE`²."""
         min_speed = self.turn_acceleration / MAX_TURN_RATE
         variance: FloatArray = np.square(self.turn_acceleration / np.maximum(speed, min_speed))
         return variance

@@ -43,38 +43,14 @@ _HEAD, _DONE, _WORK, _LOCK = 'archive.json', 'done', 'unfinished', '.lock'
 
 
 def recording_key(recording: Path) -> str:
-    """Name of a recording's files in the archive; the same in every run.
-
-    Parameters
-    ----------
-    recording : Path
-
-    Returns
-    -------
-    str
-    """
+    """File name of a recording in the archive, without suffix; the same in every run."""
     path = recording.resolve()
     stem = path.stem.encode(errors='replace')[:MAX_STEM_BYTES].decode(errors='ignore')
     return f'{stem}-{_hash(str(path))}'
 
 
 def recording_state(recording: Path) -> list[list[Any]]:
-    """Names, sizes and modification times of a recording's files, to detect changes.
-
-    Parameters
-    ----------
-    recording : Path
-        File or folder.
-
-    Returns
-    -------
-    list of [name, size in bytes, modification time in ns]
-
-    Raises
-    ------
-    OSError
-        If the files cannot be read.
-    """
+    """[name, size in bytes, modification time in ns] of a recording's files, to detect changes."""
     files = sorted(recording.iterdir()) if recording.is_dir() else [recording]
     return [[f.name, f.stat().st_size, f.stat().st_mtime_ns] for f in files if f.is_file()]
 
@@ -87,22 +63,9 @@ def _hash(text: str) -> str:
 class ArchiveFolder:
     """Folder of an archive, locked against other runs until it is closed; a context manager.
 
-    Parameters
-    ----------
-    folder : Path
-        Created if it does not exist.
-    head : mapping
-        Metadata that must be identical in all runs that write to this folder.
-
-    Attributes
-    ----------
-    path : Path
-
-    Raises
-    ------
-    OutputError
-        If the folder is neither empty nor an archive, was created with other metadata or another
-        table version, is locked by another run, or cannot be written.
+    `head` is metadata that must be identical in all runs that write to the folder. Raises
+    OutputError if the folder is neither empty nor an archive, has other metadata or another table
+    version, or is locked.
     """
 
     def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
@@ -171,22 +134,8 @@ class ArchiveFolder:
                               'with the existing rows. Choose another folder')
 
     def done(self, recording: Path) -> dict[str, Any] | None:
-        """Return the summary of a recording that was processed and has not changed since then.
-
-        Parameters
-        ----------
-        recording : Path
-
-        Returns
-        -------
-        dict or None
-            None if the recording must be processed.
-
-        Raises
-        ------
-        OutputError
-            If the summary or a table is damaged.
-        """
+        """Summary of a recording, or None if it was not processed or has changed since; raises
+        OutputError if the summary or a table is damaged."""
         name = recording_key(recording)
         path = self.path / _DONE / f'{name}.json'
         if not path.exists():
@@ -200,24 +149,7 @@ class ArchiveFolder:
             return None
 
     def begin(self, recording: Path, state: list[list[Any]]) -> Path:
-        """Remove outdated results of a recording, and create the folder for its partial results.
-
-        Parameters
-        ----------
-        recording : Path
-        state : list
-            Result of `recording_state`.
-
-        Returns
-        -------
-        Path
-            Folder of the partial results.
-
-        Raises
-        ------
-        OutputError
-            If the archive cannot be written.
-        """
+        """Remove outdated results of a recording, and create the folder for its partial results."""
         name, work = recording_key(recording), self.path / _WORK
         folder = work / f'{name}.{_hash(json.dumps([VERSION, version(_PACKAGE), state]))}'
         try:
@@ -233,47 +165,23 @@ class ArchiveFolder:
 
     def complete(self, recording: Path, work: Path, state: list[list[Any]],
                  summary: Mapping[str, Any]) -> None:
-        """Mark a recording as processed, after all of its tables have been written.
+        """Mark a recording as processed, after all of its tables are written, and remove `work`.
 
-        Parameters
-        ----------
-        recording : Path
-        work : Path
-            Folder of the partial results, which is removed.
-        state : list
-            State of the recording when its processing began. If the recording has changed since
-            then, the next run processes it again.
-        summary : mapping
-            Summary of the recording.
+        `state` is that of the beginning: a recording that has changed meanwhile is processed again.
         """
         replace_text(self.path / _DONE / f'{recording_key(recording)}.json',
                      json.dumps({**summary, 'state': state}, indent=1) + '\n')
         _remove(work)
 
     def write_recordings(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Write the table `recordings` atomically.
-
-        Parameters
-        ----------
-        rows : iterable of mapping
-            Values by column.
-        """
+        """Write the table `recordings` atomically."""
         with TableWriter(self.path / 'recordings.parquet', TABLES['recordings']) as table:
             for row in rows:
                 table.add(row)
 
     def summaries(self, report: Callable[[str], object]) -> Iterator[dict[str, Any]]:
-        """Read the summaries of all processed recordings, from this run and earlier runs.
-
-        Parameters
-        ----------
-        report : function
-            Called with a message for each damaged summary, which is left out.
-
-        Yields
-        ------
-        dict
-        """
+        """Summaries of all processed recordings of all runs; damaged ones are reported and left
+        out."""
         for path in sorted((self.path / _DONE).glob('*.json')):
             try:
                 yield _read_summary(path)
@@ -291,30 +199,10 @@ def _remove(folder: Path) -> None:
 
 def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder: Path,
                 name: str) -> int:
-    """Concatenate the tables of a recording's segments and write one file per day.
+    """Concatenate the tables of a recording's segments, write a file per day, and count the rows.
 
-    Parameters
-    ----------
-    parts : iterable of Path
-        Files of the same table, in chronological order.
-    shifts : iterable of int
-        Offset of each part, which is added to its column `track_id`.
-    table : str
-        Name of the table.
-    folder : Path
-        Folder of the archive.
-    name : str
-        Stem of the files `folder`/`table`/date=.../`name`.parquet.
-
-    Returns
-    -------
-    int
-        Number of rows.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
+    `parts` are in chronological order; each of `shifts` is added to the column `track_id` of its
+    part. The files are `folder`/`table`/date=.../`name`.parquet.
     """
     pa = import_pyarrow()
     n, day_ns = 0, pa.scalar(86_400 * NS)
@@ -338,19 +226,7 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
 
 
 def common_columns(recording: Path, stamp_ns: int | None) -> dict[str, Any]:
-    """Return the columns that the rows of all tables have in common.
-
-    Parameters
-    ----------
-    recording : Path
-    stamp_ns : int, ns, or None
-        Timestamp of the row.
-
-    Returns
-    -------
-    dict
-        Values by column.
-    """
+    """Columns that the rows of all tables have in common."""
     return {'recording': recording.stem, 'source': str(recording), 'stamp_ns': stamp_ns,
             'time': stamp_ns}
 

@@ -25,52 +25,21 @@ _HEAD = '{"version": '
 
 
 def default_path(network_path: str | PathLike[str], node: str) -> Path:
-    """Default path of the file in which a node stores the backgrounds of a network.
-
-    Parameters
-    ----------
-    network_path : path_like
-        Network file.
-    node : str
-        Fully qualified name of the node.
-
-    Returns
-    -------
-    Path
-        File in the state folder.
-    """
+    """File in the state folder in which a node (fully qualified name) stores a network's
+    backgrounds."""
     path = Path(network_path).resolve()
     digest = hashlib.sha256(f'{path} {node}'.encode()).hexdigest()[:8]
     return state_folder() / f'{path.stem}_{digest}.json'
 
 
 def is_background_file(path: Path) -> bool:
-    """Whether a file begins with the header of a background file.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    bool
-
-    Raises
-    ------
-    OSError
-        If the file cannot be read.
-    """
+    """Whether a file begins with the header of a background file."""
     with open(path, 'rb') as stream:
         return stream.read(len(_HEAD)) == _HEAD.encode()
 
 
 def state_folder() -> Path:
-    """Folder of the nodes' persistent state, below $ROS_HOME or ~/.ros.
-
-    Returns
-    -------
-    Path
-    """
+    """Folder of the nodes' persistent state, below $ROS_HOME or ~/.ros."""
     return Path(os.environ.get('ROS_HOME') or Path.home() / '.ros') / 'mag_tracking'
 
 
@@ -84,39 +53,14 @@ def _dependencies(network: SensorNetwork, j: int, settings: CalibrateSettings) -
 
 def background_text(stored: StoredBackground, network: SensorNetwork, j: int,
                     settings: CalibrateSettings) -> str:
-    """Serialise the background of a sensor as JSON.
-
-    Parameters
-    ----------
-    stored : StoredBackground
-    network : SensorNetwork
-    j : int
-        Index of the sensor in the network.
-    settings : CalibrateSettings
-
-    Returns
-    -------
-    str
-    """
+    """Serialise the background of sensor `j` as JSON."""
     return json.dumps({'stamp_ns': stored.stamp_ns, 'background': stored.background.tolist(),
                        'covariance': stored.covariance.tolist(),
                        'made_of': _dependencies(network, j, settings)})
 
 
 def write_backgrounds(path: str | PathLike[str], texts: Mapping[str, str]) -> None:
-    """Write the backgrounds of all sensors atomically.
-
-    Parameters
-    ----------
-    path : path_like
-    texts : mapping of str to str
-        Result of `background_text` for each sensor, by name.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write the backgrounds of all sensors (`background_text` by name) atomically."""
     path = Path(path)
     rows = ',\n'.join(f'{json.dumps(name)}: {text}' for name, text in texts.items())
     try:
@@ -129,25 +73,9 @@ def write_backgrounds(path: str | PathLike[str], texts: Mapping[str, str]) -> No
 def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
                      settings: CalibrateSettings
                      ) -> tuple[dict[str, StoredBackground], dict[str, str]]:
-    """Read the stored backgrounds that match a network and the calibration settings.
+    """Usable backgrounds, and the reasons for those refused, by sensor.
 
-    Parameters
-    ----------
-    path : path_like
-    network : SensorNetwork
-    settings : CalibrateSettings
-
-    Returns
-    -------
-    stored : dict of str to StoredBackground
-        Usable backgrounds by sensor. Empty if the file does not exist.
-    refused : dict of str to str
-        Reason for each background that cannot be used, by sensor.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read or is not a background file of this version.
+    A missing file has none. Raises RecordingError for a file of another kind or version.
     """
     try:
         content = json.loads(Path(path).read_text())

@@ -40,27 +40,14 @@ _ROS1_COMPRESSIONS: dict[object, str] = {bz2.decompress: 'bz2', lz4.frame.decomp
 
 
 class BagFile:
-    """Reader of one bag of a recording.
-
-    Parameters
-    ----------
-    path : Path
-    losses : Counter
-        Number of unreadable parts by description, updated in place.
+    """Reader of one bag of a recording; raises RecordingError if the file is not a bag.
 
     Attributes
     ----------
-    types : dict of str to str
-        Message type by topic.
-    message_counts : Counter
-        Number of messages by topic.
-    start_ns, end_ns : int, ns, or None
-        Log times of the first and last message. None if the bag has no messages.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read as a bag.
+    types : message type by topic
+    message_counts : number of messages by topic
+    start_ns, end_ns : log times of the first and last message; None if there is none
+    losses : number of unreadable parts by description, updated in place
     """
 
     def __init__(self, path: Path, losses: 'Counter[str]') -> None:
@@ -110,18 +97,9 @@ class BagFile:
 
     def blocks(self, start_ns: int | None = None,
                progress: Progress | None = None) -> Iterator[MessageBlock]:
-        """Iterate over blocks of CDR messages in order of log time.
+        """Iterate over blocks of CDR messages from `start_ns` on, in order of log time.
 
-        Parameters
-        ----------
-        start_ns : int, ns, optional
-            Skip messages that were logged earlier.
-        progress : callable, optional
-            Called with the number of bytes read since the last call.
-
-        Yields
-        ------
-        MessageBlock
+        `progress` is called with the number of bytes read since the last call.
         """
         size, total = self._path.stat().st_size, max(self.message_counts.total(), 1)
         reported = n = 0
@@ -214,12 +192,7 @@ class BagFile:
 
 @functools.cache
 def bag_errors() -> tuple[type[Exception], ...]:
-    """Exceptions that `rosbags` raises for damaged or invalid bags.
-
-    Returns
-    -------
-    tuple of exception types
-    """
+    """Exceptions that `rosbags` raises for damaged or invalid bags."""
     import apsw
     from rosbags.rosbag1 import ReaderError as Ros1Error
     from rosbags.rosbag2 import ReaderError

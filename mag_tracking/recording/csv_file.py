@@ -22,23 +22,8 @@ Lines: TypeAlias = list[tuple[int, list[str]]]
 
 
 def read_csv(path: CsvPath) -> tuple[list[str], Lines]:
-    """Read header and rows of a CSV file.
-
-    Parameters
-    ----------
-    path : path_like
-
-    Returns
-    -------
-    header : list of str
-    rows : list of (int, list of str)
-        Line number and cells.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read, has no rows, or a row has a wrong number of columns.
-    """
+    """Header and numbered rows of a CSV file; raises RecordingError if a row is too long or
+    short."""
     lines = csv_lines(path)
     if len(lines) < 2:
         raise RecordingError(f'{path} has no rows')
@@ -51,24 +36,10 @@ def read_csv(path: CsvPath) -> tuple[list[str], Lines]:
 
 
 def csv_lines(path: CsvPath) -> Lines:
-    """Read the non-empty lines of a CSV file.
+    """Non-empty lines of a CSV file as (line number, cells).
 
     Tabs, semicolons, bars and white space also separate cells. Decimal commas, which need one of
     them, become points.
-
-    Parameters
-    ----------
-    path : path_like
-
-    Returns
-    -------
-    list of (int, list of str)
-        Line number and cells.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read.
     """
     lines, _ = read_text(path)
     first = next((line for line in lines if line.strip() and not line.startswith('#')), '')
@@ -81,23 +52,8 @@ def csv_lines(path: CsvPath) -> Lines:
 
 
 def read_numbers(path: CsvPath, columns: Sequence[str]) -> FloatArray:
-    """Read a CSV file of numbers without a header; # begins a comment line.
-
-    Parameters
-    ----------
-    path : path_like
-    columns : sequence of str
-        Names of the columns, for error messages.
-
-    Returns
-    -------
-    (n, len(columns)) array
-
-    Raises
-    ------
-    RecordingError
-        If the file is invalid. The message names file, row and column.
-    """
+    """Read a CSV file of numbers without a header as an (n, len(columns)) array; # begins a
+    comment."""
     rows = [(line, row) for line, row in csv_lines(path) if not row[0].startswith('#')]
     if not rows:
         raise RecordingError(f'{path} has no rows')
@@ -110,31 +66,8 @@ def read_numbers(path: CsvPath, columns: Sequence[str]) -> FloatArray:
 
 
 def number(path: CsvPath, line: int, column: str, text: str, finite: bool) -> float:
-    """Convert a cell to a number.
-
-    Parameters
-    ----------
-    path : path_like
-    line : int
-        Line number, for error messages.
-    column : str
-        Name of the column, for error messages.
-    text : str
-        Content of the cell.
-    finite : bool
-        Whether an empty or NaN cell is an error.
-
-    Returns
-    -------
-    float
-        NaN for an empty or NaN cell.
-
-    Raises
-    ------
-    RecordingError
-        If the cell is not a number, is infinite, or is empty or NaN although `finite` is true. The
-        message names file, row and column.
-    """
+    """Convert a cell to a number, NaN if it is empty; raises RecordingError for NaN if `finite`,
+    and for infinity."""
     try:
         value = float(text) if text.strip() else np.nan
     except ValueError:

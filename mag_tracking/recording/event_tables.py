@@ -18,16 +18,7 @@ SIGNATURE_COLUMNS = ('sensor', 'number', 'time_s', 'x_nt', 'y_nt', 'z_nt')
 
 
 def event_row(event: PassEvent) -> list[object]:
-    """Values of `EVENT_COLUMNS` for an event.
-
-    Parameters
-    ----------
-    event : PassEvent
-
-    Returns
-    -------
-    list
-    """
+    """Values of `EVENT_COLUMNS` for an event."""
     return [event.sensor, event.number, event.ended, event.onset_ns, event.release_ns,
             event.peak_ns, *(_number(1e9 * v) for v in event.peak), _number(1e18 * event.energy),
             event.axes, event.closest_ns, _number(event.closest_std), _number(event.time_scale),
@@ -40,18 +31,7 @@ def _number(value: float) -> str:
 
 
 def write_events(folder: str | PathLike[str], events: Iterable[PassEvent]) -> None:
-    """Write `events.csv` and `signatures.csv` to a folder.
-
-    Parameters
-    ----------
-    folder : path_like
-    events : iterable of PassEvent
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write `events.csv` and `signatures.csv` to a folder."""
     folder, events = output_folder(folder), list(events)
     try:
         with new_text_file(folder / 'events.csv', newline='') as stream:

@@ -28,17 +28,8 @@ class RefusedDataError(ValueError):
 
 
 def largest_chunk() -> int:
-    """Largest size of a decompressed chunk, message or record that is read.
-
-    Returns
-    -------
-    int, bytes
-
-    Raises
-    ------
-    SettingsError
-        If the environment variable is not a positive number.
-    """
+    """Size in bytes of the largest decompressed chunk, message or record that is read; raises
+    SettingsError if the environment variable is not a positive number."""
     text = os.environ.get(LARGEST_CHUNK_VARIABLE) or str(LARGEST_CHUNK_MB)
     try:
         megabytes = float(text)
@@ -51,45 +42,17 @@ def largest_chunk() -> int:
 
 
 def check_size(size: int, limit: int) -> None:
-    """Check the size of a chunk, message or record.
-
-    Parameters
-    ----------
-    size, limit : int, bytes
-
-    Raises
-    ------
-    RefusedDataError
-        If the size exceeds the limit.
-    """
+    """Raise RefusedDataError if a size [bytes] exceeds the limit."""
     if size > limit:
         raise RefusedDataError(f'larger than {limit / 1e6:g} MB, the limit of '
                                f'{LARGEST_CHUNK_VARIABLE}')
 
 
 def expanded(compression: str, data: bytes, limit: int, is_cut: bool = False) -> bytes:
-    """Decompress data.
+    """Decompress zstd, lz4, bz2 or uncompressed data of at most `limit` bytes.
 
-    Parameters
-    ----------
-    compression : str
-        Name: zstd, lz4 or bz2; empty or none for data that are not compressed.
-    data : bytes
-    limit : int, bytes
-        Largest accepted size of the result.
-    is_cut : bool, optional
-        Whether the end of the data may be missing. The result is then also cut.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    RefusedDataError
-        If the result exceeds the limit, or the compression is not supported.
-    ValueError, EOFError, OSError, RuntimeError, zstandard.ZstdError
-        If the data are damaged.
+    `is_cut` permits that the end is missing. Raises RefusedDataError beyond the limit or for
+    another compression, and the errors of the compression for damaged data.
     """
     if compression in ('', 'none'):
         check_size(len(data), limit)
@@ -146,17 +109,8 @@ _PIECES: dict[str, Callable[[bytes], Iterator[bytes]]] = {
 
 
 def expanded_message(data: bytes) -> bytes:
-    """Decompress a CDR message that the recorder has compressed.
-
-    Parameters
-    ----------
-    data : bytes
-
-    Returns
-    -------
-    bytes
-        The data themselves if they are not compressed; empty if they are damaged or too large.
-    """
+    """Decompress a CDR message if the recorder has compressed it; empty if it is damaged or too
+    large."""
     compression = _MAGIC.get(data[:4])
     if compression is None:
         return data

@@ -41,7 +41,7 @@ _Path: TypeAlias = str | PathLike[str]
 
 @dataclass(frozen=True)
 class TableOptions:
-    """Properties of a table that the user states. Empty properties are found from the table."""
+    """Properties of a table that the user states; empty ones are found from the table."""
 
     columns: Sequence[str] = ()
     """Assignments as for `parse_columns`."""
@@ -79,26 +79,10 @@ class FieldTable:
 
 
 def read_field_table(path: _Path, options: TableOptions, with_times: bool = True) -> FieldTable:
-    """Read a table of readings.
+    """Read a table of readings; without `with_times`, the timestamps count the rows.
 
-    Parameters
-    ----------
-    path : path_like
-    options : TableOptions
-    with_times : bool, optional
-        Whether the times matter. If not, the timestamps count the rows.
-
-    Returns
-    -------
-    FieldTable
-
-    Raises
-    ------
-    RecordingError
-        If the table is ambiguous, or does not match the options. The message names the property,
-        and the option that states it.
-    SettingsError
-        If an option is not valid.
+    Raises RecordingError if the table is ambiguous or contradicts the options; the message names
+    the option that states the property.
     """
     table = read_table(checked_path(path, RecordingError), options.separator, options.header,
                        options.encoding)
@@ -277,30 +261,10 @@ def _sessions(rows: _Rows, stamps: Sequence[int], session: Sequence[int], order:
 
 def import_field_table(table: _Path, options: TableOptions, out: _Path
                        ) -> tuple[list[Path], FieldTable]:
-    """Import a table of readings as a recording.
+    """Import a table as recordings with the readings on `/NAME/imu/mag`.
 
-    Parameters
-    ----------
-    table : path_like
-    options : TableOptions
-    out : path_like
-        Folder for `<table>.mcap` and `metadata.yaml`, or, if the clock restarts, for one folder
-        `session_1`, `session_2`, ... each.
-
-    Returns
-    -------
-    recordings : list of Path
-        Recordings with the readings on `/NAME/imu/mag`.
-    content : FieldTable
-
-    Raises
-    ------
-    RecordingError
-        As for `read_field_table`.
-    SettingsError
-        If an option is not valid.
-    OutputError
-        If `out` cannot be written.
+    `out` receives `<table>.mcap` and `metadata.yaml`, or folders `session_1`, `session_2`, ... if
+    the clock restarts.
     """
     content = read_field_table(table, options)
     recordings = []
@@ -316,17 +280,9 @@ def import_field_table(table: _Path, options: TableOptions, out: _Path
 
 
 def describe(readings: Readings) -> list[str]:
-    """Describe the readings of each sensor: number, rate, gaps and median field.
+    """Number, rate, gaps and median field of each sensor's readings (chronological), one line each.
 
-    Parameters
-    ----------
-    readings : Readings
-        In chronological order.
-
-    Returns
-    -------
-    list of str
-        One line per sensor, and a warning if all fields have an unusual magnitude.
+    A warning follows if all fields have an unusual magnitude.
     """
     out, magnitudes = [], []
     spans: dict[str, tuple[int, int]] = {}

@@ -75,45 +75,16 @@ _UNKNOWN = _Kind('of an unknown format', 'Recordings are .mcap, .db3 and .bag fi
 
 
 def describe_file(path: Path) -> str:
-    """Describe a file that is not a recording, by its content.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    str
-        Sentences that name the file, its kind, and the command or program that reads it.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be read.
-    """
+    """Sentences that name a file that is no recording, its kind, and the command or program to read
+    it."""
     kind = _kind_of(path)
     return f'{path} is not a recording but {kind.description}. {kind.advice}'.replace(
         'FILE', str(path))
 
 
 def binary_kind(path: Path) -> str:
-    """Describe a file that is not a text.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    str
-        Kind of the file, and the command or program that reads it; empty for a text, and for an
-        unknown format.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be read.
-    """
+    """Kind of a binary file and the command or program to read it; empty for text and unknown
+    formats."""
     kind = _kind_of(path)
     return '' if kind in (_UNKNOWN, *(k for _, k in _TEXT)) else \
         f'{kind.description}. {kind.advice}'.replace('FILE', str(path))

@@ -60,19 +60,9 @@ class _FittedPass(Protocol):
 
 
 def fit_row(fit: PassFit, is_reported: bool = True) -> dict[str, Any]:
-    """Values of a fit by column, without the columns that identify the pass.
+    """Values of a fit by column, without those that identify the pass; NaN if not trusted.
 
-    Parameters
-    ----------
-    fit : PassFit
-    is_reported : bool, optional
-        Whether the fit is reported for its pass. If not, and if the fit is not trusted as a whole,
-        its trusted quantities are not included either.
-
-    Returns
-    -------
-    dict
-        NaN for quantities that are not trusted.
+    A fit that is neither trusted nor reported for its pass lacks its trusted quantities too.
     """
     row: dict[str, Any] = dict.fromkeys(FIT_COLUMNS[FIT_COLUMNS.index('stamp_ns'):], math.nan)
     row |= {'ambiguous': '', 'trusted': '', 'n_dipoles': fit.n_dipoles, 'reason': fit.reason,
@@ -120,17 +110,7 @@ def _trusted_quantities(fit: PassFit, centre: FloatArray) -> dict[str, float]:
 
 
 def pass_rows(fitted_pass: _FittedPass) -> list[dict[str, Any]]:
-    """Rows of a fitted pass, one per fit.
-
-    Parameters
-    ----------
-    fitted_pass : FittedPass
-
-    Returns
-    -------
-    list of dict
-        Values by `FIT_COLUMNS`.
-    """
+    """Rows of a fitted pass with `FIT_COLUMNS`, one per fit."""
     chosen, reported, c = fitted_pass.chosen, fitted_pass.reported, fitted_pass.correlated
     delay = {'delay_speed': c.speed, 'sd_delay_speed': c.speed_std,
              'delay_heading_deg': math.degrees(c.heading),
@@ -144,25 +124,8 @@ def pass_rows(fitted_pass: _FittedPass) -> list[dict[str, Any]]:
 class FitFolder:
     """Writes `fits.csv` and `fits.json` to a folder; a context manager.
 
-    Rows are written immediately. `fits.json` is written on exit, even after an error.
-
-    Parameters
-    ----------
-    folder : path_like
-        Created if it does not exist.
-
-    Attributes
-    ----------
-    folder : Path
-    rows : list of dict
-        Rows that have been written.
-    summary : dict
-        Additional entries of `fits.json`, which the caller sets.
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be created or written.
+    Rows are written immediately. `fits.json`, with the entries of `summary`, is written on exit,
+    even after an error.
     """
 
     def __init__(self, folder: str | PathLike[str]) -> None:
@@ -187,12 +150,7 @@ class FitFolder:
             stream.write('\n')
 
     def add(self, fitted_pass: _FittedPass) -> None:
-        """Write the rows of a fitted pass.
-
-        Parameters
-        ----------
-        fitted_pass : FittedPass
-        """
+        """Write the rows of a fitted pass."""
         for fit, row in zip(fitted_pass.fits, pass_rows(fitted_pass), strict=True):
             self.rows.append(row | {'notes': list(fitted_pass.notes),
                                     'bearing': _bearing(fit.bearing)})

@@ -30,22 +30,7 @@ class FleetPass:
 
 
 def read_fleet(path: str | PathLike[str]) -> dict[str, list[FleetPass]]:
-    """Read enrolled vehicles.
-
-    Parameters
-    ----------
-    path : path_like
-
-    Returns
-    -------
-    dict of str to list of FleetPass
-        Passes by vehicle.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read or is not a valid fleet file of this version.
-    """
+    """Passes of enrolled vehicles by name; raises RecordingError for a file of another version."""
     path = checked_path(path, RecordingError)
     try:
         with open(path, encoding='utf-8') as stream:
@@ -65,19 +50,7 @@ def read_fleet(path: str | PathLike[str]) -> dict[str, list[FleetPass]]:
 
 
 def write_fleet(path: Path, fleet: dict[str, list[FleetPass]]) -> None:
-    """Write enrolled vehicles atomically.
-
-    Parameters
-    ----------
-    path : Path
-    fleet : dict of str to list of FleetPass
-        Passes by vehicle.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write the passes of enrolled vehicles atomically."""
     vehicles = {name: [{k: v.tolist() if isinstance(v, np.ndarray) else v
                         for k, v in asdict(p).items()} for p in passes]
                 for name, passes in fleet.items()}

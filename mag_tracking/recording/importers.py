@@ -26,39 +26,15 @@ MAX_ID, MAX_TIME_S = 1e6, 9e9
 
 def import_pose_table(table: _Path, background: _Path, out: _Path,
                       noise_std: float) -> tuple[Path, Path, int]:
-    """Import a table of magnet poses and sensor fields as a recording and a network file.
+    """Import a table of magnet poses and sensor fields; return recording, network file and row
+    count.
 
-    The table repeats the measured sensor positions and orientations for every pose; their medians
-    over all poses are used.
-
-    Parameters
-    ----------
-    table : path_like
-        CSV file with one row per sensor and pose: `id`, `timestamp` [s], `Bx By Bz` [µT, sensor
-        frame, including the background], `sensor_x..z` [mm] and `sensor_ox..oz` (rotation vector,
-        sensor to world), and the true pose of the magnet `m_x..z` [mm] and `m_ox..oz` (rotation
-        vector; the magnet's axis is the rotated z axis).
-    background : path_like
-        CSV file with one row per sensor, in the order of the ids: field without the magnet
-        [µT, sensor frame].
-    out : path_like
-        Folder for `<table>.mcap`, `metadata.yaml` and `network.yaml`.
-    noise_std : float, T
-        Noise standard deviation of one reading, which the table does not contain.
-
-    Returns
-    -------
-    recording : Path
-    network : Path
-        Network file.
-    n_readings : int
-
-    Raises
-    ------
-    RecordingError
-        If the tables cannot be read or do not match.
-    OutputError
-        If `out` cannot be written.
+    `table` has one row per sensor and pose: `id`, `timestamp` [s], `Bx By Bz` [µT, sensor frame,
+    including the background], `sensor_x..z` [mm], `sensor_ox..oz` (rotation vector, sensor to
+    world), and the true pose of the magnet, `m_x..z` [mm] and `m_ox..oz` (rotation vector; the
+    magnet's axis is the rotated z axis). Sensor poses repeat in every row; their medians are used.
+    `background` has the field without the magnet [µT, sensor frame], one row per sensor in the
+    order of the ids. `noise_std` [T] is that of one reading, which the table does not contain.
     """
     rows = _read_table(table)
     backgrounds = read_numbers(background, ('Bx', 'By', 'Bz'))

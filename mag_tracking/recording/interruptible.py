@@ -13,26 +13,10 @@ class ReadingStopped(Exception):
 
 def until_stopped(read: Callable[[Progress], Iterator[_Item]], progress: Progress | None = None,
                   stopped: Callable[[], bool] | None = None) -> Iterator[_Item]:
-    """Iterate over the items of `read` until the caller stops the iteration.
+    """Iterate over the items of `read`, which calls its `Progress` argument while it reads.
 
-    Parameters
-    ----------
-    read : callable
-        Takes a `Progress` function and returns an iterator that calls this function while reading.
-    progress : callable, optional
-        Called with the number of bytes read since the last call.
-    stopped : callable, optional
-        Returns whether to stop. Called after every item and after every progress report.
-
-    Yields
-    ------
-    object
-        The items.
-
-    Raises
-    ------
-    ReadingStopped
-        When `stopped` returns true.
+    `stopped` is called after every item and every progress report; ReadingStopped is raised when it
+    returns true.
     """
     def advance(n: int) -> None:
         if progress is not None:

@@ -52,30 +52,17 @@ class _Part(NamedTuple):
 
 
 class McapFile:
-    """Reader of one MCAP file of a recording.
+    """Reader of one MCAP file of a recording; raises RecordingError for another kind of file.
 
     Schemas and channels are those of the summary and of the parts that were read. A file without a
     summary is read once when it is opened, to find its topics and chunks.
 
-    Parameters
-    ----------
-    path : Path
-    losses : Counter
-        Number of unreadable parts by description, updated in place.
-
     Attributes
     ----------
-    types : dict of str to str
-        Message type by topic.
-    message_counts : Counter
-        Number of messages by topic. Empty if unknown.
-    start_ns, end_ns : int, ns, or None
-        Log times of the first and last message. None if there are no messages.
-
-    Raises
-    ------
-    RecordingError
-        If the file is not an MCAP file.
+    types : message type by topic
+    message_counts : number of messages by topic; empty if unknown
+    start_ns, end_ns : log times of the first and last message; None if there is none
+    losses : number of unreadable parts by description, updated in place
     """
 
     def __init__(self, path: Path, losses: 'Counter[str]') -> None:
@@ -138,11 +125,8 @@ class McapFile:
                 self.message_counts[self._channels.kinds[channel].topic] += n
 
     def _scan(self, stream: BinaryIO, begin: int, end: int) -> None:
-        """Find the parts between two offsets that the index does not contain.
-
-        The scan stops at the end of the data section, or at the first record that is cut or
-        invalid, which is counted as a loss.
-        """
+        """Find the parts between two offsets that the index does not contain, up to the end of the
+        data section or the first record that is cut or invalid, which counts as a loss."""
         run: Record | None = None
         for record in records(stream, begin, end):
             begin = record.begin
@@ -181,10 +165,8 @@ class McapFile:
                 *(a.tolist() for a in np.unique(rows[:, 0], return_counts=True)), strict=True)))
 
     def _read(self, stream: BinaryIO, record: Record) -> tuple[bytes, IntArray]:
-        """Read the records of a part; return their bytes and the rows of its messages.
-
-        Raises one of `DECODE_ERRORS` if the part is damaged.
-        """
+        """Read the records of a part: their bytes and the rows of its messages; raises one of
+        `DECODE_ERRORS` if it is damaged."""
         if record.opcode == Opcode.CHUNK:
             data = chunk_content(stream, record, self._limit)
         else:
@@ -202,18 +184,10 @@ class McapFile:
 
     def blocks(self, start_ns: int | None = None,
                progress: Progress | None = None) -> Iterator[MessageBlock]:
-        """Iterate over the messages chunk by chunk, in order of log time.
+        """Iterate over the messages chunk by chunk, in order of log time, without chunks that end
+        before `start_ns`.
 
-        Parameters
-        ----------
-        start_ns : int, ns, optional
-            Skip chunks that end earlier.
-        progress : callable, optional
-            Called with the number of bytes read since the last call.
-
-        Yields
-        ------
-        MessageBlock
+        `progress` is called with the number of bytes read since the last call.
         """
         pending = MessageBlock.of_messages([])
         parts = [p for p in self._parts if start_ns is None or p.end_ns >= start_ns]
@@ -277,13 +251,7 @@ def _reason(error: Exception) -> str:
 
 
 class _Channels:
-    """Schemas and channels that have been read from a file.
-
-    Attributes
-    ----------
-    kinds : dict of int to ChannelKind
-        Topic and type by number of the channel.
-    """
+    """Schemas and channels that have been read from a file; `kinds` by number of the channel."""
 
     def __init__(self) -> None:
         self._schemas: dict[int, Schema] = {0: Schema(id=0, data=b'', encoding='', name='')}

@@ -13,23 +13,14 @@ from mag_tracking.recording.rosbag2_folder import FileSummary, Opener, Topic, Un
 
 
 class McapFileWriter:
-    """Writer of one MCAP file of a recording.
+    """Writer of one MCAP file of a recording; raises OSError if a write fails.
 
-    The methods raise OSError if a write fails.
-
-    Parameters
-    ----------
-    path : Path
-    opener : callable
-        Creates the file and returns an unbuffered stream.
+    `opener` creates the file and returns an unbuffered stream.
 
     Attributes
     ----------
-    path : Path
-    counts : Counter
-        Number of messages by topic, including pending messages.
-    pending : Counter
-        Number of messages by topic that are not yet in a complete chunk.
+    counts : number of messages by topic, including pending ones
+    pending : number of messages by topic that are not yet in a complete chunk
     """
 
     def __init__(self, path: Path, opener: Opener) -> None:
@@ -58,20 +49,7 @@ class McapFileWriter:
 
     def add(self, name: str, topic: Topic, sequence: int, data: bytes, log_ns: int,
             publish_ns: int) -> None:
-        """Append a message.
-
-        Parameters
-        ----------
-        name : str
-            Name of the topic.
-        topic : Topic
-        sequence : int
-            Sequence number of the message.
-        data : bytes
-            Serialised message, CDR.
-        log_ns, publish_ns : int, ns
-            Times at which the message was received and published.
-        """
+        """Append a CDR message with the times at which it was received and published."""
         self.counts[name] += 1
         self.pending[name] += 1
         if name not in self._channels:
@@ -95,13 +73,8 @@ class McapFileWriter:
             name, 'cdr', self._schemas[topic.type], {'offered_qos_profiles': topic.qos})
 
     def flush(self) -> None:
-        """Complete the current chunk, so that a crash cannot lose its messages.
-
-        Raises
-        ------
-        OSError
-            If the chunk cannot be written or the file was removed.
-        """
+        """Complete the current chunk, so that a crash cannot lose its messages; raises OSError also
+        if the file was removed."""
         if self.pending:
             self._writer.flush()
             self._mark_intact()
@@ -132,10 +105,5 @@ class McapFileWriter:
             self._stream.raw.close()
 
     def summary(self) -> FileSummary:
-        """Entry of the file in `metadata.yaml`.
-
-        Returns
-        -------
-        FileSummary
-        """
+        """Entry of the file in `metadata.yaml`."""
         return FileSummary(self.path.name, Counter(self.counts), *self._span)

@@ -44,33 +44,14 @@ class Record(NamedTuple):
 
 
 def file_size(stream: BinaryIO) -> int:
-    """Size of an open file.
-
-    Parameters
-    ----------
-    stream : binary stream
-
-    Returns
-    -------
-    int, bytes
-    """
+    """Size of an open file in bytes."""
     return os.fstat(stream.fileno()).st_size
 
 
 def records(stream: BinaryIO, begin: int, end: int) -> Iterator[Record]:
     """Iterate over the positions of records without reading their content.
 
-    Parameters
-    ----------
-    stream : binary stream
-    begin : int, bytes
-        Offset of the first record.
-    end : int, bytes
-        Offset at which the iteration ends. It also ends after a record that exceeds `end`.
-
-    Yields
-    ------
-    Record
+    It ends at the offset `end` or after a record that exceeds it.
     """
     while begin + RECORD_HEADER.size <= end:
         stream.seek(begin)
@@ -97,23 +78,10 @@ class ChunkHeader(NamedTuple):
 
 
 def chunk_header(stream: BinaryIO, chunk: Record) -> ChunkHeader:
-    """Read the header of a chunk; the position is then the beginning of its content.
+    """Read the header of a chunk, up to the beginning of its content.
 
-    Parameters
-    ----------
-    stream : binary stream
-    chunk : Record
-
-    Returns
-    -------
-    ChunkHeader
-
-    Raises
-    ------
-    ValueError
-        If there is no chunk at this position, or its header is damaged.
-    EOFError
-        If its content is longer than the chunk.
+    Raises ValueError if there is no intact header, EOFError if the content is longer than the
+    chunk.
     """
     stream.seek(chunk.begin)
     opcode, length = RECORD_HEADER.unpack(stream.read(RECORD_HEADER.size))
@@ -131,27 +99,11 @@ def chunk_header(stream: BinaryIO, chunk: Record) -> ChunkHeader:
 
 
 def chunk_content(stream: BinaryIO, chunk: Record, limit: int) -> bytes:
-    """Read and decompress the records in a chunk.
+    """Read and decompress the records in a chunk, at most `limit` bytes.
 
-    Parameters
-    ----------
-    stream : binary stream
-    chunk : Record
-        If it extends beyond the end of the file, the part that was written is read, and the CRC,
-        which covers the whole content, is not checked.
-    limit : int, bytes
-        Largest accepted size of the content.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    RefusedDataError
-        If the content exceeds the limit, or its compression is not supported.
-    ValueError
-        If the chunk is damaged. Other DECODE_ERRORS may occur as well.
+    Of a chunk beyond the end of the file, the part that was written is read without checking the
+    CRC, which covers the whole. Raises one of DECODE_ERRORS if the chunk is damaged,
+    RefusedDataError if it is too large or has an unsupported compression.
     """
     is_cut = chunk.end > file_size(stream)
     header = chunk_header(stream, chunk)
@@ -163,16 +115,7 @@ def chunk_content(stream: BinaryIO, chunk: Record, limit: int) -> bytes:
 
 
 def has_footer(stream: BinaryIO) -> bool:
-    """Whether a file is complete: it ends with a footer, with or without a summary.
-
-    Parameters
-    ----------
-    stream : binary stream
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a file is complete: it ends with a footer, with or without a summary."""
     return _footer(stream) is not None
 
 
@@ -188,17 +131,7 @@ def _footer(stream: BinaryIO) -> tuple[int, int] | None:
 
 
 def read_summary(stream: BinaryIO) -> Summary | None:
-    """Read the summary of a file.
-
-    Parameters
-    ----------
-    stream : binary stream
-
-    Returns
-    -------
-    Summary or None
-        None if there is no summary, or it is damaged.
-    """
+    """Read the summary of a file; None if it is missing or damaged."""
     start, crc = _footer(stream) or (0, 0)
     if start == 0:
         return None

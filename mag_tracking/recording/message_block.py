@@ -35,20 +35,7 @@ class ChannelKind(NamedTuple):
 
     @classmethod
     def of(cls, topic: str, encoding: str, schema: Schema) -> 'ChannelKind':
-        """Describe a channel.
-
-        Parameters
-        ----------
-        topic : str
-        encoding : str
-            Encoding of the messages.
-        schema : Schema
-            Schema in the file.
-
-        Returns
-        -------
-        ChannelKind
-        """
+        """Describe a channel by the schema in its file."""
         return cls(topic, type_of(encoding, schema), schema, encoding)
 
 
@@ -72,19 +59,8 @@ class MessageBlock:
     @classmethod
     def of_rows(cls, data: bytes, kinds: Mapping[int, ChannelKind],
                 rows: IntArray) -> 'MessageBlock':
-        """Create a block from the positions of messages.
-
-        Parameters
-        ----------
-        data : bytes
-        kinds : mapping of int to ChannelKind
-        rows : (n, 4) int array
-            Channel, log time [ns], and begin and end in `data`; one row per message, in any order.
-
-        Returns
-        -------
-        MessageBlock
-        """
+        """Create a block from rows (n, 4) in any order: channel, log time [ns], begin and end in
+        `data`."""
         block = cls(data, kinds, *np.ascontiguousarray(rows.T))
         if np.all(rows[1:, 1] >= rows[:-1, 1]):
             return block
@@ -92,17 +68,7 @@ class MessageBlock:
 
     @classmethod
     def of_messages(cls, messages: Sequence[RawMessage]) -> 'MessageBlock':
-        """Create a block from individual messages.
-
-        Parameters
-        ----------
-        messages : sequence of RawMessage
-            In order of log time.
-
-        Returns
-        -------
-        MessageBlock
-        """
+        """Create a block from messages in order of log time."""
         numbers: dict[tuple[str, str], int] = {}
         kinds: dict[int, ChannelKind] = {}
         channel = []
@@ -122,17 +88,7 @@ class MessageBlock:
         return (self.message(k) for k in range(len(self)))
 
     def message(self, k: int) -> RawMessage:
-        """Return one message, converted to CDR.
-
-        Parameters
-        ----------
-        k : int
-            Index in the block.
-
-        Returns
-        -------
-        RawMessage
-        """
+        """Return message `k` of the block, converted to CDR."""
         topic, kind, schema, encoding = self.kinds[int(self.channel[k])]
         stored = self.data[self.begin[k]:self.end[k]]
         data, fault = cdr_of(encoding, kind, schema,
@@ -142,40 +98,16 @@ class MessageBlock:
                           schema if is_defined else schema_of(kind), fault)
 
     def part(self, selection: IntArray | slice) -> 'MessageBlock':
-        """Select messages.
-
-        Parameters
-        ----------
-        selection : int array or slice
-            Indices of the messages. The order of the indices is kept.
-
-        Returns
-        -------
-        MessageBlock
-        """
+        """Select messages by index, in the order of the indices."""
         return MessageBlock(self.data, self.kinds, self.channel[selection],
                             self.log_time_ns[selection], self.begin[selection], self.end[selection])
 
     def with_used_kinds(self) -> 'MessageBlock':
-        """Copy the block without the channels that have no messages in it.
-
-        Returns
-        -------
-        MessageBlock
-        """
+        """Copy the block without the channels that have no messages in it."""
         return replace(self, kinds={n: self.kinds[n] for n in np.unique(self.channel).tolist()})
 
     def merged(self, other: 'MessageBlock') -> 'MessageBlock':
-        """Merge this block with another block of the same file, in order of log time.
-
-        Parameters
-        ----------
-        other : MessageBlock
-
-        Returns
-        -------
-        MessageBlock
-        """
+        """Merge this block with another block of the same file, in order of log time."""
         if not len(self):
             return other
         shift = len(other.data)
@@ -187,12 +119,7 @@ class MessageBlock:
         return block.part(np.argsort(block.log_time_ns, kind='stable'))
 
     def compacted(self) -> 'MessageBlock':
-        """Copy the messages, so that the bytes of other messages can be freed.
-
-        Returns
-        -------
-        MessageBlock
-        """
+        """Copy the messages, so that the bytes of other messages can be freed."""
         end = np.cumsum(self.end - self.begin, dtype=np.int64)
         return MessageBlock(
             b''.join(self.data[b:e] for b, e in zip(self.begin, self.end, strict=True)),

@@ -41,37 +41,14 @@ class Column(NamedTuple):
 
 
 def columns_of(kind: str, unit: str, /, **meanings: str) -> tuple[Column, ...]:
-    """Create columns of the same type and unit.
-
-    Parameters
-    ----------
-    kind : str
-        Type, as in `Column.kind`.
-    unit : str
-        Unit, as in `Column.unit`.
-    **meanings : str
-        Description of each column, by name.
-
-    Returns
-    -------
-    tuple of Column
-    """
+    """Create columns of the same type and unit from their descriptions by name."""
     return tuple(Column(name, kind, unit, meaning) for name, meaning in meanings.items())
 
 
 def check_row(row: Mapping[str, Any], columns: Iterable[Column]) -> None:
-    """Check a row of texts, integers and times that was read from a file.
+    """Check a row of texts, integers and times from a file; raises ValueError.
 
-    Parameters
-    ----------
-    row : mapping
-        Values by column. Integers and times may be None.
-    columns : iterable of Column
-
-    Raises
-    ------
-    ValueError
-        If a column is missing, or its value has another type or is out of range.
+    Integers and times may be None.
     """
     for column in columns:
         if column.name not in row:
@@ -84,17 +61,7 @@ def check_row(row: Mapping[str, Any], columns: Iterable[Column]) -> None:
 
 
 def import_pyarrow() -> Any:
-    """Import pyarrow with its Parquet module.
-
-    Returns
-    -------
-    module
-
-    Raises
-    ------
-    MissingDependencyError
-        If pyarrow is not installed.
-    """
+    """Import pyarrow with its Parquet module; raises MissingDependencyError."""
     try:
         import pyarrow.compute
         import pyarrow.parquet
@@ -105,21 +72,7 @@ def import_pyarrow() -> Any:
 
 
 def schema_of(columns: Iterable[Column]) -> 'pa.Schema':
-    """Arrow schema of a table, with unit and meaning of each column as metadata.
-
-    Parameters
-    ----------
-    columns : iterable of Column
-
-    Returns
-    -------
-    pyarrow.Schema
-
-    Raises
-    ------
-    MissingDependencyError
-        If pyarrow is not installed.
-    """
+    """Arrow schema of a table, with unit and meaning of each column as metadata."""
     pa = import_pyarrow()
     # DuckDB 1.5 cuts nanoseconds of times with a time zone, and 2.0 has fewer functions for them.
     kinds = {'i': pa.int64(), 'f': pa.float64(), 's': pa.string(), 'b': pa.bool_(),
@@ -129,16 +82,7 @@ def schema_of(columns: Iterable[Column]) -> 'pa.Schema':
 
 
 def is_complete(path: Path) -> bool:
-    """Whether a file begins and ends as a Parquet file; its content is not read.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a file begins and ends as a Parquet file; its content is not read."""
     with open(path, 'rb') as stream:
         begin = stream.read(len(_MAGIC))
         stream.seek(max(0, path.stat().st_size - len(_MAGIC)))
@@ -146,21 +90,10 @@ def is_complete(path: Path) -> bool:
 
 
 class TableWriter:
-    """Writer of a Parquet file; a context manager.
+    """Writer of a Parquet file, in batches of rows; a context manager.
 
-    Rows are written in batches. An existing file is replaced only on success. After an error, no
-    file is created or replaced.
-
-    Parameters
-    ----------
-    path : Path
-        Parent folders are created.
-    columns : iterable of Column
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
+    Parent folders are created. An existing file is replaced only on success; after an error, none
+    is created.
     """
 
     def __init__(self, path: Path, columns: Iterable[Column]) -> None:
@@ -185,24 +118,13 @@ class TableWriter:
             raise OutputError(f'cannot write {self._path}: {error.strerror or error}') from error
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Add a row.
-
-        Parameters
-        ----------
-        row : mapping
-            Values by column. Missing columns are null, and NaN in a matrix.
-        """
+        """Add a row; missing columns are null, and NaN in a matrix."""
         self._rows.append({**self._unknown, **row})
         if len(self._rows) >= MAX_BUFFERED_ROWS:
             self._flush()
 
     def add_table(self, table: 'pa.Table') -> None:
-        """Add all rows of a table.
-
-        Parameters
-        ----------
-        table : pyarrow.Table
-        """
+        """Add all rows of a table."""
         self._flush()
         with self._convert_errors():
             self._writer.write_table(table)

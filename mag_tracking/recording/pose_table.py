@@ -10,28 +10,12 @@ _POSE_COLUMNS = ('mag_x0', 'mag_y0', 'mag_z0', 'mag_mx0', 'mag_my0', 'mag_mz0')
 
 
 def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Read the fields at fixed sensors and the poses of a magnet from an external tracker.
+    """Read fields and the poses of a magnet from an external tracker.
 
-    Parameters
-    ----------
-    path : path_like
-        CSV file with the columns `x0,y0,z0,x1...` [T, sensor frame; empty or nan if not measured],
-        `mag_x0..z0` [m, tracker frame] and `mag_mx0..mz0` (unit vector, tracker frame).
-
-    Returns
-    -------
-    field : (K, n, 3) array, T, sensor frames
-        Fields of the n sensors at each of the K poses. NaN if not measured.
-    positions : (K, 3) array, m, tracker frame
-        Positions of the magnet.
-    axes : (K, 3) array, tracker frame
-        Unit vectors of the magnet's axis, normalised.
-
-    Raises
-    ------
-    RecordingError
-        If the file is invalid or the length of an axis differs from 1 by more than 1e-3. The
-        message names file, row and column.
+    Columns: `x0,y0,z0,x1...` [T, sensor frame; empty or nan if not measured], `mag_x0..z0` [m,
+    tracker frame] and `mag_mx0..mz0` (unit vector, tracker frame). Results: fields (K, n, 3), NaN
+    if not measured; positions (K, 3); normalised axes (K, 3). Raises RecordingError also if the
+    length of an axis differs from 1 by more than 1e-3.
     """
     rows, values = _values(path, _POSE_COLUMNS)
     axes = values[:, -3:]
@@ -44,43 +28,15 @@ def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def read_readings(path: CsvPath) -> FloatArray:
-    """Read only the fields of a pose table, whose pose columns may be missing.
-
-    Parameters
-    ----------
-    path : path_like
-
-    Returns
-    -------
-    (K, n, 3) array, T, sensor frames
-        NaN if not measured.
-
-    Raises
-    ------
-    RecordingError
-        If the file is invalid. The message names file, row and column.
-    """
+    """Fields (K, n, 3), T, sensor frames, of a pose table, which may lack pose columns; NaN if not
+    measured."""
     rows, values = _values(path, ())
     return values.reshape(len(rows), -1, 3)
 
 
 def read_sensor_positions(path: CsvPath) -> FloatArray:
-    """Read sensor positions from a CSV file without a header; # begins a comment line.
-
-    Parameters
-    ----------
-    path : path_like
-        CSV file with the columns x, y, z [m].
-
-    Returns
-    -------
-    (n, 3) array, m
-
-    Raises
-    ------
-    RecordingError
-        If the file is invalid. The message names file, row and column.
-    """
+    """Sensor positions (n, 3), m, from a CSV file x, y, z without header; # begins a comment
+    line."""
     return read_numbers(path, ('x', 'y', 'z'))
 
 

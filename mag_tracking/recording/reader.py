@@ -30,27 +30,15 @@ _COMPRESSED_SUFFIXES = {'.zstd': 'zstd', '.zst': 'zstd', '.lz4': 'lz4'}
 class Recording:
     """Recording in one file (MCAP, SQLite bag `.db3`, ROS 1 `.bag`) or in a rosbag2 folder.
 
-    Parameters
-    ----------
-    path : path_like
+    Raises RecordingError if `path` is not a readable recording.
 
     Attributes
     ----------
-    path : Path
-    types : dict of str to str
-        Message type by topic.
-    message_counts : Counter
-        Number of messages by topic. Empty for a truncated file.
-    start_ns, end_ns : int, ns, or None
-        Log times of the first and last message. None if unknown.
-    losses : Counter
-        Number of unreadable parts by description, updated while messages are read. The
-        description begins with the plural of the part, such as 'damaged chunks (a.mcap)'.
-
-    Raises
-    ------
-    RecordingError
-        If `path` is not a readable recording.
+    types : message type by topic
+    message_counts : number of messages by topic; empty for a truncated file
+    start_ns, end_ns : log times of the first and last message; None if unknown
+    losses : number of unreadable parts by description, updated while messages are read; the
+        description begins with the plural of the part, such as 'damaged chunks (a.mcap)'
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
@@ -74,16 +62,7 @@ class Recording:
         self.start_ns, self.end_ns = min(starts, default=None), max(ends, default=None)
 
     def lies_in(self, folder: str | PathLike[str]) -> bool:
-        """Whether a file of this recording, or a link to it, is directly in a folder.
-
-        Parameters
-        ----------
-        folder : path_like
-
-        Returns
-        -------
-        bool
-        """
+        """Whether a file of this recording, or a link to it, is directly in a folder."""
         folder = checked_path(folder, OutputError).resolve()
         return any(folder in (f.resolve().parent, f.parent.resolve()) for f in self._files)
 
@@ -94,23 +73,11 @@ class Recording:
 
     def messages(self, topics: Collection[str] | None = None, start_ns: int | None = None,
                  progress: Progress | None = None) -> Iterator[RawMessage]:
-        """Iterate over the messages file by file, in order of log time.
+        """Iterate over the messages of `topics` (None: all) from `start_ns` on, file by file, in
+        order of log time.
 
         Messages of a file without an index are in file order. Unreadable parts are counted in
-        `losses`.
-
-        Parameters
-        ----------
-        topics : collection of str, optional
-            None selects all topics.
-        start_ns : int, ns, optional
-            Skip messages that were logged earlier.
-        progress : callable, optional
-            Called with the number of bytes read since the last call.
-
-        Yields
-        ------
-        RawMessage
+        `losses`. `progress` is called with the number of bytes read since the last call.
         """
         for block in self.blocks(start_ns, progress):
             for m in block:
@@ -120,19 +87,8 @@ class Recording:
 
     def blocks(self, start_ns: int | None = None, progress: Progress | None = None
                ) -> Iterator[MessageBlock]:
-        """Iterate over blocks of messages.
-
-        Parameters
-        ----------
-        start_ns : int, ns, optional
-            Messages that were logged earlier may be skipped; unlike in `messages`, some may remain.
-        progress : callable, optional
-            Called with the number of bytes read since the last call.
-
-        Yields
-        ------
-        MessageBlock
-        """
+        """Iterate over blocks of messages; unlike in `messages`, some before `start_ns` may
+        remain."""
         for file in self._opened:
             for block in file.blocks(start_ns, progress):
                 for kind in block.kinds.values():

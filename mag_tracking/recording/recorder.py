@@ -44,41 +44,22 @@ _Message: TypeAlias = tuple[int, bytes, int, int]
 class Recorder:
     """Records messages in a rosbag2 folder, in a sequence of files.
 
-    While the disk is full, messages are dropped, counted and reported. Once space is available,
-    recording continues in a new file.
+    While the disk is full, messages are dropped, counted and reported; once space is available,
+    recording continues in a new file. `opener` creates a file and returns an unbuffered stream.
+    Raises OutputError if the folder contains a recording or cannot be written.
 
     Parameters
     ----------
-    folder : path_like
-        Created if it does not exist. Must not contain a recording.
-    split_bytes : int, bytes, optional
-        Size at which a new file begins.
-    split_ns : int, ns, optional
-        Duration after which a new file begins.
-    retry_ns : int, ns, optional
-        Delay before the next attempt after a failure.
-    report : callable, optional
-        Called with each message to the user.
-    opener : callable, optional
-        Creates a file and returns an unbuffered stream.
+    split_bytes, split_ns : size and duration after which a new file begins
+    retry_ns : delay before the next attempt after a failure
 
     Attributes
     ----------
-    folder : Path
-    counts : Counter
-        Number of recorded messages by topic.
-    dropped : Counter
-        Number of messages by topic that were lost because they could not be written.
-    repeated : int
-        Number of latched messages that were repeated at the start of a file, so that the file is
-        self-contained.
-    unfinished : list of Path
-        Files without an index.
-
-    Raises
-    ------
-    OutputError
-        If the folder contains a recording or cannot be written.
+    counts : number of recorded messages by topic
+    dropped : number of messages by topic that could not be written
+    repeated : number of latched messages repeated at the start of a file, which makes it
+        self-contained
+    unfinished : files without an index
     """
 
     def __init__(self, folder: str | PathLike[str], split_bytes: int = 10**9,
@@ -121,18 +102,9 @@ class Recorder:
                   latched: int = 0) -> None:
         """Register a topic before its first message, or change its number of latched messages.
 
-        Parameters
-        ----------
-        name : str
-        type_name : str
-            Message type.
-        definition : str, optional
-            Definition of the type as a `ros2msg` schema. Without it, only ROS can read the
-            messages.
-        qos : str, optional
-            QoS profiles from `offered_qos`. None selects its defaults.
-        latched : int, optional
-            Number of latest messages that are repeated at the start of each later file.
+        Without `definition` (`ros2msg` schema), only ROS can read the messages. `qos` is a result
+        of `offered_qos`. The latest `latched` messages are repeated at the start of each later
+        file.
         """
         # All files use the same profile, because readers use it to match channels across files.
         self._topics.setdefault(name, Topic(type_name, definition, qos or offered_qos()))
@@ -140,18 +112,9 @@ class Recorder:
             self._latched[name] = deque(self._latched.get(name, ()), latched)
 
     def write(self, name: str, data: bytes, log_ns: int, publish_ns: int | None = None) -> None:
-        """Record a serialised message of a registered topic, or count it as dropped.
+        """Record a CDR message of a registered topic, or count it as dropped.
 
-        Parameters
-        ----------
-        name : str
-            Name of the topic.
-        data : bytes
-            Serialised message, CDR.
-        log_ns : int, ns
-            Time at which the message was received.
-        publish_ns : int, ns, optional
-            Time at which the message was published. Defaults to `log_ns`.
+        `log_ns` is the time of receipt, also the default of `publish_ns`.
         """
         message = (self._sequence[name], data, log_ns, publish_ns or log_ns)
         self._sequence[name] += 1
@@ -169,12 +132,7 @@ class Recorder:
     def tick(self, now_ns: int) -> None:
         """Flush or split the file, and retry writing the metadata, when due.
 
-        To be called several times per second.
-
-        Parameters
-        ----------
-        now_ns : int, ns
-            Time of a monotonic clock.
+        To be called several times per second with a monotonic clock.
         """
         self._now_ns = now_ns
         self._opened_ns = now_ns if self._opened_ns is None else self._opened_ns

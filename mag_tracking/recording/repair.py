@@ -59,8 +59,7 @@ MESSAGE_PREFIX = 31
 
 
 class _Scan:
-    """Scan of a file up to the first damage. It finds the end of the intact records and collects
-    the data for an index."""
+    """Scan of a file up to the first damage, for the end of the intact records and an index."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self.schemas: dict[int, Schema] = {}
@@ -109,8 +108,8 @@ class _Scan:
             self.chunks[-1].message_index_length += record.end - record.begin
 
     def _add_content(self, data: bytes) -> tuple[IntArray, int]:
-        """Add records and count their messages; return the rows of the messages, as `records_of`,
-        and the length of the complete records."""
+        """Add records; return the rows of their messages, as `records_of`, and the length of the
+        complete records."""
         rows, definitions, end = core.records_of(
             data, 2**63 - 1, self._limit // MIN_BYTES_PER_MESSAGE)
         for opcode, first, last in definitions:
@@ -201,27 +200,10 @@ class _Scan:
 
 
 def finish_file(path: str | PathLike[str]) -> list[str]:
-    """Add the index to a truncated file in place; a complete file is not modified.
+    """Add the index to a truncated file in place; return a report, empty for a complete file.
 
-    An incomplete record at the end is moved to `<name>.cut`.
-
-    Parameters
-    ----------
-    path : path_like
-
-    Returns
-    -------
-    list of str
-        Report for the user. Empty for a complete file.
-
-    Raises
-    ------
-    RecordingError
-        If the file is not an MCAP file.
-    OutputError
-        If the file is still being recorded.
-    OSError
-        If the file cannot be written. The messages in the file are then unchanged.
+    An incomplete record at the end is moved to `<name>.cut`. Raises OutputError if the file is
+    still being recorded; after an OSError, the messages in the file are unchanged.
     """
     path = Path(path)
     with open(path, 'r+b', buffering=0) as raw, open(path, 'rb') as stream:
@@ -267,27 +249,11 @@ def _replace_end(raw: io.FileIO, end: int, index: bytes) -> None:
 
 
 def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -> int:
-    """Repair a truncated recording.
+    """Repair a truncated MCAP file or folder, including `metadata.yaml`; return the number of
+    files.
 
-    Parameters
-    ----------
-    path : path_like
-        MCAP file, or folder of MCAP files, in which `metadata.yaml` is also rewritten.
-    report : callable, optional
-        Called with each message to the user.
-
-    Returns
-    -------
-    int
-        Number of files that were repaired.
-
-    Raises
-    ------
-    RecordingError
-        If `path` does not contain a recording, or no message can be recovered: no message is
-        complete, or the files have an index and damaged chunks.
-    OutputError
-        If the recording cannot be written or is still being recorded.
+    Raises RecordingError if no message can be recovered (none is complete, or the files have an
+    index and damaged chunks), OutputError if the recording is still being recorded.
     """
     path = checked_path(path, RecordingError)
     files = [path] if path.is_file() else sorted(path.glob('*.mcap'), key=_number)

@@ -45,43 +45,16 @@ _TRACK_FILE = re.compile(r'(map|weights|field)_track_[0-9]+\.png|track_[0-9]+(_s
 
 
 def figure_name(kind: str, track_id: int) -> str:
-    """File name of a track's figure.
-
-    Parameters
-    ----------
-    kind : str
-        `map`, `weights` or `field`.
-    track_id : int
-
-    Returns
-    -------
-    str
-    """
+    """File name of a track's figure of kind `map`, `weights` or `field`."""
     return f'{kind}_track_{track_id}.png'
 
 
 class ResultFolder:
     """Writes the tables and the recording of one run; a context manager.
 
-    Rows are written immediately, so that an interrupted run does not lose them.
-
-    Parameters
-    ----------
-    folder : path_like
-        Created if it does not exist.
-    network : SensorNetwork
-
-    Attributes
-    ----------
-    folder : Path
-    replaces_earlier : bool
-        Whether the folder contained results of an earlier run. These results are removed,
-        including figures and trajectories of tracks. All other files remain.
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be created or written, or contains another recording.
+    Rows are written immediately, so that an interrupted run does not lose them. Results of an
+    earlier run, including figures and trajectories, are removed (`replaces_earlier`); other files
+    remain. Raises OutputError if the folder contains another recording.
     """
 
     def __init__(self, folder: str | PathLike[str], network: SensorNetwork) -> None:
@@ -129,34 +102,20 @@ class ResultFolder:
             self._recording.close()
 
     def add_detection(self, d: Detection) -> None:
-        """Write a row for the onset or the release of a target.
-
-        Parameters
-        ----------
-        d : Detection
-        """
+        """Write a row for the onset or the release of a target."""
         self._detections.writerow([
             d.stamp_ns, d.id, 'onset' if d.onset else 'release', repr(d.statistic),
             d.degrees_of_freedom, repr(d.threshold), repr(d.false_alarm_probability),
             d.strongest_sensor])
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Write the fields of a frame to the recording, not to a table.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-        """
+        """Write the fields of a frame to the recording, not to a table."""
         self._recording.add_frame(frame)
 
     def add_track(self, track: Track) -> None:
-        """Write a track record to the recording; write one row for its pose and one per hypothesis.
+        """Write a track record to the recording, and rows for its pose and each hypothesis.
 
         The last record of a track has no new pose and adds no rows.
-
-        Parameters
-        ----------
-        track : Track
         """
         self._recording.add_track(track)
         if track.ended:
@@ -183,24 +142,14 @@ class ResultFolder:
             f'{row_prefix}{names[pair]},{row}\r\n' for pair, row in zip(pairs, rows, strict=True)))
 
     def add_disturbance(self, d: Disturbance) -> None:
-        """Write a disturbance to the recording and the table, at its detection and at its end.
-
-        Parameters
-        ----------
-        d : Disturbance
-        """
+        """Write a disturbance to the recording and the table, at its detection and at its end."""
         self._recording.add_disturbance(d)
         self._disturbances.writerow([
             d.stamp_ns, d.id, int(d.ended), d.begin_ns, repr(d.largest), ' '.join(d.sensors),
             repr(d.uniform), d.track_id])
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Write a pose smoothed over the whole track; ignore poses from fixed-lag smoothing.
-
-        Parameters
-        ----------
-        pose : SmoothedPose
-        """
+        """Write a pose smoothed over the whole track; ignore poses from fixed-lag smoothing."""
         if pose.complete:
             self._recording.add_smoothed(pose)
             sd = np.sqrt(np.diagonal(pose.covariance))
@@ -209,13 +158,7 @@ class ResultFolder:
                 int(pose.ambiguous), pose.kind, *_floats([pose.length, pose.length_std])])
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Write `summary.json`.
-
-        Parameters
-        ----------
-        summary : mapping
-            Content of the file; NaN is written as null.
-        """
+        """Write `summary.json`; NaN is written as null."""
         with new_text_file(self.folder / _SUMMARY) as stream:
             json.dump(without_nan(summary), stream, indent=1, allow_nan=False)
             stream.write('\n')

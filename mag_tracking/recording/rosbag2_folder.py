@@ -44,17 +44,9 @@ class FileSummary(NamedTuple):
 
 
 def open_new(path: Path) -> io.FileIO:
-    """Create a file and open it unbuffered, so that a crash loses no written data.
+    """Create a file that must not exist, unbuffered, so that a crash loses no written data.
 
-    Parameters
-    ----------
-    path : Path
-        Must not exist.
-
-    Returns
-    -------
-    binary stream
-        Locked, if the file system supports locks.
+    It is locked if the file system supports locks.
     """
     stream = open(path, 'xb', buffering=0)
     # The lock prevents a repair of a file that is still being written. Some file systems do not
@@ -68,29 +60,13 @@ class UnbufferedWriter:
     """Stream that writes all bytes or raises OSError.
 
     On a full disk, an unbuffered write may write only part of its data without raising an error.
-
-    Parameters
-    ----------
-    raw : io.FileIO
-        Unbuffered stream.
-
-    Attributes
-    ----------
-    raw : io.FileIO
-    offset : int
-        Number of bytes written.
     """
 
     def __init__(self, raw: io.FileIO) -> None:
         self.raw, self.offset = raw, 0
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Append data to the file.
-
-        Parameters
-        ----------
-        data : bytes-like
-        """
+        """Append data to the file."""
         remaining = memoryview(data)
         while remaining:
             n = self.raw.write(remaining)
@@ -98,12 +74,7 @@ class UnbufferedWriter:
             remaining = remaining[n:]
 
     def tell(self) -> int:
-        """Number of bytes written.
-
-        Returns
-        -------
-        int
-        """
+        """Number of bytes written."""
         return self.offset
 
     def flush(self) -> None:
@@ -111,17 +82,7 @@ class UnbufferedWriter:
 
 
 def check_no_recording(folder: Path) -> None:
-    """Check that a folder does not contain a recording.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Raises
-    ------
-    OutputError
-        If `folder` is not a folder or contains a recording.
-    """
+    """Raise OutputError if a path is not a folder or contains a recording."""
     if folder.exists() and not folder.is_dir():
         raise OutputError(f'{folder} is not a folder')
     existing = sorted(p.name for pattern in ('metadata.yaml', '*.mcap', '*.db3')
@@ -133,23 +94,9 @@ def check_no_recording(folder: Path) -> None:
 
 def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[str, Topic],
                    opener: Opener = open_new) -> None:
-    """Write the `metadata.yaml` of rosbag2 atomically.
+    """Write the `metadata.yaml` of rosbag2 atomically, with the topics by name.
 
-    Parameters
-    ----------
-    folder : Path
-    files : sequence of FileSummary
-    topics : mapping of str to Topic
-        Topics by name.
-    opener : callable, optional
-        Creates a file and returns an unbuffered stream.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
-    RecordingError
-        If the QoS profiles of a topic are not valid YAML.
+    Raises OSError, or RecordingError if the QoS profiles of a topic are not valid YAML.
     """
     no_counts: Counter[str] = Counter()
     counts = sum((f.counts for f in files), no_counts)
@@ -186,10 +133,8 @@ def _qos_profiles(name: str, topic: Topic) -> object:
 
 
 def _span(first_times: Sequence[int], last_times: Sequence[int]) -> dict[str, dict[str, int]]:
-    """Metadata entries of start time and duration, from the first and last log times [ns] of files.
-
-    Both are 0 if there are no times.
-    """
+    """Metadata entries of start time and duration from first and last log times [ns] of files; 0 if
+    there are none."""
     first, last = min(first_times, default=0), max(last_times, default=0)
     return {'starting_time': {'nanoseconds_since_epoch': first},
             'duration': {'nanoseconds': last - first}}

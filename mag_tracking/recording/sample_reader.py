@@ -47,27 +47,15 @@ MAX_TOPICS = 10
 class SampleReader:
     """Iterates over the readings of a network in a recording and collects the true poses.
 
-    Parameters
-    ----------
-    recording : Recording
-    network : SensorNetwork
-    truth : str, optional
-        Topic of the true poses. None selects all topics below `TRUTH_PREFIX`.
+    `truth` is the topic of the true poses, by default all below `TRUTH_PREFIX`. Raises
+    RecordingError if the recording contains no topic of the network, its namespace is ambiguous,
+    `truth` is not a topic with poses, or the messages of the sensors have another type or encoding.
 
     Attributes
     ----------
-    rejected : Counter
-        Number of messages and readings that cannot be used, or not as they are, by cause.
-    clocks : dict of str to ClockSpan
-        First and last timestamp of each sensor so far, with their log times.
-    namespace : str
-        Namespace of the network's relative topics in the recording.
-
-    Raises
-    ------
-    RecordingError
-        If the recording contains no topic of the network, its namespace is ambiguous, `truth` is
-        not a topic with poses, or the messages of the sensors have another type or encoding.
+    rejected : number of messages and readings that cannot be used, or not as they are, by cause
+    clocks : first and last timestamp of each sensor so far, with their log times
+    namespace : namespace of the network's relative topics in the recording
     """
 
     def __init__(self, recording: Recording, network: SensorNetwork,
@@ -116,29 +104,14 @@ class SampleReader:
         return found.unstamped, found.dated, shared
 
     def missing_topics(self) -> list[str]:
-        """List the network's topics that are not in the recording.
-
-        Returns
-        -------
-        list of str
-            Empty if one topic carries the readings of several sensors.
-        """
+        """Topics of the network that are not in the recording; none if one topic carries several
+        sensors."""
         if self._is_batched or self._shared:
             return []
         return [t for t in self._sensors if t not in self._recording.types]
 
     def readings(self, progress: Progress | None = None) -> Iterator[Readings]:
-        """Iterate over batches of readings in order of log time.
-
-        Parameters
-        ----------
-        progress : callable, optional
-            Called with the number of bytes read since the last call.
-
-        Yields
-        ------
-        Readings
-        """
+        """Iterate over batches of readings in order of log time."""
         for block in self._recording.blocks(progress=progress):
             for first in range(0, len(block), BATCH_SIZE):
                 # A recording may have thousands of other topics.
@@ -191,50 +164,25 @@ class SampleReader:
 
     def readings_as_received(self, progress: Progress | None = None
                              ) -> Iterator[tuple[Readings, int]]:
-        """Iterate over the readings message by message, in order of log time.
-
-        Parameters
-        ----------
-        progress : callable, optional
-            Called with the number of bytes read since the last call.
-
-        Yields
-        ------
-        readings : Readings
-            Readings of one message.
-        log_time_ns : int, ns
-        """
+        """Iterate over (readings, log time [ns]) of each message, in order of log time."""
         for record, log_time_ns in self._records({}, progress):
             if isinstance(record, Readings):
                 yield record, log_time_ns
 
     def readings_and_accelerations(self, progress: Progress | None = None
                                    ) -> Iterator[Readings | AccelerationSample]:
-        """Iterate over readings and accelerations message by message, in order of log time.
-
-        Parameters
-        ----------
-        progress : callable, optional
-            Called with the number of bytes read since the last call.
-
-        Returns
-        -------
-        iterator of Readings or AccelerationSample
-        """
+        """Iterate over readings and accelerations message by message, in order of log time."""
         return (record for record, _ in self._records(self._imus, progress))
 
     def _records(self, imus: Mapping[str, Sequence[str]], progress: Progress | None
                  ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """Iterate over (record, log time [ns]) in the recording.
-
-        A record is a batch of readings, or an acceleration from a topic in `imus`, which maps
-        topics to sensors.
-        """
+        """Iterate over (batch of readings or acceleration, log time [ns]); `imus` maps topics of
+        accelerations to sensors."""
         return self._records_of(self._recording.messages(progress=progress), imus)
 
     def _records_of(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
                     ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """Decode messages to (record, log time [ns]). Also collect the true poses, and count the
+        """Decode messages to (record, log time [ns]), collect the true poses, and count the
         messages that cannot be decoded."""
         for message in messages:
             sensor = self._sensors.get(message.topic)
@@ -270,7 +218,7 @@ class SampleReader:
 
     def _single(self, content: MagneticField, sensor: str, message: RawMessage
                 ) -> Iterator[tuple[Readings, int]]:
-        """Convert a decoded message, unless its sensor is not in the network or its time is
+        """Convert a decoded message unless its sensor is not in the network or its time is
         missing."""
         reading = self._network_readings(reading_of(content, sensor))
         if not reading.stamp_ns.all():
@@ -311,21 +259,14 @@ class SampleReader:
         return readings.part(is_known)
 
     def truth_arrays(self) -> dict[str, Truth]:
-        """Return the true poses read so far, and add the counts of rejected poses to `rejected`.
-
-        Returns
-        -------
-        dict of str to Truth
-            Arrays by name of the target.
-        """
+        """True poses read so far, by target; adds the counts of rejected poses to `rejected`."""
         self.rejected.update(self._truth.rejected)
         self._truth.rejected.clear()
         return self._truth.arrays()
 
 
 def _candidates(types: Mapping[str, str], frames: Mapping[str, set[str]]) -> str:
-    """Format the topics with magnetic fields and several `frames`, or all topics if there are
-    none."""
+    """Format the topics with magnetic fields and several `frames`, or else all topics."""
     fields = [topic + (f' (with the frame_ids {", ".join(sorted(frames[topic]))})'
                        if len(frames.get(topic, ())) > 1 else '')
               for topic, kind in sorted(types.items()) if kind == MAGNETIC_FIELD]
@@ -335,10 +276,9 @@ def _candidates(types: Mapping[str, str], frames: Mapping[str, set[str]]) -> str
 
 
 def _namespace(recording: Recording, network: SensorNetwork) -> str:
-    """Namespace of the network's relative topics: the configured one, or the one in the recording.
+    """Namespace of the network's relative topics: configured, found in the recording, or '/'.
 
-    The result is '/' if the recording contains none of these topics. Raises RecordingError if it
-    contains them in several namespaces.
+    Raises RecordingError if the recording contains them in several namespaces.
     """
     if network.namespace is not None:
         return network.namespace

@@ -39,39 +39,14 @@ class TopicFindings(NamedTuple):
     """The frame_ids of the first messages of each topic."""
 
     def shared(self, names: Collection[str]) -> frozenset[str]:
-        """Find the topics with the readings of several sensors, named by their frame_id.
-
-        Parameters
-        ----------
-        names : collection of str
-            Names of the sensors.
-
-        Returns
-        -------
-        frozenset of str
-        """
+        """Topics with the readings of several of the sensors `names`, named by their frame_id."""
         return frozenset(topic for topic, frames in self.frames.items()
                          if len(frames) > 1 and frames <= set(names))
 
 
 def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindings:
-    """Examine the first messages of a recording.
-
-    Parameters
-    ----------
-    recording : Recording
-    topics : collection of str
-        Topics of the sensors.
-
-    Returns
-    -------
-    TopicFindings
-
-    Raises
-    ------
-    RecordingError
-        If none of the first messages can be read. The error names the cause.
-    """
+    """Examine the first messages of the sensors' topics; raises RecordingError if none is
+    readable."""
     n_zero: Counter[str] = Counter()
     n_read: Counter[str] = Counter()
     faults: Counter[str] = Counter()
@@ -102,27 +77,12 @@ def _first_messages(recording: Recording, topics: Collection[str]) -> Iterator[R
 
 
 def fault_of(message: RawMessage) -> str:
-    """Cause for which a message cannot be read.
-
-    Parameters
-    ----------
-    message : RawMessage
-
-    Returns
-    -------
-    str
-    """
+    """Cause for which a message cannot be read."""
     return f'{message.fault or UNDECODABLE} on {message.topic}'
 
 
 class FrameCheck:
-    """Check that each topic has the readings of one sensor.
-
-    Parameters
-    ----------
-    path : Path
-        Recording, for the error.
-    """
+    """Check that each topic has the readings of one sensor."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -130,33 +90,13 @@ class FrameCheck:
         self._numbers: dict[str, int] = {}
 
     def number(self, topic: str) -> int:
-        """Number of the latest frame of a topic, as in `FieldArrays.frame`.
-
-        Parameters
-        ----------
-        topic : str
-
-        Returns
-        -------
-        int
-            -1 if the topic has no frame yet.
-        """
+        """Number of the latest frame of a topic, as in `FieldArrays.frame`; -1 if it has none
+        yet."""
         return self._numbers.get(topic, -1)
 
     def check(self, topic: str, frame: str, number: int = -1) -> None:
-        """Check the frame of a reading.
-
-        Parameters
-        ----------
-        topic, frame : str
-        number : int, optional
-            Number of the frame, which `number` returns until the next call.
-
-        Raises
-        ------
-        RecordingError
-            If the topic alternates between frames.
-        """
+        """Check the frame of a reading, and store its number; raises RecordingError if the topic
+        alternates between frames."""
         self._numbers[topic] = number
         frames = self._frames.setdefault(topic, [frame])
         if frame == frames[-1]:

@@ -55,22 +55,8 @@ class LabelledInterval:
 def read_signatures(path: str | PathLike[str], is_labelled: bool = True) -> list[Signature]:
     """Read the signatures of a table.
 
-    Parameters
-    ----------
-    path : path_like
-    is_labelled : bool, optional
-        Whether labels are required.
-
-    Returns
-    -------
-    list of Signature
-
-    Raises
-    ------
-    RecordingError
-        If the table cannot be read.
-    LabelsError
-        If required labels are missing, a signature has several labels, or the columns are invalid.
+    Raises LabelsError if required labels are missing, a signature has several, or columns are
+    invalid.
     """
     header, lines = read_csv(path)
     if LABEL not in header and is_labelled:
@@ -81,8 +67,10 @@ def read_signatures(path: str | PathLike[str], is_labelled: bool = True) -> list
 
 
 def _read_by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
-    """Read a table with one row per sample. The columns that contain neither field, label, time nor
-    pass identify the signature to which a row belongs."""
+    """Read a table with one row per sample.
+
+    The columns that contain neither field, label, time nor pass identify the signature of a row.
+    """
     axes = {name: match for name in header if (match := _AXIS_COLUMN.fullmatch(name.lower()))}
     names = [name for name in header if name not in (*axes, LABEL, TIME, PASS)]
     if not axes:
@@ -109,10 +97,8 @@ def _read_by_sample(path: str | PathLike[str], header: list[str], lines: Lines) 
 
 
 def _unique_value(source: str, column: str, rows: list[tuple[int, dict[str, str]]]) -> str:
-    """Return the value that all rows have in a column; '' if the column is missing.
-
-    Raises LabelsError if the rows have different values.
-    """
+    """Value that all rows have in a column, '' if it is missing; raises LabelsError if they
+    differ."""
     values = sorted({cells.get(column, '').strip() for _, cells in rows})
     if len(values) > 1:
         raise LabelsError(f'{source} has several values of {column}: {", ".join(values)}')
@@ -148,10 +134,9 @@ def _read_by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> 
 
 
 class _Fields:
-    """Field columns of a table by axis.
+    """Field columns of a table by axis, from `columns`: [(axis, unit, names)].
 
-    Raises LabelsError if an axis is duplicated, or only some of the `columns`,
-    [(axis, unit, names)], have a unit.
+    Raises LabelsError if an axis is duplicated, or only some columns have a unit.
     """
 
     def __init__(self, path: str | PathLike[str], columns: list[tuple[str, str, list[str]]]
@@ -184,25 +169,10 @@ class _Fields:
 
 
 def read_intervals(path: str | PathLike[str], first_ns: int) -> list[LabelledInterval]:
-    """Read the labelled intervals of a recording.
+    """Read the labelled intervals of a recording whose first reading is at `first_ns`.
 
-    Parameters
-    ----------
-    path : path_like
-    first_ns : int, ns
-        Timestamp of the first reading of the recording.
-
-    Returns
-    -------
-    list of LabelledInterval
-
-    Raises
-    ------
-    RecordingError
-        If the table cannot be read.
-    LabelsError
-        If a column or label is missing, an interval does not end after it begins, or two intervals
-        of a sensor overlap.
+    Raises LabelsError if a column or label is missing, an interval does not end after it begins, or
+    two intervals of a sensor overlap.
     """
     header, lines = read_csv(path)
     unit = 'ns' if 'begin_ns' in header else 's'
@@ -227,10 +197,7 @@ def read_intervals(path: str | PathLike[str], first_ns: int) -> list[LabelledInt
 
 def _stamp(path: str | PathLike[str], line: int, column: str, cells: dict[str, str],
            first_ns: int) -> int:
-    """Convert a cell to ns since 1970; small times [s] are relative to `first_ns`.
-
-    Raises RecordingError or LabelsError if the time is invalid.
-    """
+    """Convert a cell to ns since 1970; small times [s] are relative to `first_ns`."""
     value = number(path, line, column, cells[column], True)
     if abs(value) > (MAX_TIME_S * NS if column.endswith('_ns') else MAX_TIME_S):
         raise LabelsError(f'{path}: row {line}: {column} is not a valid time')
@@ -253,39 +220,14 @@ def _check_overlaps(path: str | PathLike[str], intervals: list[LabelledInterval]
 
 
 def write_model(path: str | PathLike[str], model: SignatureModel) -> None:
-    """Write a trained model as JSON.
-
-    Parameters
-    ----------
-    path : path_like
-    model : SignatureModel
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write a trained model as JSON."""
     content = {name: value.tolist() if isinstance(value, np.ndarray) else value
                for name, value in asdict(model).items()}
     replace_text(path, json.dumps({_VERSION_ENTRY: VERSION, **content}, indent=1) + '\n')
 
 
 def read_model(path: str | PathLike[str]) -> SignatureModel:
-    """Read a model written by `write_model`.
-
-    Parameters
-    ----------
-    path : path_like
-
-    Returns
-    -------
-    SignatureModel
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read or is not a valid model of this version.
-    """
+    """Read a model written by `write_model`; raises RecordingError for another version."""
     path = checked_path(path, RecordingError)
     try:
         with open(path, encoding='utf-8') as stream:

@@ -64,28 +64,13 @@ class Columns:
 
 
 def parse_columns(texts: Sequence[str]) -> _Assigned:
-    """Parse the assignments of table columns.
+    """Parse assignments to (columns of the time, column of the sensor name, {sensor: {axis:
+    column}}).
 
-    Parameters
-    ----------
-    texts : sequence of str
-        `time=COLUMN`, or `time=DATE+TIME` for two columns, and either `x=COLUMN` and so on (one row
-        per reading), with `sensor=COLUMN` if there are several sensors, or `NAME.x=COLUMN` and so
-        on (one row for all sensors). Omit axes that were not measured.
-
-    Returns
-    -------
-    time : str
-        Columns of the time, joined by +. Empty if there is none.
-    sensor : str or None
-        Column of the sensor name.
-    axes : dict of str to dict of str to str
-        Column by sensor and axis. The only key is '' if the axes name no sensor.
-
-    Raises
-    ------
-    RecordingError
-        If an assignment is invalid, duplicated or missing.
+    `time=COLUMN`, or `time=DATE+TIME` for two columns, and either `x=COLUMN` and so on (one row per
+    reading; the sensor is ''), with `sensor=COLUMN` if there are several sensors, or
+    `NAME.x=COLUMN` and so on (one row for all sensors). Axes that were not measured are omitted.
+    Raises RecordingError if an assignment is invalid, duplicated or missing.
     """
     found: dict[str, str] = {}
     for text in texts:
@@ -110,25 +95,8 @@ def parse_columns(texts: Sequence[str]) -> _Assigned:
 
 
 def sensor_name(text: str, where: str, names: Mapping[str, str] | None = None) -> str:
-    """Convert a text to the name of a sensor.
-
-    Parameters
-    ----------
-    text : str
-    where : str
-        Place of the text, for the error message.
-    names : dict of str to str, optional
-        Name of the sensor for each text; 3 becomes `mag_3` without an entry.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    RecordingError
-        If the text is not a valid name.
-    """
+    """Convert a text at `where` to the name of a sensor, by `names` or as `mag_3` for 3; raises
+    RecordingError."""
     text = text.strip()
     if names and text in names:
         return names[text]
@@ -141,29 +109,11 @@ def sensor_name(text: str, where: str, names: Mapping[str, str] | None = None) -
 
 
 def find_columns(table: Table, assigned: Sequence[str], unit: str, sensor: str) -> Columns:
-    """Find the columns of a table.
+    """Find the columns of a table by assignments (`parse_columns`), or else by their names.
 
-    Parameters
-    ----------
-    table : Table
-    assigned : sequence of str
-        Assignments as for `parse_columns`, of names or numbers (from 1) of columns. If empty, the
-        columns are found by their names.
-    unit : str
-        Unit of the field; if empty, that of the header.
-    sensor : str
-        Name of the only sensor, if the columns name none.
-
-    Returns
-    -------
-    Columns
-
-    Raises
-    ------
-    RecordingError
-        If a column is missing or ambiguous, or the unit is unknown.
-    SettingsError
-        If `unit` is not a unit.
+    Assignments are names or numbers from 1. An empty `unit` is that of the header; `sensor` names
+    the only sensor if the columns name none. Raises RecordingError if a column is missing or
+    ambiguous, or the unit is unknown.
     """
     time, sensor_column, axes = parse_columns(assigned) if assigned else _by_header(table)
     notes = [] if assigned else [_assignment_note(time, sensor_column, axes)]
@@ -229,19 +179,7 @@ def _index(table: Table, column: str) -> int:
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Split the name of a column into name and unit.
-
-    Parameters
-    ----------
-    name : str
-        Such as 'Bx (µT)', 'Bx_uT' or 'time [ms]'.
-
-    Returns
-    -------
-    name : str
-    unit : str
-        Empty if there is none.
-    """
+    """Split names such as 'Bx (µT)', 'Bx_uT' or 'time [ms]' into name and unit ('' if none)."""
     match = _UNIT_AT_END(name) if len(name) < MAX_NAME else None
     if match and match[1]:
         return match[1], match[2]

@@ -47,18 +47,8 @@ class Table:
     """Line number and fault of each unusable row."""
 
     def check_bad_rows(self, n_good: int) -> None:
-        """Raise the first fault if too many rows are unusable.
-
-        Parameters
-        ----------
-        n_good : int
-            Number of usable rows.
-
-        Raises
-        ------
-        RecordingError
-            If more than `MAX_BAD_FRACTION` of the rows are unusable, or no row is usable.
-        """
+        """Raise the first fault as RecordingError if more than `MAX_BAD_FRACTION` of the rows, or
+        all, are unusable."""
         if self.bad and len(self.bad) > MAX_BAD_FRACTION * (n_good + len(self.bad)):
             line, fault = min(self.bad)
             others = f' ({len(self.bad)} of {n_good + len(self.bad)} rows are unusable)' \
@@ -68,26 +58,10 @@ class Table:
 
 def read_table(path: Path, separator: str = '', header: int | None = None,
                encoding: str = '') -> Table:
-    """Read a table of text.
+    """Read a table of text; what is not given is found.
 
-    Parameters
-    ----------
-    path : Path
-    separator : str, optional
-        Separator, or its name in `SEPARATORS`; found by default.
-    header : int, optional
-        Number of the header line, or 0 if there is none; found by default.
-    encoding : str, optional
-        As for `read_text`.
-
-    Returns
-    -------
-    Table
-
-    Raises
-    ------
-    RecordingError
-        If the file is not a table. The message names the property and the option that states it.
+    `separator` may be a name in `SEPARATORS`; `header` is a line number, 0 for none. Raises
+    RecordingError that names the property and the option that states it.
     """
     lines, found_encoding = read_text(path, encoding)
     numbers = [k for k, line in enumerate(lines) if line.strip()]

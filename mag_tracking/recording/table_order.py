@@ -40,38 +40,12 @@ class OrderedTimes:
 
 def order_times(where: str, times: Times, texts: Sequence[str], keys: Sequence[int],
                 lines: Sequence[int], wrap: int = 0, jumps: str = '') -> OrderedTimes:
-    """Unwrap times that run backwards, or divide them into sessions.
+    """Unwrap times that run backwards, or divide them into sessions; sort them only on request.
 
-    Times are sorted only on request.
-
-    Parameters
-    ----------
-    where : str
-        File and column, for error messages.
-    times : Times
-        Rows without a time are left out.
-    texts : sequence of str
-        Cells of the times, for error messages.
-    keys : sequence of int
-        Series (sensor) of each row.
-    lines : sequence of int
-        Line number of each row.
-    wrap : int, optional
-        Number at which the time returns to 0. By default, usual numbers are recognised.
-    jumps : str, optional
-        Value of `JUMPS`.
-
-    Returns
-    -------
-    OrderedTimes
-
-    Raises
-    ------
-    RecordingError
-        If a time runs backwards for an unknown reason, or jumps ahead by years. The message names
-        the row and the options.
-    SettingsError
-        If `jumps` is not valid.
+    Rows without a time are left out. `keys` are the series (sensors) of the rows. `wrap` is the
+    number at which the time returns to 0; by default, usual numbers are recognised. `jumps` is one
+    of `JUMPS`. Raises RecordingError, with row and options, if a time runs backwards for an unknown
+    reason or jumps ahead by years.
     """
     if jumps and jumps not in JUMPS:
         raise SettingsError(f'--jumps: expected {" or ".join(JUMPS)}, got {jumps!r}')
@@ -149,18 +123,7 @@ def _outliers(raw: dict[int, int], rows: Sequence[int], keys: Sequence[int], tol
 
 
 def equal_fraction(values: Sequence[int], keys: Sequence[int]) -> float:
-    """Fraction of times that equal the previous time of the same series.
-
-    Parameters
-    ----------
-    values : sequence of int
-    keys : sequence of int
-        Series of each time.
-
-    Returns
-    -------
-    float
-    """
+    """Fraction of times that equal the previous time of the same series (`keys`)."""
     last: dict[int, int] = {}
     n_equal = n = 0
     for value, key in zip(values, keys, strict=True):
@@ -173,24 +136,8 @@ def equal_fraction(values: Sequence[int], keys: Sequence[int]) -> float:
 
 def check_resolution(where: str, texts: Sequence[str], values: Sequence[int], keys: Sequence[int]
                      ) -> None:
-    """Check that the times distinguish the readings of a sensor.
-
-    Parameters
-    ----------
-    where : str
-        File and column, for the message.
-    texts : sequence of str
-        Cells of the times.
-    values : sequence of int
-    keys : sequence of int
-        Series of each time.
-
-    Raises
-    ------
-    RecordingError
-        If more than `MAX_EQUAL_FRACTION` of the times equal the previous one. The message names the
-        cause and the remedy.
-    """
+    """Raise RecordingError, with cause and remedy, if more than `MAX_EQUAL_FRACTION` of the times
+    equal the previous one of the series (`keys`)."""
     equal = equal_fraction(values, keys)
     if equal <= MAX_EQUAL_FRACTION:
         return

@@ -37,24 +37,10 @@ _POINT_DECIMALS = re.compile(
 
 
 def read_text(path: str | PathLike[str], encoding: str = '') -> tuple[list[str], str]:
-    """Read the lines of a text file.
+    """Lines (without ends and NUL characters) and encoding of a text file.
 
-    Parameters
-    ----------
-    path : path_like
-    encoding : str, optional
-        By default: a byte order mark, UTF-16 by its zero bytes, UTF-8, or else Windows-1252.
-
-    Returns
-    -------
-    lines : list of str
-        Lines without their ends; NUL characters are removed.
-    encoding : str
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read, or is not text.
+    The encoding is found: a byte order mark, UTF-16 by its zero bytes, UTF-8, or else Windows-1252.
+    Raises RecordingError if the file is not text.
     """
     path = checked_path(path, RecordingError)
     try:
@@ -99,18 +85,8 @@ def _encoding_of(data: bytes) -> str:
 
 
 def split_line(line: str, separator: str) -> list[str]:
-    """Split a line into cells without surrounding white space.
-
-    Parameters
-    ----------
-    line : str
-    separator : str
-        A blank stands for white space of any length.
-
-    Returns
-    -------
-    list of str
-    """
+    """Split a line into cells without white space around; a blank separates by white space of any
+    length."""
     if '"' in line:
         try:
             # The line may end within quotes, so strictness is left to the number of cells.
@@ -124,18 +100,8 @@ def split_line(line: str, separator: str) -> list[str]:
 
 
 def find_separator(lines: Sequence[str]) -> str | None:
-    """Find the separator that splits most lines into equal numbers of numbers and times.
-
-    Parameters
-    ----------
-    lines : sequence of str
-        Lines of a table, most of them rows.
-
-    Returns
-    -------
-    str or None
-        None if no separator splits the lines.
-    """
+    """Separator that splits most lines, mostly rows, into equal numbers of numbers and times, or
+    None."""
     best: tuple[float, str | None] = (0.0, None)
     for separator in SEPARATORS:
         rows = [split_line(line, separator) for line in lines]
@@ -150,62 +116,23 @@ def find_separator(lines: Sequence[str]) -> str | None:
 
 
 def is_value(cell: str) -> bool:
-    """Whether a cell is a number or a time, or missing.
-
-    Parameters
-    ----------
-    cell : str
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a cell is a number or a time, or missing."""
     return is_missing(cell) or bool(_NUMBER(cell) or _TIME(cell)) or cell.lower() in (
         'inf', '-inf', 'infinity')
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell is a number with any decimal mark.
-
-    Parameters
-    ----------
-    cell : str
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a cell is a number with any decimal mark."""
     return bool(_NUMBER(cell))
 
 
 def is_missing(cell: str) -> bool:
-    """Whether a cell is empty or a usual mark of a missing value.
-
-    Parameters
-    ----------
-    cell : str
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a cell is empty or a usual mark of a missing value."""
     return cell.lower() in _MISSING
 
 
 def find_decimal(cells: Iterable[str], separator: str) -> str:
-    """Find the decimal mark of numbers.
-
-    Parameters
-    ----------
-    cells : iterable of str
-    separator : str
-        Separator of the table.
-
-    Returns
-    -------
-    str
-        '.' or ','. Empty if the numbers fit both, or contradict each other.
-    """
+    """Decimal mark of numbers, '.' or ','; empty if they fit both or contradict each other."""
     marked = {cell for cell in cells if (',' in cell or '.' in cell) and _NUMBER(cell)
               and not _DATE(cell)}
     with_comma = any(',' in cell for cell in marked)
@@ -221,24 +148,8 @@ def find_decimal(cells: Iterable[str], separator: str) -> str:
 
 
 def parse_number(cell: str, decimal: str = '.') -> float:
-    """Convert a cell to a number.
-
-    Parameters
-    ----------
-    cell : str
-    decimal : str, optional
-        Decimal mark, '.' or ','.
-
-    Returns
-    -------
-    float
-        NaN if the value is missing.
-
-    Raises
-    ------
-    ValueError
-        If the cell is not a finite number. The message is a phrase such as "is 'b', not a number".
-    """
+    """Convert a cell to a number, NaN if missing; raises ValueError with a phrase like "is 'b', not
+    a number", also for infinity."""
     try:
         # The most frequent case; float also accepts '1_000' and a word for infinity.
         value = float(plain_number(cell, decimal))
@@ -252,18 +163,7 @@ def parse_number(cell: str, decimal: str = '.') -> float:
 
 
 def plain_number(cell: str, decimal: str) -> str:
-    """Write a number with a decimal point and without grouping.
-
-    Parameters
-    ----------
-    cell : str
-    decimal : str
-        Decimal mark, '.' or ','.
-
-    Returns
-    -------
-    str
-    """
+    """Write a number with a decimal point and without grouping."""
     if decimal == ',' and ('.' in cell or ',' in cell):
         cell = cell.replace('.', '').replace(',', '.')
     elif ',' in cell:

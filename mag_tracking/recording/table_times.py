@@ -47,34 +47,15 @@ class Times:
     notes: list[str]
 
     def stamps(self, values: Iterable[int]) -> list[int]:
-        """Convert values to timestamps.
-
-        Parameters
-        ----------
-        values : iterable of int
-
-        Returns
-        -------
-        list of int, ns
-        """
+        """Convert values to timestamps, ns."""
         numerator, denominator = self.scale.numerator, self.scale.denominator
         half = denominator // 2
         return [(v * numerator + half) // denominator - self.offset_ns for v in values]
 
 
 def step_of(values: Sequence[int | None], keys: Sequence[int]) -> int:
-    """Median interval between successive times of the same series; 0 if no time increases.
-
-    Parameters
-    ----------
-    values : sequence of int or None
-    keys : sequence of int
-        Series of each value.
-
-    Returns
-    -------
-    int
-    """
+    """Median interval between successive times of the same series (`keys`); 0 if no time
+    increases."""
     last: dict[int, int] = {}
     steps = []
     for value, key in zip(values, keys, strict=True):
@@ -89,31 +70,9 @@ def read_times(where: str, texts: Sequence[str], keys: Sequence[int], decimal: s
                header_unit: str, order: str) -> Times:
     """Convert the times of a table.
 
-    Parameters
-    ----------
-    where : str
-        File and column, for error messages.
-    texts : sequence of str
-    keys : sequence of int
-        Series (sensor) of each time.
-    decimal : str
-        Decimal mark of numbers.
-    unit : str
-        Unit of numbers; if empty, that of the header, or else found from the values.
-    header_unit : str
-    order : str
-        Order of day, month and year; found by default.
-
-    Returns
-    -------
-    Times
-
-    Raises
-    ------
-    RecordingError
-        If the form or unit of the times is ambiguous. The message names the option that states it.
-    SettingsError
-        If `unit` or `order` is not valid.
+    `keys` are the series (sensors) of the times. An empty `unit` is that of the header, or else
+    found from the values; an empty `order` of day, month and year is found. Raises RecordingError,
+    with the option that states it, if form or unit is ambiguous.
     """
     if order and order not in DATE_ORDERS:
         raise SettingsError(f'--date-order: expected one of {", ".join(DATE_ORDERS)}, got '
@@ -225,17 +184,7 @@ def _rates(step_s: float, span_s: float) -> str:
 
 
 def span_text(span_s: float) -> str:
-    """Describe a duration.
-
-    Parameters
-    ----------
-    span_s : float, s
-
-    Returns
-    -------
-    str
-        Such as '14 s' or '3.9 h'.
-    """
+    """Describe a duration, such as '14 s' or '3.9 h'."""
     for unit, length in (('years', 31557600.0), ('days', 86400.0), ('h', 3600.0), ('s', 1.0),
                          ('ms', 1e-3), ('us', 1e-6)):
         if span_s >= 1.5 * length or unit == 'us':
@@ -244,21 +193,7 @@ def span_text(span_s: float) -> str:
 
 
 def check_range(where: str, line: int, stamp_ns: int) -> None:
-    """Check that a time is in the range of ROS headers.
-
-    Parameters
-    ----------
-    where : str
-        File and column, for the message.
-    line : int
-        Row of the time.
-    stamp_ns : int, ns
-
-    Raises
-    ------
-    RecordingError
-        If it is not.
-    """
+    """Raise RecordingError if a time is not in the range of ROS headers."""
     if not 0 <= stamp_ns <= LATEST_NS:
         raise RecordingError(f'{where}: row {line}: {stamp_ns / NS:.6g} s is not a valid time '
                              'since 1970; check --time-unit')

@@ -40,18 +40,7 @@ LATCHED = ('/tf_static', '/tracker_node/sensor_markers')
 
 
 class TrackRecording:
-    """Writer of a recording of tracks, calibrated fields and sensor poses.
-
-    Parameters
-    ----------
-    path : path_like
-    network : SensorNetwork
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Writer of a recording of tracks, calibrated fields and sensor poses."""
 
     def __init__(self, path: str | PathLike[str], network: SensorNetwork) -> None:
         self._writer = RecordingWriter(path, LATCHED)
@@ -78,12 +67,7 @@ class TrackRecording:
                            sensor_markers(self._network), stamp_ns)
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Write the calibrated field of each sensor in a frame.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-        """
+        """Write the calibrated field of each sensor in a frame."""
         self._write_smoothed()
         self._write_sensors(frame.stamp_ns)
         for j, name in enumerate(self._network.names):
@@ -94,12 +78,7 @@ class TrackRecording:
                 self._writer.write(self._topics[name], MAGNETIC_FIELD, content, frame.stamp_ns)
 
     def add_track(self, track: Track) -> None:
-        """Write a record of a track to its topics; at the end of the track, write its path.
-
-        Parameters
-        ----------
-        track : Track
-        """
+        """Write a record of a track to its topics; at the end of the track, write its path."""
         self._write_smoothed()
         self._write_sensors(track.stamp_ns)
         stamp_ns, frame = track.stamp_ns, self._frame
@@ -125,12 +104,7 @@ class TrackRecording:
             self._path.append(pose_dict(stamp_ns, frame, track.position, track.orientation))
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
-        """Buffer a smoothed pose; all smoothed poses of a track are written as a single message.
-
-        Parameters
-        ----------
-        pose : SmoothedPose
-        """
+        """Buffer a smoothed pose; all smoothed poses of a track are written as a single message."""
         if self._smoothed and pose.id != self._smoothed[0].id:
             self._write_smoothed()
         self._smoothed.append(pose)
@@ -148,12 +122,7 @@ class TrackRecording:
                       for p in poses]}, last_ns)
 
     def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Write a record of a disturbance: its detection or its end.
-
-        Parameters
-        ----------
-        disturbance : Disturbance
-        """
+        """Write a record of a disturbance: its detection or its end."""
         self._write('disturbances', DISTURBANCE, disturbance_dict(disturbance, self._frame),
                     disturbance.stamp_ns)
 

@@ -62,20 +62,7 @@ _INTERVAL_COLUMNS = (
 
 
 def tables_of(class_names: Sequence[str], with_fleet: bool) -> dict[str, tuple[Column, ...]]:
-    """Columns of the tables `passages` and `intervals`.
-
-    Parameters
-    ----------
-    class_names : sequence of str
-        Each class has a column for its probability.
-    with_fleet : bool
-        Whether to include the columns of enrolled vehicles.
-
-    Returns
-    -------
-    dict of str to tuple of Column
-        Columns by table.
-    """
+    """Columns of the tables `passages` and `intervals`, with a probability per class."""
     classes = tuple(Column(f'p_{name}', 'f', '', f'probability of the class {name}')
                     for name in class_names)
     vehicle = _VEHICLE_COLUMNS if with_fleet else ()
@@ -85,23 +72,10 @@ def tables_of(class_names: Sequence[str], with_fleet: bool) -> dict[str, tuple[C
 
 def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[str],
                 delay: dict[str, Any], vehicle: dict[str, Any]) -> dict[str, Any]:
-    """Values of a passage by column, in the units of the table. Unknown values are NaN.
+    """Values of a passage by column, in the units of the table; NaN if unknown.
 
-    Parameters
-    ----------
-    recording : str
-        Name of the recording.
-    passage : VehiclePassage
-    class_names : sequence of str
-        Names of the classes, in the order of `passage.class_probabilities`.
-    delay : dict
-        Values of the columns for the speed from the delay between sensors.
-    vehicle : dict
-        Values of the columns for the matching enrolled vehicle. Empty without a fleet.
-
-    Returns
-    -------
-    dict
+    `delay` has the columns of the speed from the delay between sensors, `vehicle` those of the
+    matching enrolled vehicle (empty without a fleet).
     """
     x, y, z = passage.position.tolist()
     vx, vy, vz = passage.velocity.tolist()
@@ -123,21 +97,7 @@ def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[s
 
 
 def summary_rows(recording: str, summary: TrafficSummary) -> list[dict[str, Any]]:
-    """Rows of the table `intervals` for one traffic summary.
-
-    There is one row per direction and class, or a single row with count 0 if no vehicle passed.
-
-    Parameters
-    ----------
-    recording : str
-        Name of the recording.
-    summary : TrafficSummary
-
-    Returns
-    -------
-    list of dict
-        Values by column.
-    """
+    """Rows of the table `intervals`: one per direction and class, or one with count 0."""
     common_values = {'recording': recording, 'begin_ns': summary.begin_ns, 'end_ns': summary.end_ns,
                      'line': summary.line, 'observed_s': summary.observed_s}
     if not summary.counts:
@@ -152,21 +112,8 @@ def write_traffic(folder: Path, rows: Mapping[str, Sequence[Mapping[str, Any]]],
                   tables: Mapping[str, Sequence[Column]]) -> None:
     """Write tables to a folder as CSV and Parquet.
 
-    Tables without rows have only a header. If pyarrow is not installed, no Parquet files are
-    written, and the Parquet files of an earlier run are removed.
-
-    Parameters
-    ----------
-    folder : Path
-    rows : mapping of str to sequence of mapping
-        Rows by table, as values by column.
-    tables : mapping of str to sequence of Column
-        Columns by table.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
+    Tables without rows have only a header. Without pyarrow, no Parquet files are written, and those
+    of an earlier run are removed.
     """
     folder = output_folder(folder)
     try:

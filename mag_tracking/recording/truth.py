@@ -30,21 +30,10 @@ _POSITION, _QUATERNION, _MOMENT = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw'), ('m
 
 
 class TruthTopics:
-    """Collects true poses from the messages of a recording.
+    """Collects true poses from `topic`, or all topics below `prefix`, and counts rejections by
+    cause.
 
-    Parameters
-    ----------
-    prefix : str
-        Prefix of the topics with true poses, unless `topic` is given.
-    frame : str
-        World frame of the network. Poses in other frames cannot be compared and are rejected.
-    topic : str, optional
-        Topic of the true poses.
-
-    Attributes
-    ----------
-    rejected : Counter
-        Number of rejected messages by cause.
+    Poses in other frames than the world frame of the network cannot be compared and are rejected.
     """
 
     def __init__(self, prefix: str, frame: str, topic: str | None = None) -> None:
@@ -53,30 +42,12 @@ class TruthTopics:
         self._rows: dict[str, list[_Rows]] = {}
 
     def accepts(self, topic: str, kind: str) -> bool:
-        """Whether a topic carries true poses.
-
-        Parameters
-        ----------
-        topic : str
-        kind : str
-            Message type.
-
-        Returns
-        -------
-        bool
-        """
+        """Whether a topic of a message type carries true poses."""
         is_truth = topic.startswith(self._prefix) if self._topic is None else topic == self._topic
         return is_truth and kind in TRUTH_TYPES
 
     def add(self, topic: str, content: Any) -> None:
-        """Add the pose of a decoded message, or reject it if it is in another frame.
-
-        Parameters
-        ----------
-        topic : str
-        content : object
-            Decoded message.
-        """
+        """Add the pose of a decoded message, or reject it if it is in another frame."""
         frame = content.header.frame_id
         if frame and frame != self._frame:
             self.rejected[f'truth on {topic} is in frame {frame}, not {self._frame}'] += 1
@@ -88,17 +59,7 @@ class TruthTopics:
              np.array([[p.x, p.y, p.z, q.x, q.y, q.z, q.w]])))
 
     def add_block(self, block: MessageBlock) -> IntArray:
-        """Add the true poses of a block; only CDR messages of type PoseStamped are decoded.
-
-        Parameters
-        ----------
-        block : MessageBlock
-
-        Returns
-        -------
-        (n,) int array
-            Indices of the messages whose poses were read.
-        """
+        """Add the CDR messages of type PoseStamped in a block; return the indices of those read."""
         collected: list[IntArray] = [np.zeros(0, dtype=np.int64)]
         for channel, kind in block.kinds.items():
             rows: IntArray = np.flatnonzero(block.channel == channel)
@@ -110,13 +71,7 @@ class TruthTopics:
         return np.concatenate(collected)
 
     def arrays(self) -> dict[str, Truth]:
-        """True poses of each topic in chronological order.
-
-        Returns
-        -------
-        dict of str to Truth
-            Arrays by name of the target.
-        """
+        """True poses by target, in chronological order."""
         out = {}
         for topic, rows in self._rows.items():
             stamps, pose = (np.concatenate(arrays) for arrays in zip(*rows, strict=True))
@@ -129,27 +84,12 @@ class TruthTopics:
 
 def read_truth_table(path: str | PathLike[str],
                      axis: ArrayLike = (0.0, 0.0, 1.0)) -> dict[str, Truth]:
-    """Read true poses in the frame of the network from a CSV file.
+    """Read true poses in the frame of the network from a CSV file, as one target named after the
+    file.
 
-    Parameters
-    ----------
-    path : path_like
-        Columns: `stamp_ns` [ns], or `t` or `time` [s], since 1970; `x`, `y` [m]; optionally `z`
-        [m], and `qx`, `qy`, `qz`, `qw` or, for a magnet, the direction `mx`, `my`, `mz` of its
-        moment. Other columns are ignored.
-    axis : (3,) array
-        Direction of the moment in the frame of the magnet, for `mx`, `my`, `mz`.
-
-    Returns
-    -------
-    dict of str to Truth
-        One target, named after the file without its suffix. Quaternions are NaN if the file has no
-        orientations.
-
-    Raises
-    ------
-    RecordingError
-        If the file is invalid. The message names file, row and column.
+    Columns: `stamp_ns` [ns], or `t` or `time` [s], since 1970; `x`, `y` [m]; optionally `z` [m],
+    and `qx`, `qy`, `qz`, `qw` or, for a magnet, the direction `mx`, `my`, `mz` of its moment, which
+    is `axis` (3,) in the frame of the magnet. Quaternions are NaN without orientations.
     """
     header, rows = read_csv(path)
     time = next((name for name in _NS_PER_UNIT if name in header), None)
@@ -189,10 +129,7 @@ def _columns(path: str | PathLike[str], header: list[str], rows: Lines,
 
 
 def _stamp(path: str | PathLike[str], line: int, column: str, text: str) -> int:
-    """Convert a cell to ns since 1970, without rounding for integers in `stamp_ns`.
-
-    Raises RecordingError if the time is invalid.
-    """
+    """Convert a cell to ns since 1970, without rounding for integers in `stamp_ns`."""
     try:
         stamp = int(text) if column == 'stamp_ns' else None
     except ValueError:

@@ -9,21 +9,7 @@ from mag_tracking.files import replace_text
 
 def write_tum(path: str | PathLike[str], stamp_ns: Sequence[int], position: Sequence[FloatArray],
               orientation: Sequence[FloatArray]) -> None:
-    """Write poses as lines of `time x y z qx qy qz qw`, in seconds and metres.
-
-    Parameters
-    ----------
-    path : path_like
-    stamp_ns : (n,) sequence of int, ns
-    position : (n,) sequence of (3,) arrays, m
-    orientation : (n,) sequence of (4,) arrays
-        Quaternions xyzw.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write poses as lines of `time x y z qx qy qz qw`, in s and m; orientations are xyzw."""
     lines = []
     for stamp, p, q in zip(stamp_ns, position, orientation, strict=True):
         # Formatted from integers: a float has a resolution of only 0.2 us for times since 1970.

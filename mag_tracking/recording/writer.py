@@ -19,18 +19,8 @@ MAX_TOPICS = 2000
 
 
 def check_no_other_recording(path: Path) -> None:
-    """Check that the folder of a new MCAP file does not contain another recording.
-
-    Parameters
-    ----------
-    path : Path
-        Path of the MCAP file.
-
-    Raises
-    ------
-    OutputError
-        If `metadata.yaml` does not list the file, or cannot be read.
-    """
+    """Raise OutputError if the folder of a new MCAP file has a `metadata.yaml` that does not list
+    it."""
     metadata = path.parent / 'metadata.yaml'
     try:
         # Only a regular file is read: a pipe or a device could block.
@@ -46,23 +36,8 @@ class RecordingWriter:
     """Writes messages to an MCAP file that rosbag2 can play; a context manager.
 
     A `metadata.yaml` in the same folder makes the folder a rosbag2 recording. Small chunks limit
-    the loss in a crash.
-
-    Parameters
-    ----------
-    path : path_like
-        Parent folders are created.
-    latched : collection of str, optional
-        Topics with transient local durability.
-
-    Attributes
-    ----------
-    path : Path
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written, or its folder contains another recording.
+    the loss in a crash. `latched` are the topics with transient local durability. Parent folders
+    are created; raises OutputError if the folder contains another recording.
     """
 
     def __init__(self, path: str | PathLike[str], latched: Collection[str] = ()) -> None:
@@ -90,24 +65,10 @@ class RecordingWriter:
         self.close()
 
     def write(self, topic: str, type_name: str, message: MessageDict, time_ns: int) -> None:
-        """Append a message.
+        """Append a message with its fields and log time.
 
-        Parameters
-        ----------
-        topic : str
-        type_name : str
-            Message type.
-        message : nested dict
-            Fields of the message.
-        time_ns : int, ns
-            Log time.
-
-        Raises
-        ------
-        RecordingError
-            If the definition of the type is unknown.
-        OutputError
-            If the recording would have more than `MAX_TOPICS` topics.
+        Raises RecordingError if the definition of the type is unknown, OutputError beyond
+        `MAX_TOPICS`.
         """
         if topic not in self._channels:
             self._open_channel(topic, type_name)
@@ -176,19 +137,9 @@ OFFERED_QOS = '''- history: keep_last
 
 
 def offered_qos(reliable: bool = True, latched: bool = False) -> str:
-    """QoS profile of a topic as rosbag2 writes it in `offered_qos_profiles`.
+    """QoS profile of a topic as rosbag2 writes it in `offered_qos_profiles`, YAML.
 
-    Parameters
-    ----------
-    reliable : bool, optional
-        Whether the topic is reliable instead of best-effort.
-    latched : bool, optional
-        Whether the durability is transient local instead of volatile.
-
-    Returns
-    -------
-    str
-        QoS profile as YAML.
+    Without `reliable` it is best-effort, without `latched` volatile.
     """
     text = OFFERED_QOS if reliable else OFFERED_QOS.replace('reliability: reliable',
                                                             'reliability: best_effort')

@@ -69,17 +69,8 @@ def calibration_figure(calibration: _Calibration, nominal: _Network,
                        max_sensors: int = 8) -> Figure:
     """Plot the knocks before and after the clock correction, and the yaw of the sensors.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    nominal : SensorNetwork
-        Network with the nominal orientations from the network file.
-    max_sensors : int
-        Maximum number of sensors in the plot of the knocks.
-
-    Returns
-    -------
-    Figure
+    `nominal` is the network with the orientations of the network file. The knocks of at most
+    `max_sensors` sensors are plotted.
     """
     figure = Figure(figsize=(11.0, 4.6), layout='constrained')
     left, middle, right = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
@@ -89,18 +80,7 @@ def calibration_figure(calibration: _Calibration, nominal: _Network,
 
 
 def first_knock(shocks: Mapping[str, tuple[FloatArray, FloatArray]]) -> float:
-    """Time of the first acceleration that exceeds 30 % of the maximum of the same sensor.
-
-    Parameters
-    ----------
-    shocks : dict of str to ((n,) array, s, and (n,) array, m/s²)
-        Times and accelerations of each sensor.
-
-    Returns
-    -------
-    float, s
-        0 if there is no knock.
-    """
+    """Time [s] of the first acceleration above 30 % of the maximum of its sensor; 0 if none."""
     return min((float(t[s > 0.3 * s.max()][0]) for t, s in shocks.values()
                 if len(s) and s.max() > 0.0), default=0.0)
 
@@ -148,16 +128,7 @@ def _plot_headings(axes: Axes, calibration: _Calibration, nominal: _Network) -> 
 def tumble_figure(fits: Mapping[str, _EllipsoidFit], readings: Mapping[str, FloatArray]) -> Figure:
     """Plot a tumble calibration: magnitudes before and after correction, and field directions.
 
-    Parameters
-    ----------
-    fits : dict of str to EllipsoidFit
-        Fit of each sensor, by name.
-    readings : dict of str to (n, 3) array
-        Readings of each sensor, in chronological order.
-
-    Returns
-    -------
-    Figure
+    `readings` (n, 3) are chronological.
     """
     figure = Figure(figsize=(10.0, 0.6 + 2.7 * len(fits)), layout='constrained')
     rows = figure.subplots(len(fits), 2, squeeze=False, width_ratios=(1.5, 1.0))

@@ -25,22 +25,9 @@ STATE_UNITS = {
 
 
 def dataframe(columns: Mapping[str, Any], units: Mapping[str, str]) -> 'pd.DataFrame':
-    """Create a DataFrame with units.
+    """Create a DataFrame with units by column; raises MissingDependencyError without pandas.
 
-    Parameters
-    ----------
-    columns : dict of str to (n,) array
-    units : dict of str to str
-        Units by column. Units of missing columns are ignored.
-
-    Returns
-    -------
-    DataFrame
-
-    Raises
-    ------
-    MissingDependencyError
-        If pandas is not installed.
+    Units of missing columns are ignored.
     """
     try:
         import pandas as pd
@@ -53,17 +40,7 @@ def dataframe(columns: Mapping[str, Any], units: Mapping[str, str]) -> 'pd.DataF
 
 
 def poses_dataframe(poses: StructArray) -> 'pd.DataFrame':
-    """Convert poses to a DataFrame with the columns of `poses.csv`.
-
-    Parameters
-    ----------
-    poses : (n,) structured array
-        As returned by `pose_array`.
-
-    Returns
-    -------
-    DataFrame
-    """
+    """Convert poses of `pose_array` to a DataFrame with the columns of `poses.csv`."""
     columns = {**_state_columns(poses), **{name: poses[name] for name in (
         'weight', 'ambiguous', 'kind', 'kind_weight', 'length')}, 'sd_length': poses['length_std'],
         'doubts': poses['doubts']}
@@ -71,17 +48,7 @@ def poses_dataframe(poses: StructArray) -> 'pd.DataFrame':
 
 
 def smoothed_dataframe(smoothed: StructArray) -> 'pd.DataFrame':
-    """Convert smoothed poses to a DataFrame: the columns of `poses_smoothed.csv`, and `complete`.
-
-    Parameters
-    ----------
-    smoothed : (n,) structured array
-        As returned by `smoothed_array`.
-
-    Returns
-    -------
-    DataFrame
-    """
+    """Convert poses of `smoothed_array` to the columns of `poses_smoothed.csv`, and `complete`."""
     columns = {**_state_columns(smoothed), **{name: smoothed[name] for name in (
         'ambiguous', 'kind', 'length')}, 'sd_length': smoothed['length_std'],
         'complete': smoothed['complete']}
@@ -89,17 +56,7 @@ def smoothed_dataframe(smoothed: StructArray) -> 'pd.DataFrame':
 
 
 def detections_dataframe(detections: StructArray) -> 'pd.DataFrame':
-    """Convert onsets and releases to a DataFrame with the columns of `detections.csv`.
-
-    Parameters
-    ----------
-    detections : (n,) structured array
-        As returned by `detection_array`.
-
-    Returns
-    -------
-    DataFrame
-    """
+    """Convert onsets and releases of `detection_array` to the columns of `detections.csv`."""
     columns = {'stamp_ns': detections['stamp_ns'], 'id': detections['id'],
                'event': np.where(detections['onset'], 'onset', 'release'),
                **{name: detections[name] for name in (

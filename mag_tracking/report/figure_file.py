@@ -14,15 +14,7 @@ _DOTS_PER_INCH = 110
 def save_figure(figure: Figure, path: str | PathLike[str]) -> None:
     """Write a figure in the format that the file suffix selects; replaces an existing file or link.
 
-    Parameters
-    ----------
-    figure : Figure
-    path : path_like
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
+    Raises OSError if the file cannot be written.
     """
     image = io.BytesIO()
     figure.savefig(image, format=Path(path).suffix.removeprefix('.').lower(), dpi=_DOTS_PER_INCH)

@@ -40,19 +40,7 @@ class _Network(Protocol):
 
 
 def ellipse_points(position: FloatArray, covariance: FloatArray, n: int = 48) -> FloatArray:
-    """Return points on the edge of the 90 % region of a position in the plane.
-
-    Parameters
-    ----------
-    position : (2,) or (3,) array, m
-    covariance : (2, 2) array, m²
-    n : int
-        Number of points.
-
-    Returns
-    -------
-    (n, 2) array, m
-    """
+    """Points (n, 2) on the edge of the 90 % region of a position in the plane."""
     values, vectors = np.linalg.eigh(covariance)
     angle = np.linspace(0.0, 2.0 * np.pi, n)
     circle = np.stack([np.cos(angle), np.sin(angle)])
@@ -79,18 +67,7 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
                smoothed: ArrayLike | None = None) -> Figure:
     """Plot a track with 90 % ellipses, its hypotheses by arrival direction, sensors and truth.
 
-    Parameters
-    ----------
-    log : TrackLog
-    network : SensorNetwork
-    truth : (n, 3) array, m, world frame, optional
-        True positions.
-    smoothed : (n, 3) array, m, world frame, optional
-        Smoothed positions.
-
-    Returns
-    -------
-    Figure
+    `truth` and `smoothed` are positions (n, 3) [m] in the world frame.
     """
     figure = Figure(figsize=(8.5, 6.5), layout='constrained')
     axes = figure.add_subplot()
@@ -149,16 +126,7 @@ def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
 
 
 def weights_figure(log: TrackLog) -> Figure:
-    """Plot the weight of each arrival direction over time, on a linear and a logarithmic axis.
-
-    Parameters
-    ----------
-    log : TrackLog
-
-    Returns
-    -------
-    Figure
-    """
+    """Plot the weight of each arrival direction over time, on a linear and a logarithmic axis."""
     figure = Figure(figsize=(8.5, 4.5), layout='constrained')
     top, bottom = figure.subplots(2, 1, sharex=True)
     t = log.seconds()
@@ -183,17 +151,8 @@ def weights_figure(log: TrackLog) -> Figure:
 def field_figure(log: TrackLog, network: _Network, max_sensors: int = 8) -> Figure:
     """Plot the measured field and the field of the best hypothesis, per sensor and axis.
 
-    Parameters
-    ----------
-    log : TrackLog
-    network : SensorNetwork
-    max_sensors : int
-        Maximum number of sensors. In a larger network, only the sensors with the strongest fields
-        are plotted, and the title states how many.
-
-    Returns
-    -------
-    Figure
+    In a network of more than `max_sensors`, only the sensors with the strongest fields are plotted,
+    and the title states how many.
     """
     measured, predicted = np.array(log.measured), np.array(log.predicted)
     strength = np.nan_to_num(np.nanmax(np.abs(np.where(np.isnan(measured), 0.0, measured)),

@@ -91,22 +91,7 @@ def pass_figure(fit: _Fit, title: str, max_sensors: int = 6) -> Figure:
 
     The bands account for the noise and for the uncertainty of the fitted parameters
     (`PassFit.robust_covariance`). A normalised cost above 1 scales the noise variance, to account
-    for model errors.
-
-    Parameters
-    ----------
-    fit : PassFit
-    title : str
-    max_sensors : int
-        Maximum number of sensors. In a larger network, only the sensors with the strongest fields
-        are plotted.
-
-    Returns
-    -------
-    Figure
-
-    References
-    ----------
+    for model errors. Only the `max_sensors` sensors with the strongest fields are plotted. As
     [TSP14]_ Fig. 6.
     """
     data = fit.data
@@ -143,16 +128,7 @@ def pass_figure(fit: _Fit, title: str, max_sensors: int = 6) -> Figure:
 
 
 def target_alone(fit: _Fit) -> FloatArray:
-    """Fitted field of the target, without the fitted background of each sensor.
-
-    Parameters
-    ----------
-    fit : PassFit
-
-    Returns
-    -------
-    (n, 3) array, T, sensor frame
-    """
+    """Fitted field (n, 3) [T] of the target, without the fitted background of each sensor."""
     out = fit.predicted.copy()
     for name, value in zip(fit.names, fit.x, strict=True):
         if name.startswith('B '):
@@ -162,21 +138,10 @@ def target_alone(fit: _Fit) -> FloatArray:
 
 
 def order_figure(passes: Sequence[_FittedPass]) -> Figure:
-    """Plot the normalised cost against the number of dipoles, one line per pass.
+    """Plot the normalised cost against the number of dipoles, one line per pass, as [TSP14]_ Fig.
+    7.
 
     A filled symbol marks the chosen number of dipoles.
-
-    Parameters
-    ----------
-    passes : sequence of FittedPass
-
-    Returns
-    -------
-    Figure
-
-    References
-    ----------
-    [TSP14]_ Fig. 7.
     """
     figure = Figure(figsize=(7.5, 5.0), layout='constrained')
     axes = figure.add_subplot()

@@ -77,16 +77,7 @@ class _Survey(Protocol):
 
 
 def geometry_figure(survey: _Survey) -> Figure:
-    """Plot the corrections of the sensor positions, orientations and gains, and the residuals.
-
-    Parameters
-    ----------
-    survey : GeometrySurvey
-
-    Returns
-    -------
-    Figure
-    """
+    """Plot the corrections of the sensor positions, orientations and gains, and the residuals."""
     g, names = survey.geometry, survey.network.names
     n = len(names)
     suspect = np.isin(names, g.suspect_sensors)

@@ -6,17 +6,7 @@ from typing import Any
 
 
 def without_nan(value: Any) -> Any:
-    """Replace NaN and infinity by None in nested dicts and lists.
-
-    Parameters
-    ----------
-    value : any
-
-    Returns
-    -------
-    any
-        Copy; tuples become lists.
-    """
+    """Replace NaN and infinity by None in a copy of nested dicts and lists; tuples become lists."""
     if isinstance(value, dict):
         return {k: without_nan(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -25,14 +15,5 @@ def without_nan(value: Any) -> Any:
 
 
 def json_text(value: Any) -> str:
-    """Serialise nested dicts and lists as JSON, with null for NaN and infinity.
-
-    Parameters
-    ----------
-    value : any
-
-    Returns
-    -------
-    str
-    """
+    """Serialise nested dicts and lists as JSON, with null for NaN and infinity."""
     return json.dumps(without_nan(value), allow_nan=False)

@@ -9,14 +9,6 @@ def literal(text: str) -> str:
     Matplotlib parses text between two `$` as mathematics, and fails on invalid mathematics such as
     `$\road$`. It omits labels that begin with `_` from a legend. Unpaired surrogates, which stand
     for bytes of a file name that are not UTF-8, are escaped as in `\udcff`.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
     """
     drawable = text.encode('utf-8', 'backslashreplace').decode()
     escaped = drawable.replace('$', r'\$')

@@ -48,18 +48,7 @@ class MagnetErrors(TypedDict):
 
 
 def interpolate_truth(truth: Truth, stamps_ns: ArrayLike) -> FloatArray:
-    """Interpolate the true positions at given times.
-
-    Parameters
-    ----------
-    truth : Truth
-    stamps_ns : (n,) int array, ns
-
-    Returns
-    -------
-    (n, 3) array, m, world frame
-        NaN outside the time range of the truth.
-    """
+    """True positions (n, 3) [m] at given times [ns]; NaN outside the time range of the truth."""
     t, position, _ = truth
     seconds = (t - t[0]) / 1e9
     at = (np.asarray(stamps_ns, dtype=np.int64) - t[0]) / 1e9
@@ -69,21 +58,9 @@ def interpolate_truth(truth: Truth, stamps_ns: ArrayLike) -> FloatArray:
 
 def pass_errors(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
                 radius: float = 5.0) -> PassErrors | None:
-    """Return the horizontal errors of a vehicle's track near a point.
+    """Horizontal errors of a vehicle's track within `radius` [m] of `centre` (3,).
 
-    Parameters
-    ----------
-    log : TrackLog or SmoothedLog
-    truth : Truth
-    centre : (3,) array, m, world frame
-        Centre of the region that is evaluated.
-    radius : float, m
-        Radius of the region.
-
-    Returns
-    -------
-    PassErrors or None
-        None if no pose has a true position.
+    None if no pose has a true position.
     """
     true = interpolate_truth(truth, log.stamp_ns)[:, :2]
     rows = near_poses(log, truth, centre, radius)
@@ -119,16 +96,8 @@ standard deviations in the direction of the error."""
 def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> UnflaggedPoses:
     """Count the vehicle poses without the ambiguous flag, and the wrong poses among them.
 
-    Parameters
-    ----------
-    logs : iterable of TrackLog
-    truths : iterable of Truth
-        A pose is wrong if its error exceeds `WRONG_M` and `WRONG_STD` standard deviations for every
-        target whose truth covers the time of the pose.
-
-    Returns
-    -------
-    UnflaggedPoses
+    A pose is wrong if its error exceeds `WRONG_M` and `WRONG_STD` standard deviations for every
+    target whose truth covers the time of the pose.
     """
     truths, n, n_wrong, n_without = list(truths), 0, 0, 0
     for log in logs:
@@ -154,21 +123,10 @@ def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> Unflag
 
 def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
                radius: float = 5.0) -> IntArray:
-    """Return the indices of the poses whose true position is horizontally near a point.
+    """Indices (k,) of the poses whose true position is horizontally within `radius` of `centre`
+    (3,).
 
-    Parameters
-    ----------
-    log : TrackLog or SmoothedLog
-    truth : Truth
-    centre : (3,) array, m, world frame
-    radius : float, m
-        Maximum horizontal distance of the true position from `centre`.
-
-    Returns
-    -------
-    (k,) int array
-        Only the closest pose if no true position is within the radius. Empty if no pose has a true
-        position.
+    If there are none, the index of the closest pose; empty if no pose has a true position.
     """
     true = interpolate_truth(truth, log.stamp_ns)[:, :2]
     has_truth = np.isfinite(true).all(axis=1)
@@ -185,21 +143,10 @@ MAGNET_SKIP = 3
 
 def magnet_errors(log: TrackLog | SmoothedLog, truth: Truth, axis: ArrayLike = (0.0, 0.0, 1.0),
                   skip: int = MAGNET_SKIP) -> MagnetErrors | None:
-    """Return the errors of a magnet's track, relative to the truth nearest in time.
+    """Errors of a magnet's track, relative to the truth nearest in time.
 
-    Parameters
-    ----------
-    log : TrackLog or SmoothedLog
-    truth : Truth
-    axis : (3,) array
-        Direction of the moment in the frame of the magnet.
-    skip : int
-        Number of poses at the start of the track that are not evaluated.
-
-    Returns
-    -------
-    MagnetErrors or None
-        None if the track has at most `skip` poses.
+    `axis` (3,) is the direction of the moment in the frame of the magnet. The first `skip` poses
+    are not evaluated; None if there are no others.
     """
     stamps = np.array(log.stamp_ns, dtype=np.int64)[skip:]
     if not len(stamps):

@@ -10,17 +10,9 @@ Packed = dict[str, str]
 
 
 def packed(values: ArrayLike, kind: str = 'f8') -> Packed:
-    """Encode an array as a JSON object.
+    """Encode an array (n,) as JSON object; `kind` is 'f8', 'f4' or 'u1'.
 
-    Parameters
-    ----------
-    values : (n,) array
-    kind : 'f8', 'f4' or 'u1'
-        'f4' is sufficient for values that are only plotted.
-
-    Returns
-    -------
-    Packed
+    'f4' is sufficient for values that are only plotted.
     """
     raw = np.ascontiguousarray(values, dtype=f'<{kind}').tobytes()
     return {kind: base64.b64encode(raw).decode('ascii')}

@@ -31,10 +31,7 @@ class Note:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Table of a page.
-
-    Numbers are shown with four significant digits, None as a dash.
-    """
+    """Table of a page; numbers are shown with four significant digits, None as a dash."""
 
     title: str
     columns: Sequence[str]
@@ -65,26 +62,12 @@ class Page:
 
 
 def report_html(page: Page) -> str:
-    """Return a report as HTML that loads no external resources.
-
-    Parameters
-    ----------
-    page : Page
-
-    Returns
-    -------
-    str
-    """
+    """Report as HTML that loads no external resources."""
     return _html(page.title, asdict(page))
 
 
 def live_html() -> str:
-    """Return the HTML of the live page, which receives its data from the WebSocket `stream`.
-
-    Returns
-    -------
-    str
-    """
+    """HTML of the live page, which receives its data from the WebSocket `stream`."""
     return _html('mag_tracking', {'title': 'mag_tracking', 'live': True})
 
 

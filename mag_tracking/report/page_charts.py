@@ -14,30 +14,12 @@ DASHES = ('solid', 'dash', 'dot', 'dashdot', 'longdash')
 
 
 def escape_markup(text: str) -> str:
-    """Escape the markup characters of Plotly.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
-    """
+    """Escape the markup characters of Plotly."""
     return text.replace('&', '&amp;').replace('<', '&lt;').replace('>', '&gt;')
 
 
 def numbers(values: ArrayLike) -> list[Any]:
-    """Convert an array to nested lists of numbers with ten digits; non-finite values become None.
-
-    Parameters
-    ----------
-    values : (...) array
-
-    Returns
-    -------
-    list
-    """
+    """Nested lists of an array's numbers with ten digits; non-finite values become None."""
     array = np.asarray(values, dtype=float)
     if array.ndim > 1:
         return [numbers(row) for row in array]
@@ -45,21 +27,9 @@ def numbers(values: ArrayLike) -> list[Any]:
 
 
 def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') -> dict[str, Any]:
-    """Create the Plotly trace of a curve.
+    """Plotly trace of a curve; `k` is the index of its colour and dash style.
 
-    Parameters
-    ----------
-    x, y : (n,) array
-    name : str
-        Legend entry. An empty string omits the entry.
-    k : int
-        Index of the colour and the dash style.
-    mode : str
-        Plotly mode, for example 'lines+markers'.
-
-    Returns
-    -------
-    dict
+    An empty `name` omits the legend entry.
     """
     colour = SERIES_COLOURS[k % len(SERIES_COLOURS)]
     return {'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y),
@@ -70,23 +40,10 @@ def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') ->
 
 def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str,
              low: float | None = None, high: float | None = None) -> dict[str, Any]:
-    """Create the Plotly trace of a heat map.
+    """Plotly trace of a heat map `z` (n_y, n_x), with `title` beside the colour bar.
 
-    Parameters
-    ----------
-    x : (n_x,) array
-    y : (n_y,) array
-    z : (n_y, n_x) array
-    scale : str
-        Name of a Plotly colour scale, preferably a perceptually uniform one.
-    title : str
-        Title of the colour bar.
-    low, high : float, optional
-        Limits of the colour scale; by default the minimum and maximum of `z`.
-
-    Returns
-    -------
-    dict
+    `scale` is a Plotly colour scale, preferably a perceptually uniform one; `low` and `high` are
+    its limits, by default those of `z`.
     """
     return {'type': 'heatmap', 'x': numbers(x), 'y': numbers(y), 'z': numbers(z),
             'colorscale': scale, 'zmin': low, 'zmax': high, 'hoverongaps': False,
@@ -95,18 +52,7 @@ def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str
 
 
 def sensor_trace(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
-    """Create the Plotly trace of the sensors on a map.
-
-    Parameters
-    ----------
-    points : (n, 2) or (n, 3) array
-        Sensor positions in the unit of the map.
-    names : sequence of str
-
-    Returns
-    -------
-    dict
-    """
+    """Plotly trace of the sensors on a map; `points` are in the unit of the map."""
     return {'type': 'scatter', 'mode': 'markers', 'x': numbers(points[:, 0]),
             'y': numbers(points[:, 1]), 'text': [escape_markup(name) for name in names],
             'hoverinfo': 'text', 'name': 'magnetometers', 'showlegend': False,
@@ -115,21 +61,7 @@ def sensor_trace(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
 
 
 def axes(x: str, y: str, is_map: bool = False, log_y: bool = False) -> dict[str, Any]:
-    """Create a Plotly layout with axis titles.
-
-    Parameters
-    ----------
-    x, y : str
-        Axis titles.
-    is_map : bool
-        Whether both axes have the same scale.
-    log_y : bool
-        Whether the y axis is logarithmic.
-
-    Returns
-    -------
-    dict
-    """
+    """Plotly layout with axis titles; both axes of a map have the same scale."""
     grid = {'gridcolor': '#e3e3e3', 'zeroline': False, 'exponentformat': 'none',
             'automargin': True}
     return {'xaxis': {'title': {'text': x}, **grid, **({'constrain': 'domain'} if is_map else {})},

@@ -50,20 +50,9 @@ class Sensors(Protocol):
 
 def scene_of(network: Sensors, begin_ns: int, end_ns: int, tracks: Sequence[Mapping[str, Any]],
              road: Road = NO_ROAD) -> dict[str, Any]:
-    """Return the content of the map with a time slider as JSON-compatible values.
+    """JSON object of the map with a time slider, of tracks from `track_entry`.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-    begin_ns, end_ns : int, ns
-        Time range; the page shows seconds since `begin_ns`.
-    tracks : sequence of dict
-        Tracks, as returned by `track_entry`.
-    road : Road, optional
-
-    Returns
-    -------
-    dict
+    The page shows seconds since `begin_ns`.
     """
     xy = network.positions[:, :2]
     low, high = xy.min(axis=0), xy.max(axis=0)
@@ -89,20 +78,9 @@ def _box(low: FloatArray, high: FloatArray) -> list[float]:
 
 def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
                       max_sensors: int = MAX_SENSORS) -> IntArray:
-    """Return the sensors with the strongest fields during a track.
+    """Indices (k,), ascending, of the sensors with the strongest fields at the poses `rows`.
 
-    Parameters
-    ----------
-    log : TrackLog
-    rows : iterable of int, optional
-        Indices of the poses that are evaluated; all by default.
-    max_sensors : int
-        Maximum number of sensors.
-
-    Returns
-    -------
-    (k,) int array
-        Indices of the sensors, ascending.
+    All poses are evaluated by default.
     """
     chosen = log.measured if rows is None else [log.measured[k] for k in rows]
     measured = np.abs(np.array(chosen).reshape(-1, len(log.measured[0]), 3))
@@ -111,19 +89,8 @@ def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
 
 
 def max_poses_of(logs: Sequence[TrackLog], max_bytes: int = MAX_BYTES) -> int:
-    """Return the maximum number of poses per track that keeps a report below a size limit.
-
-    Parameters
-    ----------
-    logs : sequence of TrackLog
-    max_bytes : int
-        Approximate size limit of the track data [bytes].
-
-    Returns
-    -------
-    int
-        At least `MIN_POSES`.
-    """
+    """Maximum number of poses per track that keeps a report below `max_bytes`; at least
+    `MIN_POSES`."""
     lengths = np.array([len(log.stamp_ns) for log in logs])
     sizes = np.array([_pose_size(log) for log in logs])
     low, high = MIN_POSES, max(int(lengths.max()), MIN_POSES)
@@ -145,20 +112,7 @@ def _pose_size(log: TrackLog) -> int:
 
 
 def thin_poses(log: TrackLog, max_poses: int) -> list[int]:
-    """Return the indices of evenly spaced poses of a track.
-
-    The first, the last and the most certain pose are included.
-
-    Parameters
-    ----------
-    log : TrackLog
-    max_poses : int
-        Maximum number of poses.
-
-    Returns
-    -------
-    list of int
-    """
+    """Indices of evenly spaced poses, with the first, the last and the most certain pose."""
     n = len(log.stamp_ns)
     if n <= max_poses:
         return list(range(n))
@@ -168,21 +122,9 @@ def thin_poses(log: TrackLog, max_poses: int) -> list[int]:
 
 def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
                 rows: Sequence[int] | None = None) -> dict[str, Any]:
-    """Return a track as JSON-compatible values.
+    """JSON object of a track, with the poses `rows` (all by default) and the fields of `sensors`.
 
-    Parameters
-    ----------
-    log : TrackLog
-    begin_ns : int, ns
-        Start of the scene.
-    sensors : (k,) int array
-        Sensors whose fields are included.
-    rows : sequence of int, optional
-        Indices of the poses; all by default.
-
-    Returns
-    -------
-    dict
+    `begin_ns` is the start of the scene.
     """
     rows = range(len(log.stamp_ns)) if rows is None else rows
     times = (np.array([log.stamp_ns[k] for k in rows], dtype=np.int64) - begin_ns) / NS
@@ -204,25 +146,10 @@ def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
 def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance: FloatArray,
                  ambiguous: bool, length: float,
                  fields: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a fitted pass as a track with constant velocity, in JSON-compatible values.
+    """JSON object of a fitted pass, as a track with constant velocity.
 
-    Parameters
-    ----------
-    track_id : int
-    times : (n,) array, s
-        Time since the start of the scene.
-    state : (n, 6) array, m and m/s, world frame
-    covariance : (n, 6, 6) array
-    ambiguous : bool
-        Whether all poses are marked as ambiguous.
-    length : float, m
-        Length of the row of dipoles.
-    fields : sequence of dict
-        Fields, as returned by `field_entry`.
-
-    Returns
-    -------
-    dict
+    `times` (n,) [s] are since the start of the scene; `state` (n, 6) [m and m/s] is in the world
+    frame; `length` [m] is that of the row of dipoles; `fields` are from `field_entry`.
     """
     n = len(times)
     columns = _columns(times, state[:, :3], state[:, 3:], covariance, np.full(n, ambiguous))
@@ -235,19 +162,9 @@ def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance
 
 def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
                 times: FloatArray | None = None) -> dict[str, Any]:
-    """Return the measured and the predicted field of a sensor as JSON-compatible values.
+    """JSON object of the measured and the predicted field (n, 3) [T] of a sensor.
 
-    Parameters
-    ----------
-    sensor : int
-        Index of the sensor.
-    measured, predicted : (n, 3) array, T, sensor frame
-    times : (n,) array, s, optional
-        Time since the start of the scene. None if the fields belong to the times of the poses.
-
-    Returns
-    -------
-    dict
+    `times` (n,) [s] are since the start of the scene; None for the times of the poses.
     """
     return {'sensor': sensor, 't': None if times is None else packed(times), **{
         name: [packed(column, 'f4') for column in values.T]
@@ -255,31 +172,15 @@ def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
 
 
 def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
-    """Return the smoothed or the true path of a track as JSON-compatible values.
-
-    Parameters
-    ----------
-    track_id : int
-    points : (n, 3) array, m, world frame
-
-    Returns
-    -------
-    dict
-    """
+    """JSON object of the smoothed or the true path (n, 3) [m] of a track."""
     return {'id': track_id, **{name: packed(points[:, a]) for a, name in enumerate('xyz')}}
 
 
 def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a track's row in the table of tracks as JSON-compatible values.
+    """JSON object of a track's row in the table of tracks.
 
-    Parameters
-    ----------
-    entry : dict
-        `TrackLog.summary()`, or the entry of a track in `summary.json`, which may contain `truth`.
-
-    Returns
-    -------
-    dict
+    `entry` is `TrackLog.summary()`, or the entry of a track in `summary.json`, which may contain
+    `truth`.
     """
     truth = entry.get('truth', {})
     error = next((truth[key] for key in ('closest', 'position_mean')
@@ -334,8 +235,11 @@ def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Pa
 
 
 def _arrivals(log: TrackLog, rows: Sequence[int]) -> dict[str, dict[str, Packed]]:
-    """Weight and best hypothesis of each arrival direction. At a pose for which no hypothesis has
-    this direction, the weight is 0 and the other values are NaN."""
+    """Weight and best hypothesis of each arrival direction.
+
+    At a pose for which no hypothesis has this direction, the weight is 0 and the other values are
+    NaN.
+    """
     log_rows = [log.arrivals[k] for k in rows]
     out = {}
     for name in sorted({name for row in log_rows for name in row}):

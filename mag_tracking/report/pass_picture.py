@@ -45,21 +45,8 @@ def pass_figure(log: TrackLog, network: _Network, smoothed: ArrayLike | None = N
     """Draw the pass of a vehicle as a picture with a scale bar.
 
     The vehicle is drawn to scale at five published poses. Earlier 90 % regions are fainter.
-    Ambiguous poses are omitted.
-
-    Parameters
-    ----------
-    log : TrackLog
-        Track of a vehicle.
-    network : SensorNetwork
-    smoothed : (n, 3) array, m, world frame, optional
-        Smoothed positions.
-    max_std : float, m, optional
-        Poses with a larger standard deviation of the horizontal position are omitted.
-
-    Returns
-    -------
-    Figure
+    Ambiguous poses are omitted, as are those with a std of the horizontal position above `max_std`
+    [m]. `smoothed` are positions (n, 3) [m].
     """
     drawn = _drawn_poses(log, max_std)
     positions = np.array(log.position)[:, :2]

@@ -114,18 +114,7 @@ def _levels(values: FloatArray, factor: float) -> FloatArray:
 
 
 def position_figure(plan: _Plan) -> Figure:
-    """Plot a map of the Cramér-Rao bound on the position, for a whole pass through each point.
-
-    The bound is a standard deviation.
-
-    Parameters
-    ----------
-    plan : Plan
-
-    Returns
-    -------
-    Figure
-    """
+    """Map of the Cramér-Rao bound on the position (std), for a whole pass through each point."""
     figure, axes, f, unit = _draw_map(
         plan, 'Position bound from a whole pass through each point (standard deviation)')
     z = f * np.clip(plan.position_std, None, np.ptp(plan.x))
@@ -139,16 +128,7 @@ def position_figure(plan: _Plan) -> Figure:
 
 
 def detection_figure(plan: _Plan) -> Figure:
-    """Plot a map of the probability that one frame detects the target.
-
-    Parameters
-    ----------
-    plan : Plan
-
-    Returns
-    -------
-    Figure
-    """
+    """Map of the probability that one frame detects the target."""
     figure, axes, f, _ = _draw_map(plan, 'Probability that one frame detects the target')
     mesh = axes.pcolormesh(f * plan.x, f * plan.y, plan.detection, vmin=0.0, vmax=1.0,
                            cmap='magma', shading='nearest', rasterized=True)
@@ -162,17 +142,9 @@ def detection_figure(plan: _Plan) -> Figure:
 
 
 def sensor_figure(plan: _Plan) -> Figure:
-    """Plot how much an additional sensor at each point reduces the median position bound [%].
+    """Map of the reduction [%] of the median position bound by an additional sensor at each point.
 
     The map is white where no sensor is allowed.
-
-    Parameters
-    ----------
-    plan : Plan
-
-    Returns
-    -------
-    Figure
     """
     gain = 1.0 - plan.std_with_added_sensor / plan.std_without_added_sensor
     possible = np.isfinite(gain).any()
@@ -195,30 +167,14 @@ def sensor_figure(plan: _Plan) -> Figure:
 
 
 def length_text(metres: float) -> str:
-    """Return a length in a readable unit.
-
-    Parameters
-    ----------
-    metres : float, m
-
-    Returns
-    -------
-    str
-    """
+    """Length in a readable unit."""
     return f'{metres:.3g} m' if metres >= 0.01 else f'{1e3 * metres:.2g} mm'
 
 
 def distinct_lanes(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
     """Group lanes with identical curves, which would overlap in a plot.
 
-    Parameters
-    ----------
-    lanes : sequence of Lane
-
-    Returns
-    -------
-    list of (str, Lane)
-        Combined names of each group, and the first lane of the group.
+    Return the combined names of each group, and its first lane.
     """
     out: list[tuple[list[str], _Lane]] = []
     for lane in lanes:
@@ -234,16 +190,7 @@ def distinct_lanes(lanes: Sequence[_Lane]) -> list[tuple[str, _Lane]]:
 
 
 def lane_figure(plan: _Plan) -> Figure:
-    """Plot bounds and detection probability along the lanes, and P(missed pass) by distance.
-
-    Parameters
-    ----------
-    plan : Plan
-
-    Returns
-    -------
-    Figure
-    """
+    """Plot bounds and detection probability along the lanes, and P(missed pass) by distance."""
     figure = Figure(figsize=(10.0, 9.0), layout='constrained')
     top, middle, bottom = figure.subplots(3, 1)
     f, unit = scale_of(np.ptp(plan.x))

@@ -28,13 +28,7 @@ SCALE_3D = float(np.sqrt(chdtri(3, 0.1)))
 
 
 def check_rerun() -> None:
-    """Check that rerun-sdk is installed.
-
-    Raises
-    ------
-    MissingDependencyError
-        If rerun-sdk is not installed.
-    """
+    """Raise MissingDependencyError if rerun-sdk is not installed."""
     if find_spec('rerun') is None:
         raise MissingDependencyError(
             'Rerun recordings require the package rerun-sdk; install it with: '
@@ -45,21 +39,8 @@ def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, 
                 smoothed: Mapping[int, SmoothedLog]) -> None:
     """Write sensors and tracks (poses, 90 % regions, speeds, fields) to a Rerun recording.
 
-    Parameters
-    ----------
-    path : path_like
-    network : SensorNetwork
-    logs : dict of int to TrackLog
-        Tracks by identifier.
-    smoothed : dict of int to SmoothedLog
-        Smoothed tracks by identifier.
-
-    Raises
-    ------
-    MissingDependencyError
-        If rerun-sdk is not installed.
-    OutputError
-        If the file cannot be written.
+    `logs` and `smoothed` are by track id. Raises MissingDependencyError without rerun-sdk, and
+    OutputError if the file cannot be written.
     """
     check_rerun()
     import rerun

@@ -37,48 +37,20 @@ _DETECTION_FIELDS: _Fields = {
 
 
 def pose_array(tracks: Sequence[Track]) -> StructArray:
-    """Convert the poses of tracks to a structured array.
+    """Structured array (n,) of the poses of tracks: fields of `Track`, `id` as `track_id`.
 
-    Parameters
-    ----------
-    tracks : sequence of Track
-        The closing record of a track (`ended`) is skipped, because it repeats the last pose.
-
-    Returns
-    -------
-    (n,) structured array
-        Fields of `Track` in SI units; `id` is named `track_id`.
+    The closing record of a track (`ended`) is skipped, because it repeats the last pose.
     """
     return _array([t for t in tracks if not t.ended], _POSE_FIELDS)
 
 
 def smoothed_array(poses: Sequence[SmoothedPose]) -> StructArray:
-    """Convert smoothed poses to a structured array.
-
-    Parameters
-    ----------
-    poses : sequence of SmoothedPose
-
-    Returns
-    -------
-    (n,) structured array
-        Fields of `SmoothedPose` in SI units; `id` is named `track_id`.
-    """
+    """Structured array (n,) of smoothed poses: fields of `SmoothedPose`, `id` as `track_id`."""
     return _array(poses, _SMOOTHED_FIELDS)
 
 
 def detection_array(detections: Sequence[Detection]) -> StructArray:
-    """Convert onsets and releases of the detector to a structured array.
-
-    Parameters
-    ----------
-    detections : sequence of Detection
-
-    Returns
-    -------
-    (n,) structured array
-        Fields of `Detection`.
-    """
+    """Structured array (n,) of onsets and releases of the detector: fields of `Detection`."""
     return _array(detections, _DETECTION_FIELDS)
 
 

@@ -25,7 +25,7 @@ BEYOND_M = 100.0
 
 @dataclass(frozen=True)
 class Road:
-    """Outline of a road with side roads. Empty if no vehicle has passed."""
+    """Outline of a road with side roads; empty if no vehicle has passed."""
 
     areas: Sequence[FloatArray] = ()
     """Polygons, each (n, 2) m, world frame."""
@@ -34,20 +34,11 @@ class Road:
 
 
 def road_of(sensors: FloatArray, paths: Sequence[FloatArray]) -> Road:
-    """Infer the road on which vehicles have passed a network.
+    """Infer the road on which vehicles have passed a network, from positions in the world frame
+    [m].
 
     The carriageway is straight and as wide as the paths along it. If sensors stand on both sides,
     it fills the space between them. A path that leaves it is surrounded by a side road.
-
-    Parameters
-    ----------
-    sensors : (n, 2) array, m, world frame
-    paths : sequence of (k, 2) array, m, world frame
-        Chronological positions, one array per vehicle.
-
-    Returns
-    -------
-    Road
     """
     paths = [path for path in map(_thinned, paths) if len(path) > 2]
     if not paths:

@@ -8,14 +8,7 @@ MINOR_LABEL_DECADES = 1.5
 
 
 def legend_beside(axes: Axes, **kwargs: float) -> None:
-    """Draw a legend to the right of the axes, outside the plot area.
-
-    Parameters
-    ----------
-    axes : Axes
-    **kwargs : float
-        Additional arguments of `Axes.legend`.
-    """
+    """Draw a legend to the right of the axes, with additional arguments of `Axes.legend`."""
     axes.legend(fontsize=8, loc='upper left', bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0,
                 **kwargs)
 
@@ -24,10 +17,6 @@ def plain_log_ticks(axes: Axes) -> None:
     """Label a logarithmic y axis with plain numbers such as 0.02 and 3 instead of powers of ten.
 
     An axis that spans more than six decades is left unchanged.
-
-    Parameters
-    ----------
-    axes : Axes
     """
     low, high = axes.get_ylim()
     plain = FuncFormatter(lambda value, _: f'{value:g}')

@@ -16,7 +16,7 @@ Arrival: TypeAlias = tuple[float, FloatArray, FloatArray]
 
 @dataclass
 class SmoothedLog:
-    """History of one smoothed track. Each list has one element per pose, as in `SmoothedPose`."""
+    """History of one smoothed track; lists have one element per pose, as in `SmoothedPose`."""
 
     id: int
     stamp_ns: list[int] = field(default_factory=list)
@@ -27,24 +27,13 @@ class SmoothedLog:
     orientation: list[FloatArray] = field(default_factory=list)
 
     def add(self, pose: SmoothedPose) -> None:
-        """Add a smoothed pose.
-
-        Parameters
-        ----------
-        pose : SmoothedPose
-        """
+        """Add a smoothed pose."""
         for name in ('stamp_ns', 'position', 'velocity', 'covariance', 'moment', 'orientation'):
             getattr(self, name).append(getattr(pose, name))
 
     def summary(self) -> dict[str, float]:
-        """Summarise the track at the pose with the most certain position.
-
-        Returns
-        -------
-        dict of str to float
-            Horizontal speed [m/s], magnitude of the moment [A m²] and standard deviation of the
-            horizontal position [m].
-        """
+        """Horizontal speed, moment and std of the horizontal position, at the most certain
+        position."""
         best = int(np.argmin([np.trace(C[:2, :2]) for C in self.covariance]))
         return {'speed': float(np.hypot(*self.velocity[best][:2])),
                 'moment_size': float(np.linalg.norm(self.moment[best])),
@@ -53,7 +42,7 @@ class SmoothedLog:
 
 @dataclass
 class TrackLog:
-    """History of one track. Each list has one value per pose, of the `Track` or of its frame."""
+    """History of one track; lists have one value per pose, of the `Track` or of its frame."""
 
     id: int
     stamp_ns: list[int] = field(default_factory=list)
@@ -82,13 +71,7 @@ class TrackLog:
     ended: bool = False
 
     def add(self, track: Track, frame: FieldFrame) -> None:
-        """Add a pose and the frame that produced it, or mark the track as ended.
-
-        Parameters
-        ----------
-        track : Track
-        frame : FieldFrame
-        """
+        """Add a pose and the frame that produced it, or mark the track as ended."""
         if track.ended:
             self.ended = True
             return
@@ -103,24 +86,13 @@ class TrackLog:
                               for h in best_of_arrivals(track.hypotheses)})
 
     def forget(self, n: int) -> None:
-        """Remove the oldest poses.
-
-        Parameters
-        ----------
-        n : int
-            Number of poses to remove.
-        """
+        """Remove the `n` oldest poses."""
         for values in vars(self).values():
             if isinstance(values, list):
                 del values[:n]
 
     def seconds(self) -> FloatArray:
-        """Time of each pose since the first pose.
-
-        Returns
-        -------
-        (n,) array, s
-        """
+        """Time (n,) [s] of each pose since the first pose."""
         stamps = np.array(self.stamp_ns, dtype=np.int64)
         seconds: FloatArray = (stamps - stamps[0]) / 1e9
         return seconds
@@ -131,46 +103,24 @@ class TrackLog:
         The criterion is the variance of the horizontal position for a magnet, and of the horizontal
         velocity for a vehicle. The position of a vehicle may become more certain only later, after
         its whole length has passed.
-
-        Returns
-        -------
-        int
         """
         first = 3 if self.kind[-1] else 0
         return int(np.argmin([np.trace(C[first:first + 2, first:first + 2])
                               for C in self.covariance]))
 
     def mounting_of(self, names: Sequence[str]) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Estimated mounting errors of the sensors at the most certain pose.
+        """Mounting errors (3,) [deg] and their stds by sensor, at the most certain pose.
 
-        Parameters
-        ----------
-        names : sequence of str
-            Sensor names.
-
-        Returns
-        -------
-        dict of str to ((3,) array, deg, and (3,) array, deg)
-            Angles and standard deviations by sensor. Empty if mounting errors are not estimated.
+        Empty if mounting errors are not estimated.
         """
         k = self.most_certain()
         return {name: (np.degrees(a), np.degrees(sd)) for name, a, sd in
                 zip(names, self.mounting[k], self.mounting_std[k], strict=False)}
 
     def nis_of(self, names: Sequence[str]) -> dict[str, float | None]:
-        """Mean normalised innovation squared per axis of each sensor.
+        """Mean normalised innovation squared per axis of each sensor; None without readings.
 
         The value is about 1 or less if a sensor agrees with the model and with the other sensors.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Sensor names.
-
-        Returns
-        -------
-        dict of str to float or None
-            None for a sensor without readings.
         """
         axes = (~np.isnan(np.array(self.measured))).sum(axis=(0, 2))
         total = np.nansum(np.array(self.nis_by_sensor), axis=0)
@@ -182,10 +132,6 @@ class TrackLog:
 
         Speed and moment are taken from the `most_certain` pose, arrival and kind from the last
         pose. The verdict is `unique` if neither pose is ambiguous.
-
-        Returns
-        -------
-        dict
         """
         best = self.most_certain()
         final = self.arrivals[-1]

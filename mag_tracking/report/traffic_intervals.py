@@ -15,14 +15,7 @@ MAX_GAP_S = 5.0
 class TrafficIntervals:
     """Counts passages in time intervals of equal length and summarises each interval.
 
-    Parameters
-    ----------
-    line_names : sequence of str
-        Names of the counting lines.
-    interval_s : float, s
-        Length of an interval.
-    counts : Counter
-        Counts by description. Passages that are counted in a later interval are added.
+    Passages that are counted in a later interval are added to `counts`.
     """
 
     def __init__(self, line_names: Sequence[str], interval_s: float,
@@ -37,12 +30,7 @@ class TrafficIntervals:
         self._last_ns: int | None = None
 
     def add(self, passage: VehiclePassage) -> None:
-        """Add a passage to its interval, or to the earliest open interval if its own is closed.
-
-        Parameters
-        ----------
-        passage : VehiclePassage
-        """
+        """Add a passage to its interval, or to the earliest open interval if its own is closed."""
         begin = self._begin_of(passage.stamp_ns)
         if self._closed_ns is not None and begin < self._closed_ns:
             self._counts['passages counted in a later interval'] += 1
@@ -53,28 +41,15 @@ class TrafficIntervals:
     def close_until(self, before_ns: int, now_ns: int) -> list[TrafficSummary]:
         """Close the intervals that end by `before_ns`, and return their summaries.
 
-        Parameters
-        ----------
-        before_ns : int, ns
-            Time before which all passages have been added.
-        now_ns : int, ns
-            Time of the latest frame.
-
-        Returns
-        -------
-        list of TrafficSummary
+        All passages before `before_ns` must have been added; `now_ns` is the time of the latest
+        frame.
         """
         self._observe(now_ns)
         return self._close([begin for begin in self._observed
                             if begin + self._length <= before_ns])
 
     def flush(self) -> list[TrafficSummary]:
-        """Close all open intervals, and return their summaries.
-
-        Returns
-        -------
-        list of TrafficSummary
-        """
+        """Close all open intervals, and return their summaries."""
         self._last_ns = None
         out = self._close(list(self._observed))
         self._closed_ns = None
@@ -111,16 +86,7 @@ class TrafficIntervals:
 
 
 def counts_of(passages: Sequence[VehiclePassage]) -> tuple[TrafficCount, ...]:
-    """Count passages by direction and class; counts of the forward direction come first.
-
-    Parameters
-    ----------
-    passages : sequence of VehiclePassage
-
-    Returns
-    -------
-    tuple of TrafficCount
-    """
+    """Count passages by direction and class; counts of the forward direction come first."""
     groups = sorted({(not p.forward, p.vehicle_class) for p in passages})
     out = []
     for backward, name in groups:

@@ -64,21 +64,9 @@ class Trajectory(Protocol):
 
 
 def body_poses(position: FloatArray, heading: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Poses of a body that stands on the ground.
+    """Rotations (n, 3, 3) from body to world frame, and origins (n, 3) [m] at z = 0, on the ground.
 
-    Parameters
-    ----------
-    position : (n, 2) array, m, world frame
-        Horizontal position.
-    heading : (n,) array, rad
-        Anticlockwise from x.
-
-    Returns
-    -------
-    R : (n, 3, 3) array
-        Rotation from the body frame to the world frame.
-    origin : (n, 3) array, m, world frame
-        Origin of the body frame, at z = 0.
+    `position` (n, 2) [m] is horizontal, `heading` (n,) [rad] anticlockwise from x.
     """
     R = np.zeros((len(heading), 3, 3))
     R[:, 0, 0], R[:, 0, 1] = np.cos(heading), -np.sin(heading)
@@ -101,24 +89,7 @@ class MagneticBody:
 
     def field(self, earth_field: FloatArray, position: FloatArray, heading: FloatArray,
               points: FloatArray) -> FloatArray:
-        """Field of the body at given points.
-
-        Parameters
-        ----------
-        earth_field : (3,) array, T, world frame
-            Flux density B0.
-        position : (n, 2) array, m, world frame
-            Horizontal position of the body at each time.
-        heading : (n,) array, rad
-            Heading at each time, anticlockwise from x.
-        points : (n_sensors, 3) array, m, world frame
-            Positions at which the field is evaluated.
-
-        Returns
-        -------
-        (n, n_sensors, 3) array, T, world frame
-            NaN at a point that coincides with a part.
-        """
+        """Field of the body, as `Body.field`; NaN at a point that coincides with a part."""
         R, origin = body_poses(position, heading)
         r = origin[:, None] + np.einsum('nij,pj->npi', R, self.parts)
         B_body = np.einsum('nji,j->ni', R, earth_field)
@@ -132,18 +103,8 @@ def point_body(hard_iron: Sequence[float] | FloatArray, soft_iron: float,
                height: float) -> MagneticBody:
     """Create a point target that matches the model of the tracker.
 
-    Parameters
-    ----------
-    hard_iron : (3,) array, A m², body frame
-        Hard iron moment m0.
-    soft_iron : float, m³
-        Soft iron D, equal on all axes.
-    height : float, m
-        Height above the ground.
-
-    Returns
-    -------
-    MagneticBody
+    `hard_iron` (3,) [A m²] is the moment m0 in the body frame, `soft_iron` [m³] the value D of all
+    axes, `height` [m] that above the ground.
     """
     return MagneticBody(np.array([[0.0, 0.0, height]]), np.array([hard_iron], dtype=float),
                         soft_iron * np.eye(3)[None])
@@ -151,25 +112,11 @@ def point_body(hard_iron: Sequence[float] | FloatArray, soft_iron: float,
 
 def random_vehicle(rng: np.random.Generator, length: float = 4.3, width: float = 1.7,
                    height: float = 1.3, n_parts: int = 60, moment: float = 400.0) -> MagneticBody:
-    """Create a vehicle of randomly magnetised parts in a box.
+    """Create a vehicle of randomly magnetised parts in a box of `length`, `width` and `height` [m].
 
-    Most parts are in the lower half of the box and near its ends.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    length : float, m
-    width : float, m
-    height : float, m
-    n_parts : int
-        Number of parts.
-    moment : float, A m²
-        Typical total moment. The permanent and the induced moment are each about `moment` / 1.4 if
-        the Earth's field is 50 microtesla.
-
-    Returns
-    -------
-    MagneticBody
+    Most parts are in the lower half of the box and near its ends. `moment` [A m²] is the typical
+    total moment: the permanent and the induced moment are each about `moment` / 1.4 if the Earth's
+    field is 50 microtesla.
     """
     along = np.where(rng.random(n_parts) < 0.6,
                      rng.choice([-0.35, 0.35], n_parts) + 0.1 * rng.standard_normal(n_parts),
@@ -207,20 +154,7 @@ class Path:
     """Radius of the arc, m."""
 
     def at(self, t: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Evaluate the trajectory.
-
-        Parameters
-        ----------
-        t : (n,) array, s
-            Times.
-
-        Returns
-        -------
-        position : (n, 2) array, m, world frame
-            Horizontal position.
-        heading : (n,) array, rad
-            Anticlockwise from x.
-        """
+        """Evaluate the trajectory, as `Trajectory.at`."""
         s = self.speed * np.asarray(t, dtype=float)
         arc = abs(self.turn) * self.radius
         before_arc = np.minimum(s, self.straight)
@@ -260,36 +194,10 @@ def simulate(network: SensorNetwork, body: Body, path: Trajectory, rate: float, 
              start_s: float = 0.0) -> tuple[Readings, FloatArray, FloatArray, FloatArray]:
     """Simulate the raw readings of all sensors for one body, with ground truth.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-        Sensor network; the Earth's field must be set.
-    body : Body
-    path : Trajectory
-    rate : float, Hz
-        Sampling rate of every sensor.
-    duration : float, s
-    rng : numpy.random.Generator
-    sensor_errors : SensorErrorModel, optional
-        By default, only white noise is simulated.
-    start_s : float, s
-        Timestamp of the first sample.
-
-    Returns
-    -------
-    readings : Readings
-        Raw readings in chronological order.
-    t : (n,) array, s
-        Time of each sample since the start.
-    position : (n, 2) array, m, world frame
-        True position at `t`.
-    heading : (n,) array, rad
-        True heading at `t`.
-
-    Raises
-    ------
-    ValueError
-        If the Earth's field of the network is not set.
+    The samples at `rate` [Hz] begin at the timestamp `start_s` [s]. By default, the only sensor
+    error is white noise. Return the readings in chronological order, the time (n,) [s] of each
+    sample since the start, and the true position (n, 2) [m] and heading (n,) [rad] at these times.
+    Raises ValueError if the network has no Earth's field.
     """
     errors, earth_field = sensor_errors or SensorErrorModel(), network.earth_field
     if earth_field is None:

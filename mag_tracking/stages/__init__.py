@@ -1,5 +1,1 @@
-"""Stages of the pipeline.
-
-Each stage processes one record or one batch of readings at a time, and returns the resulting
-records.
-"""
+"""Stages of the pipeline: each processes one record or batch of readings at a time."""

@@ -52,17 +52,6 @@ class Stage(Protocol[In, Out]):
 
 
 def rejected(counts: Mapping[str, int]) -> dict[str, int]:
-    """Select the rejections from the counts of a stage.
-
-    Parameters
-    ----------
-    counts : mapping of str to int
-        Number by cause; rejections have the prefix `rejected:`.
-
-    Returns
-    -------
-    dict of str to int
-        Number by cause, without the prefix `rejected:`.
-    """
+    """Select the rejections from the counts of a stage, without the prefix `rejected:`."""
     return {k.removeprefix('rejected: '): n for k, n in sorted(counts.items())
             if k.startswith('rejected: ')}

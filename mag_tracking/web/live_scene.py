@@ -31,17 +31,7 @@ looped bag causes such a jump."""
 class LiveScene:
     """Thread-safe state of a live page: collects records and creates messages for viewers.
 
-    Parameters
-    ----------
-    title : str
-    network : Sensors
-
-    Attributes
-    ----------
-    title : str
-        Title, sent with the next complete scene.
-    subtitle : str
-        Subtitle, sent with the next complete scene.
+    Title and subtitle are sent with the next complete scene.
     """
 
     def __init__(self, title: str, network: Sensors) -> None:
@@ -55,12 +45,7 @@ class LiveScene:
         self._clear()
 
     def use_network(self, network: Sensors) -> None:
-        """Start a new scene with another network.
-
-        Parameters
-        ----------
-        network : Sensors
-        """
+        """Start a new scene with another network."""
         with self._lock:
             self._network = network
             self._clear()
@@ -77,12 +62,7 @@ class LiveScene:
         self._is_scene_new = True
 
     def add_frame(self, frame: FieldFrame) -> None:
-        """Add a frame; it must be added before the tracks with the same timestamp.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-        """
+        """Add a frame; it must be added before the tracks with the same timestamp."""
         with self._lock:
             # Only frames are checked: the record of a track may be late or repeat its last pose.
             if self._frame_ns - frame.stamp_ns > JUMP_BACK_S * NS:
@@ -95,12 +75,7 @@ class LiveScene:
                 self._frames.popitem(last=False)
 
     def add_track(self, track: Track) -> None:
-        """Add a pose or the closing record of a track.
-
-        Parameters
-        ----------
-        track : Track
-        """
+        """Add a pose or the closing record of a track."""
         with self._lock:
             live = self._latest_by_id.get(track.id)
             if live is None or not live.continues(track):
@@ -120,14 +95,7 @@ class LiveScene:
                           np.zeros(n, dtype=int), np.zeros(n))
 
     def add_smoothed(self, track_id: int, points: FloatArray) -> None:
-        """Add the smoothed path of an ended track.
-
-        Parameters
-        ----------
-        track_id : int
-        points : (n, 3) array, m
-            Smoothed positions.
-        """
+        """Add the smoothed positions (n, 3) [m] of an ended track."""
         with self._lock:
             live = self._latest_by_id.get(track_id)
             if live is not None:
@@ -135,26 +103,14 @@ class LiveScene:
                 live.is_smoothed_new = True
 
     def set_health(self, notes: Iterable[Note], tables: Iterable[Table]) -> None:
-        """Replace the notes and tables of the page.
-
-        Parameters
-        ----------
-        notes : iterable of Note
-        tables : iterable of Table
-        """
+        """Replace the notes and tables of the page."""
         notes, tables = list(notes), list(tables)
         with self._lock:
             if (notes, tables) != (self._notes, self._tables):
                 self._notes, self._tables, self._is_health_new = notes, tables, True
 
     def snapshot(self) -> list[str]:
-        """Messages that give a new viewer the state that all other viewers have received.
-
-        Returns
-        -------
-        list of str
-            JSON messages.
-        """
+        """JSON messages that give a new viewer the state that all other viewers have received."""
         with self._lock:
             begin_ns = self._begin_ns or 0
             tracks = [live.sent_entry(begin_ns) for live in self._tracks.values()]
@@ -163,13 +119,7 @@ class LiveScene:
                     self._rows_message([], [], frames), self._health_message()]
 
     def updates(self) -> list[str]:
-        """Return messages with all changes since the last call.
-
-        Returns
-        -------
-        list of str
-            JSON messages.
-        """
+        """JSON messages with all changes since the last call."""
         with self._lock:
             if self._is_scene_new:
                 self._is_scene_new = False

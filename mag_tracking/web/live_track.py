@@ -20,21 +20,7 @@ Only the fields of these sensors are sent."""
 class LiveTrack:
     """Track of a live page, which stores the poses and counts the poses that have been sent.
 
-    Parameters
-    ----------
-    key : int
-        Key that is unique on the page. Track ids are not unique, because a restarted tracker
-        begins at 1.
-    track_id : int
-
-    Attributes
-    ----------
-    key : int
-    log : TrackLog
-    smoothed : dict or None
-        Smoothed path as a JSON object.
-    is_smoothed_new : bool
-        Whether the smoothed path has not been sent yet.
+    `key` is unique on the page; track ids are not, because a restarted tracker begins at 1.
     """
 
     def __init__(self, key: int, track_id: int) -> None:
@@ -54,69 +40,32 @@ class LiveTrack:
         return self._n_sent < len(self.log.stamp_ns) or self.log.ended and not self._is_end_sent
 
     def continues(self, track: Track) -> bool:
-        """Whether a record with the same track id belongs to this track.
-
-        Parameters
-        ----------
-        track : Track
-
-        Returns
-        -------
-        bool
-        """
+        """Whether a record with the same track id belongs to this track."""
         return not self.log.ended and abs(track.stamp_ns - self.end_ns) <= MAX_GAP_S * NS
 
     def add(self, track: Track, frame: FieldFrame) -> None:
-        """Add a pose, and remove the oldest poses of a very long track.
-
-        Parameters
-        ----------
-        track : Track
-        frame : FieldFrame
-            Frame with the same timestamp.
-        """
+        """Add a pose and its frame, and remove the oldest poses of a very long track."""
         self.log.add(track, frame)
         if len(self.log.stamp_ns) > MAX_TRACK_POSES:
             self.log.forget(N_REMOVED)
             self._n_sent = max(0, self._n_sent - N_REMOVED)
 
     def unsent_entry(self, begin_ns: int) -> dict[str, Any]:
-        """Return an entry with all unsent poses, and mark these poses as sent.
+        """JSON object with all unsent poses, which are then marked as sent.
 
-        Parameters
-        ----------
-        begin_ns : int, ns
-            Start of the scene.
-
-        Returns
-        -------
-        dict
-            JSON object.
+        `begin_ns` is the start of the scene.
         """
         first, self._n_sent = self._n_sent, len(self.log.stamp_ns)
         self._is_end_sent = self.log.ended
         return self._entry(begin_ns, range(first, self._n_sent))
 
     def sent_entry(self, begin_ns: int) -> dict[str, Any] | None:
-        """Entry with all poses that have already been sent.
-
-        Parameters
-        ----------
-        begin_ns : int, ns
-            Start of the scene.
-
-        Returns
-        -------
-        dict or None
-            JSON object; None if nothing has been sent.
-        """
+        """JSON object with all poses that have already been sent; None if there are none."""
         return self._entry(begin_ns, range(self._n_sent)) if self._n_sent else None
 
     def _entry(self, begin_ns: int, rows: range) -> dict[str, Any]:
-        """JSON object with the poses of `rows`, and the fields at some of the sensors.
-
-        The sensors are those with the strongest fields at the latest poses.
-        """
+        """JSON object with the poses of `rows`, and the fields at the sensors with the strongest
+        fields at the latest poses."""
         recent = range(max(0, rows.stop - max(N_RECENT, len(rows))), rows.stop)
         entry = track_entry(self.log, begin_ns, strongest_sensors(self.log, recent), rows)
         entry['key'], entry['smoothed'] = self.key, self.smoothed

@@ -61,9 +61,10 @@ class Source(Protocol):
 class PageServer:
     """Server of the live page, for up to `MAX_VIEWERS` browsers.
 
+    Raises DeviceError if the port cannot be opened.
+
     Parameters
     ----------
-    source : Source
     host : str, optional
         Local address to listen on. Unless it is a loopback address, browsers need the token in
         `url`.
@@ -72,16 +73,8 @@ class PageServer:
 
     Attributes
     ----------
-    url : str
-        Address of the page, including the token if there is one.
-    port : int
-    n_lagged : int
-        Number of times that messages to a lagging viewer were suspended.
-
-    Raises
-    ------
-    DeviceError
-        If the port cannot be opened.
+    url : address of the page, including the token if there is one
+    n_lagged : number of times that messages to a lagging viewer were suspended
     """
 
     def __init__(self, source: Source, host: str = LOOPBACK, port: int = DEFAULT_PORT) -> None:
@@ -277,33 +270,12 @@ def _reachable_name(host: str) -> str:
 
 
 def check_port(host: str, port: int) -> None:
-    """Check that the page can be served on a port.
-
-    Parameters
-    ----------
-    host : str
-        Local address to listen on.
-    port : int
-
-    Raises
-    ------
-    DeviceError
-        If the port cannot be opened.
-    """
+    """Check that the page can be served on a port; raises DeviceError if it cannot be opened."""
     _open_socket(host, port).close()
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name or address is a loopback address.
-
-    Parameters
-    ----------
-    host : str
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a host name or address is a loopback address."""
     if host == 'localhost':
         return True
     try:

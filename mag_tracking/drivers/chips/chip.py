@@ -102,27 +102,12 @@ class ChipLocation(NamedTuple):
 
 
 class Bus:
-    """I2C bus with its multiplexers.
+    """I2C bus with its multiplexers, of which at most one channel is open at any time.
 
-    Source: TCA9548A data sheet (SCPS207), section 8.5. The only register of a multiplexer has one
-    bit for each channel and is written without a register number.
-
-    Parameters
-    ----------
-    smbus : smbus2.SMBus or None
-        None for a bus that is not open; transfers then raise OSError.
-    monotonic_ns : callable
-        Monotonic clock, such as `time.monotonic_ns`.
-    sleep : callable
-        Function that waits for a time in seconds, such as `time.sleep`.
-    multiplexers : collection of int, optional
-        Addresses of all TCA9548A multiplexers. At most one channel of all multiplexers is open at
-        any time. No channel is open during a transfer to a chip directly on the bus.
-
-    Attributes
-    ----------
-    monotonic_ns : callable
-    sleep : callable
+    No channel is open during a transfer to a chip directly on the bus. The only register of a
+    multiplexer has one bit for each channel and is written without a register number (TCA9548A data
+    sheet, SCPS207, section 8.5). Transfers raise OSError if `smbus` is None, a bus that is not
+    open.
     """
 
     def __init__(self, smbus: SmBus | None, monotonic_ns: Callable[[], int],
@@ -134,24 +119,13 @@ class Bus:
 
     @property
     def smbus(self) -> SmBus:
-        """Interface to the open bus.
-
-        Raises
-        ------
-        OSError
-            If no bus is open.
-        """
+        """Interface to the open bus; raises OSError if none is open."""
         if self._smbus is None:
             raise OSError(errno.ENODEV, 'the bus is not open')
         return self._smbus
 
     def select(self, location: ChipLocation) -> None:
-        """Open the multiplexer channel of a chip and close all other channels.
-
-        Parameters
-        ----------
-        location : ChipLocation
-        """
+        """Open the multiplexer channel of a chip and close all other channels."""
         selection = (location.multiplexer, location.channel)
         if not self._multiplexers or selection == self._selected:
             return
@@ -171,59 +145,20 @@ class Bus:
 
 
 class Registers:
-    """Access to the registers of one chip. All methods raise OSError if the chip does not answer.
-
-    Parameters
-    ----------
-    bus : Bus
-    location : ChipLocation
-        Location of the chip.
-
-    Attributes
-    ----------
-    monotonic_ns : callable
-        Monotonic clock of the bus.
-    sleep : callable
-        Function that waits for a time in seconds.
-    """
+    """Access to the registers of one chip; all methods raise OSError if it does not answer."""
 
     def __init__(self, bus: Bus, location: ChipLocation) -> None:
         self._bus, self._location = bus, location
         self.monotonic_ns, self.sleep = bus.monotonic_ns, bus.sleep
 
     def read(self, register: int) -> int:
-        """Read one register.
-
-        Parameters
-        ----------
-        register : int
-
-        Returns
-        -------
-        int
-        """
+        """Read one register."""
         self._bus.select(self._location)
         return self._bus.smbus.read_byte_data(self._location.address, register)
 
     def read_block(self, register: int, length: int) -> bytes:
-        """Read successive registers.
-
-        Parameters
-        ----------
-        register : int
-            First register.
-        length : int
-            Number of registers, up to 32.
-
-        Returns
-        -------
-        (length,) bytes
-
-        Raises
-        ------
-        OSError
-            If the chip does not answer, or the block is shorter than requested.
-        """
+        """Read up to 32 successive registers; raises OSError if the block is shorter than
+        requested."""
         self._bus.select(self._location)
         block = bytes(self._bus.smbus.read_i2c_block_data(self._location.address, register, length))
         if len(block) != length:
@@ -231,23 +166,12 @@ class Registers:
         return block
 
     def write(self, register: int, value: int) -> None:
-        """Write one register.
-
-        Parameters
-        ----------
-        register : int
-        value : int
-        """
+        """Write one register."""
         self._bus.select(self._location)
         self._bus.smbus.write_byte_data(self._location.address, register, value)
 
     def transfer(self, *messages: i2c_msg) -> None:
-        """Transfer messages in one transaction.
-
-        Parameters
-        ----------
-        *messages : i2c_msg
-        """
+        """Transfer messages in one transaction."""
         self._bus.select(self._location)
         self._bus.smbus.i2c_rdwr(*messages)
 
@@ -327,20 +251,7 @@ class ChipClass(Identified, Protocol):
 
 
 def check_identity(chip: Identified, registers: Registers) -> None:
-    """Check that the expected chip answers.
-
-    Parameters
-    ----------
-    chip : Identified
-    registers : Registers
-
-    Raises
-    ------
-    DeviceError
-        If another chip answers.
-    OSError
-        If no chip answers.
-    """
+    """Raise DeviceError if another chip answers, OSError if none does."""
     for register, expected in chip.IDENTITY:
         value = registers.read(register)
         if value != expected:
@@ -349,45 +260,13 @@ def check_identity(chip: Identified, registers: Registers) -> None:
 
 
 def look_up_choice(name: str, value: Value, choices: Mapping[Value, Choice]) -> Choice:
-    """Look up the value of a setting in the table of its permitted values.
-
-    Parameters
-    ----------
-    name : str
-        Name of the setting, for the error message.
-    value : int or float
-        Value of the setting.
-    choices : dict
-        Result for each permitted value.
-
-    Returns
-    -------
-    object
-        `choices[value]`.
-
-    Raises
-    ------
-    SettingsError
-        If `value` is not permitted.
-    """
+    """Look up the value of a setting in `choices`; raises SettingsError if it is not permitted."""
     if value not in choices:
         raise SettingsError(f'{name}: expected one of {", ".join(map(str, choices))}, got {value}')
     return choices[value]
 
 
 def mask_overrange(values: Iterable[float], largest: float) -> Axes:
-    """Replace values whose magnitude exceeds `largest` by NaN.
-
-    Parameters
-    ----------
-    values : iterable of float
-        Three values.
-    largest : float
-        Largest permitted magnitude, in the unit of `values`.
-
-    Returns
-    -------
-    tuple of three float
-    """
+    """Replace values (3) whose magnitude exceeds `largest` by NaN."""
     x, y, z = (v if abs(v) <= largest else math.nan for v in values)
     return x, y, z

@@ -2,17 +2,15 @@
 
 The chip name `adafruit_lis3mdl.LIS3MDL` selects the class `LIS3MDL` of the module
 `adafruit_lis3mdl`, which must be installed (`pip install adafruit-circuitpython-lis3mdl`). The
-adapter creates an instance with a bus, the address, and the default arguments of the class, and
-reads its property `magnetic` or `magnetometer`. The address is passed to the parameter that is
-named after it; a class without such a parameter uses one address only, which must be the
-configured one.
+adapter creates an instance with a bus, the address (if a parameter is named after it; otherwise the
+class uses one address only, which must be the configured one) and default arguments, and reads its
+property `magnetic` or `magnetometer`.
 
-If `chips/` has a module for the chip, that module is preferable, because the adapter has several
-limitations. The adapter does not distinguish an old conversion from a new one, and does not detect
-an axis over its range. Some drivers block while they wait for a conversion. The driver defines axes
-and scale; for example, the fields of the MMC5603 driver 1.0.16 are 2.4 % larger than with the scale
-of the data sheet, 16384 counts per gauss. The timestamp of a reading is the middle of the call,
-which is 0.5 to 1.5 periods late for a chip that measures continuously.
+A module of `chips/` is preferable: the adapter neither distinguishes an old conversion from a new
+one nor detects an axis over its range, and some drivers block while they wait. Axes and scale are
+those of the driver; the fields of the MMC5603 driver 1.0.16 are 2.4 % larger than with the scale of
+the data sheet, 16384 counts per gauss. The timestamp of a reading is the middle of the call, 0.5 to
+1.5 periods late for a chip that measures continuously.
 
 Sources: the CircuitPython API reference, `busio.I2C`. The CircuitPython design guide, "sensor
 properties and units", demands microtesla of `magnetic`, which not all classes return: `UNITS` was
@@ -61,16 +59,8 @@ class BusioI2c:
     """Subset of the interface of `busio.I2C` that CircuitPython drivers use.
 
     After the deadline, `try_lock` and every transaction raise DeviceError, because drivers wait for
-    their chip in unbounded loops. Some of these loops ignore OSError.
-
-    Parameters
-    ----------
-    registers : Registers
-
-    Attributes
-    ----------
-    addresses : set of int
-        Addresses of all chips to which a driver has written or from which it has read.
+    their chip in unbounded loops, of which some ignore OSError. `addresses` are those of all chips
+    that a driver has accessed.
     """
 
     def __init__(self, registers: Registers) -> None:
@@ -80,24 +70,12 @@ class BusioI2c:
         self._deadline_ns = 0
 
     def begin(self, timeout_ns: int) -> None:
-        """Unlock the bus and set the deadline.
-
-        Parameters
-        ----------
-        timeout_ns : int, ns
-            Time until the deadline.
-        """
+        """Unlock the bus and set the deadline."""
         self._locked = False
         self._deadline_ns = self._registers.monotonic_ns() + timeout_ns
 
     def try_lock(self) -> bool:
-        """Lock the bus if it is free.
-
-        Returns
-        -------
-        bool
-            Whether the bus was free.
-        """
+        """Lock the bus; return whether it was free."""
         self._check_deadline()
         free, self._locked = not self._locked, True
         return free
@@ -108,30 +86,14 @@ class BusioI2c:
 
     def writeto(self, address: int, buffer: bytes | bytearray, *, start: int = 0,
                 end: int | None = None) -> None:
-        """Write `buffer[start:end]`; an empty write checks whether the chip answers.
-
-        Parameters
-        ----------
-        address : int
-        buffer : bytes or bytearray
-        start : int, optional
-        end : int, optional
-        """
+        """Write `buffer[start:end]`; an empty write checks whether the chip answers."""
         data = bytes(buffer[start:end])
         # Many adapters refuse a message of zero length.
         self._transfer(i2c_msg.write(address, data) if data else i2c_msg.read(address, 1))
 
     def readfrom_into(self, address: int, buffer: bytearray, *, start: int = 0,
                       end: int | None = None) -> None:
-        """Read into `buffer[start:end]`.
-
-        Parameters
-        ----------
-        address : int
-        buffer : bytearray
-        start : int, optional
-        end : int, optional
-        """
+        """Read into `buffer[start:end]`."""
         message = i2c_msg.read(address, len(buffer[start:end]))
         self._transfer(message)
         buffer[start:end] = bytes(message)
@@ -140,18 +102,7 @@ class BusioI2c:
                               in_buffer: bytearray, *, out_start: int = 0,
                               out_end: int | None = None, in_start: int = 0,
                               in_end: int | None = None) -> None:
-        """Write and read in one transaction.
-
-        Parameters
-        ----------
-        address : int
-        out_buffer : bytes or bytearray
-        in_buffer : bytearray
-        out_start : int, optional
-        out_end : int, optional
-        in_start : int, optional
-        in_end : int, optional
-        """
+        """Write and read in one transaction."""
         message = i2c_msg.read(address, len(in_buffer[in_start:in_end]))
         self._transfer(i2c_msg.write(address, bytes(out_buffer[out_start:out_end])), message)
         in_buffer[in_start:in_end] = bytes(message)
@@ -169,17 +120,7 @@ class BusioI2c:
 
 
 class CircuitpythonChip:
-    """Chip read through a CircuitPython driver. Implements `Chip`.
-
-    Parameters
-    ----------
-    registers : Registers
-    name : str
-        `module.Class` of the driver.
-    address : int
-    scale : float, T
-        Unit of the driver.
-    """
+    """Chip read through a CircuitPython driver `module.Class` in units of `scale` [T], a `Chip`."""
 
     IDENTITY = ()
 
@@ -194,13 +135,8 @@ class CircuitpythonChip:
     def set_up(self) -> None:
         """Load the driver and create its instance.
 
-        Raises
-        ------
-        DeviceError
-            If the driver is not installed, does not find the chip, uses another address, or has no
-            property that reads the field.
-        OSError
-            If the chip does not answer.
+        Raises DeviceError if it is not installed, does not find the chip, uses another address, or
+        has no property that reads the field.
         """
         cls = load(self._name)
         self._i2c.addresses.clear()
@@ -238,22 +174,7 @@ class CircuitpythonChip:
             self._registers.sleep(0.01)
 
     def measure(self) -> Measurement:
-        """Read the property of the driver.
-
-        Returns
-        -------
-        Conversion
-
-        Yields
-        ------
-        float, s
-            Nothing is yielded: the driver itself waits for the chip.
-
-        Raises
-        ------
-        OSError
-            If the driver fails.
-        """
+        """Read the property of the driver, which waits for the chip; nothing is yielded."""
         yield from ()
         self._i2c.begin(TIMEOUT_NS)
         start_ns = self._registers.monotonic_ns()
@@ -281,23 +202,8 @@ def _text(error: Exception) -> str:
 
 
 def load(name: str) -> Any:
-    """Load a driver class.
-
-    Parameters
-    ----------
-    name : str
-        `module.Class`.
-
-    Returns
-    -------
-    type
-
-    Raises
-    ------
-    DeviceError
-        If the class cannot be loaded. If the import fails, the message names the package to
-        install.
-    """
+    """Load a driver class `module.Class`; the DeviceError of a failed import names the package to
+    install."""
     module_name, _, class_name = name.rpartition('.')
     try:
         module = importlib.import_module(module_name)

@@ -24,23 +24,10 @@ class Sensor(NamedTuple):
 
 
 def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor]:
-    """Parse the entries of all sensors of a bus, and check them for conflicts.
+    """Parse the entries name:chip:address[@multiplexer.channel][:unit] of a bus.
 
-    Parameters
-    ----------
-    entries : sequence of str
-        Each as name:chip:address[@multiplexer.channel][:unit].
-    known : collection of str
-        Names of the supported chips; any other chip must be a module.Class.
-
-    Returns
-    -------
-    list of Sensor
-
-    Raises
-    ------
-    SettingsError
-        If an entry is not valid, or two entries conflict with each other.
+    A chip that is not in `known` must be a module.Class. Raises SettingsError if an entry is not
+    valid or two conflict.
     """
     sensors = [parse_sensor(entry, known) for entry in entries]
     multiplexers = {s.location.multiplexer for s in sensors} - {None}
@@ -64,24 +51,7 @@ def _conflict(one: ChipLocation, other: ChipLocation) -> bool:
 
 
 def parse_sensor(entry: str, known: Collection[str]) -> Sensor:
-    """Parse the entry of one sensor.
-
-    Parameters
-    ----------
-    entry : str
-        As name:chip:address[@multiplexer.channel][:unit].
-    known : collection of str
-        Names of the supported chips.
-
-    Returns
-    -------
-    Sensor
-
-    Raises
-    ------
-    SettingsError
-        If the entry is not valid.
-    """
+    """Parse one entry, as `parse_sensors` does."""
     match = ENTRY.fullmatch(entry)
     if match is None:
         raise SettingsError('sensors: expected name:chip:0xNN or name:chip:0xNN@0xNN.channel, '

@@ -55,15 +55,7 @@ class Hmc5883lSettings:
 
 
 class Hmc5883l:
-    """HMC5883L magnetometer; the module describes its timing, axes and scale.
-
-    Parameters
-    ----------
-    registers : Registers
-    settings : Hmc5883lSettings
-    count : callable
-        Not used.
-    """
+    """HMC5883L magnetometer; the module describes its timing, axes and scale."""
 
     IDENTITY = ((0x0A, ord('H')), (0x0B, ord('4')), (0x0C, ord('3')))
     NAME = 'hmc5883l'
@@ -86,22 +78,9 @@ class Hmc5883l:
         self._registers.sleep(CONVERSION_S * CONVERSION_MARGIN)
 
     def measure(self) -> Measurement:
-        """Make a single measurement.
+        """Make a single measurement, None if it is not finished in time; yields times to wait, s.
 
-        Returns
-        -------
-        Conversion or None
-            None if the conversion is not finished in time.
-
-        Yields
-        ------
-        float, s
-            Time to wait for the conversion.
-
-        Raises
-        ------
-        OSError
-            If the chip has lost its configuration.
+        Raises OSError if the chip has lost its configuration.
         """
         self._registers.write(MODE, SINGLE_MEASUREMENT)
         start_ns = self._registers.monotonic_ns()

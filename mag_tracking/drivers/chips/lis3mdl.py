@@ -48,15 +48,7 @@ class Lis3mdlSettings:
 
 
 class Lis3mdl:
-    """LIS3MDL magnetometer; the module describes its timing, axes and scale.
-
-    Parameters
-    ----------
-    registers : Registers
-    settings : Lis3mdlSettings
-    count : callable
-        Called with the cause of a loss.
-    """
+    """LIS3MDL magnetometer; the module describes its timing, axes and scale."""
 
     IDENTITY = ((0x0F, 0x3D),)
     NAME = 'lis3mdl'
@@ -80,18 +72,8 @@ class Lis3mdl:
         self._registers.sleep(PERIOD_NS * 1e-9 * CONVERSION_MARGIN)
 
     def measure(self) -> Measurement:
-        """Read the latest conversion.
-
-        Returns
-        -------
-        Conversion or None
-            None if no new conversion is available.
-
-        Yields
-        ------
-        float, s
-            Nothing is yielded: the chip measures continuously.
-        """
+        """Read the latest conversion, None if it is not new; nothing is yielded, since it measures
+        continuously."""
         yield from ()
         now_ns = self._registers.monotonic_ns()
         status = self._registers.read(STATUS)

@@ -6,21 +6,20 @@ Half the difference of the measurements after a SET and a RESET therefore has no
 their sum is the offset. The pulses also remove the effect of a strong magnet on the chip. By
 default, a reading is a pair of such measurements, `1 ms + 1.1 conversion` apart. If `set_reset_s`
 is above 0, a pair is measured only at that interval, and its offset is subtracted from the single
-measurements until the next pair. Single measurements are faster but have 1.4 times the noise. If
-the field changes during a pair, half the change remains in the offset until the next pair.
+measurements until the next pair: faster, but with 1.4 times the noise, and half of a change of the
+field during a pair remains in the offset until the next.
 
 Each reading starts its own conversions. Its timestamp is the middle of the conversion, or the mean
-of the two middles in a pair. The uncertainty due to the chip's oscillator is below 0.5 ms. A pair
-lasts twice `1 ms + 1.1 conversion`, plus about 1 ms on a bus of 400 kHz.
+of the two middles in a pair, within 0.5 ms for the chip's oscillator. A pair lasts twice `1 ms +
+1.1 conversion`, plus about 1 ms on a bus of 400 kHz.
 
-Axes: the sensing directions after RESET are taken as positive, because they form a right-handed
-frame. After SET they are reversed, although the data sheet of the MMC5983MA calls the value after
-SET positive. Linux describes the MMC5603 and its relatives as "naturally aligned after RESET"
-(mmc5633.c). Rotate the board once in the Earth's field to verify the signs.
+Axes: positive after RESET, which makes them right-handed (Linux, mmc5633.c: "naturally aligned
+after RESET"), although the data sheet of the MMC5983MA calls the value after SET positive. Rotate
+the board once in the Earth's field to verify the signs.
 
 MMC5983MA: ±800 µT, 6.10 nT per count. Noise of 40, 60, 80, 120 nT rms for conversions of 8, 4, 2,
-0.5 ms; a pair has 0.7 times the noise.
-MMC5603NJ: ±3 mT, 6.10 nT per count. Noise of 200 nT rms for the conversion of 6.6 ms.
+0.5 ms; a pair has 0.7 times the noise. MMC5603NJ: ±3 mT, 6.10 nT per count. Noise of 200 nT rms for
+the conversion of 6.6 ms.
 
 Sources: MMC5983MA data sheet Rev A (2019), "Register Map" and "Using SET and RESET to remove bridge
 offset"; MMC5603NJ data sheet Rev B (2018).
@@ -69,15 +68,7 @@ class Mmc5603Settings(Mmc5983maSettings):
 
 
 class Mmc5983ma:
-    """MMC5983MA magnetometer; the module describes its timing, axes and scale.
-
-    Parameters
-    ----------
-    registers : Registers
-    settings : Mmc5983maSettings
-    count : callable
-        Not used.
-    """
+    """MMC5983MA magnetometer; the module describes its timing, axes and scale."""
 
     IDENTITY = ((0x2F, 0x30),)
     NAME = 'mmc5983ma'
@@ -107,15 +98,7 @@ class Mmc5983ma:
     def measure(self) -> Measurement:
         """Make one measurement if the stored offset is recent enough, otherwise a SET/RESET pair.
 
-        Returns
-        -------
-        Conversion or None
-            None if a conversion is not finished in time.
-
-        Yields
-        ------
-        float, s
-            Time to wait for a pulse or a conversion.
+        Yields times to wait [s]; the result is None if a conversion is not finished in time.
         """
         if self._offset is None or (
                 self._registers.monotonic_ns() - self._offset_ns >= self._set_reset_ns):

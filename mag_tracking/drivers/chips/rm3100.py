@@ -49,15 +49,7 @@ class Rm3100Settings:
 
 
 class Rm3100:
-    """RM3100 magnetometer; the module describes its timing, axes and scale.
-
-    Parameters
-    ----------
-    registers : Registers
-    settings : Rm3100Settings
-    count : callable
-        Not used.
-    """
+    """RM3100 magnetometer; the module describes its timing, axes and scale."""
 
     IDENTITY = ((0x36, 0x22),)
     NAME = 'rm3100'
@@ -80,18 +72,8 @@ class Rm3100:
         self._registers.sleep(self._delay_ns * 1e-9 * CONVERSION_MARGIN)
 
     def measure(self) -> Measurement:
-        """Read the latest conversion.
-
-        Returns
-        -------
-        Conversion or None
-            None if no new conversion is available.
-
-        Yields
-        ------
-        float, s
-            Nothing is yielded: the chip measures continuously.
-        """
+        """Read the latest conversion, None if it is not new; nothing is yielded, since it measures
+        continuously."""
         yield from ()
         now_ns = self._registers.monotonic_ns()
         if not self._registers.read(STATUS) & READY:

@@ -50,36 +50,18 @@ class BinarySettings:
 
 
 class BinaryFraming:
-    """Extracts readings from binary frames. Implements `Framing`.
+    """Extracts readings from binary frames of `size` bytes, a `Framing`.
 
     If a frame is not valid, the search continues one byte after the beginning of its sync. If the
     frames have an n-bit checksum, every true frame is found, with one exception: a sync in garbage
-    or in a payload begins a false frame, which is accepted with probability 2^-n. An accepted false
-    frame hides the true frames that begin within it. If the frames have no checksum, every sync is
-    accepted; a tail is a weak checksum. True frames are then found if they follow each other
-    without a gap, or if the gap contains no sync. After any other gap, readings may be false or
-    lost until the search is aligned with the frames again.
+    or in a payload begins a false frame, which is accepted with probability 2^-n and hides the true
+    frames that begin within it. If the frames have no checksum, every sync is accepted; a tail is a
+    weak checksum. True frames are then found if they follow each other without a gap, or if the gap
+    contains no sync. After any other gap, readings may be false or lost until the search is aligned
+    again.
 
-    No standard defines this format, but many sensor boards use it.
-
-    Parameters
-    ----------
-    settings : BinarySettings
-
-    Attributes
-    ----------
-    size : int
-        Length of a frame in bytes.
-    CLOCK : dict of str to float
-        Clock settings: `wrap`, from the type of `ticks`. Empty if frames contain no `ticks`.
-    DRIVER : dict of str to int
-        Driver settings: `sequence_wrap`, from the type of `sequence`. Empty if frames contain no
-        `sequence`.
-
-    Raises
-    ------
-    SettingsError
-        If the settings do not describe a valid frame.
+    No standard defines this format, but many sensor boards use it. `CLOCK` has `wrap` from the type
+    of `ticks`, `DRIVER` has `sequence_wrap` from that of `sequence`, if sent.
     """
 
     SETTINGS = BinarySettings
@@ -113,18 +95,7 @@ class BinaryFraming:
             {'sequence_wrap': _wrap(kinds['sequence'])} if 'sequence' in kinds else {})
 
     def parse(self, data: bytes, final: bool = False) -> Parsed:
-        """Find all readings; see `Framing.parse`.
-
-        Parameters
-        ----------
-        data : bytes
-        final : bool, optional
-            Whether no bytes follow.
-
-        Returns
-        -------
-        Parsed
-        """
+        """Find all readings; see `Framing.parse`."""
         readings: list[Reading] = []
         rejected: Counter[str] = Counter()
         at = frames = 0

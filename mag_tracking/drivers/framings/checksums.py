@@ -22,38 +22,18 @@ class Checksum(NamedTuple):
 
 
 def sum8(data: bytes) -> int:
-    """Sum of the bytes modulo 256; check value 0xDD.
-
-    Parameters
-    ----------
-    data : bytes
-
-    Returns
-    -------
-    int
-    """
+    """Sum of the bytes modulo 256; check value 0xDD."""
     return sum(data) & 0xFF
 
 
 def xor8(data: bytes) -> int:
-    """Exclusive or of the bytes, as in NMEA 0183; check value 0x31.
-
-    Parameters
-    ----------
-    data : bytes
-
-    Returns
-    -------
-    int
-    """
+    """Exclusive or of the bytes, as in NMEA 0183; check value 0x31."""
     return reduce(xor, data, 0)
 
 
 def _forward_table(polynomial: int) -> tuple[int, ...]:
-    """Table of the 8-bit CRC of each byte value, most significant bit first.
-
-    `polynomial` includes the term x^8.
-    """
+    """Table of the 8-bit CRC of each byte value, most significant bit first; `polynomial` with its
+    x^8."""
     table = []
     for byte in range(256):
         for _ in range(8):
@@ -63,10 +43,8 @@ def _forward_table(polynomial: int) -> tuple[int, ...]:
 
 
 def _reflected_table(polynomial: int) -> tuple[int, ...]:
-    """Table of the CRC of each byte value, least significant bit first.
-
-    The bit order of `polynomial` is reversed as well.
-    """
+    """Table of the CRC of each byte value, least significant bit first; `polynomial` is reversed
+    too."""
     table = []
     for byte in range(256):
         for _ in range(8):
@@ -80,16 +58,7 @@ _MODBUS_TABLE = _reflected_table(0xA001)
 
 
 def crc8(data: bytes) -> int:
-    """CRC-8/SMBUS: polynomial 0x07, initial value 0; check value 0xF4.
-
-    Parameters
-    ----------
-    data : bytes
-
-    Returns
-    -------
-    int
-    """
+    """CRC-8/SMBUS: polynomial 0x07, initial value 0; check value 0xF4."""
     crc, table = 0, _CRC8_TABLE
     for byte in data:
         crc = table[crc ^ byte]
@@ -97,30 +66,13 @@ def crc8(data: bytes) -> int:
 
 
 def crc16_ccitt(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE (IBM-3740): polynomial 0x1021, initial value 0xFFFF; check value 0x29B1.
-
-    Parameters
-    ----------
-    data : bytes
-
-    Returns
-    -------
-    int
-    """
+    """CRC-16/CCITT-FALSE (IBM-3740): polynomial 0x1021, initial value 0xFFFF; check value
+    0x29B1."""
     return binascii.crc_hqx(data, 0xFFFF)
 
 
 def crc16_modbus(data: bytes) -> int:
-    """CRC-16/MODBUS: polynomial 0x8005, reflected, initial value 0xFFFF; check value 0x4B37.
-
-    Parameters
-    ----------
-    data : bytes
-
-    Returns
-    -------
-    int
-    """
+    """CRC-16/MODBUS: polynomial 0x8005, reflected, initial value 0xFFFF; check value 0x4B37."""
     crc, table = 0xFFFF, _MODBUS_TABLE
     for byte in data:
         crc = crc >> 8 ^ table[(crc ^ byte) & 0xFF]
@@ -128,16 +80,7 @@ def crc16_modbus(data: bytes) -> int:
 
 
 def crc32(data: bytes) -> int:
-    """CRC-32 (ISO-HDLC), as in Ethernet and zip; check value 0xCBF43926.
-
-    Parameters
-    ----------
-    data : bytes
-
-    Returns
-    -------
-    int
-    """
+    """CRC-32 (ISO-HDLC), as in Ethernet and zip; check value 0xCBF43926."""
     return zlib.crc32(data)
 
 

@@ -30,14 +30,9 @@ _Choice = TypeVar('_Choice', bound=str)
 
 
 class Rejected(ValueError):
-    """Rejection of a line or frame.
+    """Rejection of a line or frame, with a cause such as 'with a wrong checksum' and a remedy.
 
-    Parameters
-    ----------
-    cause : str
-        Such as 'with a wrong checksum'. It has no values of the line, because causes are counted.
-    remedy : str, optional
-        What to change, with values of the line.
+    The remedy may have values of the line; the cause has none, because causes are counted.
     """
 
     def __init__(self, cause: str, remedy: str = '') -> None:
@@ -48,27 +43,11 @@ class Rejected(ValueError):
 class FieldLayout:
     """Converts the values of one frame to one reading per sensor.
 
-    Parameters
-    ----------
-    fields : sequence of str
-        Fields in the order in which they are sent.
-    each : sequence of str, optional
-        Axes and skipped values of one sensor, without its name, if a frame contains several
-        identical sensors. They are repeated `count` times after `fields`, for the sensors '0', '1',
-        ...
-    count : int, optional
-        Number of identical sensors.
-
-    Attributes
-    ----------
-    quantities : tuple of str
-        Field of each value of a frame, without the name of the sensor.
-
-    Raises
-    ------
-    SettingsError
-        If a field is unknown or appears twice, if no field is an axis, if only some of the axes
-        name a sensor, or if only one of `each` and `count` is given.
+    `fields` are in the order in which they are sent. For identical sensors '0', '1', ..., `each`
+    (axes and skipped values of one sensor, without its name) follows `count` times. `quantities`
+    are the fields of all values without the names of sensors. Raises SettingsError if a field is
+    unknown or appears twice, no field is an axis, only some axes name a sensor, or only one of
+    `each` and `count` is given.
     """
 
     def __init__(self, fields: Sequence[str], each: Sequence[str] = (), count: int = 0) -> None:
@@ -98,19 +77,12 @@ class FieldLayout:
                          for sensor, axes in sensors.items()]
 
     def readings(self, values: Values) -> list[Reading]:
-        """Readings of one frame, in the order in which the sensors first appear.
+        """Readings of one frame, in the order in which the sensors first appear, from a value for
+        each of `quantities`.
 
-        Parameters
-        ----------
-        values : sequence
-            One value for each of `quantities`: float for an axis (NaN if missing), str for
-            `sensor`, float for `ticks`, int for `sequence`, anything for a skipped value.
-
-        Returns
-        -------
-        list of Reading
-            All with the same ticks and sequence. If a frame has the field `sensor` and its axes
-            also name sensors, both names are joined by a dot ('board.A').
+        Values are float for an axis (NaN if missing) and `ticks`, str for `sensor`, int for
+        `sequence`. If both the field `sensor` and axes name sensors, a dot joins the names
+        ('board.A').
         """
         v = [*values, math.nan, None]
         ticks, sequence = v[self._ticks], v[self._sequence]
@@ -165,22 +137,8 @@ def _is_valid_name(name: str) -> bool:
 
 
 def axis_value(value: float | bytes) -> float:
-    """Convert the value of an axis to float.
-
-    Parameters
-    ----------
-    value : float or bytes
-        Number, or text of a number. NaN if the axis is missing.
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    Rejected
-        If `value` is infinite.
-    """
+    """Convert a number or its text to float, NaN if the axis is missing; raises Rejected if
+    infinite."""
     try:
         value = float(value)
     except OverflowError:
@@ -191,21 +149,7 @@ def axis_value(value: float | bytes) -> float:
 
 
 def ticks_value(value: float) -> float:
-    """Convert a device time to float.
-
-    Parameters
-    ----------
-    value : float
-
-    Returns
-    -------
-    float, ticks
-
-    Raises
-    ------
-    Rejected
-        If `value` is not finite.
-    """
+    """Convert a device time to float; raises Rejected if it is not finite."""
     value = axis_value(value)
     if math.isnan(value):
         raise Rejected('without ticks')
@@ -213,23 +157,8 @@ def ticks_value(value: float) -> float:
 
 
 def text_number(text: str, decimal: str) -> float:
-    """Convert the text of a number, as in quotes, to float.
-
-    Parameters
-    ----------
-    text : str
-    decimal : str
-        Decimal mark, '.' or ','.
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    ValueError
-        If `text` is not a decimal number, nan or inf.
-    """
+    """Convert a text, as in quotes, to float; raises ValueError unless it is decimal, nan or
+    inf."""
     text = text.strip()
     if decimal == ',':
         text = text.replace(',', '.')
@@ -239,23 +168,8 @@ def text_number(text: str, decimal: str) -> float:
 
 
 def text_ticks(text: str, decimal: str) -> float:
-    """Convert the text of a device time: a number, or a date and time, or a time of day.
-
-    Parameters
-    ----------
-    text : str
-    decimal : str
-        Decimal mark of a number, '.' or ','.
-
-    Returns
-    -------
-    float, ticks, or DeviceDate
-
-    Raises
-    ------
-    Rejected
-        If it is neither a finite number nor a time.
-    """
+    """Convert the text of a device time: a finite number, a date and time, or a time of day; raises
+    Rejected."""
     try:
         value = text_number(text, decimal)
     except ValueError:
@@ -270,93 +184,37 @@ def text_ticks(text: str, decimal: str) -> float:
 
 
 def decimal_remedy(text: str) -> str:
-    """Remedy for a text that is not a number.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
-    """
+    """Remedy for a text that is not a number."""
     if ',' in text and re.fullmatch(r'[+-]?[0-9]*,[0-9]+', text.strip()):
         return "the decimal mark is a comma: set decimal: ','"
     return f'{text[:30]!r} is not a number; fields: - skips a value'
 
 
 def sequence_value(value: int) -> int:
-    """Check a sequence number.
-
-    Parameters
-    ----------
-    value : int
-
-    Returns
-    -------
-    int
-
-    Raises
-    ------
-    Rejected
-        If `value` is outside -2^63 .. 2^64 - 1.
-    """
+    """Check a sequence number; raises Rejected outside -2^63 .. 2^64 - 1."""
     if not -2**63 <= value < 2**64:
         raise Rejected('with a sequence number of more than 64 bits')
     return value
 
 
 def sensor_name(text: str) -> str:
-    """Check the name of a sensor.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    Rejected
-        If the name is empty, too long, or contains unprintable characters.
-    """
+    """Check the name of a sensor; raises Rejected if it is empty, too long or unprintable."""
     if not _is_valid_name(text):
         raise Rejected('with an invalid sensor name')
     return text
 
 
 def ignore_value(value: object) -> None:
-    """Discard a skipped value.
-
-    Parameters
-    ----------
-    value : object
-    """
+    """Discard a skipped value."""
     return None
 
 
 def decode_escapes(setting: str, text: str) -> bytes:
-    r"""Replace the escape sequences of a string, and encode it as UTF-8.
+    r"""Replace the escape sequences \n, \r, \t, \0, \\ and \xhh of a string, and encode it as
+    UTF-8.
 
-    The sequences \n, \r, \t, \0, \\ and \xhh are recognised, so that both kinds of YAML quotes
-    have the same effect.
-
-    Parameters
-    ----------
-    setting : str
-        Name of the setting, for the error message.
-    text : str
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    SettingsError
-        If an escape sequence is unknown, or the string is not valid Unicode.
+    Both kinds of YAML quotes thus have the same effect. Raises SettingsError for another escape
+    sequence or invalid Unicode.
     """
     def character(match: re.Match[str]) -> str:
         code = match[1]
@@ -374,25 +232,7 @@ def decode_escapes(setting: str, text: str) -> bytes:
 
 
 def check_choice(setting: str, value: str, choices: Sequence[_Choice]) -> _Choice:
-    """Check that a setting is one of the permitted values.
-
-    Parameters
-    ----------
-    setting : str
-        Name of the setting, for the error message.
-    value : str
-    choices : sequence of str
-
-    Returns
-    -------
-    str
-        `value`.
-
-    Raises
-    ------
-    SettingsError
-        If `value` is not permitted.
-    """
+    """Return a setting if it is one of the permitted values; raises SettingsError."""
     if value not in choices:
         raise SettingsError(f'{setting}: expected one of {", ".join(choices)}, got {value!r}')
     return choices[choices.index(value)]

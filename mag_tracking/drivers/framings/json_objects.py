@@ -61,24 +61,14 @@ class JsonSettings:
 
 
 class JsonFraming:
-    """Extracts readings from JSON objects, one reading per object. Implements `Framing`.
+    """Extracts readings from JSON objects (RFC 8259), one reading per object, a `Framing`.
 
-    An axis is missing if it is null or NaN; an object that lacks a configured path is rejected. An
-    object that spans several lines is parsed only if the data are `final` and contain only this
-    object; otherwise each line is parsed separately.
-
-    Source: RFC 8259. The parser also accepts what many libraries and devices write: NaN and
-    Infinity, keys without quotes or in single quotes, and numbers in quotes. The device time may be
-    a date and time. An infinite axis is rejected.
-
-    Parameters
-    ----------
-    settings : JsonSettings
-
-    Raises
-    ------
-    SettingsError
-        If a path is not valid, or neither the field nor the acceleration has a path.
+    An axis is missing if it is null or NaN; an object that lacks a configured path is rejected, as
+    is an infinite axis. An object that spans several lines is parsed only if the data are `final`
+    and contain only this object; otherwise each line is parsed separately. The parser also accepts
+    what many libraries and devices write: NaN and Infinity, keys without quotes or in single
+    quotes, and numbers in quotes. The device time may be a date and time. Raises SettingsError if a
+    path is not valid, or neither field nor acceleration has one.
     """
 
     SETTINGS = JsonSettings
@@ -105,7 +95,7 @@ class JsonFraming:
         self._layout = FieldLayout(names)
 
     def _axis_paths(self, name: str, paths: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the paths of the three axes of setting `name`; raises SettingsError if invalid.
+        """Paths of the three axes of setting `name`; raises SettingsError if invalid.
 
         The path of a list is expanded to the paths of its values, and added to `_lists`.
         """
@@ -118,18 +108,7 @@ class JsonFraming:
         return paths if any(paths) else ('', '', '')
 
     def parse(self, data: bytes, final: bool = False) -> Parsed:
-        """Find all readings; see `Framing.parse`.
-
-        Parameters
-        ----------
-        data : bytes
-        final : bool, optional
-            Whether no bytes follow.
-
-        Returns
-        -------
-        Parsed
-        """
+        """Find all readings; see `Framing.parse`."""
         if final and self._is_single_document(data):
             return self._lines.read([data], len(data), self._read)
         return self._lines.parse(data, final, self._read)
@@ -227,8 +206,7 @@ def _paths(value: Any, prefix: str = '', depth: int = 3) -> list[str]:
 
 
 def _number(value: object, path: str, decimal: str) -> int | float:
-    """Return `value` if it is a number, or the number in its quotes; raises Rejected otherwise,
-    also for a bool."""
+    """Return a number, or the number in its quotes; raises Rejected otherwise, also for a bool."""
     if isinstance(value, str):
         try:
             return text_number(value, decimal)
@@ -251,10 +229,7 @@ def _ticks(value: object, path: str, decimal: str) -> float:
 
 
 def _sequence(value: object, path: str, decimal: str) -> int:
-    """Convert a sequence number, such as 12 or 12.0, to int.
-
-    Raises Rejected if the value is not an integer of at most 64 bits.
-    """
+    """Convert a sequence number, such as 12 or 12.0, to int; raises Rejected beyond 64 bits."""
     value = _number(value, path, decimal)
     if isinstance(value, float):
         if not value.is_integer():

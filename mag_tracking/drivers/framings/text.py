@@ -63,26 +63,8 @@ class TextSettings:
 
 
 class Lines:
-    """Splits bytes into lines and counts invalid lines. It has no state.
-
-    Parameters
-    ----------
-    end : str
-        Line terminator, as in `TextSettings`.
-    max_length : int, bytes
-        Maximum length of a line.
-
-    Attributes
-    ----------
-    end : bytes
-        Line terminator.
-    max_length : int, bytes
-
-    Raises
-    ------
-    SettingsError
-        If `end` is empty.
-    """
+    """Splits bytes into lines of at most `max_length` bytes and counts invalid lines, without
+    state."""
 
     def __init__(self, end: str, max_length: int) -> None:
         self.end = decode_escapes('end', end)
@@ -93,18 +75,8 @@ class Lines:
     def parse(self, data: bytes, final: bool, read: Callable[[bytes], list[Reading]]) -> Parsed:
         """Parse all lines; see `Framing.parse`.
 
-        Parameters
-        ----------
-        data : bytes
-        final : bool
-            Whether the bytes after the last terminator are a complete line.
-        read : callable
-            Function that returns the readings of a line or raises Rejected. The line is valid UTF-8
-            (bytes), not empty and not too long.
-
-        Returns
-        -------
-        Parsed
+        `read` returns the readings of a line, valid UTF-8 that is neither empty nor too long, or
+        raises Rejected. `final` tells that the bytes after the last terminator are a complete line.
         """
         *lines, rest = data.split(self.end)
         if final:
@@ -116,20 +88,7 @@ class Lines:
 
     def read(self, lines: Iterable[bytes], consumed: int,
              read: Callable[[bytes], list[Reading]]) -> Parsed:
-        """Parse lines that are already separated.
-
-        Parameters
-        ----------
-        lines : iterable of bytes
-        consumed : int
-            Number of bytes to report as consumed in the result.
-        read : callable
-            As in `parse`.
-
-        Returns
-        -------
-        Parsed
-        """
+        """Parse lines that are already separated; `consumed` is reported in the result."""
         readings: list[Reading] = []
         rejected: Counter[str] = Counter()
         examples: dict[str, str] = {}
@@ -159,24 +118,14 @@ class Lines:
 
 
 class TextFraming:
-    """Extracts readings from lines of text, one frame per line. Implements `Framing`.
+    """Extracts readings from lines of text, one frame per line, a `Framing`.
 
     An axis is missing if it is `nan` or empty; all other numbers are decimal, with or without
-    quotation marks. The device time may also be a date and time. A line that does not
-    match the settings is rejected as a whole. Without a prefix or a checksum, part of a line may be
-    mistaken for a complete line: '12.5,3,4' is also the end of '-12.5,3,4'. If the data end within
-    a line and `final` is set, '1,2,3' may be the beginning of '1,2,34'.
-
-    Source: NMEA 0183, section "Checksum field".
-
-    Parameters
-    ----------
-    settings : TextSettings
-
-    Raises
-    ------
-    SettingsError
-        If the settings do not describe a valid line.
+    quotation marks. The device time may also be a date and time. A line that does not match the
+    settings is rejected as a whole. Without a prefix or a checksum (NMEA 0183, section "Checksum
+    field"), part of a line may be mistaken for a complete line: '12.5,3,4' is also the end of
+    '-12.5,3,4'. If the data end within a line and `final` is set, '1,2,3' may be the beginning of
+    '1,2,34'.
     """
 
     SETTINGS = TextSettings
@@ -216,18 +165,7 @@ class TextFraming:
                                 f'with {self._comment!r} and would be ignored')
 
     def parse(self, data: bytes, final: bool = False) -> Parsed:
-        """Find all readings; see `Framing.parse`.
-
-        Parameters
-        ----------
-        data : bytes
-        final : bool, optional
-            Whether no bytes follow.
-
-        Returns
-        -------
-        Parsed
-        """
+        """Find all readings; see `Framing.parse`."""
         return self._lines.parse(data, final, self._read)
 
     def _read(self, line: bytes) -> list[Reading]:

@@ -2,24 +2,20 @@
 
 A message consists of the preamble 0xFA, the address 0xFF, its type (MID), the length of DATA (one
 byte, or 0xFF and two bytes), DATA, and a checksum byte, which makes the sum of all bytes but the
-preamble a multiple of 256. A byte sequence that only looks like a message (a false message) has a
-valid checksum with probability 1/256. Further checks are therefore applied:
+preamble a multiple of 256. A false message, bytes that only look like one, has a valid checksum
+with probability 1/256. Further checks are therefore applied:
 
-- The message type must be one that devices send: MTData2, MTData, WakeUp, Error, or a reply. The
-  MID of a reply is the MID of the request plus one, and therefore odd.
+- The type must be one that devices send: MTData2, MTData, WakeUp, Error, or a reply, whose MID is
+  that of the request plus one, and therefore odd.
 - The message must not be longer than the settings permit.
 - The packets of MTData2 must fill the message, and MTData must have the configured length.
 - A message that contains the start of a valid data message is rejected: it is garbage, or it has
   lost bytes and includes bytes of the next message.
 
-A false message that begins before a true data message hides it only in two cases:
-
-- The false message is a data message, and both messages together are longer than the longest frame.
-- The false message is a data message that has lost one byte, and the preamble of the next message
-  takes its place, so that the message is valid.
-
-A false message that overlaps no true message may be accepted. After a rejected message, the search
-continues at the byte after its preamble.
+A false message that begins before a true data message hides it only if it is a data message, and
+both together are longer than the longest frame, or it has lost one byte for which the preamble of
+the next message takes its place. One that overlaps no true message may be accepted. After a
+rejected message, the search continues at the byte after its preamble.
 
 Sources: Xsens, "MT Low Level Communication Protocol Documentation", MT0101P, revision 2019.A:
 message structure and message listing; Xsens, "MTi User Manual", MT0605P, section 5.3.2:
@@ -95,10 +91,8 @@ def _is_from_device(mid: int) -> bool:
 
 
 def _message_at(window: bytes, index: int, longest: int) -> _Message | None:
-    """Message that may begin at `index` of `window`; None if no message can begin there.
-
-    Its DATA may have at most `longest` bytes.
-    """
+    """Message with DATA of at most `longest` bytes that may begin at `index` of `window`, or
+    None."""
     # While the header is incomplete, MID is -1 and the end is one byte after the window.
     header = window[index:index + 6]
     if not header.startswith(_START[:len(header)]):
@@ -121,22 +115,13 @@ def _is_checksum_valid(window: bytes, index: int, message: _Message) -> bool:
 
 
 class XsensFraming:
-    """Extracts readings from the messages of an MTi or MTx. Implements `Framing`.
+    """Extracts readings from the messages of an MTi or MTx, a `Framing`.
 
     A reading has the field in arbitrary units (1 is the magnitude of the field where Xsens
     calibrated the sensor), the acceleration in m/s², the packet counter as sequence (modulo 2^16),
     and SampleTimeFine as ticks (10 kHz). Quantities that the device does not send are None. A
-    message with neither field nor acceleration gives no reading. Such a message is counted, and its
-    sequence number is counted as lost.
-
-    Parameters
-    ----------
-    settings : XsensSettings
-
-    Raises
-    ------
-    SettingsError
-        If `mtdata` or `mtdata_format` does not describe a message.
+    message with neither field nor acceleration is counted, and its sequence number is counted as
+    lost.
     """
 
     SETTINGS = XsensSettings
@@ -153,18 +138,7 @@ class XsensFraming:
                                 'set mtdata to the blocks of the messages')
 
     def parse(self, data: bytes, final: bool = False) -> Parsed:
-        """Find all readings; see `Framing.parse`.
-
-        Parameters
-        ----------
-        data : bytes
-        final : bool, optional
-            Whether no bytes follow.
-
-        Returns
-        -------
-        Parsed
-        """
+        """Find all readings; see `Framing.parse`."""
         readings: list[Reading] = []
         rejected: Counter[str] = Counter()
         position = 0
@@ -210,11 +184,8 @@ class XsensFraming:
 
     def _search_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
                        more: bool) -> _ParseStep | None:
-        """Search `outer` for another data message.
-
-        Returns None if `outer` contains no other data message, otherwise a step
-        that rejects `outer`, or that waits for more bytes.
-        """
+        """Search `outer` for another data message; return a step that rejects `outer` or waits for
+        more bytes, or None if there is none."""
         rejection = _REJECT_STEP._replace(causes=('messages that contain the start of another',))
         index = 0
         while True:

@@ -72,7 +72,7 @@ def _three_reals(data: bytes, precision: int) -> _Triple | None:
 
 
 def _decode_packet(identifier: int, data: bytes) -> tuple[str, float | _Triple | None] | None:
-    """Decode a packet into (attribute of `Reading`, value); None if the packet is not used.
+    """Decode a packet into (attribute of `Reading`, value), None if it is not used.
 
     The value is None if the length of the packet is wrong.
     """
@@ -89,20 +89,12 @@ def _decode_packet(identifier: int, data: bytes) -> tuple[str, float | _Triple |
 
 
 def read_mtdata2(data: bytes) -> DecodedMessage | None:
-    """Decode DATA of an MTData2 message.
+    """Decode DATA of an MTData2 message; None if the packets do not fill it, or a used one has an
+    invalid length.
 
     A packet is an identifier (u16), the length of its data (u8), and the data. Unused packets are
     counted only if they contain raw values (0xA0..) or other magnetic data (0xC0..).
-    SampleTimeCoarse (0x1070) is not used, because it is too coarse for a clock.
-
-    Parameters
-    ----------
-    data : bytes
-
-    Returns
-    -------
-    DecodedMessage or None
-        None if the packets do not fill `data`, or if a used packet has an invalid length.
+    SampleTimeCoarse (0x1070) is too coarse for a clock.
     """
     values: dict[str, Any] = {}
     causes: list[str] = []
@@ -131,36 +123,20 @@ def read_mtdata2(data: bytes) -> DecodedMessage | None:
 
 
 def _decoded_message(values: Mapping[str, Any], causes: Sequence[str]) -> DecodedMessage:
-    """Create a `DecodedMessage` from the values {attribute of `Reading`: value}.
-
-    Its reading is None if `values` has neither field nor acceleration.
-    """
+    """Create a message from {attribute of `Reading`: value}; without field and acceleration, it has
+    no reading."""
     if 'field' in values or 'acceleration' in values:
         return DecodedMessage(Reading(**values), tuple(causes))
     return DecodedMessage(None, (*causes, 'messages without field or acceleration'))
 
 
 class MTDataLayout:
-    """Layout of MTData messages. The messages do not describe it, so it must be configured.
+    """Layout of MTData messages, which do not describe it, so that it must be configured.
 
-    Parameters
-    ----------
-    blocks : sequence of str
-        Enabled blocks in this order: 'temp', 'acc', 'gyr', 'mag', one of 'quaternion', 'euler' and
-        'matrix', 'analog_1', 'analog_2', 'status', 'counter'.
-    number_format : str
-        Format of all real numbers: 'float' or 'fp12.20'.
-
-    Attributes
-    ----------
-    size : int
-        Length of DATA in bytes.
-
-    Raises
-    ------
-    SettingsError
-        If a block is unknown or out of order, if there are several orientations, if there
-        is neither 'acc' nor 'mag', or if the number format is unknown.
+    `blocks`, in this order: 'temp', 'acc', 'gyr', 'mag', one of 'quaternion', 'euler' and 'matrix',
+    'analog_1', 'analog_2', 'status', 'counter'. `number_format` of all real numbers is 'float' or
+    'fp12.20'. `size` is the length of DATA in bytes. Raises SettingsError if a block is unknown or
+    out of order, there are several orientations, or neither 'acc' nor 'mag'.
     """
 
     def __init__(self, blocks: Sequence[str], number_format: str) -> None:
@@ -187,16 +163,7 @@ class MTDataLayout:
             self.size += _BLOCK_LENGTHS[name]
 
     def read(self, data: bytes) -> DecodedMessage:
-        """Decode DATA of an MTData message.
-
-        Parameters
-        ----------
-        data : (size,) bytes
-
-        Returns
-        -------
-        DecodedMessage
-        """
+        """Decode DATA of `size` bytes of an MTData message."""
         values: dict[str, Any] = {}
         for block, name in (('mag', 'field'), ('acc', 'acceleration')):
             if block in self._begin:

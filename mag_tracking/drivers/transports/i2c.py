@@ -83,28 +83,12 @@ class I2cSettings:
 
 
 class I2cDevice(Closable):
-    """Chips on one I2C bus; readings are in tesla. Implements `reading.Device`.
+    """Chips on one I2C bus, read in tesla, a `reading.Device`.
 
-    Parameters
-    ----------
-    settings : I2cSettings
-    open_bus : callable, optional
-        Function that opens the bus with a given number as an `smbus2.SMBus` or equivalent.
-    monotonic_ns : callable, optional
-        Monotonic clock; tests replace it.
-    sleep : callable, optional
-        Function that waits for a time in seconds.
-
-    Attributes
-    ----------
-    counts : Counter
-        Number of missed polling cycles. For each sensor, number of failed readings, of cycles
-        without a new conversion, and of overwritten conversions.
-
-    Raises
-    ------
-    SettingsError
-        If no sensor is configured, or if a sensor or a chip setting is not valid.
+    `open_bus` opens the bus with a given number as an `smbus2.SMBus` or equivalent. `counts` are
+    missed polling cycles and, for each sensor, failed readings, cycles without a new conversion,
+    and overwritten conversions. Raises SettingsError if no sensor is configured or a setting is not
+    valid.
     """
 
     SETTINGS = I2cSettings
@@ -129,13 +113,8 @@ class I2cDevice(Closable):
         self._chips = self._create_chips(Bus(None, monotonic_ns, sleep))
 
     def open(self) -> None:
-        """Open the bus, identify the chips and configure them.
-
-        Raises
-        ------
-        DeviceError
-            If the bus cannot be opened, or a chip is missing or of another type.
-        """
+        """Open the bus, identify the chips and configure them; raises DeviceError if one is missing
+        or of another type."""
         with self._lock:
             self._release()
             try:
@@ -216,23 +195,8 @@ class I2cDevice(Closable):
         return f'cannot be read: {error.strerror or error}'
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """Return the readings of the next polling cycle with at least one reading.
-
-        Parameters
-        ----------
-        timeout_s : float, s
-            Maximum time to wait.
-
-        Returns
-        -------
-        list of Arrival
-            Empty if no reading is available in time, or if `close` was called.
-
-        Raises
-        ------
-        DeviceError
-            If the bus is not open, or a chip is lost.
-        """
+        """Return the readings of the next polling cycle with at least one reading; none after
+        `close`."""
         with self._lock:
             end_ns = self._monotonic_ns() + round(timeout_s * 1e9)
             while True:

@@ -78,22 +78,11 @@ class _TlsContext(ssl.SSLContext):
 
 
 class MqttTopics:
-    """Transport over MQTT. Implements `reading.Transport`.
+    """Messages of MQTT topics as a `reading.Transport`.
 
-    Parameters
-    ----------
-    settings : MqttSettings
-
-    Attributes
-    ----------
-    counts : Counter
-        Number of dropped messages by cause. Messages that the broker has delivered again are
-        accepted; they are counted as 'messages with the dup flag'.
-
-    Raises
-    ------
-    SettingsError
-        If a topic filter is empty, a password has no user name, or `ca_file` is set without TLS.
+    `counts` are dropped messages by cause; messages that the broker has delivered again are
+    accepted and counted as 'messages with the dup flag'. Raises SettingsError if a topic filter is
+    empty, a password has no user name, or `ca_file` is set without TLS.
     """
 
     SETTINGS = MqttSettings
@@ -126,11 +115,8 @@ class MqttTopics:
     def open(self) -> None:
         """Connect and subscribe.
 
-        Raises
-        ------
-        DeviceError
-            If the broker cannot be reached, or refuses the connection or a subscription, or if a
-            configured file cannot be read.
+        Raises DeviceError if the broker cannot be reached or refuses the connection or a
+        subscription, or a configured file cannot be read.
         """
         self.close()
         client = self._client()
@@ -292,20 +278,7 @@ class MqttTopics:
     def read(self, timeout_s: float) -> list[Chunk]:
         """Return the queued messages; wait only if the queue is empty.
 
-        Parameters
-        ----------
-        timeout_s : float, s
-            Maximum time to wait.
-
-        Returns
-        -------
-        list of Chunk
-            Empty if nothing arrived in time, or if `close` was called.
-
-        Raises
-        ------
-        DeviceError
-            If the connection is lost and all messages have been returned.
+        Raises DeviceError if the connection is lost and all messages have been returned.
         """
         with self._changed:
             if self._loss and not self._queue:

@@ -49,21 +49,10 @@ class SerialSettings:
 
 
 class SerialPort(Polled[serial.Serial]):
-    """Transport over a serial line. Implements `reading.Transport`.
+    """Bytes of a serial line as a `reading.Transport`.
 
-    Parameters
-    ----------
-    settings : SerialSettings
-
-    Attributes
-    ----------
-    counts : Counter
-        Number of line errors by cause, if the driver of the port counts them.
-
-    Raises
-    ------
-    SettingsError
-        If no port is configured, or the parity is not valid.
+    `counts` are line errors by cause, if the driver of the port counts them. Raises SettingsError
+    if no port is configured or the parity is not valid.
     """
 
     SETTINGS = SerialSettings
@@ -80,13 +69,8 @@ class SerialPort(Polled[serial.Serial]):
         self._line_errors: tuple[int, ...] | None = None
 
     def open(self) -> None:
-        """Open the port.
-
-        Raises
-        ------
-        DeviceError
-            If the port does not exist, is in use, or access is not permitted.
-        """
+        """Open the port; raises DeviceError if it does not exist, is in use, or access is not
+        permitted."""
         s = self._settings
         with self._lock:
             self._release()
@@ -121,23 +105,9 @@ class SerialPort(Polled[serial.Serial]):
         return f'cannot be opened at {self._settings.baud} bit/s: {error}'
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """Return the available bytes; wait only if no byte is available.
+        """Return the available bytes as one chunk; wait only if no byte is available.
 
-        Parameters
-        ----------
-        timeout_s : float, s
-            Maximum time to wait.
-
-        Returns
-        -------
-        list of Chunk
-            One chunk; its arrival is the time at which the thread woke up. Empty if nothing arrived
-            in time, or if `close` was called.
-
-        Raises
-        ------
-        DeviceError
-            If the port is not open, or the connection is lost.
+        Its arrival is the time at which the thread woke up.
         """
         with self._lock:
             if self._handle is None:

@@ -1,16 +1,14 @@
 """Transport over UDP (IPv4), in which each datagram is a message.
 
-The kernel measures the arrival time of a datagram (SO_TIMESTAMPNS), so the arrival time does not
-depend on when this process runs. The wall-clock time of the kernel is converted to the monotonic
-clock by the difference of the clocks. The difference is constant unless the wall clock is set,
-because fine adjustments by the system change the rate of both clocks. If the difference has changed
-since the queue was last empty, the wake-up time of the thread is used instead, and the datagram is
-counted. For a few milliseconds after the first socket of the machine has requested timestamps, the
-kernel returns the time of the read access instead of the arrival time.
+The kernel measures the arrival time (SO_TIMESTAMPNS), so it does not depend on when this process
+runs. It is converted to the monotonic clock by the difference of the clocks, which is constant
+unless the wall clock is set, because fine adjustments change the rate of both. If the difference
+has changed since the queue was last empty, the wake-up time of the thread is used instead, and the
+datagram is counted. For a few milliseconds after the first socket of the machine has requested
+timestamps, the kernel returns the time of the read access.
 
-The number of datagrams dropped by the kernel because of a full buffer is read from the counter of
-the socket (SO_MEMINFO). SO_RXQ_OVFL is not used, because it is delivered with the next datagram and
-therefore misses losses after which no datagram arrives.
+Datagrams dropped because of a full buffer are read from the counter of the socket (SO_MEMINFO).
+SO_RXQ_OVFL is delivered with the next datagram and therefore misses the last losses.
 
 Sources: socket(7), ip(7) and udp(7) of Linux; order of the counters: SK_MEMINFO_* of
 linux/sock_diag.h, described in sock_diag(7).
@@ -68,13 +66,8 @@ class UdpSettings:
 
 
 def clock_difference() -> int | None:
-    """Wall clock minus monotonic clock, from the fastest of three measurements.
-
-    Returns
-    -------
-    int or None, ns
-        None if even the fastest measurement was too slow to be accurate.
-    """
+    """Wall clock minus monotonic clock, ns, from the fastest of three measurements; None if even
+    that was too slow to be accurate."""
     measurements = []
     for _ in range(3):
         before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
@@ -84,25 +77,12 @@ def clock_difference() -> int | None:
 
 
 class UdpSocket(Polled[socket.socket]):
-    """Transport over UDP with one chunk per datagram. Implements `reading.Transport`.
+    """Datagrams as chunks of a `reading.Transport`.
 
     The source of a chunk is the address of its sender, with the port if `source_port` is set.
-
-    Parameters
-    ----------
-    settings : UdpSettings
-    report : callable, optional
-        Called with a message for the user if the kernel limits the receive buffer.
-
-    Attributes
-    ----------
-    counts : Counter
-        Number of dropped datagrams and of wake-up times used as arrival times, by cause.
-
-    Raises
-    ------
-    SettingsError
-        If an address or the port is not valid.
+    `report` is called if the kernel limits the receive buffer. `counts` are dropped datagrams and
+    wake-up times used as arrival times. Raises SettingsError if an address or the port is not
+    valid.
     """
 
     SETTINGS = UdpSettings
@@ -132,13 +112,7 @@ class UdpSocket(Polled[socket.socket]):
         return self._settings
 
     def open(self) -> None:
-        """Bind the socket, and join the group if one is configured.
-
-        Raises
-        ------
-        DeviceError
-            If the socket cannot be opened.
-        """
+        """Bind the socket, and join the group if one is configured."""
         with self._lock:
             self._release()
             opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -190,24 +164,7 @@ class UdpSocket(Polled[socket.socket]):
         return f'cannot be opened: {error.strerror}'
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """Return the available datagrams; wait only if no datagram is available.
-
-        Parameters
-        ----------
-        timeout_s : float, s
-            Maximum time to wait.
-
-        Returns
-        -------
-        list of Chunk
-            Up to `MAX_DATAGRAMS_PER_READ` datagrams. Empty if none arrived in time, or if `close`
-            was called.
-
-        Raises
-        ------
-        DeviceError
-            If the socket is not open or fails.
-        """
+        """Return up to `MAX_DATAGRAMS_PER_READ` available datagrams; wait only if there is none."""
         with self._lock:
             if self._handle is None:
                 raise DeviceError(f'UDP {self._socket_name()}: not open')
@@ -253,7 +210,7 @@ class UdpSocket(Polled[socket.socket]):
         return False
 
     def _arrival(self, ancillary: list[Ancillary], difference: int | None, woken_ns: int) -> int:
-        """Return the monotonic arrival time of a datagram [ns] from the timestamp in `ancillary`.
+        """Monotonic arrival time of a datagram, ns, from the timestamp in `ancillary`.
 
         If there is no timestamp or `difference` is None, count the datagram and return `woken_ns`.
         """

@@ -35,7 +35,6 @@ class ClockStepFilter:
 
     Parameters
     ----------
-    n_sensors : int
     max_jump : int, ns
         Largest forward jump that passes unchecked. A held sample is rejected if it is not confirmed
         before the timestamps of its own sensor, or of the other sensors, advance by more than this.
@@ -44,10 +43,8 @@ class ClockStepFilter:
 
     Attributes
     ----------
-    latest : (n_sensors,) int array, ns
-        Timestamp of the latest accepted sample of each sensor.
-    newest : int, ns
-        Newest accepted timestamp of any sensor.
+    latest : (n_sensors,) int array, ns, latest accepted timestamp of each sensor
+    newest : int, ns, newest accepted timestamp of any sensor
     """
 
     def __init__(self, n_sensors: int, max_jump: int, max_held: int) -> None:
@@ -72,7 +69,7 @@ class ClockStepFilter:
 
     @property
     def is_calm(self) -> bool:
-        """Whether no clock step is suspected. Samples that do not jump then bypass the filter."""
+        """Whether no clock step is suspected: samples that do not jump then bypass the filter."""
         if not self._held and not self._ahead_since:
             return True
         # The entry of a sensor without held samples expires when a newer timestamp is accepted.
@@ -80,20 +77,9 @@ class ClockStepFilter:
             newest != self.newest for newest, _ in self._ahead_since.values())
 
     def feed(self, i: int, sample: HeldSample) -> tuple[SensorSamples, SensorSamples]:
-        """Check a sample, and release the held samples that it confirms or refutes.
+        """Check a sample of sensor `i`; return accepted and rejected samples in order of arrival.
 
-        Parameters
-        ----------
-        i : int
-            Index of the sensor.
-        sample : HeldSample
-
-        Returns
-        -------
-        passed : list of (int, HeldSample)
-            Accepted samples, in order of arrival.
-        rejected : list of (int, HeldSample)
-            Samples with a wrong timestamp, in order of arrival.
+        Besides the sample itself, these are the held samples that it confirms or refutes.
         """
         stamp = sample.stamp_ns
         if not self._jumps(i, stamp):
@@ -117,12 +103,7 @@ class ClockStepFilter:
         return passed, []
 
     def flush(self) -> SensorSamples:
-        """Accept and return all held samples at the end of the input.
-
-        Returns
-        -------
-        list of (int, HeldSample)
-        """
+        """Accept and return all held samples at the end of the input."""
         return self._accept(self._release(lambda *_: True))
 
     def _jumps(self, i: int, stamp: int) -> bool:
@@ -159,7 +140,7 @@ class ClockStepFilter:
     def _release_expired(self, i: int, stamp: int) -> SensorSamples:
         """Remove and return held samples of sensor `i` that precede `stamp` by over `max_jump`.
 
-        The oldest held sample of the sensor is also removed if it has more than `max_held`.
+        The oldest held sample is also removed if the sensor has more than `max_held`.
         """
         own_samples = [s for j, s, _ in self._held if j == i]
         oldest = own_samples[0] if len(own_samples) > self._max_held else None

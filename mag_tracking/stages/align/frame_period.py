@@ -19,18 +19,8 @@ MAX_TARGET_SPEED = 20.0
 
 
 def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
-    """Shortest time in which a target at `MAX_TARGET_SPEED` travels between two sensors.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-
-    Returns
-    -------
-    (float, str, str) or None
-        Delay [s] and the names of the two sensors. None if all sensors have nearly the same
-        horizontal position.
-    """
+    """Shortest time [s] in which a target at `MAX_TARGET_SPEED` travels between two sensors, and
+    their names; None if all sensors have nearly the same horizontal position."""
     shortest, pair = np.inf, None
     for j, position in enumerate(network.positions):
         distance = np.linalg.norm((network.positions[:j] - position)[:, :2], axis=1)
@@ -42,26 +32,13 @@ def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
 
 
 def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
-    """Frame period: the setting, or a period derived from the geometry if the setting is 0.
+    """Frame period [s]: the setting, or a period derived from the geometry if the setting is 0.
 
     A frame that is longer than the delay between two sensors mixes their signals. In a compact
     network, the derived period is therefore half the shortest delay, within `MIN_AUTO_PERIOD_S` and
     `DEFAULT_PERIOD_S`. In a larger network, tracking does not use this delay, and the default
     period saves computing time. In burst mode, the period is the maximum duration of a round.
-
-    Parameters
-    ----------
-    settings : AlignSettings
-    network : SensorNetwork
-
-    Returns
-    -------
-    float, s
-
-    Raises
-    ------
-    SettingsError
-        If the configured period is below `MIN_PERIOD_S`.
+    Raises SettingsError if the setting is below `MIN_PERIOD_S`.
     """
     if 0.0 < settings.period_s < MIN_PERIOD_S:
         raise SettingsError(f'align.period_s: {settings.period_s:g} s is shorter than the minimum '
@@ -75,19 +52,8 @@ def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
 
 
 def frame_period_warning(settings: AlignSettings, network: SensorNetwork) -> str | None:
-    """Warning if the configured period exceeds the travel time of a target between two sensors.
-
-    There is no warning in burst mode, where a frame is one round of the sensors.
-
-    Parameters
-    ----------
-    settings : AlignSettings
-    network : SensorNetwork
-
-    Returns
-    -------
-    str or None
-    """
+    """Warning if the setting exceeds the travel time of a target between two sensors, except in
+    burst mode, where a frame is one round of the sensors."""
     shortest, period = shortest_delay(network), frame_period(settings, network)
     if not settings.period_s or settings.burst or shortest is None or period <= shortest[0]:
         return None

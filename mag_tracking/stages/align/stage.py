@@ -40,16 +40,6 @@ class Align:
     The cost of a sample between two frames does not depend on the number of sensors: while one
     sensor is known to delay the frame, the other sensors are not checked. The rules are in
     `alignment.hpp`; this class handles the events that the compiled code reports.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : AlignSettings
-
-    Attributes
-    ----------
-    counts : Counter of str
-        Number of frames and of rejected samples, by cause.
     """
 
     def __init__(self, network: SensorNetwork, settings: AlignSettings) -> None:
@@ -86,17 +76,7 @@ class Align:
         return self._clock_steps.n_held
 
     def feed(self, readings: Readings) -> list[FieldFrame]:
-        """Add calibrated readings.
-
-        Parameters
-        ----------
-        readings : Readings
-
-        Returns
-        -------
-        list of FieldFrame
-            Completed frames.
-        """
+        """Add calibrated readings, and return the completed frames."""
         rows, C = readings.rows(self._index), readings.covariance
         if C is None:
             C = self._noise[rows]
@@ -166,12 +146,7 @@ class Align:
         return out
 
     def flush(self) -> list[FieldFrame]:
-        """Return all frames of the held and pending samples at the end of the input.
-
-        Returns
-        -------
-        list of FieldFrame
-        """
+        """Return all frames of the held and pending samples at the end of the input."""
         out = self._hold_passed(self._clock_steps.flush())
         return out + self._frames(final=True)
 

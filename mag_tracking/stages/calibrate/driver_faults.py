@@ -31,8 +31,6 @@ class DriverFaults:
 
     Parameters
     ----------
-    names : sequence of str
-        Names of the sensors.
     sensors : (n,) SENSOR array
         State of the sensors. The compiled code leaves out the faults that are stored there.
     """
@@ -46,41 +44,17 @@ class DriverFaults:
         self._n_skipped = dict.fromkeys(names, 0)
 
     def of(self, sensor: str) -> ReadingFaults:
-        """Return the faults of a sensor that have been found so far.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        ReadingFaults
-        """
+        """Faults of a sensor that have been found so far."""
         s = self._states[sensor]
         return ReadingFaults(s['marks'][:s['n_marks']].copy(), float(s['repetition']),
                              self._rates[sensor])
 
     def n_marked(self, sensor: str) -> int:
-        """Number of readings of a sensor with a mark for a missing reading on any axis.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        int
-        """
+        """Number of readings of a sensor with a mark for a missing reading on any axis."""
         return int(self._states[sensor]['n_marked'])
 
     def store(self, sensor: str, faults: ReadingFaults) -> None:
-        """Leave out faults of a sensor from now on.
-
-        Parameters
-        ----------
-        sensor : str
-        faults : ReadingFaults
-        """
+        """Leave out faults of a sensor from now on."""
         s, self._rates[sensor] = self._states[sensor], faults.rate
         s['n_marks'], s['marks'][:len(faults.marks)] = len(faults.marks), faults.marks
         s['repetition'] = faults.repetition
@@ -90,19 +64,10 @@ class DriverFaults:
         s['repeats'] = s['changes'] = s['run'] = 0
 
     def examine(self, sensor: str, stamp_ns: int) -> float:
-        """Search the latest raw readings of a sensor.
+        """Search the latest raw readings of a sensor; `stamp_ns` is that of the first reading after
+        them.
 
-        Parameters
-        ----------
-        sensor : str
-        stamp_ns : int, ns
-            Timestamp of the first reading after the window.
-
-        Returns
-        -------
-        float
-            Fraction of the readings in the window with a mark if a fault was found and stored; NaN
-            otherwise.
+        Return the fraction of readings with a mark if a fault was found and stored, otherwise NaN.
         """
         s, known = self._states[sensor], self.of(sensor)
         n = int(s['n_window'])
@@ -136,20 +101,7 @@ class DriverFaults:
         return True
 
     def rejection(self, sensor: str, reason: int) -> tuple[Cause, str]:
-        """Cause and description of the rejection of a reading of a sensor.
-
-        Parameters
-        ----------
-        sensor : str
-        reason : int
-            MARKED or REPEATED.
-
-        Returns
-        -------
-        cause : Cause
-        description : str
-            With the marks, or with the rates.
-        """
+        """Cause and description of a rejection; `reason` is MARKED or REPEATED."""
         faults = self.of(sensor)
         if reason == core.MARKED:
             return (Cause.NO_READING_MARK,

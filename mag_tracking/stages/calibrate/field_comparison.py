@@ -20,22 +20,9 @@ def compared_with_earth(network: SensorNetwork, survey: SurveySettings,
                         levels: FloatArray) -> list[FieldInconsistency]:
     """Find the sensors whose field without a target contradicts the Earth's field.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-        Without `earth_field`, the sensors are compared with their median.
-    survey : SurveySettings
-    levels : (n, 3) array, T, sensor frames
-        Fields without a target; NaN if unknown.
-
-    Returns
-    -------
-    list of FieldInconsistency
-
-    Raises
-    ------
-    ValueError
-        If the Earth's field is unknown, and fewer than three sensors report all axes.
+    `levels` (n, 3) [T] are these fields, NaN if unknown. If the Earth's field is unknown, the
+    sensors are compared with their median; raises ValueError if fewer than three then report all
+    axes.
     """
     std = np.array([np.full(3, np.deg2rad(survey.nominal_std_deg)) if s is None else s
                     for s in network.orientation_std])
@@ -47,30 +34,14 @@ def compared_with_earth(network: SensorNetwork, survey: SurveySettings,
 
 
 def earth_field_findings(inconsistencies: Iterable[FieldInconsistency]) -> list[Finding]:
-    """Findings about sensors that contradict the Earth's field.
-
-    Parameters
-    ----------
-    inconsistencies : iterable of FieldInconsistency
-
-    Returns
-    -------
-    list of Finding
-        Serious if the sensor misleads.
-    """
+    """Findings about sensors that contradict the Earth's field; serious if the sensor misleads."""
     return [Finding(d.misleads, d.sensor, str(d).removeprefix(f'{d.sensor} ')
                     + ('; all its tracks are ambiguous' if d.misleads else ''), d.advice,
                     Cause.CONTRADICTS_EARTH) for d in inconsistencies]
 
 
 class FieldComparison:
-    """Times at which the background of a sensor contradicts the Earth's field.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    survey : SurveySettings
-    """
+    """Times at which the background of a sensor contradicts the Earth's field."""
 
     def __init__(self, network: SensorNetwork, survey: SurveySettings) -> None:
         self._survey = survey
@@ -80,26 +51,15 @@ class FieldComparison:
         self.use(network)
 
     def use(self, network: SensorNetwork) -> None:
-        """Compare with another calibration of the same sensors from now on.
-
-        Parameters
-        ----------
-        network : SensorNetwork
-        """
+        """Compare with another calibration of the same sensors from now on."""
         self._network = network
         self._levels = np.full((len(network), 3), np.nan)
 
     def update(self, j: int, level: FloatArray, first_ns: int, last_ns: int) -> None:
-        """Compare the background of a sensor if it has changed.
+        """Compare the background (3,) [T] of sensor `j` if it has changed.
 
-        Parameters
-        ----------
-        j : int
-            Index of the sensor.
-        level : (3,) array, T, sensor frame
-        first_ns, last_ns : int, ns
-            Times of the first and of the latest reading of the sensor. The first background also
-            holds for the readings before it was learnt.
+        `first_ns` and `last_ns` are the times of its first and latest reading. The first background
+        also holds for the readings before it was learnt.
         """
         previous = self._levels[j]
         if not self._survey.offset_std or (
@@ -122,46 +82,18 @@ class FieldComparison:
         self._found |= found
 
     def doubtful_times(self) -> dict[str, DoubtfulTimes]:
-        """Intervals in which a background contradicted the Earth's field.
-
-        Returns
-        -------
-        dict of str to DoubtfulTimes
-            Intervals of each sensor that has any.
-        """
+        """Intervals in which a background contradicted the Earth's field, by sensor."""
         return {name: times for name, times in self._times.items() if times}
 
     def times_of(self, sensor: str) -> DoubtfulTimes:
-        """Intervals in which the background of a sensor contradicted the Earth's field.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        DoubtfulTimes
-        """
+        """Intervals in which the background of a sensor contradicted the Earth's field."""
         return self._times.get(sensor, ())
 
     def shift(self, sensor: str, ns: int) -> None:
-        """Shift the intervals of a sensor by a change of its clock offset.
-
-        Parameters
-        ----------
-        sensor : str
-        ns : int, ns
-            Added to all times.
-        """
+        """Shift the intervals of a sensor by a change of its clock offset."""
         if sensor in self._times:
             self._times[sensor] = shifted(self._times[sensor], ns)
 
     def inconsistencies(self) -> list[FieldInconsistency]:
-        """Latest misleading inconsistency of each sensor that had any.
-
-        Returns
-        -------
-        list of FieldInconsistency
-            In the order of the network.
-        """
+        """Latest misleading inconsistency of each sensor, in the order of the network."""
         return [self._found[name] for name in self._network.names if name in self._found]

@@ -20,8 +20,6 @@ class OutputBuffer:
 
     Parameters
     ----------
-    names : tuple of str
-        Names of all sensors.
     capacity : int
         Maximum number of readings.
     batch : Record
@@ -42,18 +40,7 @@ class OutputBuffer:
                        np.empty((capacity, 3)), np.empty((capacity, 3, 3)))
 
     def finish(self, counts: 'Counter[str]') -> list[Readings]:
-        """Count and return the readings that have been appended.
-
-        Parameters
-        ----------
-        counts : Counter of str
-            Updated in place.
-
-        Returns
-        -------
-        list of Readings
-            One batch, or an empty list if no reading was appended.
-        """
+        """Return the appended readings as one batch, if any, and count them in `counts`."""
         n = int(self._batch['n_out'])
         for key, name in (('calibrated', 'n_out'), *COUNTED.items()):
             if self._batch[name]:

@@ -25,18 +25,9 @@ REJECTIONS = {
 
 
 def own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
-    """Covariances of readings, and whether they are valid.
+    """Validity (NONE, VALID or INVALID) and covariance of each reading.
 
-    Parameters
-    ----------
-    readings : Readings
-
-    Returns
-    -------
-    validity : (n,) int array
-        NONE, VALID or INVALID; all NONE if the readings have no covariances.
-    covariance : (n, 3, 3) array, T²
-        Empty if the readings have no covariances.
+    The covariances are an empty array if the readings have none.
     """
     if readings.covariance is None:
         return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
@@ -46,52 +37,20 @@ def own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
 
 
 class Rejections:
-    """Numbers of the rejected readings of several sensors.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Names of the sensors.
-    """
+    """Numbers of the rejected readings of several sensors."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self._n: dict[str, Counter[tuple[Cause, str]]] = {name: Counter() for name in names}
 
     def add(self, sensor: str, cause: tuple[Cause, str], n: int) -> None:
-        """Add rejected readings.
-
-        Parameters
-        ----------
-        sensor : str
-        cause : tuple of Cause and str
-            Cause and description.
-        n : int
-        """
+        """Add `n` rejected readings."""
         self._n[sensor][cause] += n
 
     def of(self, sensor: str) -> 'Counter[tuple[Cause, str]]':
-        """Numbers of a sensor, by cause and description.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        Counter of (Cause, str)
-        """
+        """Numbers of a sensor, by cause and description."""
         return self._n[sensor].copy()
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
-        """Numbers of a sensor, in total (`rejected`) and by description (`rejected: ...`).
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        Counter of str
-        """
+        """Numbers of a sensor, in total (`rejected`) and by description (`rejected: ...`)."""
         counts = {f'rejected: {description}': n for (_, description), n in self._n[sensor].items()}
         return Counter(counts) + Counter(rejected=self._n[sensor].total())

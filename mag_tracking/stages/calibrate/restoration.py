@@ -23,21 +23,9 @@ class StoredBackground:
 
 def stored_background(background: RunningBackground, stamp_ns: int,
                       level: FloatArray) -> StoredBackground | None:
-    """Convert the background of a sensor to its stored form.
+    """Convert a known background with `level` (3,) [T] at `stamp_ns` to its stored form.
 
-    Parameters
-    ----------
-    background : RunningBackground
-        Background estimator, which must have a background.
-    stamp_ns : int, ns
-        Timestamp of the latest reading of the sensor.
-    level : (3,) array, T
-        Background at `stamp_ns`.
-
-    Returns
-    -------
-    StoredBackground or None
-        None if no axis has both a level and a noise variance.
+    None if no axis has both a level and a noise variance.
     """
     C = background.covariance
     assert C is not None
@@ -51,8 +39,8 @@ class BackgroundRestoration:
 
     Parameters
     ----------
-    max_gap_s : float, s
-        Maximum age of a stored background at the first reading of its sensor.
+    max_gap_s : float
+        Maximum age of a stored background at the first reading of its sensor [s].
     """
 
     def __init__(self, max_gap_s: float) -> None:
@@ -63,39 +51,17 @@ class BackgroundRestoration:
         return sensor in self._stored
 
     def set_stored(self, stored: Mapping[str, StoredBackground]) -> None:
-        """Replace all stored backgrounds.
-
-        Parameters
-        ----------
-        stored : mapping of str to StoredBackground
-            Background of each sensor.
-        """
+        """Replace all stored backgrounds; the keys are the sensors."""
         self._stored = dict(stored)
 
     def forget(self, sensor: str) -> None:
-        """Drop the stored background of a sensor.
-
-        Parameters
-        ----------
-        sensor : str
-        """
+        """Drop the stored background of a sensor."""
         self._stored.pop(sensor, None)
 
     def restore(self, sensor: str, stamp_ns: int, background: RunningBackground) -> str:
         """Restore the stored background of a sensor at its first reading, unless it is outdated.
 
-        Parameters
-        ----------
-        sensor : str
-        stamp_ns : int, ns
-            Timestamp of the first reading.
-        background : RunningBackground
-            Background estimator of the sensor, which receives the stored background.
-
-        Returns
-        -------
-        str
-            Outcome, as a key of `Calibrate.counts`.
+        `background` receives it. Return the outcome, as a key of `Calibrate.counts`.
         """
         stored = self._stored.pop(sensor)
         if 0 < stamp_ns - stored.stamp_ns <= self._max_gap_ns:

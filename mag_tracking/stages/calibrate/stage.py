@@ -83,8 +83,6 @@ class Calibrate:
 
     Parameters
     ----------
-    network : SensorNetwork
-    settings : CalibrateSettings
     background_type : type, optional
         Class that estimates the background of each sensor.
     survey : SurveySettings, optional
@@ -92,14 +90,9 @@ class Calibrate:
 
     Attributes
     ----------
-    counts : Counter of str
-        Number of readings by outcome, and of events such as time jumps.
-    rejections : Rejections
-        Number of rejected readings of each sensor by cause.
-    driver_faults : DriverFaults
-        Marks and repetitions, which are left out.
-    timestamps : TimestampMonitor
-        Faults of the timestamps, and rates.
+    counts : number of readings by outcome, and of events such as time jumps
+    driver_faults : marks and repetitions, which are left out
+    timestamps : faults of the timestamps, and rates
     """
 
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
@@ -127,19 +120,10 @@ class Calibrate:
         self.update_network(network)
 
     def update_network(self, network: SensorNetwork) -> None:
-        """Apply a new calibration of the same sensors.
+        """Apply a new calibration of the same sensors; raises NetworkError if their names differ.
 
         If the offset or the correction of a sensor has changed, the background of this sensor is
         learnt again. Otherwise it is retained, even while it is frozen.
-
-        Parameters
-        ----------
-        network : SensorNetwork
-
-        Raises
-        ------
-        NetworkError
-            If the names of the sensors differ.
         """
         if network.names != tuple(self._index):
             raise NetworkError(f'the new network has the sensors {", ".join(network.names)}; '
@@ -188,24 +172,14 @@ class Calibrate:
             evaluate_change=partial(self._changes.evaluate_change, i))
 
     def unready(self) -> list[str]:
-        """Names of the sensors whose background is not known yet.
-
-        Returns
-        -------
-        list of str
-        """
+        """Names of the sensors whose background is not known yet."""
         return [name for name, b in self._background.items() if not b.ready]
 
     def input_doubts(self) -> dict[str, dict[str, DoubtfulTimes]]:
-        """Intervals in which the background or the timestamps of a sensor were doubtful.
+        """{reason: {sensor: intervals}} in which backgrounds or timestamps were doubtful, if any.
 
         A background is doubtful while it is provisional or may contain the field of a target, and
         while it contradicts the Earth's field.
-
-        Returns
-        -------
-        dict of str to dict of str to DoubtfulTimes
-            {reason: {sensor: intervals}}, for each sensor that has any.
         """
         out = {DOUBTFUL_BACKGROUND: {n: b.doubtful_times for n, b in self._background.items()
                                      if b.doubtful_times},
@@ -214,16 +188,9 @@ class Calibrate:
         return {reason: by_sensor for reason, by_sensor in out.items() if by_sensor}
 
     def latest_doubt(self, sensor: str) -> tuple[int, int | None] | None:
-        """Latest interval in which the background or the timestamps of a sensor were doubtful.
+        """Latest interval [ns] in which the background or the timestamps of a sensor were doubtful.
 
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        (begin, end), int, ns, or None
-            Open intervals (end None) come first. None if there is no interval.
+        An open interval has the end None and comes first. None if there is no interval.
         """
         times = [interval for by_sensor in (
             self._background[sensor].doubtful_times, self._comparison.times_of(sensor),
@@ -232,41 +199,17 @@ class Calibrate:
         return max(times, key=lambda t: (t[1] is None, t[0]), default=None)
 
     def field_inconsistencies(self) -> list[FieldInconsistency]:
-        """Sensors whose background contradicts the Earth's field so much that tracks are wrong.
-
-        Returns
-        -------
-        list of FieldInconsistency
-            The latest inconsistency of each sensor that had any, in the order of the network.
-        """
+        """Latest inconsistency of each sensor whose background has contradicted the Earth's field
+        so much that tracks are wrong, in the order of the network."""
         return self._comparison.inconsistencies()
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
-        """Number of accepted and rejected readings of a sensor, in total and by cause of rejection.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        Counter of str
-        """
+        """Number of accepted and rejected readings of a sensor, the latter also by cause."""
         return self.rejections.counts_of(sensor) \
             + Counter(accepted=int(self._state_of(sensor)['accepted']))
 
     def lowest_rate(self, sensor: str) -> float:
-        """Lowest rate at which a sensor has measured so far.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        float, Hz
-            Without repetitions; inf if unknown.
-        """
+        """Lowest rate [Hz] of a sensor so far, without repetitions; inf if unknown."""
         return self.timestamps.lowest_rate(sensor) / self.driver_faults.of(sensor).repetition
 
     def _state_of(self, sensor: str) -> Record:
@@ -274,17 +217,9 @@ class Calibrate:
         return self._sensors[self._index[sensor]]
 
     def feed(self, readings: Readings) -> list[Readings]:
-        """Calibrate raw readings; the result does not depend on how they are split into batches.
+        """Calibrate raw readings, and return those that are no longer held as at most one batch.
 
-        Parameters
-        ----------
-        readings : Readings
-
-        Returns
-        -------
-        list of Readings
-            One batch of the calibrated readings that are no longer held; an empty list if there
-            are none.
+        The result does not depend on how the readings are split into batches.
         """
         rows = readings.rows(self._index)
         validity, covariances = own_covariances(readings)
@@ -395,14 +330,8 @@ class Calibrate:
                    steps: Mapping[str, FloatArray], faults: Mapping[str, ReadingFaults]) -> None:
         """Initialise the stage with the results of a first pass over the readings.
 
-        Parameters
-        ----------
-        levels : mapping of str to MostFrequentLevel
-            Background of each sensor that is not quiet at the start.
-        steps : mapping of str to (3,) array, T
-            Resolution of the axes of each sensor.
-        faults : mapping of str to ReadingFaults
-            Faults of the drivers.
+        `levels` are the backgrounds of the sensors that are not quiet at the start, `steps` (3,)
+        [T] the resolution of the axes of each sensor.
         """
         for name, found in faults.items():
             if found:
@@ -414,23 +343,11 @@ class Calibrate:
             self._background[name].start_from(quiet.level, quiet.covariance)
 
     def compare_clocks(self, clocks: Mapping[str, ClockSpan]) -> None:
-        """Report sensors whose clocks differ from those of other sensors as doubtful.
-
-        Parameters
-        ----------
-        clocks : {sensor: ClockSpan}
-            Raw timestamps, and their times of receipt.
-        """
+        """Report sensors whose raw timestamps differ from those of other sensors as doubtful."""
         self.timestamps.compare_clocks(corrected(clocks, self._network))
 
     def resume(self, stored: Mapping[str, StoredBackground]) -> None:
-        """Provide stored backgrounds, which are restored at the first reading of each sensor.
-
-        Parameters
-        ----------
-        stored : mapping of str to StoredBackground
-            Background of each sensor.
-        """
+        """Provide stored backgrounds, which are restored at the first reading of each sensor."""
         self._restoration.set_stored(stored)
         self._mark_restorable()
 
@@ -439,17 +356,7 @@ class Calibrate:
         self._sensors['is_restorable'] = [name in self._restoration for name in self._index]
 
     def stored(self, sensor: str) -> StoredBackground | None:
-        """Return the background of a sensor in the form that `resume` accepts.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        StoredBackground or None
-            None while the background is unknown or doubtful.
-        """
+        """Background of a sensor for `resume`; None while it is unknown or doubtful."""
         background, last = self._background[sensor], self.last_stamp_ns(sensor)
         if not background.certain or last is None:
             return None
@@ -465,12 +372,7 @@ class Calibrate:
             self._evaluate_block(int(i))
 
     def flush(self) -> list[Readings]:
-        """Calibrate and return the readings that are still held.
-
-        Returns
-        -------
-        list of Readings
-        """
+        """Calibrate and return the readings that are still held."""
         out = self._new_output(0)
         for i in np.flatnonzero(self._sensors['n_held']):
             s = self._sensors[i]
@@ -488,17 +390,9 @@ class Calibrate:
             self.rejections.add(sensor, cause, n)
 
     def forget(self, sensors: Collection[str] = ()) -> None:
-        """Discard the backgrounds of sensors and learn them again.
+        """Discard the backgrounds of sensors, by default of all sensors, and learn them again.
 
-        Parameters
-        ----------
-        sensors : collection of str, optional
-            Names of the sensors; an empty collection selects all sensors.
-
-        Raises
-        ------
-        NetworkError
-            If a sensor is not in the network.
+        Raises NetworkError if a sensor is not in the network.
         """
         for name in sensors:
             self._network.index(name)
@@ -508,62 +402,21 @@ class Calibrate:
         self._mark_restorable()
 
     def last_stamp_ns(self, sensor: str) -> int | None:
-        """Timestamp of the latest accepted reading of a sensor.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        int or None, ns
-        """
+        """Timestamp of the latest accepted reading of a sensor."""
         last = int(self._state_of(sensor)['last_ns'])
         return None if last == NEVER else last
 
     def background(self, sensor: str) -> FloatArray:
-        """Background of a sensor at the time of its latest reading.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        (3,) array, T
-
-        Raises
-        ------
-        ValueError
-            If the background is not known yet.
-        """
+        """Background (3,) [T] at the latest reading of a sensor; ValueError if unknown."""
         state = self._state_of(sensor)
         return self._background[sensor].level(int(state['last_ns'] - state['first_ns']) / NS)
 
     def overruled_covariances(self, sensor: str) -> tuple[int, FloatArray, FloatArray]:
-        """Message covariances of a sensor that contradict its measured noise.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        n : int
-            Number of overruled covariances.
-        stated : (3,) array, T
-            Standard deviation in the latest message; NaN if unknown.
-        measured : (3,) array, T
-            Measured standard deviation of the readings; NaN if unknown.
-        """
+        """Number of message covariances of a sensor that contradict its measured noise, the std
+        (3,) [T] in the latest message, and the measured std (3,) [T]; NaN if unknown."""
         s = self._state_of(sensor)
         return int(s['n_overruled']), s['stated_std'].copy(), s['noise_std'].copy()
 
     def backgrounds(self) -> dict[str, RunningBackground]:
-        """Background estimators of all sensors, for inspection.
-
-        Returns
-        -------
-        dict of str to RunningBackground
-        """
+        """Background estimators of all sensors, for inspection."""
         return dict(self._background)

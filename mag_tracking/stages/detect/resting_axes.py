@@ -22,40 +22,18 @@ step of one axis, which background drift can cause, remains below the threshold.
 
 
 class RestingAxes:
-    """Finds axes at rest by the mean square of their field in frames without a target.
-
-    Parameters
-    ----------
-    n_sensors : int
-    """
+    """Finds axes at rest by the mean square of their field in frames without a target."""
 
     def __init__(self, n_sensors: int) -> None:
         self._n: FloatArray = np.zeros((n_sensors, 3))
         self._mean_square: FloatArray = np.zeros((n_sensors, 3))
 
     def learn(self, field: FloatArray) -> None:
-        """Update the averages with a frame that contains no target.
-
-        Parameters
-        ----------
-        field : (n_sensors, 3) array, T
-            NaN for a missing axis.
-        """
+        """Update the averages with the field (n_sensors, 3) of a frame without a target."""
         core.learn(plain(field), MEMORY_FRAMES, self._n, self._mean_square)
 
     def covariance(self, covariance: FloatArray, background_variance: float) -> FloatArray:
-        """Reduce the variances of axes at rest in a covariance, and add the background variance.
-
-        Parameters
-        ----------
-        covariance : (n_sensors, 3, 3) array, T²
-            Covariance of the frame.
-        background_variance : float, T²
-            Variance of the background error, which is added to each axis.
-
-        Returns
-        -------
-        (n_sensors, 3, 3) array, T²
-        """
+        """Covariance of a frame, with smaller variances of the axes at rest and
+        `background_variance` [T²] added to each axis."""
         return core.scaled(plain(covariance), self._n, self._mean_square, MEMORY_FRAMES / 4,
                            RESTING_RATIO, VARIANCE_REDUCTION, background_variance)

@@ -28,17 +28,9 @@ RECOVERY_S = 5.0
 class Detect:
     """Decides for each frame whether a target is present, and reports onset and release.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : DetectSettings
-
     Attributes
     ----------
-    counts : Counter of str
-        Number of frames, onsets and rejections.
-    max_consecutive_above : int
-        Largest number of consecutive frames above the threshold.
+    max_consecutive_above : largest number of consecutive frames above the threshold
 
     References
     ----------
@@ -69,18 +61,9 @@ class Detect:
         self._frozen_s = 0.0
 
     def threshold(self, probability: float, degrees_of_freedom: int) -> float:
-        """Energy threshold that noise exceeds with a given probability; cached.
+        """Energy threshold that noise exceeds with `probability`; cached.
 
-        Parameters
-        ----------
-        probability : float
-            Probability of exceeding the threshold.
-        degrees_of_freedom : int
-            Number of measured axes.
-
-        Returns
-        -------
-        float
+        The degrees of freedom are the measured axes.
         """
         key = probability, degrees_of_freedom
         if key not in self._thresholds:
@@ -88,17 +71,9 @@ class Detect:
         return self._thresholds[key]
 
     def feed(self, frame: FieldFrame) -> list[FieldFrame | Detection]:
-        """Test a frame.
+        """Test a frame: return an onset or release, if any, and the frame with its detection flag.
 
-        Parameters
-        ----------
-        frame : FieldFrame
-
-        Returns
-        -------
-        list of FieldFrame or Detection
-            An onset or release, if there is one, and the frame with its detection flag. A frame
-            with an invalid covariance is dropped.
+        A frame with an invalid covariance is dropped.
         """
         out: list[FieldFrame | Detection] = []
         if self._last_ns is not None and frame.stamp_ns <= self._last_ns:
@@ -142,10 +117,6 @@ class Detect:
         """Square root of the largest ratio of energy to single-sensor threshold, for each sensor.
 
         As for `largest_excursion`, only frames without a detection are used.
-
-        Returns
-        -------
-        (n_sensors,) array
         """
         return np.sqrt(self._max_ratios)
 
@@ -206,10 +177,5 @@ class Detect:
         """Do nothing: no work is deferred."""
 
     def flush(self) -> list[FieldFrame | Detection]:
-        """Return an empty list: no frame is buffered.
-
-        Returns
-        -------
-        list of FieldFrame or Detection
-        """
+        """Return an empty list: no frame is buffered."""
         return []

@@ -39,27 +39,11 @@ class ClosestPoint(NamedTuple):
 
 
 def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> ClosestPoint:
-    """Fit the Anderson functions of a dipole on a straight line to the field of one sensor.
+    """Fit the Anderson functions of a dipole on a straight line to the field (n, 3) of one sensor.
 
-    One axis is sufficient. The linear parameters (three coefficients and a constant per axis) are
-    solved for each candidate time and time scale.
-
-    Parameters
-    ----------
-    t : (n,) array, s
-        Times of the readings, ascending.
-    field : (n, 3) array, T
-        NaN for a missing axis.
-    noise_std : (3,) array, T
-        Noise standard deviation of one reading, per axis.
-
-    Returns
-    -------
-    ClosestPoint
-
-    References
-    ----------
-    [TSP14]_ eq. (22), (23), with the exponent 5/2.
+    One axis is sufficient; a missing axis is NaN. `noise_std` (3,) [T] is the noise of one reading.
+    The linear parameters (three coefficients and a constant per axis) are solved for each candidate
+    time and time scale. See [TSP14]_ eq. (22), (23), with the exponent 5/2.
     """
     present = ~np.isnan(field).all(axis=0) & ~np.isnan(noise_std)
     complete = ~np.isnan(field[:, present]).any(axis=1)
@@ -101,10 +85,7 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
 
 
 def _averaged(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Average consecutive samples in at most `MAX_SAMPLES` blocks of equal length.
-
-    The samples after the last complete block are dropped.
-    """
+    """Average samples in at most `MAX_SAMPLES` equal blocks; drop an incomplete last block."""
     n = -(-len(t) // MAX_SAMPLES) or 1
     k = len(t) // n
     return t[:k * n].reshape(k, n).mean(axis=1), y[:k * n].reshape(k, n, -1).mean(axis=1)

@@ -40,20 +40,8 @@ class Events:
     """Converts calibrated readings to pass events, one for each detection at each sensor.
 
     The events that one batch completes are returned sensor by sensor. An event contains no lengths,
-    because a single sensor does not observe the spatial scale.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    align : AlignSettings
-    detect : DetectSettings
-    track : TrackSettings
-        They determine the rate below which a pass is not resolved.
-
-    Attributes
-    ----------
-    counts : Counter of str
-        Number of events.
+    because a single sensor does not observe the spatial scale. The align and track settings
+    determine the rate below which a pass is not resolved.
     """
 
     def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
@@ -66,29 +54,15 @@ class Events:
                          for j, part in enumerate(parts)]
 
     def set_relearnt(self, backgrounds: Mapping[str, RunningBackground]) -> None:
-        """Set the changes of the backgrounds, which are not the departure of a target.
+        """Set the changes of each sensor's background, which are not the departure of a target.
 
-        Parameters
-        ----------
-        backgrounds : mapping of str to RunningBackground
-            Background of each sensor. Without them, the event of a parked vehicle ends when its
-            field has become the background.
+        Without them, the event of a parked vehicle ends when its field has become the background.
         """
         for name, background in backgrounds.items():
             self._sensors[self._index[name]].relearnt = background.relearnt
 
     def feed(self, readings: Readings) -> list[PassEvent]:
-        """Add calibrated readings.
-
-        Parameters
-        ----------
-        readings : Readings
-
-        Returns
-        -------
-        list of PassEvent
-            Completed events.
-        """
+        """Add calibrated readings, and return the completed events."""
         rows = readings.rows(self._index)
         out: list[PassEvent] = []
         for j in np.unique(rows[rows >= 0]).tolist():
@@ -99,12 +73,7 @@ class Events:
         """Do nothing: no work is deferred."""
 
     def flush(self) -> list[PassEvent]:
-        """Return the events that are still in progress at the end of the input.
-
-        Returns
-        -------
-        list of PassEvent
-        """
+        """Return the events that are still in progress at the end of the input."""
         return [event for s in self._sensors for event in s.flush()]
 
 
@@ -242,7 +211,7 @@ class _SensorEvents:
 def _left_to_right(horizontal: FloatArray, noise_std: float, n_quiet: int) -> float:
     """Probability that the target passes the sensor from left to right; 0.5 if unobservable.
 
-    `horizontal` (n, 2) [T] is the horizontal field; its first `n_quiet` samples precede the target.
+    The first `n_quiet` samples of the field `horizontal` (n, 2) [T] precede the target.
     """
     rotation = rotation_of_pass(horizontal, noise_std, n_quiet)
     if rotation is None:
@@ -268,7 +237,7 @@ def _median_interval(stamp: IntArray) -> float:
 def _signature(t: FloatArray, field: FloatArray, time: float, scale: float) -> FloatArray:
     """Field (`SIGNATURE_POINTS`, 3) [T] at equidistant times around the closest point of approach.
 
-    The times [s] are centred on `time` and proportional to `scale`. The field is NaN outside the
+    The times are centred on `time` and proportional to `scale`. The field is NaN outside the
     readings, or if `scale` is not finite.
     """
     if not np.isfinite(scale):

@@ -69,8 +69,7 @@ class Stays:
 
     Attributes
     ----------
-    first_ns : int
-        Time of the first reading [ns].
+    first_ns : int, ns, time of the first reading
     """
 
     def __init__(self, free_field: FloatArray) -> None:
@@ -83,20 +82,10 @@ class Stays:
             relearnt: Sequence[RelearntBackground]) -> list[PassEvent]:
         """Add an event, and return the completed events.
 
-        Parameters
-        ----------
-        event : PassEvent
-        readings : Readings
-            Calibrated readings from before the onset until after the release.
-        relearnt : sequence of RelearntBackground
-            Changes of the background.
-
-        Returns
-        -------
-        list of PassEvent
-            `event`, unless it is the arrival or the departure of a parked vehicle; a departure
-            completes the event of the arrival. The event of a vehicle that was present from the
-            start begins with the first reading.
+        `readings` are the calibrated readings from before the onset until after the release. The
+        event itself is returned unless it is the arrival or the departure of a parked vehicle; a
+        departure completes the event of the arrival. The event of a vehicle that was present from
+        the start begins with the first reading.
         """
         end_ns = int(readings.stamp_ns[-1])
         change = max((c for c in relearnt if event.onset_ns < c.stamp_ns <= end_ns),
@@ -133,7 +122,7 @@ class Stays:
                    tolerance: float) -> list[PassEvent]:
         """Events completed by an event during which the background did not change.
 
-        `fields` (n, 3) [T] are its readings, and `level` (3,) [T] is the field after its end.
+        `fields` (n, 3) [T] are its readings; `level` (3,) [T] is the field after its end.
         """
         remains = np.linalg.norm(level) > MIN_REMAINING * np.linalg.norm(np.nan_to_num(event.peak))
         for k in reversed(range(len(self._open))):
@@ -178,17 +167,7 @@ class Stays:
         return before - after > MIN_APPROACH * _size(change)
 
     def flush(self, last_ns: int) -> list[PassEvent]:
-        """Return the events of the vehicles that have not left, as not ended.
-
-        Parameters
-        ----------
-        last_ns : int, ns
-            Time of the last reading.
-
-        Returns
-        -------
-        list of PassEvent
-        """
+        """Return the events of vehicles that have not left by the last reading, as not ended."""
         stays, self._open = self._open, []
         held, self._held = self._held, None
         return [*([held.event] if held is not None and held.event is not None else []),

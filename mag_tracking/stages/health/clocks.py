@@ -47,32 +47,13 @@ class ClockSpan(NamedTuple):
     last_received_ns: int
 
     def until(self, later: 'ClockSpan') -> 'ClockSpan':
-        """Span from the begin of this span to the end of a later one.
-
-        Parameters
-        ----------
-        later : ClockSpan
-
-        Returns
-        -------
-        ClockSpan
-        """
+        """Span from the begin of this span to the end of a later one."""
         return ClockSpan(self.first_ns, later.last_ns, self.first_received_ns,
                          later.last_received_ns)
 
     @classmethod
     def of(cls, stamps: IntArray, received: IntArray) -> 'ClockSpan':
-        """Span of consecutive readings.
-
-        Parameters
-        ----------
-        stamps : (n,) int array, ns
-        received : (n,) int array, ns
-
-        Returns
-        -------
-        ClockSpan
-        """
+        """Span of consecutive readings with times of receipt."""
         return cls(int(stamps[0]), int(stamps[-1]), int(received[0]), int(received[-1]))
 
     @property
@@ -93,30 +74,14 @@ class ClockSpan(NamedTuple):
             else np.nan
 
     def corrected(self, offset_ns: int) -> 'ClockSpan':
-        """Subtract the offset of the clock from the timestamps.
-
-        Parameters
-        ----------
-        offset_ns : int, ns
-
-        Returns
-        -------
-        ClockSpan
-        """
+        """Subtract the offset of the clock from the timestamps."""
         return self._replace(first_ns=self.first_ns - offset_ns, last_ns=self.last_ns - offset_ns)
 
     def ahead_s(self, reference: 'ClockSpan') -> tuple[float, bool]:
-        """Difference from another clock [s], and whether it is too large for delays.
+        """Time [s] by which this clock is ahead of another, and whether it is too large for delays.
 
-        Parameters
-        ----------
-        reference : ClockSpan
-
-        Returns
-        -------
-        tuple of (float, bool)
-            Positive if this clock is ahead. Clocks that do not advance like the time of receipt,
-            as those of a fast replay, cannot be compared.
+        Clocks that do not advance like the time of receipt, as those of a fast replay, cannot be
+        compared.
         """
         ahead_s = reference.delay_s - self.delay_s
         first_s = reference.first_delay_s - self.first_delay_s
@@ -140,35 +105,15 @@ class ClockSpan(NamedTuple):
 
 
 def corrected(clocks: Mapping[str, ClockSpan], network: SensorNetwork) -> dict[str, ClockSpan]:
-    """Correct the clocks of the sensors of a network.
-
-    Parameters
-    ----------
-    clocks : {sensor: ClockSpan}
-        Other sensors are omitted.
-    network : SensorNetwork
-
-    Returns
-    -------
-    {sensor: ClockSpan}
-    """
+    """Correct the clocks of the sensors of a network, and omit other sensors."""
     return {name: clocks[name].corrected(offset_ns) for name, offset_ns in zip(
         network.names, network.clock_offset_ns.tolist(), strict=True) if name in clocks}
 
 
 def clock_differences(clocks: Mapping[str, ClockSpan]) -> dict[str, tuple[float, bool]]:
-    """Compare clocks with the one nearest to the clock of the host.
+    """Compare clocks with the one nearest to the clock of the host, as by `ClockSpan.ahead_s`.
 
     In a replay, all clocks differ from that of the host by about the same time.
-
-    Parameters
-    ----------
-    clocks : {sensor: ClockSpan}
-
-    Returns
-    -------
-    {sensor: (float, bool)}
-        See `ClockSpan.ahead_s`.
     """
     reference = min(clocks.values(), key=lambda clock: abs(clock.delay_s), default=None)
     return {} if reference is None else {
@@ -176,16 +121,7 @@ def clock_differences(clocks: Mapping[str, ClockSpan]) -> dict[str, tuple[float,
 
 
 def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
-    """Report wrong units of timestamps, and clocks that differ from those of other sensors.
-
-    Parameters
-    ----------
-    clocks : {sensor: ClockSpan}
-
-    Yields
-    ------
-    Finding
-    """
+    """Report wrong units of timestamps, and clocks that differ from those of other sensors."""
     for name, (ahead_s, differs) in clock_differences(clocks).items():
         clock = clocks[name]
         if clock.wrong_unit is not None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 class Cause(enum.Enum):
-    """Kind of a fault. The value names it in `summary.json`."""
+    """Kind of a fault; the value names it in `summary.json`."""
 
     # The computer, the recording and the topics.
     OVERLOADED = 'overloaded computer'
@@ -162,19 +162,10 @@ their own subject."""
 
 
 def ranked(findings: Iterable[Finding]) -> list[Diagnosis]:
-    """Attach each finding to the cause that explains it.
+    """Attach each finding to the cause that explains it; serious diagnoses come first.
 
     A further finding of the same cause and subject is a consequence of the first one. Findings that
     are artefacts of another finding are omitted.
-
-    Parameters
-    ----------
-    findings : iterable of Finding
-
-    Returns
-    -------
-    list of Diagnosis
-        One per cause that no other finding explains; serious diagnoses first.
     """
     same_fault: dict[tuple[str, Cause], list[Finding]] = {}
     for finding in findings:

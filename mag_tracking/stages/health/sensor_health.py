@@ -53,18 +53,7 @@ class SensorHealth:
     """Monitors the readings of one sensor.
 
     Statistics are updated after every `update_interval` readings, before each query, and for each
-    batch.
-
-    Parameters
-    ----------
-    update_interval : int, optional
-        Number of readings between two updates.
-    faults : ReadingFaults, optional
-        Marks and repetitions, which are not evaluated as readings.
-
-    Attributes
-    ----------
-    faults : ReadingFaults
+    batch. The marks and repetitions of `faults` are not evaluated as readings.
     """
 
     def __init__(self, update_interval: int = UPDATE_INTERVAL,
@@ -96,16 +85,7 @@ class SensorHealth:
         self._steps: FloatArray = np.full(3, np.inf)
 
     def add(self, stamp_ns: int, field: FloatArray, received_ns: int | None = None) -> None:
-        """Add a reading.
-
-        Parameters
-        ----------
-        stamp_ns : int, ns
-        field : (3,) array, T
-            As measured, without calibration.
-        received_ns : int, ns, optional
-            Time of receipt by the clock of the host.
-        """
+        """Add a reading, without calibration; `received_ns` is by the clock of the host."""
         self._buffered.append((stamp_ns, field, NEVER if received_ns is None else received_ns))
         if len(self._buffered) == self._update_interval:
             self.update()
@@ -130,18 +110,10 @@ class SensorHealth:
                            np.array(received, dtype=np.int64))
 
     def add_batch(self, stamps: IntArray, fields: FloatArray, received: IntArray) -> None:
-        """Add readings directly to the window, and update the statistics.
+        """Add at most `WINDOW` readings directly to the window, and update the statistics.
 
-        The arrays may be modified afterwards. Readings that `add` has buffered are not added first,
-        so use either `add` or `add_batch`.
-
-        Parameters
-        ----------
-        stamps : (n,) int array, ns
-            At most `WINDOW` readings.
-        fields : (n, 3) array, T
-        received : (n,) int array, ns
-            Time of receipt, or `NEVER`.
+        An unknown time of receipt is `NEVER`. The arrays may be modified afterwards. Readings that
+        `add` has buffered are not added first, so use either `add` or `add_batch`.
         """
         n, self._cache, self._delays = len(stamps), {}, None
         if not n:
@@ -203,7 +175,7 @@ class SensorHealth:
                 / self._interval_ns
 
     def _are_gaps(self, intervals: IntArray) -> BoolArray:
-        """Whether readings are missing in each of the latest intervals [ns], (n,).
+        """Whether readings are missing in each of the latest intervals [ns].
 
         The adjacent intervals compensate for a timestamp that is only late.
         """
@@ -291,7 +263,7 @@ class SensorHealth:
 
     @property
     def noise_std(self) -> FloatArray:
-        """Noise standard deviation, (3,) T; NaN for a missing axis or too few readings.
+        """Noise std (3,) [T]; NaN for a missing axis or too few readings.
 
         It is computed from second differences, which suppress targets.
         """
@@ -346,22 +318,11 @@ class SensorHealth:
 
     def findings(self, name: str, noise_std: FloatArray | None = None,
                  max_field: float = 1e-3, is_live: bool = True) -> list[Finding]:
-        """Faults of the sensor, without ranking.
+        """Faults of the sensor `name`, without ranking.
 
-        Parameters
-        ----------
-        name : str
-            Name of the sensor.
-        noise_std : (3,) array, T, optional
-            Noise standard deviation when the sensor was calibrated, for comparison.
-        max_field : float, T, optional
-            Limit above which readings are rejected.
-        is_live : bool, optional
-            False for a replay, whose timestamps may be old or repeat; clocks are then not checked.
-
-        Returns
-        -------
-        list of Finding
+        `noise_std` (3,) [T] is that of the calibration; readings above `max_field` [T] are
+        rejected. The timestamps of a replay (not `is_live`) may be old or repeat, so clocks are not
+        checked.
         """
         n = self.counts['readings']
         if not n:

@@ -36,18 +36,7 @@ CAUSES = {
 
 
 def timestamp_finding(sensor: str, fault: TimestampFault) -> Finding:
-    """Convert a fault of timestamps to a finding.
-
-    Parameters
-    ----------
-    sensor : str
-    fault : TimestampFault
-
-    Returns
-    -------
-    Finding
-        Serious if the error exceeds `MAX_ERROR_S`.
-    """
+    """Convert a fault of timestamps to a finding, serious if its error exceeds `MAX_ERROR_S`."""
     is_serious, text = fault.error_s > MAX_ERROR_S, fault.text
     if is_serious and np.isfinite(fault.error_s):
         text += (f'; the timestamps are wrong by up to {1e3 * fault.error_s:.0f} ms, which makes '
@@ -60,11 +49,6 @@ class TimestampMonitor:
     """Examines the timestamps of several sensors while their readings arrive.
 
     The result does not depend on how the readings are split into batches.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Names of the sensors.
     """
 
     def __init__(self, names: tuple[str, ...]) -> None:
@@ -79,15 +63,7 @@ class TimestampMonitor:
         self._differing: set[str] = set()
 
     def add(self, rows: IntArray, stamps: IntArray, fields: FloatArray) -> None:
-        """Add readings.
-
-        Parameters
-        ----------
-        rows : (n,) int array
-            Index of the sensor of each reading; readings with a negative index are skipped.
-        stamps : (n,) int array, ns
-        fields : (n, 3) array, T
-        """
+        """Add readings; `rows` are sensor indices, and negative ones are skipped."""
         i = 0
         while (i := self._buffer.add(rows, stamps, fields, 0, i)) < len(rows):
             self._examine(int(rows[i]))
@@ -116,53 +92,25 @@ class TimestampMonitor:
     def compare_clocks(self, clocks: Mapping[str, ClockSpan]) -> None:
         """Mark all timestamps of sensors whose clocks differ from those of other sensors.
 
-        Parameters
-        ----------
-        clocks : {sensor: ClockSpan}
-            Latest clocks, which replace those of the previous call.
+        The clocks replace those of the previous call.
         """
         self._differing = {
             name for name, (_, differs) in clock_differences(clocks).items() if differs}
 
     def doubtful_times(self) -> dict[str, DoubtfulTimes]:
-        """Intervals in which timestamps were wrong by more than `MAX_ERROR_S`.
-
-        Returns
-        -------
-        dict of str to DoubtfulTimes
-            Of each sensor that has any.
-        """
+        """Intervals in which timestamps were wrong by over `MAX_ERROR_S`, by sensor."""
         out = {name: self._doubtful_times[j] for name, j in self._index.items()
                if self._doubtful_times[j]}
         return {**out, **dict.fromkeys(self._differing, ((0, None),))}
 
     def worst_fault(self, sensor: str) -> TimestampFault | None:
-        """Return the fault of a sensor with the largest error so far.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        TimestampFault or None
-        """
+        """Fault of a sensor with the largest error so far."""
         j = self._index[sensor]
         latest, worst = self._latest_fault(j), self._worst.get(j)
         return worst if latest is None else latest.after(worst)
 
     def lowest_rate(self, sensor: str) -> float:
-        """Return the lowest rate of a sensor so far.
-
-        Parameters
-        ----------
-        sensor : str
-
-        Returns
-        -------
-        float, Hz
-            Of readings without a fault of the timestamps; inf if there are none.
-        """
+        """Lowest rate [Hz] of a sensor without faults of the timestamps; inf if unknown."""
         j = self._index[sensor]
         stamps = np.append(self._stamps[j], self._buffer.peek(j)[0])
         latest_s = latest_interval_s(stamps) if self.worst_fault(sensor) is None else 0.0

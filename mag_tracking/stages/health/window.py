@@ -10,20 +10,10 @@ from mag_tracking.calibration.resolution import smallest_steps
 
 def quantiles(values: Sequence[float] | FloatArray | IntArray,
               *probabilities: float) -> list[float]:
-    """Quantiles of finite values, by linear interpolation.
+    """Quantiles of finite values, by linear interpolation; NaN if `values` is empty.
 
     This is `numpy.quantile` without its checks, which take longer than the computation for small
     arrays.
-
-    Parameters
-    ----------
-    values : (n,) array
-    *probabilities : float
-
-    Returns
-    -------
-    list of float
-        One value per probability; NaN if `values` is empty.
     """
     if not len(values):
         return [float('nan')] * len(probabilities)
@@ -37,34 +27,16 @@ def quantiles(values: Sequence[float] | FloatArray | IntArray,
 
 
 def median_field(fields: FloatArray) -> FloatArray:
-    """Median of each axis.
-
-    Parameters
-    ----------
-    fields : (n, 3) array, T
-
-    Returns
-    -------
-    (3,) array, T
-        NaN for a missing axis.
-    """
+    """Median (3,) of each axis of `fields` (n, 3); NaN for a missing axis."""
     return np.array([quantiles(axis[~np.isnan(axis)], 0.5)[0] for axis in fields.T])
 
 
 def sample_noise_std(fields: FloatArray) -> FloatArray:
-    """Noise standard deviation of each axis, from second differences without outliers.
+    """Noise std (3,) of each axis of `fields` (n, 3), from second differences without outliers.
 
     Second differences suppress a passing target, whose field has a slope but hardly any curvature
-    from one reading to the next. The result is at least the quantisation error.
-
-    Parameters
-    ----------
-    fields : (n, 3) array, T
-
-    Returns
-    -------
-    (3,) array, T
-        NaN for an axis with fewer than eight second differences.
+    from one reading to the next. The result is at least the quantisation error, and NaN for an axis
+    with fewer than eight second differences.
     """
     out, steps = np.full(3, np.nan), smallest_steps(fields)
     for axis, d in enumerate(np.abs(np.diff(fields, n=2, axis=0)).T):

@@ -83,12 +83,7 @@ class NetworkSurvey:
     clock of each sensor, relative to the first reading of any sensor."""
 
     def warnings(self) -> list[str]:
-        """Warnings about the fields, orientations and clocks of the sensors.
-
-        Returns
-        -------
-        list of str
-        """
+        """Warnings about the fields, orientations and clocks of the sensors."""
         out = [str(d) for d in self.disagreements]
         reasons = {s.sensor: s.lag.reason for s in self.sensors if s.lag and s.lag.reason}
         out += [f'{s.sensor}: {text}' for s in self.sensors for text in s.warnings]
@@ -101,18 +96,7 @@ class NetworkSurvey:
 
 
 class Survey:
-    """Collects accelerations, from which `solve` computes orientations and clock offsets.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : SurveySettings
-
-    Attributes
-    ----------
-    counts : Counter of str
-        Number of accepted and rejected accelerations.
-    """
+    """Collects accelerations, from which `solve` computes orientations and clock offsets."""
 
     def __init__(self, network: SensorNetwork, settings: SurveySettings) -> None:
         self.counts: Counter[str] = Counter()
@@ -122,17 +106,7 @@ class Survey:
             name: deque(maxlen=MAX_ACCELERATIONS) for name in network.names}
 
     def feed(self, sample: AccelerationSample) -> list[NetworkSurvey]:
-        """Add an acceleration, or reject and count it if it is invalid.
-
-        Parameters
-        ----------
-        sample : AccelerationSample
-
-        Returns
-        -------
-        list of NetworkSurvey
-            Always empty.
-        """
+        """Add an acceleration, or reject and count it if it is invalid; return an empty list."""
         recorded = self._accelerations.get(sample.sensor)
         if recorded is None:
             self.counts[f'rejected: acceleration of unknown sensor {sample.sensor}'] += 1
@@ -154,28 +128,15 @@ class Survey:
         """Do nothing: no work is deferred."""
 
     def flush(self) -> list[NetworkSurvey]:
-        """Return an empty list: no record is buffered.
-
-        Returns
-        -------
-        list of NetworkSurvey
-        """
+        """Return an empty list: no record is buffered."""
         return []
 
     def solve(self, fields: Mapping[str, FloatArray], date: str) -> NetworkSurvey:
         """Compute orientations and clock offsets from fields and the accelerations added so far.
 
-        Parameters
-        ----------
-        fields : mapping of str to (3,) array, T, sensor frame
-            Field at each sensor while no target is present. NaN for an axis that is not reported;
-            sensors may be missing.
-        date : str
-            Date of the survey, for the calibration records.
-
-        Returns
-        -------
-        NetworkSurvey
+        `fields` (3,) [T] are measured in the sensor frame while no target is present; an axis that
+        is not reported is NaN, and sensors may be missing. `date` is entered in the calibration
+        records.
         """
         network, names = self._network, self._network.names
         field = np.array([fields.get(name, np.full(3, np.nan)) for name in names])
@@ -242,8 +203,8 @@ class Survey:
                  ) -> tuple[float, dict[int, tuple[Orientation, str]]]:
         """Estimate the orientations of the sensors with a compass.
 
-        Returns the standard deviation of the compass biases [T], and {sensor index: (orientation,
-        source of the orientation)}.
+        Return the std of the compass biases [T], and the orientation and its source by sensor
+        index.
         """
         network, bias_std = self._network, COMPASS_BIAS_STD
         usable = {j: up for j, up in ups.items() if not np.isnan(field[j]).all()}
@@ -290,7 +251,7 @@ class Survey:
 
     def _lags(self, signals: Mapping[str, tuple[FloatArray, FloatArray]]
               ) -> tuple[str, dict[str, Lag]]:
-        """Find the reference sensor, and estimate {sensor: lag} of the other sensors from knocks.
+        """Find the reference sensor, and estimate the lags of the other sensors from knocks.
 
         The name of the reference is empty if no two sensors measured the same knock.
         """
@@ -339,17 +300,9 @@ class NoiseSource(Protocol):
 
 
 def with_measured_noise(network: SensorNetwork, calibrate: NoiseSource) -> SensorNetwork:
-    """Create a network with the noise that a `Calibrate` stage has measured.
+    """Network with the noise that a `Calibrate` stage has measured.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-    calibrate : NoiseSource
-
-    Returns
-    -------
-    SensorNetwork
-        A sensor retains its previous noise if the measured noise of any axis is unknown.
+    A sensor retains its previous noise if the measured noise of any axis is unknown.
     """
     noise = list(network.noise_std)
     for j, background in enumerate(calibrate.backgrounds().values()):

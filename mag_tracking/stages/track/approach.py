@@ -39,17 +39,7 @@ class Approach:
         self._is_open = True
 
     def add(self, frame: FieldFrame) -> bool:
-        """Add a frame, and return whether the test fails with this frame.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-
-        Returns
-        -------
-        bool
-            True if this frame completes the test and the test fails.
-        """
+        """Add a frame, and return whether it completes the test and the test fails."""
         if not self._is_open:
             return False
         self._times.append(frame.stamp_ns / NS)

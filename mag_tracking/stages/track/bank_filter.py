@@ -45,17 +45,7 @@ class PathResult(NamedTuple):
 
 def compiled_filter(model: SourceModel, observation: Observation
                     ) -> core.RowVehicleFilter | core.VehiclesFilter | core.MagnetFilter:
-    """Return the compiled filter for a source model and its observation model.
-
-    Parameters
-    ----------
-    model : SourceModel
-    observation : Observation
-
-    Returns
-    -------
-    core.RowVehicleFilter, core.VehiclesFilter or core.MagnetFilter
-    """
+    """Compiled filter for a source model and its observation model."""
     sensors = (observation.positions, observation.R_sw, observation.n_angles,
                observation.n_own - observation.n_angles)
     if isinstance(model, RowVehicle):
@@ -69,21 +59,9 @@ def compiled_filter(model: SourceModel, observation: Observation
 
 
 class BankFilter:
-    """Stateless prediction and update of a `FilterBank`.
+    """Stateless prediction and update of a `FilterBank` of targets that share a state.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-    model : SourceModel
-    settings : TrackSettings
-        `configure` may change the live settings.
-    n_targets : int
-        Number of targets that share a state; their fields add up.
-
-    Attributes
-    ----------
-    observation : Observation
-        Measurement model of the targets.
+    The fields of the `n_targets` targets add up.
     """
 
     def __init__(self, network: SensorNetwork, model: SourceModel, settings: TrackSettings,
@@ -96,12 +74,7 @@ class BankFilter:
         self.configure(settings)
 
     def configure(self, settings: TrackSettings) -> None:
-        """Apply new values of the live settings.
-
-        Parameters
-        ----------
-        settings : TrackSettings
-        """
+        """Apply new values of the live settings."""
         self._settings = settings
         is_vehicle = settings.target == 'vehicle'
         self._near_field_lengths: FloatArray = np.array(
@@ -111,14 +84,8 @@ class BankFilter:
             [kind.length for kind in settings.vehicle.kinds] if is_vehicle else [0.0]) > MAX_CAR_ROW
 
     def move(self, bank: FilterBank, dt: float) -> None:
-        """Predict a bank in place, without a measurement update.
-
-        Parameters
-        ----------
-        bank : FilterBank
-        dt : float, s
-            Negative values move the bank backwards in time, without process noise.
-        """
+        """Predict a bank in place by `dt` seconds, without an update; negative values move it
+        backwards, without process noise."""
         n = self._n_sensors
         empty_frame = FieldFrame(0, np.full((n, 3), np.nan), np.tile(np.eye(3), (n, 1, 1)),
                                  np.zeros(n, dtype=np.int64), np.zeros(n))
@@ -126,36 +93,19 @@ class BankFilter:
 
     def advance(self, bank: FilterBank, frame: FieldFrame, dt: float, keeps_prior: bool = False
                 ) -> tuple[FloatArray, FloatArray]:
-        """Predict a bank to the time of a frame, and update it with the measurements.
+        """Predict a bank in place to the time of a frame and update it; return the predicted states
+        (n_hyp, n_x) and the log-likelihoods (n_hyp,), which are -inf if a dipole is at a sensor.
 
-        The setting `iterations` is the number of linearisations of the measurement update.
-
-        Parameters
-        ----------
-        bank : FilterBank
-            Updated in place.
-        frame : FieldFrame
-        dt : float, s
-            Time since the previous frame. Unless it is positive, the prediction is skipped.
-        keeps_prior : bool
-            Whether to write the states and covariances to new arrays, which is slower. By default,
-            the arrays `bank.x` and `bank.P` are overwritten.
-
-        Returns
-        -------
-        predicted : (n_hyp, n_x) array
-            States before the update.
-        log_likelihood : (n_hyp,) array
-            Log-likelihood of the frame; -inf if a dipole is at a sensor.
+        The prediction over `dt` seconds is skipped unless `dt` is positive. The setting
+        `iterations` is the number of linearisations. With `keeps_prior`, new arrays replace
+        `bank.x` and `bank.P` instead of overwriting them, which is slower.
         """
         return self._advance(bank, frame, dt, dt > 0.0, self._settings.iterations, keeps_prior)
 
     def _advance(self, bank: FilterBank, frame: FieldFrame, dt: float, moves: bool,
                  iterations: int, keeps_prior: bool = False) -> tuple[FloatArray, FloatArray]:
-        """Advance a bank, and return predicted states (n_hyp, n_x) and log-likelihoods (n_hyp,).
-
-        The prediction is skipped unless `moves` is true. The update is skipped with 0 iterations.
-        """
+        """Advance a bank like `advance`; skip the prediction unless `moves`, and the update with 0
+        iterations."""
         n_hyp = len(bank)
         decay, variance = self.observation.drift(np.asarray(dt), self._settings.background_drift)
         # With a thousand hypotheses the speed is limited by memory: writing to new arrays takes
@@ -176,35 +126,21 @@ class BankFilter:
                   intervals: Sequence[float], paths: FloatArray, *, passes: int, step: float,
                   first_is_updated: bool, rejects_outliers: bool = False,
                   wants_covariances: bool = False) -> PathResult:
-        """Filter and smooth each hypothesis along its path.
+        """Filter and smooth each hypothesis along its path; the bank moves in place from the first
+        to the last of the n frames.
+
+        Each pass is linearised along the path of the previous pass.
 
         Parameters
         ----------
-        bank : FilterBank
-            Bank at the first frame; updated in place to the last frame.
-        frames : list of FieldFrame
-            The n frames of the path.
-        intervals : list of float, s
-            Time since the previous frame, for each frame.
-        paths : (n_hyp, n, n_x) array
-            Linearisation points, updated in place. At NaN, a frame is linearised at its prediction,
-            with the iterations of `advance`.
-        passes : int
-            Number of passes; each pass is linearised along the path of the previous pass.
-        step : float
-            Fraction of the difference between smoothed states and path by which each pass moves the
-            path.
-        first_is_updated : bool
-            Whether the bank has already been updated with the first frame.
-        rejects_outliers : bool
-            Whether to skip the update with frames whose normalised innovation squared exceeds
-            `end_nis` per axis.
-        wants_covariances : bool
-            Whether to return the smoothed covariances.
-
-        Returns
-        -------
-        PathResult
+        intervals : time from the previous frame to each frame, s
+        paths : (n_hyp, n, n_x) array, linearisation points, updated in place; at NaN, a frame is
+            linearised at its prediction, with the iterations of `advance`
+        step : fraction of the difference between smoothed states and path by which each pass moves
+            the path
+        first_is_updated : whether the bank has already been updated with the first frame
+        rejects_outliers : whether frames whose normalised innovation squared exceeds `end_nis` per
+            axis are not used for updates
         """
         n_hyp, n, n_x = paths.shape
         out = PathResult(np.empty(n_hyp), np.empty(n_hyp), np.empty((n_hyp, n), dtype=bool),
@@ -233,41 +169,18 @@ class BankFilter:
                 'dt': dt, 'decay': decay, 'variance': variance}
 
     def time_offset(self, frame: FieldFrame, dt: float) -> FloatArray:
-        """Sampling time of each sensor relative to the timestamp of a frame.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-        dt : float, s
-            Time since the previous frame.
-
-        Returns
-        -------
-        (n_sensors,) array, s
-            Multiples of `TIME_RESOLUTION_S`; 0 if the frame is treated as simultaneous.
-        """
+        """Sampling time (n_sensors,) of each sensor relative to the timestamp of a frame, s, in
+        multiples of `TIME_RESOLUTION_S`; 0 if the frame is treated as simultaneous."""
         offset: FloatArray = frame.time_offset
         if dt <= 0.0 or offset.max() - offset.min() < SAME_TIME_FRACTION * dt:
             return self._zero_offset
         return np.round(offset / TIME_RESOLUTION_S) * TIME_RESOLUTION_S
 
     def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
-        """Variance per axis of the model error in the field of a hypothesis, for each sensor.
+        """Variance (n_sensors,) per axis of the model error in the field of hypothesis `i`, T²; 0
+        where a dipole is at the sensor.
 
         Only the part of the error that is uncorrelated with the previous frame is included.
-
-        Parameters
-        ----------
-        bank : FilterBank
-        i : int
-            Index of the hypothesis.
-        dt : float, s
-            Time since the previous frame.
-
-        Returns
-        -------
-        (n_sensors,) array, T²
-            0 where a dipole is at the sensor.
         """
         error = self.observation.model_error(
             bank.x[i], self._lengths(bank.kind[i:i + 1])[0], self._settings.field_error)
@@ -277,22 +190,10 @@ class BankFilter:
 
     def predicted_field(self, bank: FilterBank, i: int, frame: FieldFrame,
                         dt: float) -> FloatArray:
-        """Field that a hypothesis predicts for a frame, including backgrounds.
+        """Field (n_sensors, 3) that hypothesis `i` predicts for a frame, T, sensor frame, with
+        backgrounds.
 
         The estimated model errors are excluded, because almost any field would fit with them.
-
-        Parameters
-        ----------
-        bank : FilterBank
-        i : int
-            Index of the hypothesis.
-        frame : FieldFrame
-        dt : float, s
-            Time since the previous frame.
-
-        Returns
-        -------
-        (n_sensors, 3) array, T, sensor frame
         """
         x = self.observation.without_errors(bank.x[i:i + 1])
         h, _, _ = self.observation.fields(
@@ -303,24 +204,12 @@ class BankFilter:
 
     def fields_at(self, x: FloatArray, kind: IntArray, frame: FieldFrame, dt: float
                   ) -> tuple[FloatArray, FloatArray]:
-        """Fields of the targets of a state at the sampling times of a frame, and their derivatives.
+        """Fields (n_sensors, 3) of the targets of a state `x` (n_x,) at the sampling times of a
+        frame, T, sensor frame, and their derivatives (n_sensors, 3, n_target) with respect to the
+        target states.
 
-        Backgrounds and model errors are excluded.
-
-        Parameters
-        ----------
-        x : (n_x,) array
-        kind : (1,) or (1, n_targets) int array
-            Kind of each target.
-        frame : FieldFrame
-        dt : float, s
-            Time since the previous frame.
-
-        Returns
-        -------
-        h : (n_sensors, 3) array, T, sensor frame
-        H : (n_sensors, 3, n_target) array
-            Derivative with respect to the state of the targets.
+        Backgrounds and model errors are excluded. `kind` (1,) or (1, n_targets) is the kind of each
+        target.
         """
         h, H, _ = self.observation.fields(
             self.observation.without_errors(x[None]), self.time_offset(frame, dt),
@@ -329,23 +218,8 @@ class BankFilter:
 
     def field_of_others(self, bank: FilterBank, i: int, target: int, frame: FieldFrame,
                         dt: float) -> FloatArray:
-        """Field of all targets of a hypothesis except one, at the sampling times of a frame.
-
-        Parameters
-        ----------
-        bank : FilterBank
-        i : int
-            Index of the hypothesis.
-        target : int
-            Index of the excluded target.
-        frame : FieldFrame
-        dt : float, s
-            Time since the previous frame.
-
-        Returns
-        -------
-        (n_sensors, 3) array, T, sensor frame
-        """
+        """Field (n_sensors, 3) of all targets of hypothesis `i` except `target`, at the sampling
+        times of a frame, T, sensor frame."""
         others = [k for k in range(self.observation.n_targets) if k != target]
         return self.observation.field_of(bank.x[i], others, self.time_offset(frame, dt))
 
@@ -354,61 +228,28 @@ class BankFilter:
         return self._near_field_lengths[kind].reshape(len(kind), -1)
 
     def are_long(self, kind: IntArray) -> BoolArray:
-        """Whether any target of each hypothesis is longer than a car.
-
-        Parameters
-        ----------
-        kind : (n,) or (n, n_targets) int array
-
-        Returns
-        -------
-        (n,) bool array
-        """
+        """Whether any target of each hypothesis is longer than a car; `kind` is (n,) or
+        (n, n_targets)."""
         are_long: BoolArray = np.any(self._is_long_kind[kind].reshape(len(kind), -1), axis=1)
         return are_long
 
     def linear_range(self, x: FloatArray) -> FloatArray:
-        """Displacement of a target over which the field is approximately linear.
-
-        Parameters
-        ----------
-        x : (n_hyp, n_x) array
-
-        Returns
-        -------
-        (n_hyp,) array, m
-        """
+        """Displacement (n_hyp,) over which the field of the targets of `x` (n_hyp, n_x) is
+        approximately linear, m."""
         return LINEAR_FRACTION * self.observation.distance_to_nearest(x)
 
     def is_implausible(self, bank: FilterBank, i: int, frame: FieldFrame) -> bool:
-        """Whether the normalised innovation squared of a hypothesis exceeds `end_nis` per axis.
-
-        Parameters
-        ----------
-        bank : FilterBank
-            Bank after the update with `frame`.
-        i : int
-            Index of the hypothesis.
-        frame : FieldFrame
-
-        Returns
-        -------
-        bool
-        """
+        """Whether the normalised innovation squared of hypothesis `i`, after the update with
+        `frame`, exceeds `end_nis` per axis."""
         n_y = np.count_nonzero(~np.isnan(frame.field))
         return bool(np.nansum(bank.nis[i]) > self._settings.end_nis * n_y)
 
 
 class NoTarget:
-    """Filter of the backgrounds under the hypothesis that there is no target.
+    """Filter of the backgrounds without a target; its log-density is the reference for the evidence
+    of a target.
 
-    Its log-density is the reference for the evidence of a target.
-
-    Parameters
-    ----------
-    n_sensors : int
-    background_std : float, T
-        Initial standard deviation of each background, per axis.
+    `background_std` [T] is the initial std of each background, per axis.
     """
 
     def __init__(self, n_sensors: int, background_std: float) -> None:
@@ -416,21 +257,9 @@ class NoTarget:
         self._P = np.tile(background_std**2 * np.eye(3), (n_sensors, 1, 1))
 
     def log_density(self, frame: FieldFrame, dt: float, background_drift: float) -> float:
-        """Update the backgrounds with a frame; return the log-density of this frame.
+        """Update the backgrounds with a frame; return its log-density given the previous frames.
 
-        The density is conditional on the previous frames.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-        dt : float, s
-            Time since the previous frame.
-        background_drift : float, T/√s
-            Random walk of the backgrounds.
-
-        Returns
-        -------
-        float
+        `background_drift` is a random walk [T/√s].
         """
         self._P += background_drift**2 * dt * np.eye(3)
         is_present = ~np.isnan(frame.field)
@@ -450,17 +279,6 @@ class NoTarget:
 
 
 def known_covariance(covariance: FloatArray) -> FloatArray:
-    """Replace the missing elements of frame covariances by elements of the identity.
-
-    Parameters
-    ----------
-    covariance : (..., 3, 3) array, T²
-        NaN where an axis is missing.
-
-    Returns
-    -------
-    (..., 3, 3) array, T²
-        Without NaN.
-    """
+    """Covariances (..., 3, 3) in which elements of the identity replace the NaN of missing axes."""
     missing = np.isnan(covariance)
     return np.where(missing, np.eye(3), covariance) if missing.any() else covariance

@@ -33,20 +33,8 @@ _FLOAT_BYTES = 8
 
 def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
                        model: SourceModel) -> None:
-    """Check the memory required by the hypotheses of a vehicle.
-
-    Parameters
-    ----------
-    settings : TrackSettings
-    network : SensorNetwork
-    model : SourceModel
-
-    Raises
-    ------
-    SettingsError
-        If the starting hypotheses, or `MIN_HYPOTHESES` hypotheses with the maximum number of
-        sensors, exceed `MAX_BYTES`.
-    """
+    """Check the memory for the hypotheses of a vehicle; raises SettingsError if the starting
+    hypotheses, or `MIN_HYPOTHESES` with the maximum number of sensors, exceed `MAX_BYTES`."""
     _check_bank('track.vehicle', _vehicle_factors(settings), settings,
                 sensors_at_start(settings, network, model), model)
     n = _n_sensors(settings, network)
@@ -68,18 +56,7 @@ def _vehicle_factors(settings: TrackSettings) -> dict[str, int]:
 
 
 def sensors_at_start(settings: TrackSettings, network: SensorNetwork, model: SourceModel) -> int:
-    """Number of sensors with which a track starts, limited by `START_BYTES` for a vehicle.
-
-    Parameters
-    ----------
-    settings : TrackSettings
-    network : SensorNetwork
-    model : SourceModel
-
-    Returns
-    -------
-    int
-    """
+    """Number of sensors with which a track starts, limited by `START_BYTES` for a vehicle."""
     n_max = _n_sensors(settings, network)
     if settings.target != 'vehicle':
         return n_max
@@ -88,19 +65,8 @@ def sensors_at_start(settings: TrackSettings, network: SensorNetwork, model: Sou
 
 
 def max_sensors(observation: Observation, n_hyp: int) -> int:
-    """Maximum number of sensors for which a bank stays within `START_BYTES`.
-
-    Parameters
-    ----------
-    observation : Observation
-    n_hyp : int
-        Number of hypotheses.
-
-    Returns
-    -------
-    int
-        At least `MIN_SENSORS_AT_START`, even if they exceed `START_BYTES`.
-    """
+    """Maximum number of sensors for which a bank of `n_hyp` hypotheses stays within `START_BYTES`,
+    but at least `MIN_SENSORS_AT_START`."""
     return _max_affordable_sensors(n_hyp, observation.n_target, observation.n_own + 3)
 
 
@@ -111,37 +77,16 @@ def _max_affordable_sensors(n_hyp: int, n_target: int, n_per_sensor: int) -> int
 
 
 def max_hypotheses(observation: Observation, n_sensors: int) -> int:
-    """Maximum number of hypotheses that a track retains when it changes to `n_sensors` sensors.
-
-    Parameters
-    ----------
-    observation : Observation
-    n_sensors : int
-
-    Returns
-    -------
-    int
-        At least `MIN_HYPOTHESES`, even if they exceed `WIDER_BYTES`.
-    """
+    """Maximum number of hypotheses that a track retains when it changes to `n_sensors` sensors:
+    those within `WIDER_BYTES`, but at least `MIN_HYPOTHESES`."""
     size = _FLOAT_BYTES * observation.n_states(n_sensors)**2
     return max(MIN_HYPOTHESES, WIDER_BYTES // size)
 
 
 def check_magnet_bank(settings: TrackSettings, network: SensorNetwork,
                       model: SourceModel) -> None:
-    """Check the memory required by the hypotheses of a magnet.
-
-    Parameters
-    ----------
-    settings : TrackSettings
-    network : SensorNetwork
-    model : SourceModel
-
-    Raises
-    ------
-    SettingsError
-        If the starting hypotheses exceed `MAX_BYTES`.
-    """
+    """Check the memory for a magnet; raises SettingsError if the starting hypotheses exceed
+    `MAX_BYTES`."""
     _check_bank('track.magnet', {'optima': MAX_STARTS}, settings, _n_sensors(settings, network),
                 model)
 

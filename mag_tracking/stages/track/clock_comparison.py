@@ -39,17 +39,7 @@ class ClockOffset:
     """Number of passes in which the clock was compared."""
 
     def text(self, names: Sequence[str]) -> str:
-        """Return a message that states the offset and how to correct the network file.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Sensor names.
-
-        Returns
-        -------
-        str
-        """
+        """Message that states the offset and how to correct the network file."""
         name = names[self.sensor]
         reference = 'the other clocks' if self.reference is None \
             else f'the clock of {names[self.reference]}'
@@ -67,10 +57,6 @@ class ClockComparison:
 
     A wrong sensor position has the same effect as a wrong clock if all vehicles pass in the same
     direction at the same speed.
-
-    Parameters
-    ----------
-    n_sensors : int
     """
 
     def __init__(self, n_sensors: int) -> None:
@@ -84,20 +70,11 @@ class ClockComparison:
         self._offset_s: FloatArray = np.zeros((n_sensors, n_sensors))
 
     def largest_offset_s(self, rows: IntArray) -> float:
-        """Largest significant offset between the clocks of two of the given sensors.
+        """Largest significant offset between the clocks of two of the sensors `rows` of the
+        network; 0 if none is significant.
 
         Clocks that were compared in only one pass are ignored, because this pass may contain two
         vehicles.
-
-        Parameters
-        ----------
-        rows : (n,) int array
-            Indices of the sensors in the network.
-
-        Returns
-        -------
-        float, s
-            0 if no offset is significant.
         """
         repeated = rows[self._n_passes[rows] > 1]
         return float(self._offset_s[np.ix_(repeated, repeated)].max(initial=0.0))
@@ -122,16 +99,10 @@ class ClockComparison:
                            int(self._n_passes[j]))
 
     def add(self, rigid_pass: RigidPass, rows: IntArray) -> None:
-        """Add a pass to the estimate.
+        """Add a pass with the sensors `rows` of the network to the estimate.
 
         A pass is ignored if no straight path explains it, if a bent path explains it significantly
         better, or if the vehicle is so slow that the fit hardly depends on the clocks.
-
-        Parameters
-        ----------
-        rigid_pass : RigidPass
-        rows : (n,) int array
-            Indices of the sensors of the pass in the network.
         """
         is_slow = rigid_pass.speed * MAX_OFFSET < MIN_DISTANCE
         if is_slow or not (rigid_pass.is_explained and rigid_pass.is_straight):
@@ -169,10 +140,8 @@ class ClockComparison:
             for j in np.flatnonzero(is_known))
 
     def _offsets(self) -> tuple[FloatArray, FloatArray]:
-        """Time by which the clock of each row is ahead of the clock of each column, (n, n) [s].
-
-        The second array contains the standard deviations (n, n) [s], infinite on the diagonal.
-        """
+        """Time by which the clock of each row is ahead of the clock of each column, and its std,
+        infinite on the diagonal, both (n, n) [s]."""
         # The common offset of all clocks is not observable; the prior fixes it.
         prior = np.eye(len(self._vector)) / PRIOR_STD_S**2
         covariance: FloatArray = np.linalg.inv(self._information + prior).astype(np.float64)

@@ -60,17 +60,11 @@ class _FrameSummary(NamedTuple):
 class CrossCheck:
     """Cross-check of a track against fits of a steady path to all frames of the pass.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-
     Attributes
     ----------
-    latest : RigidPass or None
-        Latest fit; None before the vehicle has passed.
-    difference : (6,) array, m and m/s
-        `RigidPass.difference` of the latest state; zero before the first fit. After the pass, the
-        difference of the last state in the pass.
+    latest : latest fit; None before the vehicle has passed
+    difference : (6,) array, `RigidPass.difference` of the latest state in the pass, m and m/s; zero
+        before the first fit
     """
 
     def __init__(self, network: SensorNetwork) -> None:
@@ -87,14 +81,7 @@ class CrossCheck:
         self.difference: FloatArray = np.zeros(6)
 
     def add(self, frame: FieldFrame, state: FloatArray) -> None:
-        """Add a frame of the track.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-        state : (n_x,) array
-            State of the best hypothesis.
-        """
+        """Add a frame of the track, with the state (n_x,) of the best hypothesis."""
         magnitude = float(field_magnitudes(frame).max(initial=0.0))
         if self._current is not None:
             # The minimum interval is not affected by gaps.
@@ -117,14 +104,7 @@ class CrossCheck:
     def doubts(self, clocks_apart_s: float) -> set[str]:
         """Fit the pass if a fit is due, and return the doubts about the track.
 
-        Parameters
-        ----------
-        clocks_apart_s : float, s
-            Largest significant offset between the clocks, from earlier passes.
-
-        Returns
-        -------
-        set of str
+        `clocks_apart_s` is the largest significant offset between the clocks, from earlier passes.
         """
         if self._current is None:
             return set()
@@ -138,20 +118,10 @@ class CrossCheck:
         return reasons
 
     def differences(self, states: Sequence[TrackState]) -> list[FloatArray]:
-        """Differences of smoothed states from the fitted pass.
+        """`RigidPass.difference` (6,) of each smoothed state, in chronological order, m and m/s.
 
-        For states before or after the pass, the difference of the first or last state in the pass
-        is returned. If no state is in the pass, `difference` is returned for every state.
-
-        Parameters
-        ----------
-        states : sequence of TrackState
-            States in chronological order.
-
-        Returns
-        -------
-        list of (6,) array, m and m/s
-            `RigidPass.difference` of each state.
+        States before or after the pass have the difference of the first or last state in the pass.
+        If no state is in the pass, all have `difference`.
         """
         covered = [k for k, (stamp_ns, _, _) in enumerate(states) if self._covers(stamp_ns)]
         if not covered:
@@ -181,15 +151,8 @@ class CrossCheck:
         return bool(self._pass_doubts())
 
     def finish(self, clocks: ClockComparison, rows: IntArray) -> None:
-        """Fit the pass if a fit is due at the end of the track; update the clock comparison.
-
-        Parameters
-        ----------
-        clocks : ClockComparison
-            Updated in place.
-        rows : (n,) int array
-            Indices of the sensors of the track in the network.
-        """
+        """Fit the pass if a fit is due at the end of the track, and add it to the clock comparison;
+        `rows` are the sensors of the track in the network."""
         self._fit_if_due(0.0)
         if self.latest is not None:
             clocks.add(self.latest, rows)

@@ -37,14 +37,8 @@ cube of this number."""
 class DisturbanceModel:
     """Models of smooth fields without a target, as the alternative explanation of a track.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-    background_std : float, T
-        Standard deviation of the backgrounds.
-    is_handover : bool
-        Whether the model starts during a track, with an unknown field. By default it starts at the
-        first frame of a track, with zero field.
+    `background_std` is in T. A model starts with zero field at the first frame of a track, but with
+    an unknown field if it starts during the track (`is_handover`).
     """
 
     def __init__(self, network: SensorNetwork, background_std: float,
@@ -67,23 +61,11 @@ class DisturbanceModel:
         return float(np.exp(self._log_w[1]))
 
     def log_density(self, frame: FieldFrame, dt: float, model_error: FloatArray) -> float | None:
-        """Update the models with a frame; return the log-density of this frame.
+        """Update the models with a frame; return its log-density given the previous frames.
 
-        The density is conditional on the previous frames.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-        dt : float, s
-            Time since the previous frame.
-        model_error : (n_sensors,) array, T²
-            Variance per axis of the model error that the tracker assumes.
-
-        Returns
-        -------
-        float or None, nats
-            None for the first frame with readings after a handover; 0 for frames before the first
-            reading.
+        `model_error` (n_sensors,) [T²] is the variance per axis that the tracker assumes. The
+        result is None for the first frame with readings after a handover, and 0 before the first
+        reading.
         """
         is_present = np.isfinite(frame.field.ravel())
         noise = np.einsum('jii->ji', frame.covariance)
@@ -128,9 +110,9 @@ class DisturbanceModel:
 def _common_field_matrix(network: SensorNetwork) -> FloatArray:
     """Matrix (3 n_sensors, m) that maps a common field and the backgrounds to the sensor axes.
 
-    The field has a uniform component and, with at least `MIN_GRADIENT_SENSORS` sensors, a gradient.
-    Without sources inside the network, the gradient is symmetric and traceless. It has five
-    parameters: the changes of the field [T] from the centre of the network to its edge.
+    The field is uniform and, with at least `MIN_GRADIENT_SENSORS` sensors, has a gradient. Without
+    sources inside the network, the gradient is symmetric and traceless. Its five parameters are the
+    changes of the field [T] from the centre of the network to its edge.
     """
     n, R_sw = len(network), network.R_sw
     field = np.tile(np.eye(3), (n, 1, 1))

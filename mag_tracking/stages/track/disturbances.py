@@ -31,13 +31,7 @@ class UnexplainedField:
 
 
 class Disturbances:
-    """Disturbance in progress, from the end of its first track to the release of the detection.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Sensor names.
-    """
+    """Disturbance in progress, from the end of its first track to the release of the detection."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self._names = names
@@ -47,19 +41,8 @@ class Disturbances:
         self._sensed: BoolArray = np.zeros(len(names), dtype=bool)
 
     def begin(self, found: UnexplainedField, stamp_ns: int) -> list[Disturbance]:
-        """Start a disturbance after an unexplained track, or extend the current disturbance.
-
-        Parameters
-        ----------
-        found : UnexplainedField
-        stamp_ns : int, ns
-            Timestamp of the record.
-
-        Returns
-        -------
-        list of Disturbance
-            Record of the new disturbance; empty if a disturbance is already in progress.
-        """
+        """Start a disturbance after an unexplained track and return its record, or extend the
+        current one."""
         if self._current is not None:
             self._largest = np.maximum(self._largest, found.largest)
             self._sensed |= found.sensed
@@ -76,10 +59,6 @@ class Disturbances:
         """Update the current disturbance, if any, with a frame that belongs to no track.
 
         The disturbance may grow stronger and affect additional sensors.
-
-        Parameters
-        ----------
-        frame : FieldFrame
         """
         if self._current is not None:
             energy, n_axes = whitened_energy(frame.field, frame.covariance)
@@ -87,18 +66,8 @@ class Disturbances:
             self._sensed |= energy > chdtri(np.maximum(n_axes, 1), FALSE_ALARM_PROBABILITY)
 
     def end(self, stamp_ns: int) -> list[Disturbance]:
-        """End the current disturbance, at the release of the detection or at a gap in the frames.
-
-        Parameters
-        ----------
-        stamp_ns : int, ns
-            Timestamp of the record.
-
-        Returns
-        -------
-        list of Disturbance
-            Closing record; empty if no disturbance is in progress.
-        """
+        """Return the closing record of the disturbance in progress, if any, at the release of the
+        detection or at a gap in the frames."""
         if self._current is None:
             return []
         last, self._current = self._current, None
@@ -112,16 +81,6 @@ class Disturbances:
 
 
 def field_magnitudes(frame: FieldFrame) -> FloatArray:
-    """Magnitude of the field of a frame at each sensor.
-
-    Parameters
-    ----------
-    frame : FieldFrame
-
-    Returns
-    -------
-    (n_sensors,) array, T
-        0 if the reading is missing.
-    """
+    """Magnitude (n_sensors,) of the field of a frame, T; 0 if the reading is missing."""
     magnitude: FloatArray = np.sqrt(np.nansum(np.square(frame.field), axis=1))
     return magnitude

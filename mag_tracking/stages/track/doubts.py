@@ -72,14 +72,5 @@ MEANINGS = {
 
 
 def ordered(doubts: Set[str]) -> tuple[str, ...]:
-    """Return doubts in the order of `MEANINGS`.
-
-    Parameters
-    ----------
-    doubts : set of str
-
-    Returns
-    -------
-    tuple of str
-    """
+    """Doubts in the order of `MEANINGS`."""
     return tuple(name for name in MEANINGS if name in doubts)

@@ -63,18 +63,11 @@ smoothed has fewer."""
 class TrackEvidence:
     """Evidence for a target, and doubts about its track.
 
-    Parameters
-    ----------
-    n_sensors : int
-
     Attributes
     ----------
-    bayes_factor : TargetBayesFactor
-        Evidence for a target against a disturbance.
-    innovations : InnovationConsistency
-        Consistency of the innovations with their covariance.
-    largest : (n_sensors,) array, T
-        Magnitude of the largest field measured by each sensor.
+    bayes_factor : evidence for a target against a disturbance
+    innovations : consistency of the innovations with their covariance
+    largest : (n_sensors,) array, magnitude of the largest field measured by each sensor, T
     """
 
     def __init__(self, n_sensors: int) -> None:
@@ -110,23 +103,11 @@ class TrackEvidence:
         return set(self._doubts)
 
     def add(self, log_likelihood_ratio: float) -> None:
-        """Add the evidence of a frame.
-
-        Parameters
-        ----------
-        log_likelihood_ratio : float, nats
-            Log-likelihood ratio of the frame, with versus without a target.
-        """
+        """Add the log-likelihood ratio of a frame with versus without a target, nats."""
         self._log_odds += log_likelihood_ratio
 
     def flag(self, reason: str) -> None:
-        """Mark the whole track as doubtful.
-
-        Parameters
-        ----------
-        reason : str
-            Name from `doubts`.
-        """
+        """Mark the whole track as doubtful, for a reason from `doubts`."""
         self._doubts.add(reason)
 
     def drop_explained_doubts(self) -> None:
@@ -141,13 +122,7 @@ class TrackEvidence:
                    ) -> None:
         """Mark the track as doubtful if its start was not observed or its range is not observable.
 
-        Parameters
-        ----------
-        approach_unobserved : bool
-            Whether the frames before the detection do not show the approach of the target.
-        network : SensorNetwork
-        starts_anywhere : bool
-            Whether the target may start at any position, as a magnet may.
+        A target that `starts_anywhere`, like a magnet, need not be seen approaching.
         """
         # A target that was not seen approaching may already have passed.
         if approach_unobserved and not starts_anywhere:
@@ -159,46 +134,23 @@ class TrackEvidence:
 
     def flag_interval(self, reason: str, stamp_ns: int, seconds: float,
                       since_ns: int | None = None) -> None:
-        """Mark the poses within a limited time as doubtful.
+        """Mark the poses within `seconds` after `stamp_ns` as doubtful, for a reason from `doubts`.
 
-        Parameters
-        ----------
-        reason : str
-            Name from `doubts`.
-        stamp_ns : int, ns
-            Start of the doubt.
-        seconds : float, s
-            Duration of the doubt.
-        since_ns : int, ns, optional
-            Earlier time from which smoothed poses are also doubtful. By default, smoothed poses are
-            not affected.
+        Smoothed poses are also doubtful, from the earlier time `since_ns` on, but only if it is
+        given.
         """
         self._expiry_ns[reason] = until_ns = stamp_ns + round(seconds * NS)
         if since_ns is not None:
             self._smoothed_segments.append((since_ns, until_ns))
 
     def check_approach(self, frame: FieldFrame) -> None:
-        """Mark the track as doubtful if a frame makes the approach test fail.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-        """
+        """Mark the track as doubtful if a frame makes the approach test fail."""
         if self._approach.add(frame):
             self.flag(doubts.NOT_SEEN_APPROACHING)
 
     def add_frame(self, frame: FieldFrame, rows: IntArray, nis: FloatArray) -> None:
-        """Add the fields and the innovations of a frame.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-            Readings of the sensors that the track uses.
-        rows : (n,) int array
-            Indices of these sensors in the network.
-        nis : (n,) array
-            Normalised innovation squared of the published hypothesis, per sensor.
-        """
+        """Add the fields of the sensors `rows` of the network, and their normalised innovations
+        squared `nis` (n,) for the published hypothesis."""
         energy, n_axes = whitened_energy(frame.field, frame.covariance)
         self._energy[rows] += energy - n_axes
         self._n_axes[rows] += n_axes
@@ -220,19 +172,8 @@ class TrackEvidence:
         return int(np.count_nonzero(self.sensed)) < 2
 
     def update_doubts(self, found: set[str], stamp_ns: int) -> set[str]:
-        """Store the doubts about the pose of a frame, and add the earlier doubts that persist.
-
-        Parameters
-        ----------
-        found : set of str
-            Doubts that were found in this frame.
-        stamp_ns : int, ns
-
-        Returns
-        -------
-        set of str
-            Doubts in `found` and earlier doubts that persist.
-        """
+        """Store the doubts found in a frame, and return them with the earlier doubts that
+        persist."""
         transient = found.intersection(TRANSIENT_DOUBTS)
         self._doubtful_times = updated(
             self._doubtful_times, stamp_ns, bool(transient), MAX_SEGMENTS)
@@ -243,20 +184,11 @@ class TrackEvidence:
                if stamp_ns <= expiry_ns}
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
-        """Whether the innovations of a frame are too large for the target model.
+        """Whether the innovations `nis` (n_sensors,) of a frame are too large for the target model;
+        NaN if missing.
 
         If the track uses at most two sensors, a contradiction also marks the track as doubtful,
         because many paths fit the fields. With more sensors, later frames correct the track.
-
-        Parameters
-        ----------
-        nis : (n_sensors,) array
-            Normalised innovation squared of each sensor; NaN if missing.
-        degrees_of_freedom : int
-
-        Returns
-        -------
-        bool
         """
         is_contradiction = bool(np.nansum(nis) > chdtri(degrees_of_freedom, CONTRADICTION))
         if is_contradiction and len(nis) <= 2:
@@ -267,17 +199,7 @@ class TrackEvidence:
                        min_bayes_factor: float) -> set[str]:
         """Update and return the doubts that follow from the measurements of a vehicle.
 
-        Parameters
-        ----------
-        nis : (n_sensors,) array
-            Normalised innovation squared of each sensor in the frame; NaN if missing.
-        degrees_of_freedom : int
-        min_bayes_factor : float
-            Minimum Bayes factor of a target against a disturbance.
-
-        Returns
-        -------
-        set of str
+        `nis` (n_sensors,) is the normalised innovation squared of each sensor; NaN if missing.
         """
         reasons = set()
         if self.bayes_factor.is_recently_disfavoured(min_bayes_factor):
@@ -293,54 +215,26 @@ class TrackEvidence:
         return reasons
 
     def update_filter_doubt(self, gain: float, stamp_ns: int, window_s: float) -> bool:
-        """Update the doubt about the filter, and return whether the filter is doubtful.
+        """Update and return the doubt about the filter, which lasts from a frame with `gain` below
+        `-OVERFIT_NATS` for the duration `window_s` of the compared frames.
 
-        The filter is doubtful from a frame in which `gain` is below `-OVERFIT_NATS` until
-        `window_s` later. It then fits the frames much better than the path of its hypothesis does.
-
-        Parameters
-        ----------
-        gain : float, nats
-            Log-likelihood along the path of the hypothesis, minus its log-likelihood in the filter,
-            for the latest frames.
-        stamp_ns : int, ns
-            Timestamp of the latest frame.
-        window_s : float, s
-            Duration of the compared frames, and time for which the doubt persists.
-
-        Returns
-        -------
-        bool
+        `gain` [nats] is the log-likelihood of these frames along the path of the hypothesis, minus
+        that in the filter. A doubtful filter fits the frames much better than the path does.
         """
         if gain < -OVERFIT_NATS:
             self._overfit_expiry_ns = stamp_ns + round(window_s * NS)
         return stamp_ns <= self._overfit_expiry_ns
 
     def was_filter_doubtful(self, stamp_ns: int) -> bool:
-        """Whether a transient doubt or a flagged interval affects the smoothed pose at a time.
-
-        Parameters
-        ----------
-        stamp_ns : int, ns
-
-        Returns
-        -------
-        bool
-        """
+        """Whether a transient doubt or a flagged interval affects the smoothed pose at a time."""
         return are_doubtful((*self._doubtful_times, *self._smoothed_segments), stamp_ns)
 
     def count_single_sensor_time(self, is_single_sensor: bool, dt: float) -> None:
-        """Update the total time with a single measuring sensor; if it is too long, flag the track.
+        """Update the total time in which only one of several sensors measured; flag the track if it
+        is too long.
 
         A single sensor determines neither the scale of a track nor which of two mirror images is
         correct. The other sensors do not always correct the error when they measure again.
-
-        Parameters
-        ----------
-        is_single_sensor : bool
-            Whether only one of several sensors measured.
-        dt : float, s
-            Time since the previous frame.
         """
         self._single_sensor_s += dt if is_single_sensor else 0.0
         if self._single_sensor_s > MAX_SINGLE_SENSOR_S:
@@ -358,25 +252,12 @@ class TrackEvidence:
 
     def reason_to_end(self, track: Track, spread: float, is_approaching: bool,
                       settings: TrackSettings) -> str | None:
-        """Update the end conditions with a pose, and return the reason to end the track.
+        """Update the end conditions with the latest pose; return the reason to end the track, or
+        None.
 
-        Parameters
-        ----------
-        track : Track
-            The latest pose.
-        spread : float, m
-            Standard deviation of the horizontal position of the published hypothesis alone.
-            Differences between hypotheses are excluded, because they do not depend on the distance
-            to the target.
-        is_approaching : bool
-            Whether the target is approaching the sensors. An approaching target is not out of
-            reach, however uncertain its position.
-        settings : TrackSettings
-
-        Returns
-        -------
-        str or None
-            None if the track continues.
+        `spread` [m] is the std of the horizontal position of the published hypothesis alone,
+        because differences between hypotheses do not depend on the distance to the target. A target
+        that `is_approaching` is not out of reach, however uncertain its position.
         """
         if self.bayes_factor.disfavoured_s(track.stamp_ns) > UNEXPLAINED_S:
             return UNEXPLAINED

@@ -42,35 +42,15 @@ class MagnetSettings:
 
 
 def magnet_model(settings: MagnetSettings) -> Magnet:
-    """Create the source model of a magnet from its settings.
-
-    Parameters
-    ----------
-    settings : MagnetSettings
-
-    Returns
-    -------
-    Magnet
-    """
+    """Source model of a magnet with the given settings."""
     return Magnet(np.full(3, settings.acceleration**2), settings.angular_acceleration**2)
 
 
 def is_lost_after(settings: MagnetSettings, network: SensorNetwork, dt: float) -> bool:
-    """Whether a magnet may have moved anywhere near the sensors during a gap.
+    """Whether a magnet may have moved anywhere near the sensors during a gap of `dt` seconds.
 
     A prediction over such a gap does not help to find the magnet again, and an update linearised
     there may diverge.
-
-    Parameters
-    ----------
-    settings : MagnetSettings
-    network : SensorNetwork
-    dt : float, s
-        Duration of the gap.
-
-    Returns
-    -------
-    bool
     """
     std = settings.acceleration * np.sqrt(dt**3 / 3.0)
     extent = np.ptp(network.positions, axis=0).max()
@@ -80,31 +60,17 @@ def is_lost_after(settings: MagnetSettings, network: SensorNetwork, dt: float) -
 def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldFrame,
                  background_std: float, own_covariance: FloatArray, relative_std: float
                  ) -> FilterBank | None:
-    """Return the hypotheses of a magnet at its first frame, for any position near the sensors.
+    """Hypotheses of a magnet at its first frame, at any position near the sensors ([PHD15]_ Paper A
+    eq. (3)); None if the frame has fewer than six axes or no fit has a finite cost.
 
     The moment is projected out at each point of a coarse grid. The best grid points are refined.
-    Each distinct optimum becomes a hypothesis, weighted by its fit.
+    Each distinct optimum becomes a hypothesis, weighted by its fit. All labels are 0.
 
     Parameters
     ----------
-    settings : MagnetSettings
-    network : SensorNetwork
-    frame : FieldFrame
-    background_std : float, T
-        Standard deviation of each background, per axis.
-    own_covariance : (n_sensors, n_own, n_own) array
-        Covariances of the states of each sensor.
-    relative_std : float
-        Model error relative to the field.
-
-    Returns
-    -------
-    FilterBank or None
-        All labels are 0. None if the frame has fewer than six axes or if no fit has a finite cost.
-
-    References
-    ----------
-    [PHD15]_ Paper A eq. (3).
+    background_std : std of each background, per axis, T
+    own_covariance : (n_sensors, n_own, n_own) array, covariances of the states of each sensor
+    relative_std : model error relative to the field
     """
     is_present = ~np.isnan(frame.field)
     if np.count_nonzero(is_present) < 6:
@@ -135,8 +101,8 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
 def _start_grid(network: SensorNetwork) -> FloatArray:
     """Grid (n, 3) [m] over the bounding box of the sensors with its margin.
 
-    A side that is shorter than half the spacing of the grid has one point, in its middle. The
-    other sides then share the number of points.
+    A side that is shorter than half the spacing of the grid has one point, in its middle. The other
+    sides then share the number of points.
     """
     low, high = network.positions.min(axis=0), network.positions.max(axis=0)
     extent, step, is_long = high - low + 2.0 * START_MARGIN, 0.0, np.full(3, True)
@@ -152,10 +118,8 @@ def _start_grid(network: SensorNetwork) -> FloatArray:
 def _distinct_optima(settings: MagnetSettings, network: SensorNetwork, start: FloatArray,
                      y: FloatArray, std: FloatArray, is_present: BoolArray
                      ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Refine the grid points `start`, and select the distinct optima.
-
-    Returns the states (n, 12), covariances (n, 12, 12) and costs (n,) of the optima.
-    """
+    """Refine the grid points `start`; return the states (n, 12), covariances (n, 12, 12) and costs
+    (n,) of the distinct optima."""
     zero = np.zeros((len(start), 1, 3, 6))
     dr_dx, dm_dx = zero.copy(), zero.copy()
     dr_dx[:, 0, :, :3] = np.eye(3)

@@ -126,22 +126,10 @@ class VehicleSettings:
 
 
 def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehicle:
-    """Create the source model of a vehicle; soft iron has no effect without an earth field.
+    """Source model of a vehicle; without an earth field, soft iron has no effect.
 
-    Parameters
-    ----------
-    settings : VehicleSettings
-    network : SensorNetwork
-
-    Returns
-    -------
-    RowVehicle
-
-    Raises
-    ------
-    SettingsError
-        If the arrivals have more or fewer headings than names, or if a kind without length has a
-        standard deviation of the length or of the moment differences.
+    Raises SettingsError if the arrivals have more or fewer headings than names, or if a kind
+    without length has a std of the length or of the moment differences.
     """
     n = len(settings.arrival_names)
     if len(settings.arrival_headings_deg) != n:
@@ -171,18 +159,7 @@ def _soft_iron_per_share(settings: VehicleSettings, kind: int) -> float:
 
 
 def soft_iron(settings: VehicleSettings, kind: int) -> float:
-    """Initial soft iron D of a kind of vehicle, along each axis.
-
-    Parameters
-    ----------
-    settings : VehicleSettings
-    kind : int
-        Index in `settings.kinds`.
-
-    Returns
-    -------
-    float, m³
-    """
+    """Initial soft iron D of a kind of vehicle, along each axis, m³."""
     return settings.induced_share * _soft_iron_per_share(settings, kind)
 
 
@@ -192,12 +169,7 @@ def _earth_field(network: SensorNetwork) -> FloatArray:
 
 
 def moment_directions() -> FloatArray:
-    """Return unit vectors along the axes and diagonals of a cube, with both signs.
-
-    Returns
-    -------
-    (14, 3) array
-    """
+    """Unit vectors (14, 3) along the axes and diagonals of a cube, with both signs."""
     axes = np.vstack([np.eye(3), -np.eye(3)])
     diagonals = np.array([[a, b, c] for a in (1, -1) for b in (1, -1) for c in (1, -1)])
     return np.vstack([axes, diagonals / np.sqrt(3.0)])
@@ -205,30 +177,18 @@ def moment_directions() -> FloatArray:
 
 def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: FieldFrame,
                   background_std: float, own_covariance: FloatArray) -> FilterBank:
-    """Return the hypotheses of a vehicle at its first frame.
+    """Hypotheses of a vehicle at its first frame ([ICASSP11]_ section 2.2; [T10]_ Alg. 3, which has
+    one hypothesis per arrival).
 
     There is one hypothesis for each combination of kind, arrival line, moment direction, lateral
     offset and speed, and a turning copy of each if turning is enabled. A hypothesis starts at the
-    first position on its line at which its field has the measured energy.
+    first position on its line at which its field has the measured energy. Labels are indices into
+    `settings.arrival_names`, kinds are indices into `settings.kinds`.
 
     Parameters
     ----------
-    settings : VehicleSettings
-    network : SensorNetwork
-    frame : FieldFrame
-    background_std : float, T
-        Standard deviation of each background, per axis.
-    own_covariance : (n_sensors, n_own, n_own) array
-        Covariances of the states of each sensor.
-
-    Returns
-    -------
-    FilterBank
-        Labels are indices into `settings.arrival_names`, kinds are indices into `settings.kinds`.
-
-    References
-    ----------
-    [ICASSP11]_ section 2.2; [T10]_ Alg. 3, which has one hypothesis per arrival.
+    background_std : std of each background, per axis, T
+    own_covariance : (n_sensors, n_own, n_own) array, covariances of the states of each sensor
     """
     states: list[FloatArray] = []
     covariances: list[FloatArray] = []
@@ -256,10 +216,8 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
 
 
 def _add_turning_hypotheses(bank: FilterBank, model: RowVehicle, fraction: float) -> FilterBank:
-    """Bank with a turning copy of each hypothesis; `bank` itself if turning is disabled.
-
-    The turning copies have a total weight of `fraction`.
-    """
+    """Bank with a turning copy of each hypothesis, with a total weight of `fraction`; `bank` itself
+    if turning is disabled."""
     if not model.turn_acceleration:
         return bank
     n, w = len(bank), len(model.state_names) - 1
@@ -287,10 +245,11 @@ class _MeasuredEnergy:
 def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
                         measured: _MeasuredEnergy, R: FloatArray, moments: FloatArray,
                         height: float) -> FloatArray:
-    """First position on each line at which the field of each moment reaches the measured energy.
+    """First position on each line at which the field of each moment reaches the measured energy,
+    (n_offsets, n_moments, 3).
 
-    The shape is (n_offsets, n_moments, 3). If a field never reaches the energy, the result is the
-    last position of the line, next to the outermost sensor.
+    If a field never reaches the energy, this is the last position of the line, next to the
+    outermost sensor.
     """
     along = (network.positions - network.centre) @ R[:, 0]
     distance = np.linspace(MAX_START_DISTANCE, 0.0, 160) - along.min()
@@ -310,8 +269,8 @@ def _initial_states(settings: VehicleSettings, kind: int, positions: FloatArray,
                     velocities: FloatArray, hard_iron: FloatArray) -> FloatArray:
     """Initial states (n_offsets * n_speeds * n_moments, n_t) for the model `RowVehicle`.
 
-    The inputs are `positions` (n_offsets, n_moments, 3), `velocities` (n_speeds, 3) and the total
-    hard iron moments `hard_iron` (n_moments, 3).
+    `positions` is (n_offsets, n_moments, 3), `velocities` is (n_speeds, 3), and `hard_iron`
+    (n_moments, 3) is the total moment.
     """
     d = _n_dipoles(settings)
     n_turn = int(settings.turn_acceleration > 0.0)
@@ -325,22 +284,10 @@ def _initial_states(settings: VehicleSettings, kind: int, positions: FloatArray,
 
 def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, speed: float,
                         moment_std: float) -> FloatArray:
-    """Initial covariance of a hypothesis that arrives from a given direction.
+    """Initial covariance (n_t, n_t) of a hypothesis that arrives along the x axis of `R` (3, 3), a
+    rotation to the world frame.
 
-    Parameters
-    ----------
-    settings : VehicleSettings
-    kind : int
-        Index in `settings.kinds`.
-    R : (3, 3) array
-        Rotation to the world frame from a frame with the x axis along the arrival heading.
-    speed : float, m/s
-    moment_std : float, A m²
-        Standard deviation of the total hard iron moment, per axis.
-
-    Returns
-    -------
-    (n_t, n_t) array
+    `moment_std` [A m²] is the std of the total hard iron moment, per axis.
     """
     d = _n_dipoles(settings)
     soft_index = 6 + 3 * d

@@ -51,23 +51,12 @@ class JointExplanation:
     """Whether the explanation has one vehicle more than the track."""
 
     def doubtful(self, n_one: int) -> tuple[int, ...]:
-        """Indices of the vehicles whose states may be wrong.
+        """Indices of the vehicles whose states may be wrong; each vehicle has `n_one` states.
 
-        - All vehicles of an explanation whose log-odds are below `CONFIDENT_NATS`, or below
-          `IMPLAUSIBLE_NATS` if a new vehicle crosses another vehicle, or one overtakes the other
-          too fast.
-        - A vehicle that the explanation relocates.
-        - Two vehicles that replace one vehicle and move in the same direction, because a long
-          vehicle with large model errors resembles two vehicles.
-
-        Parameters
-        ----------
-        n_one : int
-            Number of states of one vehicle.
-
-        Returns
-        -------
-        tuple of int
+        These are a relocated vehicle, and two vehicles that replace one and move in the same
+        direction, because a long vehicle with large model errors resembles two. All vehicles are
+        doubtful if the log-odds are below `CONFIDENT_NATS`, or below `IMPLAUSIBLE_NATS` if a new
+        vehicle crosses another vehicle, or one overtakes the other too fast.
         """
         n = self.bank.label.shape[1] if self.bank.label.ndim > 1 else 1
         x = self.bank.x[self.bank.best()]
@@ -83,10 +72,8 @@ class JointExplanation:
 
 
 def _are_implausible(velocity: FloatArray, n_new: int) -> bool:
-    """Whether a new vehicle crosses another vehicle, or one overtakes the other too fast.
-
-    The last `n_new` rows of `velocity` (n, 2) [m/s] are the velocities of the new vehicles.
-    """
+    """Whether one of the last `n_new` vehicles of `velocity` (n, 2) [m/s] crosses another vehicle,
+    or one overtakes the other too fast."""
     speed = np.linalg.norm(velocity, axis=1)
     for i in range(len(velocity) - n_new, len(velocity)):
         for k in range(i):
@@ -102,14 +89,6 @@ def are_sensed_by_two(joint: JointExplanation) -> bool:
     """Whether at least two sensors sense each new vehicle.
 
     A field that only one sensor measures may be a fault of this sensor.
-
-    Parameters
-    ----------
-    joint : JointExplanation
-
-    Returns
-    -------
-    bool
     """
     n, best = joint.bank.label.shape[1], joint.bank.best()
     for i in range(n - (1 if joint.replaced is None else 2), n):

@@ -23,37 +23,19 @@ N_PATHS = 41
 
 
 def typical_speed(settings: TrackSettings) -> float:
-    """Median of the initial speeds of a vehicle.
-
-    Parameters
-    ----------
-    settings : TrackSettings
-
-    Returns
-    -------
-    float, m/s
-    """
+    """Median of the initial speeds of a vehicle, m/s."""
     return float(np.median(settings.vehicle.speeds))
 
 
 def required_rate(network: SensorNetwork, settings: TrackSettings) -> float:
-    """Minimum rate of readings that shows the pass of a vehicle.
+    """Minimum rate of readings that shows the pass of a vehicle, Hz; 0 for a magnet, which may be
+    at rest.
 
     Between two readings, a vehicle at `typical_speed` must not move further than
     `MAX_RELATIVE_MOVE` times its distance from the nearest sensor. The field of a pass at distance
     d and speed v has little content above the frequency v / (2 d), because its spectrum decreases
     like exp(-2 pi f d / v). The distance is that of the path between the outermost lanes that keeps
     furthest from all sensors, and includes `LATERAL_STD`: a lower rate is too low in every lane.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : TrackSettings
-
-    Returns
-    -------
-    float, Hz
-        0 for a magnet, which may be at rest.
     """
     if settings.target != 'vehicle':
         return 0.0
@@ -70,19 +52,8 @@ def required_rate(network: SensorNetwork, settings: TrackSettings) -> float:
 
 
 def low_rate_fault(rate: float, network: SensorNetwork, settings: TrackSettings) -> str | None:
-    """Describe a rate that is too low for tracks.
-
-    Parameters
-    ----------
-    rate : float, Hz
-    network : SensorNetwork
-    settings : TrackSettings
-
-    Returns
-    -------
-    str or None
-        None if the rate suffices or is unknown (NaN).
-    """
+    """Message about a rate [Hz] that is too low for tracks; None if it suffices or is unknown
+    (NaN)."""
     required = required_rate(network, settings)
     if not rate < required:
         return None
@@ -93,13 +64,7 @@ def low_rate_fault(rate: float, network: SensorNetwork, settings: TrackSettings)
 
 
 class SampleRates:
-    """Rates of the sensors, from the frames in which they have samples.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : TrackSettings
-    """
+    """Rates of the sensors, from the frames in which they have samples."""
 
     def __init__(self, network: SensorNetwork, settings: TrackSettings) -> None:
         required = required_rate(network, settings)
@@ -112,14 +77,7 @@ class SampleRates:
         self._are_short, self._complete_ns = False, NEVER
 
     def add(self, frame: FieldFrame, first: int = 0) -> None:
-        """Update the rates with a frame.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-        first : int, optional
-            Index of the first sensor of the frame in the network.
-        """
+        """Update the rates with a frame whose first sensor has the index `first` in the network."""
         is_complete = len(frame.n_samples) == len(self._last_ns) and bool(frame.n_samples.all())
         interval_ns, self._complete_ns = frame.stamp_ns - self._complete_ns, \
             frame.stamp_ns if is_complete else NEVER
@@ -139,12 +97,7 @@ class SampleRates:
                                and (self._intervals_s <= self._max_interval_s).all())
 
     def are_slow(self) -> BoolArray:
-        """Whether most of the latest intervals of each sensor are too long.
-
-        Returns
-        -------
-        (n_sensors,) bool array
-        """
+        """Whether most of the latest intervals of each sensor are too long, (n_sensors,)."""
         n_long = np.count_nonzero(self._intervals_s > self._max_interval_s, axis=1)
         n_known = np.minimum(self._next, N_INTERVALS)
         are_slow: BoolArray = (n_long >= MIN_INTERVALS) & (2 * n_long > n_known)

@@ -50,24 +50,12 @@ class TrackManager:
 
     While a target is present, the manager returns one `Track` per frame and target. Smoothed poses
     follow with a fixed lag during the track, and for the whole track at its end. Vehicles that
-    appear during a track become members of the track.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : TrackSettings
-    clocks : ClockComparison, optional
-        Clock comparison from earlier passes, to be continued. By default, a new comparison starts.
+    appear during a track become members of the track. A given clock comparison is continued. Raises
+    SettingsError if the settings contradict each other.
 
     Attributes
     ----------
-    counts : Counter
-        Number of events, by description.
-
-    Raises
-    ------
-    SettingsError
-        If the settings contradict each other.
+    counts : number of events, by description
     """
 
     def __init__(self, network: SensorNetwork, settings: TrackSettings,
@@ -96,43 +84,22 @@ class TrackManager:
             self.counts[UNCERTAIN_ORIENTATIONS] = n_uncertain
 
     def use_network(self, network: SensorNetwork) -> None:
-        """Apply another calibration of the same sensors as soon as no track is running.
-
-        Parameters
-        ----------
-        network : SensorNetwork
-
-        Raises
-        ------
-        NetworkError
-            If the sensors differ.
-        """
+        """Apply another calibration of the same sensors as soon as no track is running; raises
+        NetworkError if the sensors differ."""
         if network.names != self._network.names:
             raise NetworkError(f'the calibration is for other sensors: {", ".join(network.names)}; '
                                f'the tracker uses {", ".join(self._network.names)}')
         self._next_network = network
 
     def configure(self, settings: TrackSettings) -> None:
-        """Apply new values of the live settings, also to running tracks.
-
-        Parameters
-        ----------
-        settings : TrackSettings
-        """
+        """Apply new values of the live settings, also to running tracks."""
         self._settings = settings
         for track in self._tracks:
             track.configure(settings)
 
     def set_input_doubts(self, doubts: InputDoubts) -> None:
-        """Set the times at which the readings of the sensors are doubtful.
-
-        Tracks with frames at these times are marked as doubtful.
-
-        Parameters
-        ----------
-        doubts : {reason: {sensor: DoubtfulTimes}}
-            Doubtful intervals; they replace all previous intervals.
-        """
+        """Replace the times {reason: {sensor: times}} at which readings are doubtful; tracks with
+        frames at these times are marked as doubtful."""
         if doubts != self._input_doubts:
             self._input_doubts = doubts
             self._doubtful_rows = {reason: {self._network.index(name): t for name, t in
@@ -157,16 +124,7 @@ class TrackManager:
         return self._tracks[0].bank if self._tracks else None
 
     def feed(self, frame: FieldFrame) -> list[TrackRecord]:
-        """Start, update or end tracks with a frame, and return the resulting records.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-
-        Returns
-        -------
-        list of TrackRecord
-        """
+        """Start, update or end tracks with a frame, and return the resulting records."""
         self.idle()
         if self._next_network is not None and not self._tracks:
             if not np.array_equal(self._next_network.clock_offset, self._network.clock_offset):
@@ -200,27 +158,13 @@ class TrackManager:
                 self._next_id += joint.adds
 
     def end_tracks(self, reason: str) -> list[TrackRecord]:
-        """End all tracks and discard the recent frames, after an interruption of the frames.
-
-        Parameters
-        ----------
-        reason : str
-
-        Returns
-        -------
-        list of TrackRecord
-        """
+        """End all tracks and discard the recent frames, after an interruption of the frames."""
         self._recent.clear()
         self._restart_energy = None
         return self._end_all(reason, self._last_ns)
 
     def flush(self) -> list[TrackRecord]:
-        """End all tracks at the end of the input.
-
-        Returns
-        -------
-        list of TrackRecord
-        """
+        """End all tracks at the end of the input."""
         return self._end_all('input ended', self._last_ns)
 
     def _end_at_gap(self, frame: FieldFrame) -> list[TrackRecord]:
@@ -335,8 +279,8 @@ class TrackManager:
 def _energy(frame: FieldFrame) -> float:
     """Squared norm of the field, summed over all sensors [T²].
 
-    The energy is not weighted with the noise, because the noise assumed by the detector increases
-    during a detection.
+    It is not weighted with the noise, because the noise assumed by the detector increases during a
+    detection.
     """
     return float(np.nansum(np.square(frame.field)))
 

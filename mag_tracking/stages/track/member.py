@@ -61,36 +61,15 @@ class MemberView:
 class Member:
     """Target of a running track.
 
-    Parameters
-    ----------
-    id : int
-        Track identifier.
-    target : Target
-    sensors : SensorSubset
-        Sensors that the track uses.
-    counts : Counter
-        Event counts of the track manager, updated in place.
-    clocks : ClockComparison
-    begin_ns : int, ns
-        Start of the track.
+    The event counts of the track manager are updated in place.
 
     Attributes
     ----------
-    id : int
-    begin_ns : int
-        Start of the track [ns].
-    evidence : TrackEvidence
-    cross_check : CrossCheck
-    last : Track or None
-        Latest record.
-    ended : str or None
-        Reason for the end; None while the target is tracked.
-    is_lost : bool
-        Whether the member ended while the target was still detected.
-    early : list of TrackState
-        Smoothed states from the time before the target shared its state with other targets.
-    slot : int
-        Index of the target in the joint states that are stored for smoothing.
+    last : latest record
+    ended : reason for the end; None while the target is tracked
+    is_lost : whether the member ended while the target was still detected
+    early : smoothed states from the time before the target shared its state with other targets
+    slot : index of the target in the joint states that are stored for smoothing
     """
 
     def __init__(self, id: int, target: Target, sensors: SensorSubset, counts: 'Counter[str]',
@@ -113,23 +92,13 @@ class Member:
         self._recent_positions: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_POSITIONS)
 
     def use(self, sensors: SensorSubset) -> None:
-        """Switch to other sensors, and restart the cross-check.
-
-        Parameters
-        ----------
-        sensors : SensorSubset
-        """
+        """Switch to other sensors, and restart the cross-check."""
         self._sensors = sensors
         self.cross_check = CrossCheck(sensors.network)
 
     def restart(self, sensors: SensorSubset) -> None:
-        """Drop the doubts caused by the field of another vehicle, and restart the checks.
-
-        Parameters
-        ----------
-        sensors : SensorSubset
-            Sensors that the track uses from now on.
-        """
+        """Switch to other sensors, drop the doubts caused by the field of another vehicle, and
+        restart the checks."""
         self.evidence.drop_explained_doubts()
         self.use(sensors)
         self._plausibility = Plausibility()
@@ -137,34 +106,16 @@ class Member:
     def start_alongside(self, first: 'Member', stamp_ns: int, ratio: float) -> None:
         """Start as a new target of a track, in addition to its first member.
 
-        The new target inherits two properties of the first member: the doubt that it was not seen
-        approaching, and its evidence for a target against a disturbance.
-
-        Parameters
-        ----------
-        first : Member
-        stamp_ns : int, ns
-        ratio : float
-            Minimum Bayes factor of a target against a disturbance.
+        The new target inherits from the first member the doubt that it was not seen approaching,
+        and the evidence for a target against a disturbance. `ratio` is the minimum Bayes factor.
         """
         self.evidence.flag_start(doubts.NOT_SEEN_APPROACHING in first.evidence.doubts,
                                  self._sensors.full_network, False)
         self.evidence.bayes_factor.add(first.evidence.bayes_factor.log_ratio, stamp_ns, ratio)
 
     def distance_from(self, stamps_ns: Sequence[int], path: FloatArray) -> float:
-        """Mean distance of the recently published positions from a path.
-
-        Parameters
-        ----------
-        stamps_ns : sequence of int, ns
-            Timestamps of the path.
-        path : (n, 2) array, m, world frame
-
-        Returns
-        -------
-        float, m
-            0 if no position was published at these timestamps.
-        """
+        """Mean distance of the recently published positions from a path (n, 2) in the world frame,
+        m; 0 if none was published at its timestamps."""
         position_at = dict(zip(stamps_ns, path, strict=True))
         distances = [float(np.hypot(*(position - position_at[stamp_ns])))
                      for stamp_ns, position in self._recent_positions if stamp_ns in position_at]
@@ -173,15 +124,7 @@ class Member:
     def publish(self, update: BankUpdate, view: MemberView) -> list[Track]:
         """Create and store the `Track` record of this member for a frame.
 
-        Parameters
-        ----------
-        update : BankUpdate
-        view : MemberView
-
-        Returns
-        -------
-        list of Track
-            The record; empty if the state is impossible, which ends the member.
+        The result is empty if the state is impossible, which ends the member.
         """
         record = self._create_record(update, view)
         self._impossible = impossible_reason(record.velocity, record.moment, record.mounting)
@@ -236,16 +179,7 @@ class Member:
         return bool(self.last.position[2] + np.sqrt(self.last.covariance[2, 2]) < 0.0)
 
     def is_doubtful(self, settings: TrackSettings) -> bool:
-        """Whether the whole track is currently doubtful.
-
-        Parameters
-        ----------
-        settings : TrackSettings
-
-        Returns
-        -------
-        bool
-        """
+        """Whether the whole track is currently doubtful."""
         return self.evidence.is_doubtful or self.cross_check.is_doubtful \
             or not self.evidence.bayes_factor.is_favoured(settings.min_bayes_factor) \
             or not self._target.starts_anywhere and self.evidence.is_sensed_by_one
@@ -283,18 +217,8 @@ class Member:
         return overfits
 
     def reason_to_end(self, sensors: SensorSubset, settings: TrackSettings) -> str | None:
-        """Update the end conditions with the latest record, and return the reason to end the track.
-
-        Parameters
-        ----------
-        sensors : SensorSubset
-        settings : TrackSettings
-
-        Returns
-        -------
-        str or None
-            None if the track continues.
-        """
+        """Update the end conditions with the latest record; return the reason to end the track, or
+        None."""
         if self._impossible:
             return self._impossible
         assert self.last is not None
@@ -302,17 +226,10 @@ class Member:
         return self.evidence.reason_to_end(self.last, self._position_std, is_approaching, settings)
 
     def unexplained(self, uniform: float) -> UnexplainedField | None:
-        """Field of the track, if all its poses were ambiguous and a disturbance explains it better.
+        """Field of the track, if all its poses were ambiguous and a disturbance explains it better;
+        else None.
 
-        Parameters
-        ----------
-        uniform : float
-            Probability that the field is the same at all sensors of the network.
-
-        Returns
-        -------
-        UnexplainedField or None
-            None if a target may have explained the field.
+        `uniform` is the probability that the field is the same at all sensors of the network.
         """
         if self._was_unambiguous or self.last is None \
                 or self.evidence.bayes_factor.disfavoured_s(self.last.stamp_ns) <= 0.0:
@@ -322,49 +239,19 @@ class Member:
 
     def states_of(self, slot: int, n_one: int, states: Iterable[TrackState],
                   end_ns: float = np.inf) -> list[TrackState]:
-        """States of the target within its lifetime, extracted from the states of all members.
-
-        Parameters
-        ----------
-        slot : int
-            Index of the target among the members.
-        n_one : int
-            Number of states of each member.
-        states : iterable of TrackState
-            States of all members.
-        end_ns : int, ns, optional
-            Only states before this time are returned.
-
-        Returns
-        -------
-        list of TrackState
-        """
+        """States of the target at index `slot` within its lifetime and before `end_ns`, from the
+        states of all members, with `n_one` each."""
         rows = slice(n_one * slot, n_one * (slot + 1))
         return [(stamp_ns, x[rows], P[rows, rows]) for stamp_ns, x, P in states
                 if self.begin_ns <= stamp_ns < end_ns]
 
     def smoothed(self, bank: FilterBank, best: int, complete: bool, states: list[TrackState],
                  doubtful: bool) -> list[SmoothedPose]:
-        """Return smoothed poses for the states of a hypothesis.
+        """Smoothed poses for the states of hypothesis `best` in the bank of this member; `complete`
+        if they cover the whole track, all ambiguous if `doubtful`.
 
         Poses at times at which the filter was doubtful are marked as ambiguous, because smoothing
         corrects its errors only in part.
-
-        Parameters
-        ----------
-        bank : FilterBank
-            Bank of this member.
-        best : int
-            Index of the hypothesis.
-        complete : bool
-            Whether the states cover the whole track.
-        states : list of TrackState
-        doubtful : bool
-            Whether to mark all poses as ambiguous.
-
-        Returns
-        -------
-        list of SmoothedPose
         """
         ambiguous = doubtful or bool(ambiguities(bank, best, bank.is_separated(best)))
         poses = [smoothed_pose(
@@ -381,22 +268,11 @@ class Member:
 
 def members_in_order(members: Sequence[Member], new: Member | None, joint: JointExplanation,
                      n_one: int) -> list[Member]:
-    """Return the members and a new target, ordered like the states in a joint explanation.
+    """The members and a new target, ordered like the states in a joint explanation, with `n_one`
+    per vehicle.
 
     If two vehicles replace one member, this member continues as the vehicle whose path is nearer to
     its published positions.
-
-    Parameters
-    ----------
-    members : sequence of Member
-    new : Member or None
-    joint : JointExplanation
-    n_one : int
-        Number of states of each vehicle.
-
-    Returns
-    -------
-    list of Member
     """
     others = list(members)
     replaced = others.pop(joint.replaced) if joint.replaced is not None else None

@@ -42,36 +42,18 @@ class NewTargetEvidence:
 
     def add(self, nis: float, degrees_of_freedom: int, stamp_ns: int, rejected: bool,
             is_long: bool) -> None:
-        """Add a frame.
+        """Add a frame with its normalised innovation squared `nis`.
 
-        Parameters
-        ----------
-        nis : float
-            Normalised innovation squared.
-        degrees_of_freedom : int
-        stamp_ns : int, ns
-        rejected : bool
-            Whether one of two sensors was rejected. This triggers a comparison in the same way as
-            improbable innovations. With more sensors, the majority shows that the rejected sensor
-            is faulty.
-        is_long : bool
-            Whether the best hypothesis is a long vehicle.
+        One `rejected` sensor of two triggers a comparison like improbable innovations do. With more
+        sensors, the majority shows that the rejected sensor is faulty. `is_long` refers to the best
+        hypothesis.
         """
         self._latest.add(stamp_ns, [nis, degrees_of_freedom])
         self._was_rejected, self._is_long = rejected, is_long
 
     def due(self, stamp_ns: int) -> str | None:
-        """Return the reason for a comparison if one is due, and restart the interval.
-
-        Parameters
-        ----------
-        stamp_ns : int, ns
-
-        Returns
-        -------
-        str or None
-            `IMPROBABLE` or `LONG_VEHICLE`; None if no comparison is due.
-        """
+        """Return `IMPROBABLE` or `LONG_VEHICLE` if a comparison is due, and restart the interval;
+        else None."""
         total, freedom = self._latest.total
         elapsed_s = np.inf if self._last_comparison_ns is None \
             else (stamp_ns - self._last_comparison_ns) / NS
@@ -86,19 +68,8 @@ class NewTargetEvidence:
         return reason
 
     def accepts(self, log_odds: float) -> bool:
-        """Record a comparison, and return whether the other explanation is accepted.
-
-        It is accepted immediately, or in two successive comparisons.
-
-        Parameters
-        ----------
-        log_odds : float, nats
-            Log-odds of the explanation against the current track.
-
-        Returns
-        -------
-        bool
-        """
+        """Record a comparison, and return whether the other explanation, with its log-odds [nats]
+        against the track, is accepted: immediately, or in two successive comparisons."""
         accepts = log_odds > ACCEPT_NATS or self._was_probable and log_odds > REPEATED_NATS
         self._was_probable = log_odds > REPEATED_NATS and not accepts
         return accepts

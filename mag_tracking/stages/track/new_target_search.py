@@ -67,19 +67,11 @@ class NewTargetSearch:
 
     Parameters
     ----------
-    bank : FilterBank
-        Bank of the track.
-    window : Window
-    filter_of : callable
-        Returns the `BankFilter` for a number of vehicles.
-    n_targets : int
-        Number of vehicles of the track.
-    vehicles : VehicleState
-    reason : str
-        Reason from `NewTargetEvidence.due`. Without improbable innovations, the search is
-        restricted to two vehicles in place of one.
-    may_add : bool
-        Whether a vehicle may be added.
+    filter_of : function that returns the `BankFilter` for a number of vehicles
+    n_targets : number of vehicles of the track
+    reason : reason from `NewTargetEvidence.due`; without improbable innovations, the search is
+        restricted to two vehicles in place of one
+    may_add : whether a vehicle may be added
     """
 
     def __init__(self, bank: FilterBank, window: Window, filter_of: Callable[[int], BankFilter],
@@ -99,13 +91,7 @@ class NewTargetSearch:
             * len(settings.kinds) * len(moment_directions()) * N_DISTANCES))
 
     def find(self) -> JointExplanation | None:
-        """Return the best explanation with a new or a relocated vehicle.
-
-        Returns
-        -------
-        JointExplanation or None
-            None if no such explanation is usable.
-        """
+        """Best explanation with a new or a relocated vehicle; None if none is usable."""
         if not len(self._search.samples.t):
             return None
         rows, track_log_likelihood, log_w, paths = self._current_track()
@@ -237,10 +223,8 @@ class NewTargetSearch:
 
     def _starts_on(self, known: KnownVehicleHypothesis, paths: FloatArray, moments: FloatArray,
                    replaced: int | None) -> list[WindowStart]:
-        """One start for each combination of kinds of k new vehicles, which join the known vehicles.
-
-        The new vehicles have the `paths` (k, 7) and the `moments` (k, 3, 3).
-        """
+        """One start for each combination of kinds of k new vehicles on `paths` (k, 7) with
+        `moments` (k, 3, 3), which join the known vehicles."""
         n_known, times = len(known.kind) * self._n_one, self._search.times
         labels = self._search.prior.nearest_line(paths)[0].tolist()
         starts = []
@@ -286,8 +270,8 @@ class NewTargetSearch:
                     ) -> tuple[FilterBank, FloatArray, FloatArray, FloatArray]:
         """Filter and smooth starts along their paths.
 
-        Returns the bank at the last frame, log-likelihoods (n,), log-weights (n,) and paths (n,
-        n_frames, n_x).
+        Returns the bank at the last frame, log-likelihoods (n,), log-weights (n,) and paths
+        (n, n_frames, n_x).
         """
         window, n = self._window, len(starts)
         bank = FilterBank(

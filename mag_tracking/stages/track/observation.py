@@ -19,19 +19,8 @@ TIME_RESOLUTION_S = 1e-3
 
 
 def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
-    """Covariances of the mounting angles at the start of a track.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    mounting_std : float, rad
-        Standard deviation for sensors without `orientation_std`.
-
-    Returns
-    -------
-    (n_sensors, 3, 3) array, rad^2
-        Covariances of the rotations about the axes of the sensor.
-    """
+    """Covariances (n_sensors, 3, 3) of the mounting rotations about the axes of the sensor at the
+    start of a track, rad²; `mounting_std` [rad] applies to sensors without `orientation_std`."""
     std = [np.full(3, mounting_std) if s is None else np.minimum(s, MAX_ROTATION)
            for s in network.orientation_std]
     # The angles are about the axes of the sensor, but `orientation_std` is about the world axes.
@@ -45,42 +34,27 @@ class Observation:
 
     The state begins with the states of `n_targets` targets of one model, one after the other; the
     fields of the targets are added. The states of each sensor follow: three mounting angles [rad]
-    if they are estimated, and three model errors in units of their standard deviation if
-    `error_time` is not 0. The backgrounds of all sensors [T] come last, as described in
-    `inference/hypothesis.hpp`.
+    if they are estimated, and three model errors in units of their std if `error_time` is not 0.
+    The backgrounds of all sensors [T] come last, as described in `inference/hypothesis.hpp`.
 
     The model errors represent the field that the target model neglects near a vehicle. They are
-    first-order Gauss-Markov processes with the correlation time `error_time`, so that their weight
-    does not depend on the frame period. If `error_time` is 0, the error is independent noise in
-    every frame.
+    first-order Gauss-Markov processes with the correlation time `error_time` [s], so that their
+    weight does not depend on the frame period. If `error_time` is 0, the error is independent noise
+    in every frame.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-    model : SourceModel
-    mounting_std : float, rad
-        Standard deviation of the mounting angles for sensors without `orientation_std`. If it is 0,
-        the mounting angles of no sensor are estimated.
-    error_time : float, s
-        Correlation time of the model errors.
-    n_targets : int, optional
+    `mounting_std` [rad] applies to sensors without `orientation_std`; if it is 0, the mounting
+    angles of no sensor are estimated.
 
     Attributes
     ----------
     positions : (n_sensors, 3) array, m, world frame
-    R_sw : (n_sensors, 3, 3) array
-        World to sensor.
-    n_angles : int
-        Number of estimated mounting angles per sensor: 3 or 0.
-    n_targets : int
-    n_one : int
-        Number of states per target.
-    n_target : int
-        Number of states of all targets.
-    own_covariance : (n_sensors, n_own, n_own) array
-        Covariance of the mounting angles and model errors of each sensor at the start of a track.
-    single_target : Observation
-        Measurement model of one target.
+    R_sw : (n_sensors, 3, 3) array, world to sensor
+    n_angles : number of estimated mounting angles per sensor, 3 or 0
+    n_one : number of states per target
+    n_target : number of states of all targets
+    own_covariance : (n_sensors, n_own, n_own) array, covariance of the mounting angles and model
+        errors of each sensor at the start of a track
+    single_target : measurement model of one target
     """
 
     def __init__(self, network: SensorNetwork, model: SourceModel, mounting_std: float,
@@ -112,123 +86,51 @@ class Observation:
         return self.own_covariance.shape[1]
 
     def n_states(self, n_sensors: int) -> int:
-        """Number of states of the targets and of a given number of sensors.
-
-        Parameters
-        ----------
-        n_sensors : int
-
-        Returns
-        -------
-        int
-        """
+        """Number of states of the targets and of `n_sensors` sensors."""
         return self.n_target + (self.n_own + 3) * n_sensors
 
     def own(self, x: FloatArray) -> FloatArray:
-        """Mounting angles and model errors of each sensor.
-
-        Parameters
-        ----------
-        x : (..., n_x) array
-
-        Returns
-        -------
-        (..., n_sensors, n_own) array
-        """
+        """Mounting angles and model errors (..., n_sensors, n_own) of each sensor, from states
+        (..., n_x)."""
         n = len(self.positions)
         own = x[..., self.n_target:x.shape[-1] - 3 * n]
         return own.reshape(*own.shape[:-1], n, self.n_own)
 
     def angles(self, x: FloatArray) -> FloatArray:
-        """Mounting angles of the sensors.
-
-        Parameters
-        ----------
-        x : (..., n_x) array
-
-        Returns
-        -------
-        (..., n_sensors, 3) array, rad
-            (..., 0, 3) if the angles are not estimated.
-        """
+        """Mounting angles (..., n_sensors, 3) from states (..., n_x), rad; (..., 0, 3) if not
+        estimated."""
         return self.own(x)[..., :3] if self.n_angles else np.zeros((*x.shape[:-1], 0, 3))
 
     def angle_covariances(self, P: FloatArray) -> FloatArray:
-        """Covariances of the mounting angles.
-
-        Parameters
-        ----------
-        P : (n_x, n_x) array
-
-        Returns
-        -------
-        (n_sensors, 3, 3) array, rad^2
-            (0, 3, 3) if the angles are not estimated.
-        """
+        """Covariances (n_sensors, 3, 3) of the mounting angles, rad²; (0, 3, 3) if not
+        estimated."""
         first = self.n_target + self.n_own * np.arange(len(self.positions))
         rows = first[:, None] + np.arange(3)
         return P[rows[:, :, None], rows[:, None, :]] if self.n_angles else np.zeros((0, 3, 3))
 
     def without_errors(self, x: FloatArray) -> FloatArray:
-        """Copy of states with the model errors set to zero.
-
-        Parameters
-        ----------
-        x : (n_hyp, n_x) array
-
-        Returns
-        -------
-        (n_hyp, n_x) array
-        """
+        """Copy of states (n_hyp, n_x) with the model errors set to zero."""
         x = x.copy()
         self.own(x)[..., self.n_angles:] = 0.0
         return x
 
     def distance_to_nearest(self, x: FloatArray) -> FloatArray:
-        """Smallest distance between a target and a sensor.
-
-        Parameters
-        ----------
-        x : (n_hyp, n_x) array
-
-        Returns
-        -------
-        (n_hyp,) array, m
-        """
+        """Smallest distance (n_hyp,) between a target and a sensor, m."""
         distances = np.linalg.norm(self.target_positions(x)[:, :, None] - self.positions, axis=3)
         nearest: FloatArray = distances.min(axis=(1, 2))
         return nearest
 
     def target_positions(self, x: FloatArray) -> FloatArray:
-        """Positions of the targets.
-
-        Parameters
-        ----------
-        x : (n_hyp, n_x) array
-
-        Returns
-        -------
-        (n_hyp, n_targets, 3) array, m, world frame
-        """
+        """Positions (n_hyp, n_targets, 3) of the targets, m, world frame."""
         positions: FloatArray = x[:, :self.n_target].reshape(
             len(x), self.n_targets, self.n_one)[:, :, :3]
         return positions
 
     def drift(self, dt: FloatArray, background_density: float) -> tuple[FloatArray, FloatArray]:
-        """Decay and process noise of the sensor states over an interval.
+        """Decay factor and added variance of the sensor states over intervals `dt` (...) [s], both
+        (..., (n_own + 3) n_sensors).
 
-        Parameters
-        ----------
-        dt : (...) array, s
-        background_density : float, T/s^0.5
-            Random walk of each background.
-
-        Returns
-        -------
-        decay : (..., (n_own + 3) n_sensors) array
-            Factor for each state.
-        variance : (..., (n_own + 3) n_sensors) array
-            Added variance of each state.
+        `background_density` [T/s^0.5] is the random walk of each background.
         """
         decay = np.exp(-np.abs(dt) / self._error_time) if self._error_time else np.ones(dt.shape)
         variance: FloatArray = np.multiply.outer(1.0 - decay**2, self._is_error) \
@@ -239,21 +141,11 @@ class Observation:
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Target fields at the sampling time of each sensor, without mounting and model errors.
 
-        Parameters
-        ----------
-        x : (n_hyp, n_x) array
-        time_offset : (n_sensors,) array, s
-        near_field_length : (n_hyp, n_targets) array, m
-            Model error near each target, relative to the field gradient.
-
-        Returns
-        -------
-        h : (n_hyp, n_sensors, 3) array, T, sensor frame
-        H : (n_hyp, n_sensors, 3, n_target) array
-            Derivative with respect to the states of the targets.
-        variance : (n_hyp, n_sensors) array, T^2
-            Variance of the model error near the targets; the errors of different targets are
-            independent.
+        The fields (n_hyp, n_sensors, 3) [T] are in the sensor frame; their derivatives
+        (n_hyp, n_sensors, 3, n_target) are with respect to the states of the targets. The variance
+        (n_hyp, n_sensors) [T²] is that of the model error near the targets; the errors of different
+        targets are independent. `near_field_length` (n_hyp, n_targets) [m] scales it with the field
+        gradient.
         """
         h, H, gradients = zip(*(
             self._single_target_field(x[:, first:first + self.n_one], time_offset)
@@ -283,20 +175,8 @@ class Observation:
 
     def field_of(self, x: FloatArray, targets: Iterable[int], time_offset: FloatArray
                  ) -> FloatArray:
-        """Field of selected targets at the sampling time of each sensor, with mounting errors.
-
-        Parameters
-        ----------
-        x : (n_x,) array
-        targets : iterable of int
-            Indices of the targets.
-        time_offset : (n_sensors,) array, s
-            Sampling time of each sensor, relative to the timestamp.
-
-        Returns
-        -------
-        (n_sensors, 3) array, T, sensor frame
-        """
+        """Field (n_sensors, 3) of selected targets of a state `x` (n_x,), with mounting errors, T,
+        sensor frame, at `time_offset` [s] from the timestamp for each sensor."""
         n = self.n_one
         h, H = np.zeros((1, *self.positions.shape)), np.zeros((1, *self.positions.shape, 0))
         for target in targets:
@@ -310,30 +190,15 @@ class Observation:
                field_error: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Fields at the sensors, without the backgrounds.
 
-        `H` neglects that the standard deviation of the model error depends on the state. This
-        dependence is a few per cent of the derivative where the error is large. The standard
-        deviation follows ICASSP11 eq. (9), which treats the error as noise.
+        The fields h (n_hyp, n_sensors, 3) [T] are in the sensor frame; the derivatives H
+        (n_hyp, n_sensors, 3, n_target + n_own) are with respect to the states of the targets and of
+        the sensor. The variance (n_hyp, n_sensors) of the model error [T²] is 0 if the model errors
+        are states. `field_error` is the model error relative to the field, and `near_field_length`
+        (n_hyp, n_targets) [m] relative to the field gradient.
 
-        Parameters
-        ----------
-        x : (n_hyp, n_x) array
-        time_offset : (n_sensors,) array, s
-        near_field_length : (n_hyp, n_targets) array, m
-            Model error near each target, relative to the field gradient.
-        field_error : float
-            Model error relative to the field.
-
-        Returns
-        -------
-        h : (n_hyp, n_sensors, 3) array, T, sensor frame
-        H : (n_hyp, n_sensors, 3, n_target + n_own) array
-            Derivative with respect to the states of the targets and the states of the sensor.
-        inflation : (n_hyp, n_sensors) array, T^2
-            Variance of the model error; 0 if the model errors are states.
-
-        References
-        ----------
-        [ICASSP11]_ eq. (9).
+        H neglects that the std of the model error depends on the state. This dependence is a few
+        per cent of the derivative where the error is large. The std follows [ICASSP11]_ eq. (9),
+        which treats the error as noise.
         """
         h, H, variance = self.target_fields(x, time_offset, near_field_length)
         variance = variance + _proportional_variance(h, field_error)
@@ -349,20 +214,10 @@ class Observation:
 
     def model_error(self, x: FloatArray, near_field_length: FloatArray, field_error: float
                     ) -> FloatArray:
-        """Variance of the model error on each axis of each sensor, for one state.
+        """Variance (n_sensors,) of the model error on each axis for one state `x` (n_x,), T²; NaN
+        if a dipole is at a sensor.
 
-        Parameters
-        ----------
-        x : (n_x,) array
-        near_field_length : (n_targets,) array, m
-            Model error near each target, relative to the field gradient.
-        field_error : float
-            Model error relative to the field.
-
-        Returns
-        -------
-        (n_sensors,) array, T^2
-            NaN if a dipole is at a sensor.
+        `field_error` and `near_field_length` (n_targets,) are as for `fields`.
         """
         h, _, variance = self.target_fields(x[None], np.zeros(len(self.positions)),
                                             near_field_length[None])

@@ -57,30 +57,12 @@ class PassSamples:
         return len(self.compared) - 1
 
     def n_free(self, n_dipoles: int) -> int:
-        """Degrees of freedom that remain after the backgrounds and moments have been estimated.
-
-        Parameters
-        ----------
-        n_dipoles : int
-
-        Returns
-        -------
-        int
-        """
+        """Degrees of freedom that remain after the backgrounds and moments have been estimated."""
         return self.n_values - self.backgrounds.shape[1] - 3 * n_dipoles
 
     def with_near_field_error(self, path: FloatArray) -> 'PassSamples':
-        """Copy of the samples with noise that includes the model error near the sensors.
-
-        Parameters
-        ----------
-        path : (10,) array
-            Path of the vehicle, as for `SteadyPass`.
-
-        Returns
-        -------
-        PassSamples
-        """
+        """Copy of the samples with noise that includes the model error near the sensors, for a
+        `SteadyPass` path (10,)."""
         c, s = np.cos(path[4]), np.sin(path[4])
         displacement = self.t[:, None] * np.array([c * path[3], s * path[3], path[5]])
         relative_error = np.maximum(MODEL_ERROR, NEAR_ERROR_LENGTH / np.linalg.norm(
@@ -95,20 +77,7 @@ class PassSamples:
     @classmethod
     def of(cls, network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int,
            max_sensors: int = MAX_SENSORS) -> 'PassSamples':
-        """Samples of the sensors with the strongest fields.
-
-        Parameters
-        ----------
-        network : SensorNetwork
-        frames : sequence of FieldFrame
-        stamp_ns : int, ns
-            Time zero of the samples.
-        max_sensors : int, optional
-
-        Returns
-        -------
-        PassSamples
-        """
+        """Samples of the sensors with the strongest fields; `stamp_ns` is time zero."""
         field = np.array([f.field for f in frames])
         energy = np.nansum(np.square(field), axis=2)
         measured = np.count_nonzero(~np.isnan(field).all(axis=2), axis=0)
@@ -134,24 +103,12 @@ class PassSamples:
 
     def fit(self, n_dipoles: int, free: IntArray, starts: FloatArray
             ) -> tuple[FloatArray, float, FloatArray]:
-        """Fit a row of dipoles on a steady path from each start, and return the best fit.
+        """Fit a row of dipoles on a steady path with the parameters `free` of `SteadyPass` from
+        each of `starts` (n, n_free).
 
-        Parameters
-        ----------
-        n_dipoles : int
-        free : (n_free,) int array
-            Free parameters; see `SteadyPass`.
-        starts : (n, n_free) array
-            Start values.
-
-        Returns
-        -------
-        path : (10 + n_clocks,) array
-            Path and clock offsets.
-        cost : float
-            Sum of squared whitened residuals; infinite if no start is valid.
-        P : (n_free, n_free) array
-            Covariance of the free parameters; zero for parameters that are not observable.
+        Returns the best path with its clock offsets (10 + n_clocks,), its sum of squared whitened
+        residuals (infinite if no start is valid), and the covariance (n_free, n_free) of the free
+        parameters, zero for parameters that are not observable.
         """
         model = SteadyPass(self.t, self.positions, self.M, self.clock, free,
                            np.zeros(N_PATH + self.n_clocks), n_dipoles)
@@ -170,16 +127,7 @@ class PassSamples:
         return model.all_parameters(theta[k:k + 1])[0], float(cost[k]), P[k]
 
     def straight_model(self, n_dipoles: int) -> SteadyPass:
-        """Row of dipoles on a straight path at constant speed, without clock offsets.
-
-        Parameters
-        ----------
-        n_dipoles : int
-
-        Returns
-        -------
-        SteadyPass
-        """
+        """Row of dipoles on a straight path at constant speed, without clock offsets."""
         return SteadyPass(self.t, self.positions, self.M, np.full(len(self.t), -1),
                           np.arange(N_STRAIGHT), np.zeros(N_PATH), n_dipoles)
 

@@ -46,24 +46,11 @@ class Plausibility:
 
     def evaluate(self, observation: Observation, bank: FilterBank, best: int,
                  settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
-        """Update the closest approach of all hypotheses; return the doubts about hypothesis `best`.
+        """Update the closest approach of all hypotheses; return the doubts about the published
+        hypothesis `best`, in a frame of duration `dt` [s].
 
-        Parameters
-        ----------
-        observation : Observation
-        bank : FilterBank
-        best : int
-            Index of the published hypothesis.
-        settings : VehicleSettings
-        mounting_std : float, rad
-            Minimum standard deviation of the mounting angles of each sensor. It also applies to
-            accurately mounted sensors, because a model error also rotates the field.
-        dt : float, s
-            Duration of the frame.
-
-        Returns
-        -------
-        set of str
+        `mounting_std` [rad] is the minimum std of the mounting angles. It also applies to
+        accurately mounted sensors, because a model error also rotates the field.
         """
         x, kind = bank.x[best], int(bank.kind[best])
         self._update_road_check(bank, settings, observation.positions)
@@ -101,9 +88,9 @@ def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray
                  n_stds: float) -> BoolArray:
     """Whether states (n, n_x) pass all sensors (n_sensors, 3) on one side, beyond the lanes.
 
-    The distance of such a vehicle is hardly observable. A train on another line resembles a truck
-    nearby. A truck beyond a sensor resembles a car on the near side of a sensor with an inverted
-    axis.
+    The distance of such a vehicle is hardly observable: a train on another line resembles a truck
+    nearby, and a truck beyond a sensor resembles a car on the near side of a sensor with an
+    inverted axis.
 
     Lanes are on both sides of the centre of the network. A network that extends beyond the road
     covers an area. A vehicle may then be as far outside the outermost sensors as a lane is from the
@@ -122,18 +109,10 @@ def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray
 
 
 def lane_note(settings: VehicleSettings, network: SensorNetwork) -> str | None:
-    """Explain which lanes are covered if the sensors stand on one side of the road.
+    """Explanation of which lanes are covered if the sensors stand on one side of the road.
 
-    Parameters
-    ----------
-    settings : VehicleSettings
-    network : SensorNetwork
-
-    Returns
-    -------
-    str or None
-        None for one sensor, for a compact network, and unless the sensors are in a line along most
-        of the arrival directions.
+    None for one sensor, for a compact network, and unless the sensors are in a line along most of
+    the arrival directions.
     """
     headings = np.deg2rad(settings.arrival_headings_deg)
     across = np.array([-np.sin(headings), np.cos(headings)])
@@ -155,22 +134,8 @@ def _is_moving(x: FloatArray) -> BoolArray:
 
 def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positions: FloatArray
                   ) -> bool:
-    """Whether the motion of a target within a frame exceeds `MAX_RELATIVE_MOVE`.
-
-    Parameters
-    ----------
-    position : (3,) array, m
-    velocity : (3,) array, m/s
-    dt : float, s
-        Duration of the frame.
-    positions : (n, 3) array, m
-        Positions of the sensors.
-
-    Returns
-    -------
-    bool
-        False if there is only one sensor.
-    """
+    """Whether the motion of a target within a frame of duration `dt` [s] exceeds
+    `MAX_RELATIVE_MOVE`; False if there is only one sensor."""
     distances = np.sort(np.linalg.norm(position - positions, axis=1))
     displacement = float(np.hypot(velocity[0], velocity[1])) * dt
     return len(distances) > 1 and bool(displacement > MAX_RELATIVE_MOVE * distances[1])

@@ -39,15 +39,32 @@ Flags: TypeAlias = tuple[bool, bool, bool]
 """Whether the rotation about the x, y and z axis of the body is unobservable."""
 
 OrientationEstimate: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, Flags]
-"""Quaternion, derivative, variance of the unobservable part, and flags; see
-`VehicleOrientation`."""
+"""Quaternion, derivative, variance of the unobservable part, and flags; see `Orientation`."""
 
 
 class Orientation(Protocol):
-    """Interface that computes an orientation from a target state; see `VehicleOrientation`."""
+    """Interface that computes an orientation from a target state."""
 
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
-        """Return quaternion, derivative, variance of the unobservable part, and flags."""
+        """Orientation of one state.
+
+        Parameters
+        ----------
+        x : (n_t,) array
+            Target state that begins with position and velocity.
+        P : (n_t, n_t) array
+            Covariance of the state.
+
+        Returns
+        -------
+        q : (4,) array, xyzw
+        T : (3, n_t) array
+            Derivative of the small rotation about the world axes with respect to the state.
+        unobserved : (3, 3) array, rad^2
+            Variance of the unobservable part, to be added.
+        flags : (3,) tuple of bool
+            Whether the rotation about the x, y and z axis of the body is unobservable.
+        """
 
     def quaternions(self, x: FloatArray) -> FloatArray:
         """Quaternions of several states.
@@ -81,25 +98,7 @@ class VehicleOrientation:
     """Orientation along the velocity; roll and pitch are unobservable."""
 
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
-        """Orientation of one state.
-
-        Parameters
-        ----------
-        x : (n_t,) array
-            Target state that begins with position and velocity.
-        P : (n_t, n_t) array
-            Covariance of the state.
-
-        Returns
-        -------
-        q : (4,) array, xyzw
-        T : (3, n_t) array
-            Derivative of the small rotation about the world axes with respect to the state.
-        unobserved : (3, 3) array, rad^2
-            Variance of the unobservable part, to be added.
-        flags : (3,) tuple of bool
-            Whether the rotation about the x, y and z axis of the body is unobservable.
-        """
+        """Orientation of one state, as for `Orientation`."""
         squared_speed = x[3] ** 2 + x[4] ** 2
         T = np.zeros((3, len(x)))
         if squared_speed > 0.0:
@@ -111,16 +110,7 @@ class VehicleOrientation:
         return self.quaternions(x[None])[0], T, unobserved, (True, True, not is_yaw_known)
 
     def quaternions(self, x: FloatArray) -> FloatArray:
-        """Quaternions of several states.
-
-        Parameters
-        ----------
-        x : (n, n_t) array
-
-        Returns
-        -------
-        (n, 4) array
-        """
+        """Quaternions (n, 4) of states (n, n_t)."""
         return quaternions_from_yaw(np.arctan2(x[:, 4], x[:, 3]))
 
 
@@ -145,16 +135,7 @@ class MagnetOrientation:
                 (nearest == 0, nearest == 1, nearest == 2))
 
     def quaternions(self, x: FloatArray) -> FloatArray:
-        """Quaternions of several states.
-
-        Parameters
-        ----------
-        x : (n, n_t) array
-
-        Returns
-        -------
-        (n, 4) array
-        """
+        """Quaternions (n, 4) of states (n, n_t)."""
         return np.array([quaternion_between(self.axis, m) for m in x[:, 6:9]])
 
 
@@ -165,43 +146,19 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
                     stamp_ns: int, id: int, ended: bool, existence: float,
                     degrees_of_freedom: int, predicted: FloatArray, mounting: FloatArray,
                     mounting_covariance: FloatArray) -> Track:
-    """Track record of one hypothesis of a bank.
+    """Track record of hypothesis `best` of a bank; the keyword parameters from `stamp_ns` are
+    entries of `Track`.
 
     Parameters
     ----------
-    bank : FilterBank
-    best : int
-        Index of the hypothesis to be published.
-    model : SourceModel
-    orientation : Orientation
-    arrivals : sequence of str
-        Name of the arrival direction for each label.
-    kinds : sequence of str
-        Name of each kind of target.
-    found : set of str
-        Doubts about the pose, without the ambiguities of the bank.
-    unobserved_length : UnobservedLength or None
-        Uncertainty of the middle of a vehicle due to its unobserved length; None for a magnet.
-    excess : float, optional
-        Ratio of the actual to the expected variance of the innovations, by which the covariance is
-        multiplied.
-    ambiguous_poses : str, optional
-        Setting `track.ambiguous_poses`.
-    difference : (6,) array, m and m/s
-        Difference from another possible position and velocity, which the covariance must cover.
-    stamp_ns : int, ns
-        This and the following parameters are entries of `Track`.
-    id : int
-    ended : bool
-    existence : float
-    degrees_of_freedom : int
-    predicted : (n_sensors, 3) array, T, sensor frame
-    mounting : (n_sensors, 3) array, rad
-    mounting_covariance : (n_sensors, 3, 3) array, rad^2
-
-    Returns
-    -------
-    Track
+    arrivals : name of the arrival direction for each label
+    kinds : name of each kind of target
+    found : doubts about the pose, without the ambiguities of the bank
+    unobserved_length : uncertainty of the middle of a vehicle; None for a magnet
+    excess : ratio of the actual to the expected variance of the innovations, by which the
+        covariance is multiplied
+    difference : (6,) array, difference from another possible position and velocity, which the
+        covariance must cover, m and m/s
     """
     n_t = len(model.state_names)
     is_separated = bank.is_separated(best)
@@ -237,24 +194,12 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
 
 def covariance_about(bank: FilterBank, best: int, model: SourceModel, is_separated: BoolArray
                      ) -> FloatArray:
-    """Covariance about the state of a hypothesis, from all hypotheses at the same position.
+    """Covariance (n_t, n_t) about the state of hypothesis `best`, from all hypotheses at the same
+    position.
 
     Hypotheses at the same position differ in linearisation, kind of target and motion; these
-    differences are part of the error. Hypotheses at other positions make the track ambiguous
-    instead.
-
-    Parameters
-    ----------
-    bank : FilterBank
-    best : int
-        Index of the hypothesis.
-    model : SourceModel
-    is_separated : (n_hyp,) bool array
-        `FilterBank.is_separated` of the hypothesis.
-
-    Returns
-    -------
-    (n_t, n_t) array
+    differences are part of the error. Hypotheses at other positions (`is_separated`) make the track
+    ambiguous instead.
     """
     return _second_moment(bank, best, model, np.where(is_separated, -np.inf, bank.log_w))
 
@@ -279,25 +224,9 @@ def mixture_uncertainty(bank: FilterBank, best: int, is_separated: BoolArray, mo
                         excess: float = 1.0) -> PoseUncertainty:
     """Uncertainty of a pose if any of the hypotheses may be correct.
 
-    Parameters
-    ----------
-    bank : FilterBank
-    best : int
-        Index of the hypothesis.
-    is_separated : (n_hyp,) bool array
-        `FilterBank.is_separated` of the hypothesis.
-    model : SourceModel
-    orientation : Orientation
-    published : PoseFields
-        Published pose, from the hypotheses at the same position.
-    P_unwidened : (n_t, n_t) array
-        Result of `covariance_about`; `published` has a wider covariance.
-    excess : float, optional
-        As for `published_track`.
-
-    Returns
-    -------
-    PoseUncertainty
+    `published` is the pose from the hypotheses at the same position as `best`, with a wider
+    covariance than `P_unwidened`, the result of `covariance_about`. `is_separated` is that of
+    `FilterBank`, and `excess` that of `published_track`.
     """
     n_t = len(model.state_names)
     widening = published['covariance'] - excess * P_unwidened[:6, :6]
@@ -320,35 +249,14 @@ def mixture_uncertainty(bank: FilterBank, best: int, is_separated: BoolArray, mo
 
 
 def pose_uncertainty(fields: PoseFields) -> PoseUncertainty:
-    """Uncertainty of a published pose.
-
-    Parameters
-    ----------
-    fields : PoseFields
-
-    Returns
-    -------
-    PoseUncertainty
-    """
+    """Uncertainty of a published pose."""
     return PoseUncertainty(fields['covariance'], fields['orientation_covariance'],
                            fields['position_orientation_covariance'])
 
 
 def ambiguities(bank: FilterBank, best: int, is_separated: BoolArray) -> set[str]:
-    """Doubts about the position and the arrival direction of the best hypothesis.
-
-    Parameters
-    ----------
-    bank : FilterBank
-    best : int
-        Index of the hypothesis.
-    is_separated : (n_hyp,) bool array
-        `FilterBank.is_separated` of the hypothesis.
-
-    Returns
-    -------
-    set of str
-    """
+    """Doubts about the position and the arrival direction of the best hypothesis; `is_separated` is
+    that of `FilterBank`."""
     reasons = set()
     if bank.weight(is_separated) > AMBIGUOUS_WEIGHT:
         reasons.add(doubts.ANOTHER_PLACE)
@@ -361,31 +269,8 @@ def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P
                   unobserved_length: UnobservedLength | None, difference: FloatArray,
                   stamp_ns: int, id: int, kind: int, kinds: Sequence[str], ambiguous: bool,
                   complete: bool) -> SmoothedPose:
-    """Record of the pose that belongs to a smoothed state.
-
-    Parameters
-    ----------
-    model : SourceModel
-    orientation : Orientation
-    x : (n_x,) array
-    P : (n_x, n_x) array
-    unobserved_length : UnobservedLength or None
-    difference : (6,) array, m and m/s
-        As for `published_track`.
-    stamp_ns : int, ns
-    id : int
-    kind : int
-        Index of the kind of target.
-    kinds : sequence of str
-        Name of each kind.
-    ambiguous : bool
-    complete : bool
-        As in `SmoothedPose`.
-
-    Returns
-    -------
-    SmoothedPose
-    """
+    """Record of the pose that belongs to a smoothed state; `difference` is that of
+    `published_track`, and `complete` that of `SmoothedPose`."""
     n_t = len(model.state_names)
     return SmoothedPose(stamp_ns=stamp_ns, id=id, kind=kinds[kind], ambiguous=ambiguous,
                         complete=complete,

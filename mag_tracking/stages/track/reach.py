@@ -22,60 +22,24 @@ predicts."""
 
 def field_energies(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame
                 ) -> FloatArray:
-    """Squared norm of the whitened field of a target at each sensor.
-
-    Parameters
-    ----------
-    bank_filter : BankFilter
-    target : int
-        Index of the target.
-    state : (n_x,) array
-    frame : FieldFrame
-
-    Returns
-    -------
-    (n_sensors,) array
-    """
+    """Squared norm (n_sensors,) of the whitened field of a target of `state` (n_x,) at each
+    sensor."""
     field = bank_filter.observation.field_of(state, [target], np.zeros(len(frame.field)))
     return whitened_energy(np.where(np.isnan(frame.field), np.nan, field), frame.covariance)[0]
 
 
 def field_energy(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame
                  ) -> float:
-    """Squared norm of the whitened field of a target, summed over all sensors.
-
-    Parameters
-    ----------
-    bank_filter : BankFilter
-    target : int
-        Index of the target.
-    state : (n_x,) array
-    frame : FieldFrame
-
-    Returns
-    -------
-    float
-    """
+    """Squared norm of the whitened field of a target of `state` (n_x,), summed over all sensors."""
     return float(field_energies(bank_filter, target, state, frame).sum())
 
 
 def first_weak_frame(bank_filter: BankFilter, target: int, window: Window | None, origin: int
                      ) -> int:
-    """Index of the frame after the last one in which the energy of a target exceeds `WEAK_ENERGY`.
+    """Index in the window of the frame after the last one in which the energy of a target exceeds
+    `WEAK_ENERGY`; 0 without a window, or if it never does.
 
-    Parameters
-    ----------
-    bank_filter : BankFilter
-    target : int
-        Index of the target.
-    window : Window or None
-    origin : int
-        Origin of the hypothesis whose path is used.
-
-    Returns
-    -------
-    int
-        Index in the window; 0 if there is no window, or if the energy never exceeds the limit.
+    `origin` selects the hypothesis whose path is used.
     """
     if window is None:
         return 0

@@ -84,20 +84,10 @@ class Window:
 
 
 class Relinearisation:
-    """Relinearisation of a bank over a window of the latest frames.
+    """Relinearisation of a bank over a window of the latest frames ([Bell94]_; [JulierUhlmann01]_).
 
-    Parameters
-    ----------
-    interval_s : float, s
-        Minimum interval between relinearisations.
-    window_s : float, s
-        Duration of the window; 0 disables relinearisation.
-    max_hypotheses : int
-        Maximum number of hypotheses that are relinearised.
-
-    References
-    ----------
-    [Bell94]_; [JulierUhlmann01]_.
+    Hypotheses are relinearised at intervals of at least `interval_s`, and at most `max_hypotheses`.
+    A window of duration 0 disables relinearisation.
     """
 
     def __init__(self, interval_s: float, window_s: float, max_hypotheses: int) -> None:
@@ -112,14 +102,8 @@ class Relinearisation:
         self._gain: dict[int, float] = {}
 
     def begin(self, anchor: FilterBank | InitialBank) -> None:
-        """Start the window at the first frame of a track.
-
-        Parameters
-        ----------
-        anchor : FilterBank or InitialBank
-            Bank of the track before the update with its first frame. The caller must not modify it
-            afterwards.
-        """
+        """Start the window with the bank before the update with the first frame of a track; the
+        caller must not modify the bank afterwards."""
         if not self._window_ns:
             return
         self._anchor, self._is_updated = anchor, False
@@ -142,19 +126,9 @@ class Relinearisation:
             evidence: float, frame: FieldFrame, dt: float) -> None:
         """Add a frame with which the bank has been updated.
 
-        Parameters
-        ----------
-        bank : FilterBank
-            Bank after the update.
-        predicted : (n_hyp, n_x) array
-            States at which the frame was first linearised.
-        log_likelihood : (n_hyp,) array
-            Log-likelihood of the frame for each hypothesis.
-        evidence : float
-            Log-density of the frame over all hypotheses.
-        frame : FieldFrame
-        dt : float, s
-            Time since the previous frame.
+        `predicted` (n_hyp, n_x) are the states at which the frame was first linearised. `evidence`
+        is the log-density of the frame over all hypotheses, `log_likelihood` (n_hyp,) that of each
+        hypothesis.
         """
         if self._anchor is None:
             return
@@ -181,19 +155,8 @@ class Relinearisation:
         self._log_likelihoods = [values[mask] for values in self._log_likelihoods]
 
     def relinearise_leading(self, bank_filter: BankFilter, bank: FilterBank) -> 'Counter[str]':
-        """Relinearise the leading hypotheses of a bank in place, if the interval has elapsed.
-
-        Parameters
-        ----------
-        bank_filter : BankFilter
-            Filter of the bank.
-        bank : FilterBank
-
-        Returns
-        -------
-        Counter of str
-            Number of relinearised paths, and number of those whose states were not adopted.
-        """
+        """Relinearise the leading hypotheses of a bank in place, if the interval has elapsed;
+        return the numbers of relinearised paths and of those whose states were not adopted."""
         anchor = self._anchor
         if anchor is None or self._last_ns is None \
                 or self._frames[-1].stamp_ns - self._last_ns < self._interval_ns:
@@ -237,19 +200,10 @@ class Relinearisation:
                       self._max_hypotheses)
 
     def without_target(self, bank_filter: BankFilter, bank: FilterBank, i: int, n: int) -> None:
-        """Remove a target from the window.
+        """Remove target `i` from the window of a bank and filter that include it.
 
-        Parameters
-        ----------
-        bank_filter : BankFilter
-            Filter that includes the target.
-        bank : FilterBank
-            Bank that includes the target.
-        i : int
-            Index of the target.
-        n : int
-            Index of the frame from which the field of the target is weak; see `first_weak_frame`.
-            The window is shortened to begin at this frame.
+        The window is shortened to begin at frame `n`, from which the field of the target is weak;
+        see `first_weak_frame`.
         """
         if self._anchor is None or self._is_stale or n >= len(self._frames):
             self.restart()
@@ -262,12 +216,7 @@ class Relinearisation:
         self._gain = {}
 
     def resume(self, window: Window) -> None:
-        """Continue with another window, whose hypotheses replace the hypotheses of the track.
-
-        Parameters
-        ----------
-        window : Window
-        """
+        """Continue with another window, whose hypotheses replace the hypotheses of the track."""
         self.begin(window.anchor)
         self._is_updated = window.is_updated
         self._frames, self._intervals = list(window.frames), list(window.intervals)
@@ -277,20 +226,8 @@ class Relinearisation:
         self._last_ns = window.frames[-1].stamp_ns
 
     def gain(self, origin: int) -> float:
-        """Increase of the window's log-likelihood by relinearising the path of a hypothesis.
-
-        The increase is relative to the log-likelihood in the filter.
-
-        Parameters
-        ----------
-        origin : int
-            Origin of the hypothesis.
-
-        Returns
-        -------
-        float, nats
-            0 if the hypothesis was not part of the last relinearisation.
-        """
+        """Increase of the window's log-likelihood over that in the filter by relinearising the path
+        of hypothesis `origin`, nats; 0 if it was not part of the last relinearisation."""
         return self._gain.get(origin, 0.0)
 
     def _leading_rows(self, bank: FilterBank) -> IntArray:

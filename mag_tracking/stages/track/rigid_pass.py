@@ -112,17 +112,8 @@ class RigidPass:
         return self.cost_with_offsets <= GOOD_MISFIT * self.degrees_of_freedom
 
     def closest(self, positions: FloatArray) -> FloatArray:
-        """Point of the straight path with free clock offsets that is closest to any sensor.
-
-        Parameters
-        ----------
-        positions : (n, 3) array, m
-            Positions of the sensors.
-
-        Returns
-        -------
-        (3,) array, m
-        """
+        """Point (3,) of the straight path with free clock offsets that is closest to any sensor,
+        m."""
         offsets = positions - self.position
         squared_speed = max(float(self.velocity @ self.velocity), 1e-12)
         points = self.position + (offsets @ self.velocity / squared_speed)[:, None] * self.velocity
@@ -130,20 +121,8 @@ class RigidPass:
         return nearest
 
     def difference(self, stamp_ns: int, state: FloatArray) -> FloatArray:
-        """Horizontal difference of a state from the nearest of the `straight_paths`.
-
-        Parameters
-        ----------
-        stamp_ns : int, ns
-            Time of the state.
-        state : (6,) array, m and m/s
-            Position and velocity.
-
-        Returns
-        -------
-        (6,) array, m and m/s
-            Zero if `straight_paths` is empty.
-        """
+        """Horizontal difference (6,) of a state (6,) from the nearest of the `straight_paths` at
+        its time, m and m/s; zero if there are none."""
         if not len(self.straight_paths):
             return np.zeros(6)
         differences = state - self.straight_paths
@@ -163,17 +142,8 @@ class RigidPass:
         return max(self.cost_with_offsets / self.degrees_of_freedom, 1.0)
 
     def clock_variance(self, sensor: int) -> float:
-        """Variance of the clock offset of a sensor, including the variation of the magnetic centre.
-
-        Parameters
-        ----------
-        sensor : int
-            Index of the sensor.
-
-        Returns
-        -------
-        float, s^2
-        """
+        """Variance of the clock offset of a sensor, including the variation of the magnetic centre,
+        s²."""
         return float(self.widening * self.offset_std[sensor]**2 + (MIDDLE_STD / self.speed)**2)
 
     @property
@@ -199,21 +169,11 @@ class RigidPass:
 
 def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int,
                    starts: FloatArray) -> RigidPass | None:
-    """Fit straight and bent paths to the frames of a pass.
+    """Fit straight and bent paths to the frames of a pass; None if the frames do not determine a
+    path.
 
-    Parameters
-    ----------
-    network : SensorNetwork
-    frames : sequence of FieldFrame
-    stamp_ns : int, ns
-        Time of the strongest field.
-    starts : (n, 6) array, m and m/s
-        Positions and velocities at that time, from which the search starts.
-
-    Returns
-    -------
-    RigidPass or None
-        None if the frames do not determine a path.
+    The search starts at positions and velocities `starts` (n, 6) at the time of the strongest
+    field, `stamp_ns`.
     """
     data = PassSamples.of(network, frames, stamp_ns)
     n_clocks = data.n_clocks

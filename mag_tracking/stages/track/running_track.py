@@ -51,31 +51,14 @@ TrackRecord = Track | SmoothedPose | Disturbance
 class RunningTrack:
     """Track of a single target, or of several targets that share a state.
 
-    Parameters
-    ----------
-    id : int
-        Identifier of the first member.
-    target : Target
-    settings : TrackSettings
-    sensors : SensorSubset
-        Sensors at the start of the track.
-    bank_filter : BankFilter
-    bank : FilterBank
-    counts : Counter of str
-        Event counts of the stage, updated in place.
-    clocks : ClockComparison
-    later_sensors : SensorSubset
-        Sensors that are used as soon as the bank is small enough.
+    Event counts of the stage are updated in place. `later_sensors` are used as soon as the bank is
+    small enough.
 
     Attributes
     ----------
-    counts : Counter of str
-    members : list of Member
-        Running members, in the order of their states.
-    ended : str or None
-        Reason why the last member has ended; None while the track runs.
-    is_lost : bool
-        Whether the last member ended while it was still detected.
+    members : running members, in the order of their states
+    ended : reason why the last member has ended; None while the track runs
+    is_lost : whether the last member ended while it was still detected
     """
 
     def __init__(self, id: int, target: Target, settings: TrackSettings, sensors: SensorSubset,
@@ -113,12 +96,7 @@ class RunningTrack:
         return self._bank.later_sensors or self._bank.sensors
 
     def configure(self, settings: TrackSettings) -> None:
-        """Apply new values of the live settings.
-
-        Parameters
-        ----------
-        settings : TrackSettings
-        """
+        """Apply new values of the live settings."""
         self._settings = settings
         self._bank.configure(settings)
         if not settings.cross_check:
@@ -126,13 +104,8 @@ class RunningTrack:
                 member.use(self._bank.sensors)
 
     def flag_doubtful_sensors(self, sensors: Mapping[str, Sequence[int]]) -> None:
-        """Mark the track as doubtful if it uses a sensor with doubtful readings.
-
-        Parameters
-        ----------
-        sensors : mapping of str to sequence of int
-            Indices of the sensors with doubtful readings, by reason.
-        """
+        """Mark the track as doubtful if it uses a sensor with doubtful readings; `sensors` has
+        their indices by reason."""
         for reason, rows in sensors.items():
             if not np.isin(self._final_sensors.rows, rows).any():
                 continue
@@ -143,20 +116,10 @@ class RunningTrack:
 
     def begin(self, frame: FieldFrame, recent: list[FieldFrame], approach_unobserved: bool = False
               ) -> list[TrackRecord]:
-        """Process the frames up to the detection, and return the records of the detection frame.
+        """Process the `recent` frames (oldest first) and the frame of the detection, all with the
+        sensors of the whole network; return the records of the detection frame.
 
-        Parameters
-        ----------
-        frame : FieldFrame
-            Frame of the detection, with all sensors of the network.
-        recent : list of FieldFrame
-            Frames before the detection, oldest first.
-        approach_unobserved : bool, optional
-            Whether the recent frames do not show the approach of the target.
-
-        Returns
-        -------
-        list of Track, SmoothedPose or Disturbance
+        `approach_unobserved` means that the recent frames do not show the approach of the target.
         """
         observed_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
         first = self.members[0]
@@ -178,21 +141,8 @@ class RunningTrack:
         return self.step(frame, dt)
 
     def step(self, frame: FieldFrame, dt: float, publish: bool = True) -> list[TrackRecord]:
-        """Predict, update and weight the bank with a frame, and return the records.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-            Frame with all sensors of the network.
-        dt : float, s
-            Time since the previous frame.
-        publish : bool, optional
-            Whether to return the records of the frame.
-
-        Returns
-        -------
-        list of Track, SmoothedPose or Disturbance
-        """
+        """Predict, update and weight the bank with a frame of the whole network; return its records
+        if `publish`."""
         if self.ended is not None:
             return []
         for member in () if self._target.starts_anywhere else self.members:
@@ -312,17 +262,8 @@ class RunningTrack:
         return out
 
     def end(self, reason: str) -> list[TrackRecord]:
-        """End all members.
-
-        Parameters
-        ----------
-        reason : str
-
-        Returns
-        -------
-        list of Track, SmoothedPose or Disturbance
-            For each member its last record, marked as ended, and its smoothed poses.
-        """
+        """End all members; return for each its last record, marked as ended, and its smoothed
+        poses."""
         self.ended = reason
         return [record for i in range(len(self.members))
                 for record in self._close_member(i, reason)]
@@ -361,13 +302,11 @@ class RunningTrack:
         return [u for u in found if u is not None]
 
     def new_target(self) -> JointExplanation | None:
-        """Search for another explanation of the latest frames, if a search is due.
+        """Search for another explanation of the latest frames, if a search is due; None if none is
+        sufficiently probable.
 
-        Returns
-        -------
-        JointExplanation or None
-            None if no search is due, or if no other explanation is sufficiently probable. If one is
-            nearly as probable as the track, the track is marked as doubtful for a limited time.
+        If one is nearly as probable as the track, the track is marked as doubtful for a limited
+        time.
         """
         window, n = self._bank.window, len(self.members)
         if self.ended is not None or self._target.starts_anywhere or window is None \
@@ -397,14 +336,8 @@ class RunningTrack:
         return None
 
     def admit(self, joint: JointExplanation, id: int) -> None:
-        """Replace the hypotheses by a joint explanation, and add its new vehicle, if any.
-
-        Parameters
-        ----------
-        joint : JointExplanation
-        id : int
-            Track identifier of the new vehicle; unused if the explanation adds none.
-        """
+        """Replace the hypotheses by a joint explanation, and add its new vehicle, if any, with the
+        track identifier `id`."""
         begin_ns, now_ns = (joint.window.frames[k].stamp_ns for k in (0, -1))
         n, sensors = self._bank.single_target.n_target, self._bank.sensors
         ratio = self._settings.min_bayes_factor

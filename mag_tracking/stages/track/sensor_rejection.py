@@ -27,13 +27,7 @@ does not confirm the track, because sensors far from the target fit any hypothes
 
 
 class SensorRejection:
-    """Update of a bank that excludes sensors whose measurements contradict the other sensors.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Names of the sensors.
-    """
+    """Update of a bank that excludes sensors whose measurements contradict the other sensors."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
@@ -47,23 +41,8 @@ class SensorRejection:
                 ) -> 'tuple[FloatArray, FloatArray, FieldFrame, Counter[str]]':
         """Predict and update a bank with a frame, without sensors that contradict the others.
 
-        Parameters
-        ----------
-        bank_filter : BankFilter
-        bank : FilterBank
-        frame : FieldFrame
-        dt : float, s
-            Time since the previous frame.
-
-        Returns
-        -------
-        predicted : (n_hyp, n_x) array
-            States before the update.
-        log_likelihood : (n_hyp,) array
-        frame : FieldFrame
-            Frame of the update, in which rejected sensors are missing.
-        counts : Counter of str
-            Number of rejections by description; one count per rejected sensor.
+        Returns the predicted states (n_hyp, n_x), log-likelihoods (n_hyp,), the frame without the
+        rejected sensors, and the number of rejections by description, one per rejected sensor.
         """
         # Copying all states takes as long as the update. If the frame fits the hypothesis that
         # leads before the update, it usually also fits the hypothesis that leads afterwards.
@@ -143,10 +122,7 @@ def _leader(bank: FilterBank, log_likelihood: FloatArray) -> int | None:
 
 
 def _misfit(bank: FilterBank, frame: FieldFrame, log_likelihood: FloatArray) -> float:
-    """Normalised innovation squared per axis of the leading hypothesis.
-
-    Infinite if no hypothesis leads.
-    """
+    """Normalised innovation squared per axis of the leading hypothesis; infinite if none leads."""
     leader = _leader(bank, log_likelihood)
     n_axes = np.count_nonzero(~np.isnan(frame.field))
     return np.inf if leader is None else float(np.nansum(bank.nis[leader])) / n_axes

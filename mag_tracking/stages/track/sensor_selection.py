@@ -20,53 +20,19 @@ PREDICTION_S = 0.5
 
 
 def nearest_sensors(positions: FloatArray, position: FloatArray, n: int) -> IntArray:
-    """Indices of the sensors nearest to a position.
-
-    Parameters
-    ----------
-    positions : (n_sensors, 3) array, m
-    position : (2,) array, m
-    n : int
-        Number of sensors.
-
-    Returns
-    -------
-    (n,) int array
-        Indices in ascending order.
-    """
+    """Indices (n,) of the sensors nearest to a horizontal position (2,), in ascending order."""
     distance = np.hypot(*(positions[:, :2] - position).T)
     return np.sort(np.argsort(distance, kind='stable')[:n])
 
 
 def offset_from_nearest(position: FloatArray, positions: FloatArray) -> FloatArray:
-    """Horizontal vector from the nearest sensor to a position.
-
-    Parameters
-    ----------
-    position : (2,) array, m
-    positions : (n_sensors, 3) array, m
-
-    Returns
-    -------
-    (2,) array, m
-    """
+    """Horizontal vector (2,) from the nearest sensor to a position (2,), m."""
     offset: FloatArray = position - positions[nearest_sensors(positions, position, 1)[0], :2]
     return offset
 
 
 def part_of_frame(frame: FieldFrame, rows: IntArray) -> FieldFrame:
-    """Part of a frame with the readings of some sensors.
-
-    Parameters
-    ----------
-    frame : FieldFrame
-    rows : (n,) int array
-        Indices of the sensors.
-
-    Returns
-    -------
-    FieldFrame
-    """
+    """Part of a frame with the readings of the sensors `rows`."""
     return replace(frame, field=frame.field[rows], covariance=frame.covariance[rows],
                    n_samples=frame.n_samples[rows], time_offset=frame.time_offset[rows])
 
@@ -74,21 +40,12 @@ def part_of_frame(frame: FieldFrame, rows: IntArray) -> FieldFrame:
 class SensorSubset:
     """Sensors that a track uses: all sensors of a network, or a selection in a large network.
 
-    Parameters
-    ----------
-    full_network : SensorNetwork
-    rows : (n,) int array, optional
-        Indices of the sensors in ascending order; all sensors by default.
-
     Attributes
     ----------
-    full_network : SensorNetwork
-    is_part : bool
-        Whether the sensors are a selection.
-    rows : (n,) int array
-        Indices of the sensors.
-    network : SensorNetwork
-        Network of the selected sensors.
+    full_network : the network from which they are selected
+    is_part : whether the sensors are a selection
+    rows : (n,) int array, indices of the sensors in the full network, ascending
+    network : network of the selected sensors
     """
 
     def __init__(self, full_network: SensorNetwork, rows: IntArray | None = None) -> None:
@@ -99,47 +56,18 @@ class SensorSubset:
 
     @classmethod
     def near(cls, full_network: SensorNetwork, position: FloatArray, n: int) -> 'SensorSubset':
-        """Create the subset of the sensors nearest to a position.
-
-        Parameters
-        ----------
-        full_network : SensorNetwork
-        position : (2,) array, m
-        n : int
-            Number of sensors.
-
-        Returns
-        -------
-        SensorSubset
-        """
+        """Subset of the `n` sensors nearest to a horizontal position (2,)."""
         return cls(full_network, nearest_sensors(full_network.positions, position, n))
 
     def part_of(self, frame: FieldFrame) -> FieldFrame:
-        """Readings of these sensors from a frame of the whole network.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-
-        Returns
-        -------
-        FieldFrame
-        """
+        """Readings of these sensors from a frame of the whole network."""
         return part_of_frame(frame, self.rows) if self.is_part else frame
 
     def ahead_of(self, state: FloatArray, n: int) -> 'SensorSubset':
-        """Subset of the sensors nearest to the predicted position of a target.
+        """Subset of the `n` sensors nearest to the predicted position of a target with `state`
+        (n_x,).
 
-        Parameters
-        ----------
-        state : (n_x,) array
-        n : int
-            Number of sensors.
-
-        Returns
-        -------
-        SensorSubset
-            The same object if it already contains the nearer half of these sensors.
+        It is the same object if it already contains the nearer half of these sensors.
         """
         position = state[:2] + PREDICTION_S * state[3:5]
         is_enough = np.isin(
@@ -147,52 +75,24 @@ class SensorSubset:
         return self if is_enough else SensorSubset.near(self.full_network, position, n)
 
     def is_approached_by(self, track: Track) -> bool:
-        """Whether a track moves towards its nearest sensor.
-
-        Parameters
-        ----------
-        track : Track
-
-        Returns
-        -------
-        bool
-        """
+        """Whether a track moves towards its nearest sensor."""
         offset = offset_from_nearest(track.position[:2], self.network.positions)
         return bool(offset @ track.velocity[:2] < 0.0)
 
     def for_whole_network(self, track: Track, settings: TrackSettings) -> Track:
-        """Extend a track record of these sensors to all sensors of the network.
-
-        Parameters
-        ----------
-        track : Track
-        settings : TrackSettings
-
-        Returns
-        -------
-        Track
-        """
+        """Extend a track record of these sensors to all sensors of the network."""
         return for_whole_network(track, self.rows, self.full_network, settings) if self.is_part \
             else track
 
 
 def exchange_sensor_states(bank: FilterBank, before: IntArray, after: IntArray,
                            own_covariance: FloatArray, background_std: float) -> None:
-    """Replace the sensor states of a bank, in place, by the states of other sensors.
+    """Replace the sensor states of a bank, in place, by the states of other sensors, given by their
+    indices in the network.
 
-    The states and correlations of sensors in both sets are retained.
-
-    Parameters
-    ----------
-    bank : FilterBank
-    before : (n_before,) int array
-        Indices of the current sensors in the network.
-    after : (n_after,) int array
-        Indices of the new sensors in the network.
-    own_covariance : (n_after, n_own, n_own) array
-        Initial covariance of the mounting angles and model errors of each new sensor.
-    background_std : float, T
-        Standard deviation of the background of a new sensor.
+    The states and correlations of sensors in both sets are retained. `own_covariance`
+    (n_after, n_own, n_own) is the initial covariance of the mounting angles and model errors of
+    each new sensor, and `background_std` [T] the std of its background.
     """
     n_own = own_covariance.shape[1]
     n_t = bank.x.shape[1] - (n_own + 3) * len(before)
@@ -221,20 +121,9 @@ def _state_columns(n_t: int, n_own: int, n_sensors: int) -> IntArray:
 
 def for_whole_network(track: Track, rows: IntArray, network: SensorNetwork,
                       settings: TrackSettings) -> Track:
-    """Extend a track record from the sensors of the track to all sensors of the network.
+    """Extend a track record from the sensors `rows` to all sensors of the network.
 
-    Parameters
-    ----------
-    track : Track
-    rows : (n,) int array
-        Indices of the sensors of the track in the network.
-    network : SensorNetwork
-    settings : TrackSettings
-
-    Returns
-    -------
-    Track
-        Entries of the other sensors are NaN; their mounting angles have the prior covariance.
+    Entries of the other sensors are NaN; their mounting angles have the prior covariance.
     """
     n_sensors = len(network)
     predicted, nis = np.full((n_sensors, 3), np.nan), np.full(n_sensors, np.nan)

@@ -109,16 +109,7 @@ class TrackSettings:
 
 
 def acceleration_density(settings: TrackSettings) -> FloatArray:
-    """Spectral density of the acceleration that the tracker assumes.
-
-    Parameters
-    ----------
-    settings : TrackSettings
-
-    Returns
-    -------
-    (3,) array, m^2/s^3
-    """
+    """Spectral density (3,) of the acceleration that the tracker assumes, m²/s³."""
     if settings.target == 'magnet':
         return np.full(3, settings.magnet.acceleration**2)
     v = settings.vehicle

@@ -46,29 +46,17 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
                    intervals: Sequence[float], updated: bool = False,
                    relinearisations: int = RELINEARISATIONS, path: Sequence[FloatArray] = ()
                    ) -> tuple[list[State], int]:
-    """Smoothed states of a hypothesis at each frame, given all frames.
+    """Smoothed states of the only hypothesis of a bank at each frame, and the number of frames
+    excluded because they contradict it.
 
     Parameters
     ----------
-    bank_filter : BankFilter
-    bank : FilterBank
-        Bank of this hypothesis alone, at the first frame.
-    frames : sequence of FieldFrame
-    intervals : sequence of float, s
-        Time from the previous frame to each frame.
-    updated : bool, optional
-        Whether the bank has already been updated with the first frame.
-    relinearisations : int, optional
-        Number of further passes, each linearised along the result of the previous pass.
-    path : sequence of (n_x,) array, optional
-        Known states at the first frames, at which the first pass is linearised.
-
-    Returns
-    -------
-    states : list of (x (n_x,), P (n_x, n_x))
-        Smoothed state at each frame.
-    n_excluded : int
-        Number of frames that were excluded because they contradict the hypothesis.
+    bank : bank of this hypothesis alone, at the first frame
+    intervals : time from the previous frame to each frame, s
+    updated : whether the bank has already been updated with the first frame
+    relinearisations : number of further passes, each linearised along the result of the previous
+        pass
+    path : known states (n_x,) at the first frames, at which the first pass is linearised
     """
     paths = np.full((1, len(frames), bank.x.shape[1]), np.nan)
     for at, known in zip(paths[0], path, strict=False):
@@ -97,18 +85,12 @@ class _TrackStart:
 
 
 class WholeTrack:
-    """Stored frames of a running track, for smoothing at its end.
-
-    Parameters
-    ----------
-    max_duration_s : float, s
-        Maximum duration of a track that is smoothed; 0 disables smoothing.
+    """Stored frames of a running track, for smoothing at its end; a `max_duration_s` of 0 disables
+    it.
 
     Attributes
     ----------
-    is_abandoned : bool
-        Whether the track cannot be smoothed as a whole, because it exceeded a limit or changed its
-        sensors.
+    is_abandoned : whether the track exceeded a limit or changed its sensors, and cannot be smoothed
     """
 
     def __init__(self, max_duration_s: float) -> None:
@@ -125,26 +107,14 @@ class WholeTrack:
         self._is_updated = False
 
     def begin(self, bank: FilterBank | InitialBank, bank_filter: BankFilter) -> None:
-        """Discard all frames, and start with a bank and a copy of its filter.
-
-        Parameters
-        ----------
-        bank : FilterBank or InitialBank
-            Bank at the first frame. The caller must not modify it afterwards.
-        bank_filter : BankFilter
-        """
+        """Discard all frames, and start with a bank at the first frame and a copy of its filter;
+        the caller must not modify the bank afterwards."""
         self.clear()
         if self._max_duration_s:
             self._start = _TrackStart(copy(bank_filter), bank)
 
     def resume(self, window: Window, bank_filter: BankFilter) -> None:
-        """Restart with a window of another filter; the frames of the window count as published.
-
-        Parameters
-        ----------
-        window : Window
-        bank_filter : BankFilter
-        """
+        """Restart with a window of another filter; the frames of the window count as published."""
         anchor = window.anchor.rows(np.arange(len(window.anchor)))
         self.begin(anchor, bank_filter)
         if self._start is not None:
@@ -161,17 +131,8 @@ class WholeTrack:
         self.is_abandoned = True
 
     def add(self, bank: FilterBank, frame: FieldFrame, dt: float, published: bool) -> None:
-        """Add a frame with which the bank has been updated.
-
-        Parameters
-        ----------
-        bank : FilterBank
-        frame : FieldFrame
-        dt : float, s
-            Time since the previous frame.
-        published : bool
-            Whether a pose was published for the frame.
-        """
+        """Add a frame with which the bank has been updated, and whether a pose was published for
+        it."""
         if self._start is None:
             return
         self._duration_s += dt
@@ -186,20 +147,10 @@ class WholeTrack:
             self._start.bank.keep(np.isin(self._start.bank.origin, bank.origin))
 
     def smoothed(self, bank: FilterBank, best: int) -> tuple[list[TrackState], int]:
-        """Smoothed states of the published frames.
+        """Smoothed states of the published frames for hypothesis `best`, and the number of frames
+        excluded because they contradict it.
 
-        Parameters
-        ----------
-        bank : FilterBank
-        best : int
-            Index of the hypothesis to be smoothed.
-
-        Returns
-        -------
-        states : list of TrackState
-            Empty if the track cannot be smoothed as a whole.
-        n_excluded : int
-            Number of frames that were excluded because they contradict the hypothesis.
+        The states are empty if the track cannot be smoothed as a whole.
         """
         start = self._start
         if start is None or not self._frames:
@@ -229,13 +180,7 @@ class _LaggedFrame(NamedTuple):
 
 
 class FixedLag:
-    """Fixed-lag smoother, with the latest frames of a track and the bank after each frame.
-
-    Parameters
-    ----------
-    lag_s : float, s
-        Lag of the smoothed poses.
-    """
+    """Fixed-lag smoother, with the latest frames of a track and the bank after each frame."""
 
     def __init__(self, lag_s: float) -> None:
         self._lag_s = lag_s
@@ -247,26 +192,8 @@ class FixedLag:
 
     def smoothed(self, bank_filter: BankFilter, bank: FilterBank, best: int, frame: FieldFrame,
                  dt: float, published: bool) -> list[TrackState]:
-        """Add a frame, and return the smoothed states of the frames that are older than the lag.
-
-        Parameters
-        ----------
-        bank_filter : BankFilter
-        bank : FilterBank
-            Bank after the update with the frame.
-        best : int
-            Index of the hypothesis to be smoothed.
-        frame : FieldFrame
-        dt : float, s
-            Time since the previous frame.
-        published : bool
-            Whether a pose is published for the frame.
-
-        Returns
-        -------
-        list of TrackState
-            Usually empty, or one state.
-        """
+        """Add a frame with which the bank has been updated; return the states of hypothesis `best`
+        at the published frames older than the lag: usually none or one."""
         self._frames.append(_LaggedFrame(
             frame, dt, published, bank.origin, bank.x.copy(), bank.P.copy()))
         if len(bank) < len(self._frames[0].origin) // 2:
@@ -280,19 +207,7 @@ class FixedLag:
         return out
 
     def remaining(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[TrackState]:
-        """Return the smoothed states of the frames that remain at the end of a track.
-
-        Parameters
-        ----------
-        bank_filter : BankFilter
-        bank : FilterBank
-        best : int
-            Index of the hypothesis to be smoothed.
-
-        Returns
-        -------
-        list of TrackState
-        """
+        """Smoothed states of hypothesis `best` at the frames that remain at the end of a track."""
         if not self._frames:
             return []
         return [(lagged.frame.stamp_ns, *state) for lagged, state in zip(

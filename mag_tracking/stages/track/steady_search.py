@@ -81,17 +81,7 @@ class PathPrior:
 
     @classmethod
     def of(cls, vehicle: VehicleSettings, network: SensorNetwork) -> 'PathPrior':
-        """Common prior of all kinds of vehicle in the settings.
-
-        Parameters
-        ----------
-        vehicle : VehicleSettings
-        network : SensorNetwork
-
-        Returns
-        -------
-        PathPrior
-        """
+        """Common prior of all kinds of vehicle in the settings."""
         def spread(means: Iterable[float], stds: Iterable[float]) -> tuple[float, float]:
             m, s = np.array(means, dtype=float), np.array(stds, dtype=float)
             return float(m.mean()), max(float(np.sqrt(m.var() + np.square(s).mean())), MIN_STD)
@@ -114,38 +104,15 @@ class PathPrior:
                    MIN_SPEED_RATIO * min(vehicle.speeds))
 
     def nearest_line(self, theta: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Arrival line whose heading is nearest to the heading of each path.
-
-        Parameters
-        ----------
-        theta : (n, 7) array
-            Paths.
-
-        Returns
-        -------
-        line : (n,) int array
-            Index in `headings`.
-        relative_heading : (n,) array, rad
-            Heading of the path relative to the line.
-        """
+        """Index in `headings` of the arrival line (n,) nearest in heading to each path (n, 7), and
+        the heading of the path relative to it, rad."""
         relative_headings = (theta[:, 4, None] - self.headings + np.pi) % (2.0 * np.pi) - np.pi
         line: IntArray = np.abs(relative_headings).argmin(axis=1)
         return line, relative_headings[np.arange(len(theta)), line]
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Normalised residuals of paths with respect to the prior.
-
-        Parameters
-        ----------
-        theta : (n, 7) array
-            Paths.
-
-        Returns
-        -------
-        residual : (n, 7) array
-        J : (n, 7, 7) array
-            Derivative of the negative residual with respect to `theta`.
-        """
+        """Normalised residuals (n, 7) of paths (n, 7) with respect to the prior, and the
+        derivatives (n, 7, 7) of the negative residuals."""
         line, relative_heading = self.nearest_line(theta)
         normals = np.stack([-np.sin(self.headings), np.cos(self.headings)], axis=1)[line]
         relative = theta.copy()
@@ -156,17 +123,8 @@ class PathPrior:
         return (self.mean - relative) / self.std, J
 
     def starts(self, vehicle: VehicleSettings, network: SensorNetwork) -> FloatArray:
-        """Grid of start paths; their positions at time zero cover the arrival lines near sensors.
-
-        Parameters
-        ----------
-        vehicle : VehicleSettings
-        network : SensorNetwork
-
-        Returns
-        -------
-        (n, 7) array
-        """
+        """Grid (n, 7) of start paths; their positions at time zero cover the arrival lines near
+        sensors."""
         offsets = np.array(vehicle.lateral_offsets)
         offsets = np.unique(np.append(offsets, 0.5 * (offsets[1:] + offsets[:-1])))
         speeds = np.array(vehicle.speeds)
@@ -195,24 +153,12 @@ class StartGrid:
 
     Arrays that do not depend on known vehicles are computed once for all searches of a window.
 
-    Parameters
-    ----------
-    samples : PassSamples
-        Samples of a window.
-    prior : PathPrior
-    theta : (n, 7) array
-        Paths.
-
     Attributes
     ----------
-    theta : (n, 7) array
-        See `PathPrior.starts`.
-    bases : (3 n_samples, 3 n) array
-        Whitened fields of unit moments: three columns for each path.
-    gram : (n, 3, 3) array
-        Gram matrix A'A of the three columns A of each path.
-    prior_cost : (n,) array
-        Squared normalised difference of each path from the mean of the prior.
+    theta : (n, 7) array, see `PathPrior.starts`
+    bases : (3 n_samples, 3 n) array, whitened fields of unit moments, three columns for each path
+    gram : (n, 3, 3) array, Gram matrix A'A of the three columns A of each path
+    prior_cost : (n,) array, squared normalised difference of each path from the mean of the prior
     """
 
     def __init__(self, samples: PassSamples, prior: PathPrior, theta: FloatArray) -> None:
@@ -228,8 +174,8 @@ class StartGrid:
 class SteadySearch:
     """Search for vehicles in the samples of a window, given the known vehicles.
 
-    In a joint search for m vehicles, a row of 7 m parameters describes their paths, and a row of
-    9 m parameters their moments. In shapes, n is the number of rows and y the number of whitened
+    In a joint search for m vehicles, a row of 7 m parameters describes their paths, and a row of 9
+    m parameters their moments. In shapes, n is the number of rows and y the number of whitened
     measurements.
     """
 
@@ -275,17 +221,8 @@ class SteadySearch:
         return np.tile(self.prior.moment_std, _n_vehicles(theta))
 
     def cost(self, grid: StartGrid) -> FloatArray:
-        """Cost of a point target on each path of a grid.
-
-        Parameters
-        ----------
-        grid : StartGrid
-
-        Returns
-        -------
-        (n,) array
-            Minus twice the log-density of the frames, up to a constant.
-        """
+        """Cost (n,) of a point target on each path of a grid: minus twice the log-density of the
+        frames, up to a constant."""
         n, std = len(grid.theta), self.prior.moment_std[0] * np.sqrt(N_DIPOLES)
         with ignoring_overflow():
             factor = self._marginal_whitener.correction_factor(grid.bases).reshape(
@@ -299,19 +236,8 @@ class SteadySearch:
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals of measurements, moments and paths, with the Jacobian of Kaufman (1975).
-
-        Parameters
-        ----------
-        theta : (n, 7 m) array
-            Paths.
-
-        Returns
-        -------
-        residual : (n, y + 16 m) array
-        J : (n, y + 16 m, 7 m) array
-            Derivative of the negative residual with respect to `theta`.
-        """
+        """Residuals (n, y + 16 m) of measurements, moments and paths (n, 7 m), with the Jacobian of
+        Kaufman (1975), the derivative (n, y + 16 m, 7 m) of the negative residual."""
         n, m, std = len(theta), _n_vehicles(theta), self._moment_std(theta)
         paths = theta.reshape(-1, N_STRAIGHT)
         A, _, inverse, p = self._solve(theta)
@@ -325,22 +251,11 @@ class SteadySearch:
                                 _block_diagonal(prior_J, m)], axis=1))
 
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
-        """Refine paths by Levenberg-Marquardt steps.
+        """Paths (n, 7 m) refined by Levenberg-Marquardt steps, and their costs (n,): infinite if a
+        vehicle is too slow, moves backwards, or is not detectable.
 
         The prior does not constrain the position along the arrival line. A vehicle that explains no
         field may therefore move arbitrarily far away.
-
-        Parameters
-        ----------
-        theta : (n, 7 m) array
-            Start paths.
-        n_steps : int, optional
-
-        Returns
-        -------
-        path : (n, 7 m) array
-        cost : (n,) array
-            Infinite if a vehicle is too slow, moves backwards, or is not detectable.
         """
         if not len(theta):
             return theta, np.zeros(0)
@@ -349,72 +264,31 @@ class SteadySearch:
         return path, np.where(are_moving & self._are_detectable(path), cost, np.inf)
 
     def best(self, grid: StartGrid, max_paths: int) -> FloatArray:
-        """Search for the paths of a single vehicle that explain the frames best.
-
-        Parameters
-        ----------
-        grid : StartGrid
-        max_paths : int
-            Maximum number of paths.
-
-        Returns
-        -------
-        (n, 7) array
-            The best path first.
-        """
+        """At most `max_paths` paths (n, 7) of a single vehicle that explain the frames best, the
+        best first."""
         path, cost = self.refined(
             _best_distinct(grid.theta, self.cost(grid), START_TOLERANCE, N_STARTS))
         return _best_distinct(path, cost, PATH_TOLERANCE, max_paths)
 
     def moments(self, theta: FloatArray) -> FloatArray:
-        """Estimate the moments of the rows of dipoles on given paths.
-
-        Parameters
-        ----------
-        theta : (7 m,) array
-            Paths.
-
-        Returns
-        -------
-        (m, 3, 3) array, A m^2, world frame
-            From the tail to the head of each row.
-        """
+        """Moments (m, 3, 3) of the rows of dipoles on paths (7 m,), from the tail to the head of
+        each row, A m², world frame."""
         _, _, _, p = self._solve(theta[None])
         moments: FloatArray = self._model.combinations @ p.reshape(-1, N_DIPOLES, 3)
         return moments
 
     def beside(self, path: FloatArray) -> 'SteadySearch':
-        """Return a search for another vehicle, given a vehicle that was found.
-
-        Parameters
-        ----------
-        path : (7,) array
-            Approximate path of the vehicle that was found.
-
-        Returns
-        -------
-        SteadySearch
-        """
+        """Search for another vehicle, given the approximate path (7,) of a vehicle that was
+        found."""
         _, _, _, p = self._solve(path[None])
         return replace(self, columns=np.hstack([
             self.columns, self._model.basis(path[None])[0] * self.prior.moment_std,
             self._model.derivative(path[None], p)[0] * FIRST_PATH_STD]))
 
     def pairs(self, grid: StartGrid, max_paths: int, max_second: int) -> list[FloatArray]:
-        """Search for the pairs of paths that explain the frames best.
+        """Pairs of paths (2, 7) that explain the frames best, the best first.
 
-        Parameters
-        ----------
-        grid : StartGrid
-        max_paths : int
-            Maximum number of first paths.
-        max_second : int
-            Maximum number of second paths for each first path.
-
-        Returns
-        -------
-        list of (2, 7) array
-            The best pair first.
+        At most `max_paths` first paths and `max_second` second paths for each are tried.
         """
         starts = [np.append(first, second) for first in self.best(grid, max_paths)
                   for second in self.beside(first).best(grid, max_second)]

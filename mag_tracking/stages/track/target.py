@@ -50,22 +50,10 @@ class Target:
 
 
 def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
-    """Create the target that the settings select, and check the settings of this target.
+    """Target that the settings select.
 
-    Parameters
-    ----------
-    settings : TrackSettings
-    network : SensorNetwork
-
-    Returns
-    -------
-    Target
-
-    Raises
-    ------
-    SettingsError
-        If the target is unknown, if its settings contradict each other, or if the start of a track
-        would need too much memory.
+    Raises SettingsError if the target is unknown, if its settings contradict each other, or if the
+    start of a track would need too much memory.
     """
     if settings.target == 'vehicle':
         vehicle = settings.vehicle

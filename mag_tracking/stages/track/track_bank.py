@@ -62,27 +62,13 @@ class FrameUpdate:
 class TrackBank:
     """Hypotheses of the targets of a track, with their filter, sensors and frames.
 
-    Parameters
-    ----------
-    target : Target
-    settings : TrackSettings
-    sensors : SensorSubset
-        Sensors at the start of the track.
-    bank_filter : BankFilter
-    bank : FilterBank
-    counts : Counter of str
-        Event counts of the stage, updated in place.
-    later_sensors : SensorSubset
-        Sensors that are used as soon as the bank is small enough.
+    The event counts of the stage are updated in place.
 
     Attributes
     ----------
-    bank : FilterBank
-    filter : BankFilter
-    sensors : SensorSubset
-        Sensors in use.
-    later_sensors : SensorSubset or None
-        Sensors that will be used later; None after the switch to them.
+    sensors : sensors in use
+    later_sensors : sensors that will be used as soon as the bank is small enough; None after the
+        switch to them
     """
 
     def __init__(self, target: Target, settings: TrackSettings, sensors: SensorSubset,
@@ -113,55 +99,23 @@ class TrackBank:
         return self._fixed_lag is not None
 
     def gain(self, row: int) -> float:
-        """Increase of the window's log-likelihood by relinearising the path of a hypothesis.
-
-        See `Relinearisation.gain`.
-
-        Parameters
-        ----------
-        row : int
-            Index of the hypothesis.
-
-        Returns
-        -------
-        float, nats
-        """
+        """Increase of the window's log-likelihood by relinearising the path of hypothesis `row`,
+        nats; see `Relinearisation.gain`."""
         return self._relinearisation.gain(int(self.bank.origin[row]))
 
     def filter_of(self, n_targets: int) -> BankFilter:
-        """Filter for a given number of targets.
-
-        Parameters
-        ----------
-        n_targets : int
-
-        Returns
-        -------
-        BankFilter
-        """
+        """Filter for a given number of targets."""
         return BankFilter(self.sensors.network, self._target.model, self._settings, n_targets)
 
     def configure(self, settings: TrackSettings) -> None:
-        """Apply new values of the live settings.
-
-        Parameters
-        ----------
-        settings : TrackSettings
-        """
+        """Apply new values of the live settings."""
         self._settings = settings
         self.filter.configure(settings)
         self._relinearisation.restart()
 
     def begin(self, first: FieldFrame, detection: FieldFrame) -> None:
-        """Move the bank back to the first frame of the track, and start to store frames.
-
-        Parameters
-        ----------
-        first : FieldFrame
-            First frame of the track.
-        detection : FieldFrame
-            Frame of the detection, at which the bank was created.
-        """
+        """Move the bank back from the frame of the detection, at which it was created, to the first
+        frame of the track, and start to store frames."""
         if first is not detection:
             self.filter.move(self.bank, (first.stamp_ns - detection.stamp_ns) / NS)
         start = InitialBank.of(self.bank, self.filter.observation.n_target)
@@ -169,19 +123,8 @@ class TrackBank:
         self._relinearisation.begin(start)
 
     def advance(self, frame: FieldFrame, dt: float) -> FrameUpdate:
-        """Predict and update the bank with a frame, and weight the hypotheses.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-            Frame of the sensors in use.
-        dt : float, s
-            Time since the previous frame.
-
-        Returns
-        -------
-        FrameUpdate
-        """
+        """Predict and update the bank with a frame of the sensors in use, and weight the
+        hypotheses."""
         predicted, log_likelihood, used, rejected = self._rejection.advance(
             self.filter, self.bank, frame, dt)
         self._counts.update(rejected)
@@ -189,20 +132,8 @@ class TrackBank:
                            len(rejected))
 
     def restart_after_gap(self, frame: FieldFrame, dt: float) -> bool:
-        """Start the hypotheses again if the target was lost in a gap before a frame.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-            First frame after the gap, of the sensors in use.
-        dt : float, s
-            Time since the previous frame.
-
-        Returns
-        -------
-        bool
-            Whether the hypotheses were started again, at the time of `frame`.
-        """
+        """Start the hypotheses again at the time of `frame` if the target was lost in the gap
+        before it; return whether they were started again."""
         network = self.sensors.network
         if not self._target.is_lost_after(self._settings, network, dt):
             return False
@@ -217,14 +148,8 @@ class TrackBank:
         return True
 
     def store_and_prune(self, frame_update: FrameUpdate, publish: bool) -> None:
-        """Store a frame, drop improbable hypotheses, and relinearise the leading ones if due.
-
-        Parameters
-        ----------
-        frame_update : FrameUpdate
-        publish : bool
-            Whether a pose is published for the frame.
-        """
+        """Store a frame, drop improbable hypotheses, and relinearise the leading ones if due;
+        `publish` if a pose is published for the frame."""
         s, bank = self._settings, self.bank
         self._relinearisation.add(bank, frame_update.predicted, frame_update.log_likelihood,
                                   frame_update.evidence, frame_update.frame, frame_update.dt)
@@ -235,53 +160,22 @@ class TrackBank:
         self._whole_track.add(bank, frame_update.frame, frame_update.dt, publish)
 
     def lagged(self, best: int, frame: FieldFrame, dt: float, publish: bool) -> list[TrackState]:
-        """Add a frame to the fixed-lag smoother; return the states of frames older than the lag.
-
-        Parameters
-        ----------
-        best : int
-            Index of the hypothesis to be smoothed.
-        frame : FieldFrame
-        dt : float, s
-            Time since the previous frame.
-        publish : bool
-            Whether a pose is published for the frame.
-
-        Returns
-        -------
-        list of TrackState
-        """
+        """Add a frame to the fixed-lag smoother; return the states of hypothesis `best` for frames
+        older than the lag."""
         return [] if self._fixed_lag is None else self._fixed_lag.smoothed(
             self.filter, self.bank, best, frame, dt, publish)
 
     def remaining_lagged(self, best: int) -> list[TrackState]:
-        """Smoothed states of the frames that remain in the fixed-lag smoother at the track's end.
-
-        Parameters
-        ----------
-        best : int
-            Index of the hypothesis to be smoothed.
-
-        Returns
-        -------
-        list of TrackState
-        """
+        """Smoothed states of hypothesis `best` for the frames that remain in the fixed-lag smoother
+        at the track's end."""
         return [] if self._fixed_lag is None else self._fixed_lag.remaining(
             self.filter, self.bank, best)
 
     def smoothed(self, best: int, counts: bool = True) -> list[TrackState]:
-        """Smoothed states of the published frames; empty if smoothing is disabled or impossible.
+        """Smoothed states of hypothesis `best` at the published frames; empty if smoothing is
+        disabled or impossible.
 
-        Parameters
-        ----------
-        best : int
-            Index of the hypothesis to be smoothed.
-        counts : bool, optional
-            Whether excluded frames are counted.
-
-        Returns
-        -------
-        list of TrackState
+        `counts` tells whether excluded frames are counted.
         """
         states, n_excluded = self._whole_track.smoothed(self.bank, best)
         if counts:
@@ -290,13 +184,7 @@ class TrackBank:
         return states
 
     def without_target(self, i: int) -> None:
-        """Remove a target from the hypotheses, the filter and the relinearisation window.
-
-        Parameters
-        ----------
-        i : int
-            Index of the target.
-        """
+        """Remove target `i` from the hypotheses, the filter and the relinearisation window."""
         best, n_targets = self.bank.best(), self.filter.observation.n_targets
         n = first_weak_frame(self.filter, i, self.window, int(self.bank.origin[best]))
         self._relinearisation.without_target(self.filter, self.bank, i, n)
@@ -306,12 +194,7 @@ class TrackBank:
         self._clear_lag()
 
     def resume(self, joint: JointExplanation) -> None:
-        """Continue with another explanation of the latest frames.
-
-        Parameters
-        ----------
-        joint : JointExplanation
-        """
+        """Continue with another explanation of the latest frames."""
         self.bank, self.filter = joint.bank, joint.bank_filter
         self._relinearisation.resume(joint.window)
         self._whole_track.resume(joint.window, self.filter)
@@ -324,18 +207,8 @@ class TrackBank:
             self._fixed_lag.clear()
 
     def hand_over(self, best: int) -> bool:
-        """Switch to the sensors near the predicted position of a hypothesis.
-
-        Parameters
-        ----------
-        best : int
-            Index of the hypothesis.
-
-        Returns
-        -------
-        bool
-            Whether the sensors have changed.
-        """
+        """Switch to the sensors near the predicted position of hypothesis `best`; return whether
+        they have changed."""
         sensors = self.sensors.ahead_of(self.bank.x[best], min(
             self._settings.max_sensors, max_sensors(self.filter.observation, len(self.bank))))
         if sensors is self.sensors:
@@ -347,19 +220,10 @@ class TrackBank:
         return True
 
     def widen(self, dt: float) -> bool:
-        """Add the remaining sensors from the next frame on, if few hypotheses are probable.
+        """Add the remaining sensors from the next frame on, in `dt` seconds, if few hypotheses are
+        probable; return whether the sensors have changed.
 
         Otherwise a later handover adds these sensors.
-
-        Parameters
-        ----------
-        dt : float, s
-            Time until the next frame.
-
-        Returns
-        -------
-        bool
-            Whether the sensors have changed.
         """
         sensors, self.later_sensors = self.later_sensors or self.sensors, None
         n, n_hyp = len(sensors.rows), max_hypotheses(self.filter.observation, len(sensors.rows))

@@ -16,7 +16,8 @@ MIN_SPEED_STDS = 3.0
 
 
 class UnobservedLength:
-    """Uncertainty of the middle of a vehicle due to the part that no sensor has observed yet.
+    """Uncertainty of the middle of a vehicle due to the part that no sensor has observed yet; use
+    one instance for each target.
 
     Until its rear has passed a sensor, an apparent car may be the engine of a truck. A row of
     dipoles explains both, and both models are too inaccurate for a reliable comparison.
@@ -26,14 +27,7 @@ class UnobservedLength:
     behind the row. Afterwards, it may be at either end, and the middle is uniformly distributed
     between these two cases.
 
-    Use one instance for each target.
-
-    Parameters
-    ----------
-    lengths : sequence of float, m
-        Length of each kind of vehicle; all kinds are equally frequent.
-    length_stds : sequence of float, m
-        Standard deviation of the length of each kind.
+    All kinds of vehicle, with `lengths` and `length_stds` in m, are equally frequent.
     """
 
     def __init__(self, lengths: Sequence[float], length_stds: Sequence[float]) -> None:
@@ -43,18 +37,11 @@ class UnobservedLength:
         self._last_position: FloatArray = np.zeros(2)
 
     def update(self, x: FloatArray, P: FloatArray, positions: FloatArray, is_certain: bool) -> None:
-        """Update the direction of travel and, if the position is certain, the distance travelled.
+        """Update the direction of travel and, if the position is certain (unambiguous), the
+        distance travelled.
 
-        Parameters
-        ----------
-        x : (n_t,) array
-            State that begins with position and velocity.
-        P : (n_t, n_t) array
-            Covariance of the state.
-        positions : (n_sensors, 3) array, m
-            Positions of the sensors that measured.
-        is_certain : bool
-            Whether the position is unambiguous.
+        The state `x` (n_t,) begins with position and velocity. `positions` (n_sensors, 3) are those
+        of the sensors that measured.
         """
         self._forward = self._direction(x, P)
         if not is_certain or not len(positions):
@@ -68,22 +55,8 @@ class UnobservedLength:
         self._last_position = x[:2].copy()
 
     def covariance(self, x: FloatArray, P: FloatArray, length: float, kind: int) -> FloatArray:
-        """Covariance of the middle, to be added to the covariance of the horizontal position.
-
-        Parameters
-        ----------
-        x : (n_t,) array
-        P : (n_t, n_t) array
-            As for `update`.
-        length : float, m
-            Length of the row of dipoles.
-        kind : int
-            Index of the kind of vehicle.
-
-        Returns
-        -------
-        (2, 2) array, m^2
-        """
+        """Covariance (2, 2) of the middle, to be added to that of the horizontal position, m², for
+        a row of dipoles of a given length [m]."""
         half_hidden = 0.5 * (self._lengths - length)
         second_moment = np.maximum(half_hidden, 0.0)**2 + 0.25 * self._stds**2
         # A longer vehicle would have been observed once its middle has passed a sensor.

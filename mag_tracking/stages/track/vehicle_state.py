@@ -47,30 +47,11 @@ class VehicleState:
 
     def prior(self, theta: FloatArray, moments: FloatArray, t: float, kind: int, label: int
               ) -> tuple[FloatArray, FloatArray]:
-        """Prior of a vehicle that arrives on a given path.
+        """Mean (n_t,) and covariance (n_t, n_t) of a vehicle that arrives on a path `theta` (7,),
+        at time `t` [s] on it.
 
-        The mean lies on the path, and its moment has the estimated direction. All other values
-        equal the prior at the start of a track.
-
-        Parameters
-        ----------
-        theta : (7,) array
-            Straight path.
-        moments : (k, 3) array, A m^2, world frame
-            Estimated moments of the dipoles.
-        t : float, s
-            Time on the path.
-        kind : int
-            Index of the kind of vehicle.
-        label : int
-            Index of the arrival direction.
-
-        Returns
-        -------
-        x : (n_t,) array
-            Mean of the state.
-        P : (n_t, n_t) array
-            Covariance of the state.
+        The mean lies on the path, and its moment has the estimated direction, that of `moments`
+        (k, 3) [A m², world frame]. All other values equal the prior at the start of a track.
         """
         s = self.settings
         R = rotation_about_z(float(np.deg2rad(s.arrival_headings_deg[label])))
@@ -84,22 +65,8 @@ class VehicleState:
 
     def along(self, theta: FloatArray, moments: FloatArray, times: FloatArray, kind: int
               ) -> FloatArray:
-        """States on a straight path.
-
-        Parameters
-        ----------
-        theta : (7,) array
-            Straight path.
-        moments : (k, 3) array, A m^2, world frame
-            Moments of a row of k dipoles, from the tail to the head.
-        times : (n,) array, s
-        kind : int
-            Index of the kind of vehicle.
-
-        Returns
-        -------
-        (n, n_t) array
-        """
+        """States (n, n_t) at `times` [s] on a straight path `theta` (7,), for a row of dipoles with
+        `moments` (k, 3) from the tail to the head, A m², world frame."""
         d, s, length = self._n_dipoles, self.settings, float(theta[6])
         heading = float(theta[4])
         R = rotation_about_z(heading)
@@ -119,35 +86,16 @@ class VehicleState:
         return x
 
     def hard_moments(self, x: FloatArray) -> FloatArray:
-        """Hard iron moments of the dipoles of a vehicle.
-
-        Parameters
-        ----------
-        x : (n_t,) array
-            State of the vehicle.
-
-        Returns
-        -------
-        (d, 3) array, A m^2, vehicle frame
-        """
+        """Hard iron moments (d, 3) of the dipoles of a vehicle with state `x` (n_t,), A m², vehicle
+        frame."""
         hard: FloatArray = x[6:6 + 3 * self._n_dipoles].reshape(-1, 3)
         return hard
 
     def turning(self, x: FloatArray, P: FloatArray, target: int) -> FloatArray | None:
-        """Return `P` with the turn-rate variance of one target set to its initial value.
+        """Return `P` with the turn-rate variance of one target set to its initial value; None if
+        turning is disabled.
 
-        Parameters
-        ----------
-        x : (n_x,) array
-            State of several targets.
-        P : (n_x, n_x) array
-        target : int
-            Index of the target.
-
-        Returns
-        -------
-        (n_x, n_x) array or None
-            None if turning is disabled in the settings.
+        The state `x` (n_x,) contains several targets.
         """
         if not self._model.turn_acceleration:
             return None

@@ -23,18 +23,9 @@ and relative standard deviation of their moments."""
 class WindowSearch:
     """Samples of a relinearisation window, prepared for searches for vehicles.
 
-    Parameters
-    ----------
-    window : Window
-    vehicles : VehicleState
-        Converts the results to states.
-
     Attributes
     ----------
-    times : (n,) array, s
-        Times of the frames, relative to the last frame.
-    prior : PathPrior
-    samples : PassSamples
+    times : (n,) array, times of the frames relative to the last frame, s
     """
 
     def __init__(self, window: Window, vehicles: VehicleState) -> None:
@@ -55,16 +46,7 @@ class WindowSearch:
                          self.prior.starts(self._vehicles.settings, self._vehicles.network))
 
     def beside(self, known: KnownVehicleHypothesis) -> SteadySearch:
-        """Return a search for a vehicle in addition to known vehicles.
-
-        Parameters
-        ----------
-        known : KnownVehicleHypothesis
-
-        Returns
-        -------
-        SteadySearch
-        """
+        """Search for a vehicle in addition to known vehicles."""
         samples = self.samples
         if known.filter is None:
             return SteadySearch(samples, self.prior, np.zeros(len(samples.y)), self._backgrounds())
@@ -87,11 +69,12 @@ class WindowSearch:
         return self._vehicles.background_std * self.samples.backgrounds
 
     def _error_columns(self, H: FloatArray, x: FloatArray, t: FloatArray, n_one: int) -> FloatArray:
-        """Field errors (n, n_sensors, 3, q) due to errors of the known vehicles.
+        """Field errors (n, n_sensors, 3, q) due to one std of each position, velocity or moment of
+        the known vehicles.
 
-        Each column is due to one standard deviation of a position, velocity or moment. `H` (n,
-        n_sensors, 3, n_t) holds the derivatives of the fields with respect to the vehicle states.
-        The times `t` (n,) [s] are relative to the end of the path; `x` (n_x,) is the state there.
+        `H` (n, n_sensors, 3, n_t) holds the derivatives of the fields with respect to the vehicle
+        states. The times `t` (n,) [s] are relative to the end of the path; `x` (n_x,) is the state
+        there.
         """
         out = []
         for first in range(0, H.shape[-1], n_one):

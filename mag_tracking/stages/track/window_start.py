@@ -54,19 +54,8 @@ class KnownVehicleHypothesis(PathHypothesis):
 
 
 def inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
-    """Return a covariance with an independent block inserted.
-
-    Parameters
-    ----------
-    P : (n, n) array
-    block : (k, k) array
-    at : int
-        Row at which the block is inserted.
-
-    Returns
-    -------
-    (n + k, n + k) array
-    """
+    """Covariance (n + k, n + k) with an independent `block` (k, k) inserted into `P` at row
+    `at`."""
     n, k = len(P), len(block)
     rows = np.append(np.arange(at), np.arange(at + k, n + k))
     out = np.zeros((n + k, n + k))
@@ -76,53 +65,23 @@ def inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
 
 
 def in_order_of(first: FloatArray, pair: FloatArray) -> FloatArray:
-    """Return a pair of paths in the order that matches another pair best, by distance.
-
-    Parameters
-    ----------
-    first : (2, 7) array
-        Pair with the required order.
-    pair : (2, 7) array
-
-    Returns
-    -------
-    (2, 7) array
-    """
+    """Pair of paths (2, 7) in the order that matches another pair best, by distance."""
     d = np.linalg.norm(pair[:, None, :2] - first[:, :2], axis=2)
     return pair if d[0, 0] + d[1, 1] <= d[0, 1] + d[1, 0] else pair[::-1].copy()
 
 
 def labels_of(labels: Sequence[tuple[int, ...]]) -> IntArray:
-    """Labels in the shape required by `FilterBank`.
-
-    Parameters
-    ----------
-    labels : sequence of tuple of int
-        Label of each vehicle, for each hypothesis.
-
-    Returns
-    -------
-    (n,) or (n, n_targets) int array
-    """
+    """Labels of each vehicle, for each hypothesis, in the shape required by `FilterBank`, (n,) or
+    (n, n_targets)."""
     out = np.array(labels)
     return out[:, 0].copy() if out.shape[1] == 1 else out
 
 
 def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length_column: int | None) -> float:
-    """Maximum depth by which any two vehicles overlap along a joint path.
+    """Maximum depth by which any two vehicles overlap along a joint path (n, n_x), m.
 
-    Parameters
-    ----------
-    path : (n, n_x) array
-    n_one : int
-        Number of states per vehicle.
-    n_targets : int
-    length_column : int or None
-        Column of the length among the states of a vehicle; None if all vehicles are points.
-
-    Returns
-    -------
-    float, m
+    Each vehicle has `n_one` states, with its length at `length_column`, which is None if all
+    vehicles are points.
     """
     x = path[:, :n_one * n_targets].reshape(len(path), n_targets, n_one)
     depth = 0.0

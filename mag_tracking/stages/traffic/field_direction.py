@@ -38,27 +38,16 @@ MAX_LOG_ODDS = float(np.log(MAX_CONFIDENCE / (1.0 - MAX_CONFIDENCE)))
 
 
 class FieldDirection:
-    """Estimates, from the latest frames, the probability that a crossing direction is wrong.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    """
+    """Estimates, from the latest frames, the probability that a crossing direction is wrong."""
 
     def __init__(self, network: SensorNetwork) -> None:
         self._network = network
         self._frames: deque[FieldFrame] = deque()
 
     def add(self, frame: FieldFrame, since_ns: int) -> None:
-        """Store a frame, and drop frames that are no longer needed.
+        """Store a frame, and drop frames not needed for crossings from `since_ns` on.
 
         If time jumps back, all earlier frames are dropped.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-        since_ns : int, ns
-            Earliest time of a crossing that may still be found.
         """
         if self._frames and frame.stamp_ns <= self._frames[-1].stamp_ns:
             self._frames.clear()
@@ -71,14 +60,7 @@ class FieldDirection:
     def error_probability(self, crossing: Crossing) -> float:
         """Probability that the direction of a crossing is wrong.
 
-        Parameters
-        ----------
-        crossing : Crossing
-
-        Returns
-        -------
-        float
-            NaN if the direction is not observable, or if the sensors contradict each other.
+        NaN if the direction is not observable, or if the sensors contradict each other.
         """
         velocity = crossing.pose.velocity[:2]
         speed = float(np.hypot(*velocity))

@@ -94,24 +94,9 @@ class Traffic:
     """Converts tracked frames to passages and summaries.
 
     A vehicle is counted when its track has ended, from its smoothed poses if available. Passages
-    are returned in chronological order, unless a track lasts longer than `MAX_WAIT_S`.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : TrafficSettings
-    counts_vehicles : bool, optional
-        False if the targets are not vehicles, which disables counting.
-
-    Attributes
-    ----------
-    counts : Counter of str
-        Number of passages, repeated crossings, tracks that crossed no line, and backward jumps.
-
-    Raises
-    ------
-    SettingsError
-        If a class has the name of vehicles that match no class.
+    are returned in chronological order, unless a track lasts longer than `MAX_WAIT_S`. Without
+    `counts_vehicles`, as for other targets, nothing is counted. Raises SettingsError if a class has
+    the name of vehicles that match no class.
     """
 
     def __init__(self, network: SensorNetwork, settings: TrafficSettings,
@@ -135,17 +120,7 @@ class Traffic:
         self._last_ns: int | None = None
 
     def feed(self, item: TrackedFrame) -> list[TrafficRecord]:
-        """Add a frame and the records of the tracker.
-
-        Parameters
-        ----------
-        item : TrackedFrame
-
-        Returns
-        -------
-        list of VehiclePassage or TrafficSummary
-            Completed passages and summaries.
-        """
+        """Add a frame and the records of the tracker; return completed passages and summaries."""
         if not self._lines:
             return []
         out: list[TrafficRecord] = []
@@ -168,12 +143,7 @@ class Traffic:
         """Do nothing: no work is deferred."""
 
     def flush(self) -> list[TrafficRecord]:
-        """End all tracks; return the remaining passages and the summary of the current interval.
-
-        Returns
-        -------
-        list of VehiclePassage or TrafficSummary
-        """
+        """End all tracks; return the remaining passages and the summary of the current interval."""
         for history in self._open.values():
             history.ended = True
         out: list[TrafficRecord] = [*self._count_ended(None), *self._intervals.flush()]
