@@ -17,7 +17,6 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
-from mag_tracking.stages.events.settings import EventsSettings
 from mag_tracking.stages.stage import Stage, rejected
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.stages.track.manager import TrackManager
@@ -33,7 +32,6 @@ class Settings:
     calibrate: CalibrateSettings = field(default_factory=CalibrateSettings)
     align: AlignSettings = field(default_factory=AlignSettings)
     detect: DetectSettings = field(default_factory=DetectSettings)
-    events: EventsSettings = field(default_factory=EventsSettings)
     track: TrackSettings = field(default_factory=TrackSettings)
     traffic: TrafficSettings = field(default_factory=TrafficSettings)
     survey: SurveySettings = field(default_factory=SurveySettings)

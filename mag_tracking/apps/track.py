@@ -257,7 +257,7 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
     target : 'vehicle', 'magnet' (in a hand) or 'bench' (a magnet on a bench)
     settings : {name: value}, optional
         Settings that differ from the defaults of the target, such as {'track.iterations': 5};
-        config/default.yaml lists all settings.
+        config/default.yaml lists those of users, the reference all.
 
     Returns
     -------

@@ -105,8 +105,8 @@ def count_traffic(source: Source, network: SensorNetwork, settings: Settings,
                             f'{settings.track.target}')
     sink = _TrafficSink(network)
     report = run(source, Pipeline(network, settings), [sink], progress, stopped)
-    return TrafficResult(settings.traffic.class_names, tuple(sink.vehicles), tuple(sink.summaries),
-                         report)
+    return TrafficResult(tuple(c.name for c in settings.traffic.classes), tuple(sink.vehicles),
+                         tuple(sink.summaries), report)
 
 
 class _TrafficSink(RecordReceiver):

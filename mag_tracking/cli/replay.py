@@ -53,8 +53,8 @@ examples:
   mag-tracking replay magnet/ --network magnet/network.yaml --target magnet --out out
   mag-tracking replay night.mcap --network site.yaml --params mine.yaml --out out
 
-The file of --params contains only the settings to override; config/default.yaml describes all
-settings. Example:
+The file of --params contains only the settings to override; config/default.yaml describes those of
+users, the reference all. Example:
   track:
     vehicle:
       arrival_names: ['east', 'west']

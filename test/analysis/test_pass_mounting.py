@@ -164,7 +164,7 @@ def test_network_is_rotated_about_the_world_axes():
     assert corrected.names == NETWORK.names and corrected.earth_field is NETWORK.earth_field
 
 
-CHANGES = {**POINT, 'track.field_error': 0.0, 'track.vehicle.near_field_lengths': [0.0],
+CHANGES = {**POINT, 'track.field_error': 0.0, 'track.vehicle.kinds.car.near_field_length': 0.0,
            'track.mounting_std_deg': 5.0}
 
 

@@ -8,6 +8,7 @@ import pytest
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.pipeline import settings_for
+from mag_tracking.stages.track.initiation_vehicle import CLIMB_STD
 from support.busy_fits import assigned_fits, fits_of_recording, fits_of_world
 from support.busy_worlds import busy
 from support.live_runs import fits_of
@@ -121,9 +122,10 @@ def test_magnets_are_not_vehicles():
 
 def test_the_ground_prior_combines_the_heights_of_all_kinds():
     settings = settings_for('vehicle', {
-        'track.vehicle.heights': [0.4, 0.4, 1.0], 'track.vehicle.height_stds': [0.3, 0.3, 0.3],
-        'track.vehicle.climb_std': 0.2})
+        f'track.vehicle.kinds.{kind}.{column}': value for kind, height in (
+            ('small', 0.4), ('car', 0.4), ('truck', 1.0))
+        for column, value in (('height', height), ('height_std', 0.3))})
     ground = ground_prior(settings.track)
     # Variance of the means plus mean of the variances.
     assert ground.height == pytest.approx((0.6, np.sqrt(0.08 + 0.09)))
-    assert ground.climb_std == 0.2
+    assert ground.climb_std == CLIMB_STD

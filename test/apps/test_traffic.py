@@ -150,7 +150,7 @@ def test_invalid_input_is_reported_before_the_run(tmp_path, capsys):
 
 def test_lines_without_crossings_count_no_vehicles():
     result = mt.traffic(vehicle_path('straight_car_right'), NETWORK_FILE, {
-        **QUICK, 'traffic.line_offsets': (500.0,)})
+        **QUICK, 'traffic.lines.road.offset': 500.0})
     assert result.vehicles == ()
     assert count_of(result.report.counts['traffic'], 'no line') == 1
     assert 'no line' in repr(result)

@@ -28,7 +28,9 @@ NAME = 'junction_left_turns_to_rear'
 NOISE = 1.2e-8
 POINT, ROW = (0.0,), (-1.0, 0.0, 1.0)
 """Positions of the dipoles along the body, in half lengths."""
-SETTINGS = {'iron three times as uneven': {'track.vehicle.difference_stds': [0.0, 90.0, 360.0]},
+SETTINGS = {'iron three times as uneven': {
+                'track.vehicle.kinds.car.difference_std': 90.0,
+                'track.vehicle.kinds.truck.difference_std': 360.0},
             'speeds of 5 m/s only': {'track.vehicle.speeds': [5.0]},
             'acceleration 0.3': {'track.vehicle.acceleration': 0.3},
             'field error 0.01': {'track.field_error': 0.01}}

@@ -101,8 +101,8 @@ def test_errors_are_reported_in_one_line(tmp_path, capsys):
     recording = vehicle_path(NAME)
     assert 'x.mcap' in fail(capsys, 'replay', tmp_path / 'x.mcap', *common)
     typo = tmp_path / 'typo.yaml'
-    typo.write_text('track: {vehicle: {momnet: 3.0}}')
-    assert 'mean track.vehicle.moments?' in fail(
+    typo.write_text('track: {vehicle: {kinds: {car: {momnet: 3.0}}}}')
+    assert 'mean track.vehicle.kinds.car.moment?' in fail(
         capsys, 'replay', recording, *common, '--params', typo)
     blocked = tmp_path / 'blocked'
     blocked.write_text('a file')

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.timeout(600)
     (['-p', 'network:=/no/such/file.yaml'], 'cannot read /no/such/file.yaml'),
     (['-p', f'network:={NETWORK_FILE}', '-p', 'track.vehicle.momnet:=1.0'],
      'mean track.vehicle.moment'),
-    (['-p', f'network:={NETWORK_FILE}', '-p', 'track.prune_ratio:=7.0'], 'prune_ratio'),
+    (['-p', f'network:={NETWORK_FILE}', '-p', 'track.iterations:=70'], 'iterations'),
     (['-p', f'network:={NETWORK_FILE}', '-p', 'track.vehicle.arrival_headings_deg:=[0.0]'],
      'expected 3 values'),
     (['-p', f'network:={NETWORK_FILE}', '-p', 'target:=submarine'], 'submarine'),

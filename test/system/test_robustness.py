@@ -8,7 +8,7 @@ import pytest
 
 from mag_tracking.apps.replay import replay
 from mag_tracking.cli import main
-from mag_tracking.errors import NetworkError, OutputError, SettingsError
+from mag_tracking.errors import NetworkError, OutputError
 from mag_tracking.messages.schema import odometry_dict, pose_covariance
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
@@ -17,14 +17,11 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Detection, FieldFrame, Track
-from mag_tracking.settings import replace
 from mag_tracking.simulation.scenario import Path, point_body
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.detect.settings import DetectSettings
-from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.manager import TrackManager
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path
@@ -77,12 +74,6 @@ def test_a_looped_recording_gives_the_same_track_again(road_network):
     common = sorted(set(a) & set(b))
     assert len(common) >= len(a) - 2
     np.testing.assert_allclose([a[k] for k in common], [b[k] for k in common], rtol=1e-9)
-
-
-def test_a_release_probability_below_that_of_the_onset_is_refused():
-    with pytest.raises(SettingsError, match='release_probability'):
-        Detect(line_network(2), replace(DetectSettings(), {
-            'false_alarm_probability': 0.2, 'release_probability': 1e-3}))
 
 
 @pytest.mark.parametrize('step', [0.0, 2e-6])

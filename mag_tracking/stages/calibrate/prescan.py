@@ -16,6 +16,10 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.units import NS
 
+LOOK_AHEAD_S = 300.0
+"""[s] Duration, from the start of the recording, that is searched for the most frequent level of a
+sensor that is not quiet at the start."""
+
 LEARNING_TOLERANCE_S = 1.0
 """Excess over the nominal learning time above which a target is considered present [s]."""
 
@@ -64,13 +68,11 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
             settings: CalibrateSettings) -> Prescan:
     """Find the backgrounds of sensors if a target is present at the start of the raw readings.
 
-    The batches are consumed up to `look_ahead_s`. If the network file contains all backgrounds,
-    there are only faults; if `look_ahead_s` is 0, the result is empty.
+    The batches are consumed up to `LOOK_AHEAD_S`. If the network file contains all backgrounds,
+    there are only faults.
     """
     without_background = [name for name, level in zip(network.names, network.background,
                                                       strict=True) if level is None]
-    if not settings.look_ahead_s:
-        return Prescan({}, {}, {})
     batches = iter(batches)
     beginning, faults = _beginning(batches, network, settings)
     if not without_background:
@@ -84,7 +86,7 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
         recorder.feed(readings)
         _learn(learner, readings, first_ns, learnt)
         start_ns = min(first_ns.values(), default=0)
-        if len(readings) and int(readings.stamp_ns[-1]) - start_ns > settings.look_ahead_s * NS:
+        if len(readings) and int(readings.stamp_ns[-1]) - start_ns > LOOK_AHEAD_S * NS:
             break
     levels, steps, is_quiet = {}, {}, True
     for name, background in recorder.backgrounds().items():

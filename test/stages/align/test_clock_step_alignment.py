@@ -37,7 +37,6 @@ def test_every_sample_is_used_rejected_or_held(seed):
     n = int(rng.integers(1, 6))
     stage = align(n, max_clock_jump_s=float(rng.choice([0.05, 0.5, 3.0])),
                   burst=bool(rng.integers(2)), max_wait_s=float(rng.choice([0.1, 0.5])),
-                  max_backward_jump_s=float(rng.choice([0.1, 1])),
                   max_buffered=int(rng.choice([2, 10_000])))
     n_used, n_fed = 0, 0
     for j, t in wild(rng, n, 500):

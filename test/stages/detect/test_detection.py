@@ -16,6 +16,7 @@ from mag_tracking.records import Detection, FieldFrame
 from mag_tracking.settings import replace
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
+from mag_tracking.stages.calibrate import stage as calibrate_stage
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.settings import DetectSettings
@@ -76,8 +77,7 @@ def test_the_default_false_alarm_probability_is_as_documented(
     assert documented in text
     # The stage itself is tested with a probability that causes enough alarms to count.
     network, rng, n = line_network(2), np.random.default_rng(12), 60_000
-    stage = Detect(network, replace(settings, {'false_alarm_probability': tested,
-                                               'release_probability': 0.05}))
+    stage = Detect(network, replace(settings, {'false_alarm_probability': tested}))
     p = chi2.sf(chi2.isf(tested, 6) * variance_ratio, 6)
     C = np.repeat(variance * np.eye(3)[None], 2, axis=0)
     std = np.sqrt(variance)
@@ -91,11 +91,11 @@ def test_the_default_false_alarm_probability_is_as_documented(
 
 
 @pytest.mark.parametrize('n', studied([40_000, 160_000], [40_000]))
-def test_the_false_alarm_rate_is_as_configured_after_calibration_and_alignment(n):
+def test_the_false_alarm_rate_is_as_configured_after_calibration_and_alignment(monkeypatch, n):
     """Raw noise at 100 Hz is calibrated with learnt backgrounds and aligned to 12.5 Hz frames."""
     network, rng = line_network(2), np.random.default_rng(8)
-    calibrate = Calibrate(network, replace(CalibrateSettings(), {'memory_s': 300.0,
-                                                                 'learn_s': 60.0}))
+    monkeypatch.setattr(calibrate_stage, 'MEMORY_S', 300.0)
+    calibrate = Calibrate(network, replace(CalibrateSettings(), {'learn_s': 60.0}))
     align = Align(network, AlignSettings())
     detectors = {p: detector(network, false_alarm_probability=p) for p in (1e-2, 1e-3)}
     noise = SIGMA * rng.standard_normal((n, 2, 3))

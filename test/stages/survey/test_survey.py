@@ -12,6 +12,7 @@ from mag_tracking.network.file import read_network, write_network
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import AccelerationSample, Readings
+from mag_tracking.stages.survey import stage as survey_stage
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.stages.survey.stage import Survey
 from support.bundled import vehicle_path
@@ -259,8 +260,9 @@ def test_the_nominal_heading_decides_between_two_headings_that_fit(nominal_yaw, 
     assert 'another heading' in result.sensors[1].warnings[0]
 
 
-def test_invalid_accelerations_are_counted_and_memory_is_bounded():
-    survey = Survey(nominal(2), SurveySettings(max_accelerations=100))
+def test_invalid_accelerations_are_counted_and_memory_is_bounded(monkeypatch):
+    monkeypatch.setattr(survey_stage, 'MAX_ACCELERATIONS', 100)
+    survey = Survey(nominal(2), SurveySettings())
     for stamp, sensor, a in ((1, 'mag_9', [0, 0, 9.8]), (1, 'mag_1', [0, np.nan, 9.8]),
                              (2, 'mag_1', [0, np.inf, 9.8]), (3, 'mag_1', [0, 0, 9.8]),
                              (3, 'mag_1', [0, 0, 9.8]), (2, 'mag_1', [0, 0, 9.8])):

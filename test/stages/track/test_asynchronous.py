@@ -60,7 +60,7 @@ def errors_of_fast_passes(compensated):
             0 if s.sensor == 'mag_1' else 4)]
         pipeline = Pipeline(network, settings_for('vehicle', {
             **POINT, 'track.vehicle.speeds': [20.0], 'track.mounting_std_deg': 0.0,
-            'track.field_error': 0.01, 'track.vehicle.near_field_lengths': [0.0]}))
+            'track.field_error': 0.01, 'track.vehicle.kinds.car.near_field_length': 0.0}))
         feed = pipeline.track.feed
         if not compensated:
             pipeline.track.feed = lambda f, feed=feed: feed(

@@ -59,7 +59,7 @@ def case(name, n_sensors=3, n_hyp=6, seed=0):
         size * rng.standard_normal((n_hyp, len(names))) + np.isin(names, 'z') * 2.0,
         P * np.outer(size, size), np.zeros(n_hyp, dtype=int), n_sensors, 1e-8,
         filters[0].observation.own_covariance,
-        rng.integers(0, len(np.atleast_1d(settings.vehicle.lengths)),
+        rng.integers(0, len(settings.vehicle.kinds),
                      (n_hyp, n_targets) if n_targets > 1 else n_hyp)
         if target == 'vehicle' else None)
     if settings.vehicle.turn_acceleration and target == 'vehicle':

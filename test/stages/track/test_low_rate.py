@@ -8,6 +8,7 @@ import pytest
 import mag_tracking as mt
 from mag_tracking.pipeline import settings_for
 from mag_tracking.stages.track import doubts
+from mag_tracking.stages.track.initiation_vehicle import LATERAL_STD
 from mag_tracking.stages.track.low_rate import low_rate_fault, required_rate
 from mag_tracking.stages.track.manager import TOO_SLOW
 from support.bundled import NETWORK_FILE
@@ -44,7 +45,7 @@ def test_a_vehicle_at_the_required_rate_moves_less_than_its_distance(n):
     """Half of the rate resolves frequencies at which the field of the pass is below 5 %."""
     network = line_network(n)
     rate = required_rate(network, SETTINGS)
-    distance = np.hypot(4.5, SETTINGS.vehicle.lateral_std)
+    distance = np.hypot(4.5, LATERAL_STD)
     assert np.exp(-np.pi * rate * distance / 10.0) < 0.05
 
 

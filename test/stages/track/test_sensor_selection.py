@@ -9,7 +9,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.simulation.scenario import Path, point_body
-from mag_tracking.stages.track import bank_size, manager
+from mag_tracking.stages.track import bank_size, manager, track_bank
 from mag_tracking.stages.track.approach import Approach
 from mag_tracking.stages.track.doubts import DOUBTFUL_BACKGROUND
 from mag_tracking.stages.track.sensor_selection import (
@@ -192,7 +192,7 @@ def test_no_hypothesis_is_dropped_without_frames_before_the_detection(monkeypatc
         monkeypatch.setattr(bank_size, name, value)
     first = next(k for k, f in enumerate(frames[1]) if f.target_present)
     tracker, _ = track_frames(frames, {}, start=slice(first, first + 1))
-    assert len(tracker.bank) == settings_for('vehicle').track.max_initial_hypotheses
+    assert len(tracker.bank) == track_bank.MAX_INITIAL_HYPOTHESES
     _, tracks = track_frames(frames, POINT, start=slice(first, None))
     used = [np.count_nonzero(~np.isnan(t.nis_by_sensor)) for t in tracks]
     assert used[0] <= 4 < max(used)

@@ -203,7 +203,7 @@ def test_smoothing_reduces_the_error_of_a_matched_target_by_two_fifths():
     bodies = [point_body(rng.uniform(300.0, 500.0) * u / np.linalg.norm(u), 3.0, 0.5)
               for u in rng.standard_normal((40, 3))]
     whole, ratios, nees = smoothing_study(bodies, {
-        **POINT, 'track.vehicle.near_field_lengths': [0.0], 'track.field_error': 0.0,
+        **POINT, 'track.vehicle.kinds.car.near_field_length': 0.0, 'track.field_error': 0.0,
         'track.mounting_std_deg': 0.0, 'track.model_error_time_s': 0.0})
     print(f'matched: smoothed over filtered error {np.median(whole):.2f} (median), within 5 m '
           f'{np.median(ratios):.2f}, ANEES {nees.mean():.2f}')

@@ -237,7 +237,7 @@ def test_the_predicted_field_excludes_the_model_errors():
     """If the predicted field included the model errors, any target would fit. Without them, a car
     that is tracked as a point has large residuals."""
     residual = {}
-    for name, changes in (('point', {**POINT, 'track.vehicle.near_field_lengths': [2.0]}),
+    for name, changes in (('point', {**POINT, 'track.vehicle.kinds.car.near_field_length': 2.0}),
                           ('row', {})):
         network = line_network(2, tilt=0.0)
         tracks, pipeline, _ = drive(network, random_vehicle(np.random.default_rng(3), **CAR),

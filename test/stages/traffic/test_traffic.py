@@ -8,7 +8,7 @@ import pytest
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import TrafficSummary, VehiclePassage
 from mag_tracking.physics.dipole import dipole_field
-from mag_tracking.stages.traffic.settings import TrafficSettings
+from mag_tracking.stages.traffic.settings import LineSettings, TrafficSettings, VehicleClass
 from mag_tracking.stages.traffic.stage import (
     AMBIGUOUS,
     CONTRADICTED,
@@ -152,8 +152,8 @@ def test_an_ambiguous_pose_makes_the_passage_ambiguous():
 
 def test_several_lines_count_separately():
     settings = TrafficSettings(
-        line_names=('west', 'east', 'across'), line_headings_deg=(0.0, 180.0, 90.0),
-        line_offsets=(-5.0, -5.0, 0.0), line_half_widths=(15.0,) * 3)
+        lines=(LineSettings('west', 0.0, -5.0), LineSettings('east', 180.0, -5.0),
+               LineSettings('across', 90.0)))
     found = passages(counted(drive(2.0, 6.0, 4.0), settings=settings)[0])
     assert [(p.line, p.forward) for p in found] == [('west', True), ('east', False)]
     assert [p.stamp_ns / NS for p in found] == pytest.approx([3.5, 4.5])
@@ -214,7 +214,7 @@ def test_the_fields_confirm_or_contradict_a_direction():
 
 def test_a_sensor_in_the_lane_confirms_no_direction():
     network = network_of([[0.0, -1.0, 0.0], [30.0, 5.0, 0.0]])
-    settings = TrafficSettings(line_offsets=(-15.0,))
+    settings = TrafficSettings(lines=(LineSettings('road', offset=-15.0),))
     (p,) = passages(counted(drive(2.0, 6.0, 4.0), field_at=field_of(1.0), network=network,
                             settings=settings)[0])
     assert np.isnan(p.direction_error)
@@ -289,12 +289,6 @@ def test_magnets_are_not_counted():
     assert stage.feed(TrackedFrame(frame(0.0), [])) == stage.flush() == []
 
 
-@pytest.mark.parametrize(('changes', 'message'), [
-    ({'line_offsets': (0.0, 1.0)}, 'line_offsets: .*got 2'),
-    ({'class_lengths': (3.0,)}, 'class_lengths: .*got 1'),
-    ({'class_names': ('car', 'car', 'truck')}, 'duplicate names'),
-    ({'class_names': ('car', 'unknown', 'truck')}, "'unknown'"),
-    ({'line_names': ('',)}, 'line_names')])
-def test_lists_of_unequal_length_and_invalid_names_are_refused(changes, message):
-    with pytest.raises(SettingsError, match=message):
-        Traffic(NETWORK, TrafficSettings(**changes))
+def test_the_name_of_vehicles_that_match_no_class_is_refused():
+    with pytest.raises(SettingsError, match="'unknown'"):
+        Traffic(NETWORK, TrafficSettings(classes=(VehicleClass('unknown'),)))
