@@ -192,14 +192,16 @@ class RunReport:
     """Errors of sinks, which did not receive the rest."""
 
     def warnings(self) -> list[str]:
-        """One line per diagnosis, loss, rejection, missing topic and failure.
+        """One line per diagnosis, rejection, loss and failure.
 
         Returns
         -------
         list of str
         """
-        lines = [str(diagnosis) for diagnosis in self.diagnoses]
-        return lines + [f'not written completely: {error}' for error in self.failures]
+        not_used = {**self.rejected, **self.lost}
+        return [*map(str, self.diagnoses), *(f'not used: {n} {cause}' for cause, n in
+                                             not_used.items()),
+                *(f'not written completely: {error}' for error in self.failures)]
 
 
 def run(source: Source, pipeline: Pipeline, sinks: Sequence[Sink],

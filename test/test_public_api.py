@@ -154,7 +154,7 @@ def test_tracking_arrays_of_a_magnet_equals_a_replay(magnet_runs, magnet_replays
     pd.testing.assert_frame_equal(
         found.poses_dataframe().astype({'ambiguous': int}), read_csv(folder / 'poses.csv'),
         check_exact=True)
-    assert len(found.poses) > 10 and found.counts == run.summary['counts']
+    assert len(found.poses) > 10 and found.report.counts == run.summary['counts']
 
 
 def test_settings_override_the_defaults(recorded, result):
@@ -214,7 +214,7 @@ def test_no_target_gives_empty_arrays(recorded, result, source):
     assert found.tracks == {} and found.report.rejected == {}
     assert found.report.sensors_without_background == (
         () if source == 'noise' else ('mag_1', 'mag_2'))
-    assert ('mag_1: no background' in repr(found)) is (source == 'nothing')
+    assert ('/mag_1/imu/mag' in repr(found)) is (source == 'nothing')
     with pytest.raises(mt.UnknownTrackError, match='no tracks'):
         found.map_figure()
 

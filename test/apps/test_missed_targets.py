@@ -49,4 +49,4 @@ def test_a_stuck_sensor_misses_targets_of_other_sensors(last_amplitude, stuck_fr
 
 
 def test_quiet_sensors_miss_no_targets():
-    assert not any('not change' in f for f in findings_of(2e-6, np.inf, n_targets=0))
+    assert not any('did not change' in f for f in findings_of(2e-6, np.inf, n_targets=0))
