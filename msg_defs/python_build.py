@@ -1,7 +1,7 @@
 """Generate the Python classes of ROS messages and the code that they need, without CMake.
 
 A CMake build makes the code of all languages and middlewares. Python and Fast DDS, the one
-middleware on PyPI, need about a third of it. Here it becomes one extension module per package,
+middleware on PyPI, need about half of it. Here it becomes one extension module per package,
 compiled from few large files: most of the time goes into reading the same headers.
 """
 
@@ -17,10 +17,13 @@ PREFIX = next((p for entry in sys.path for p in Path(entry).resolve().parents
 if PREFIX is None:
     raise RuntimeError('rosidl_generator_py is not in the build environment: build with `pip install`')
 
+SOURCE = Path(__file__).resolve().parent
 DISPATCH = 'rosidl_typesupport_c'
 MIDDLEWARE = 'rosidl_typesupport_fastrtps_c'
-KINDS = 'rosidl_generator_c', 'rosidl_generator_py', MIDDLEWARE, DISPATCH
-LIBRARIES = ['fastcdr', 'rcutils', 'rosidl_runtime_c', DISPATCH, MIDDLEWARE,
+# Fast DDS describes the types of its topics to other participants with it.
+INTROSPECTION = 'rosidl_typesupport_introspection_c'
+KINDS = 'rosidl_generator_c', 'rosidl_generator_py', MIDDLEWARE, INTROSPECTION
+LIBRARIES = ['fastcdr', 'rcutils', 'rosidl_runtime_c', DISPATCH, MIDDLEWARE, INTROSPECTION,
              'rosidl_typesupport_fastrtps_cpp']
 
 
@@ -43,15 +46,14 @@ import rosidl_adapter  # noqa: E402
 import rosidl_generator_c  # noqa: E402
 import rosidl_generator_py  # noqa: E402
 import rosidl_generator_type_description  # noqa: E402
-import rosidl_typesupport_c  # noqa: E402
 import rosidl_typesupport_fastrtps_c  # noqa: E402
+import rosidl_typesupport_introspection_c  # noqa: E402
 
 GENERATORS = {
     'rosidl_generator_type_description': rosidl_generator_type_description.generate_type_hash,
     'rosidl_generator_c': rosidl_generator_c.generate_c,
     MIDDLEWARE: rosidl_typesupport_fastrtps_c.generate_typesupport_fastrtps_c,
-    # With one middleware, the dispatcher refers to its code directly and loads no library.
-    DISPATCH: lambda arguments: rosidl_typesupport_c.generate_c(arguments, [MIDDLEWARE]),
+    INTROSPECTION: rosidl_typesupport_introspection_c.generate_c,
     'rosidl_generator_py': lambda arguments: rosidl_generator_py.generate_py(
         arguments, [DISPATCH]),
 }
@@ -98,7 +100,17 @@ def joined(path, sources):
     return str(path)
 
 
-def extension_options(name, work):
+def dispatch(name, source, path):
+    """Write the code that leads to the type supports of all messages and services."""
+    lines = [f'#include "{SOURCE / "dispatch.h"}"']
+    for f in interface_files(source):
+        kind = {'.msg': 'MESSAGE', '.srv': 'SERVICE'}[f.suffix]
+        lines.append(f'DISPATCH_{kind}({name}__{f.parent}__{f.stem})')
+    path.write_text('\n'.join(lines) + '\n')
+    return path
+
+
+def extension_options(name, source, work):
     """Sources and options of the extension module of package `name`, of which `generate` has
     written the code: {parameter of `Extension`: its value}.
     """
@@ -113,9 +125,10 @@ def extension_options(name, work):
         'sources': [
             joined(work / f'{name}.c', [
                 *(f for f in code.glob('*/detail/*.c') if f not in descriptions),
-                *folders['rosidl_generator_py'].rglob('*.c')]),
-            joined(work / f'{name}_middleware.cpp', [
-                f for kind in (MIDDLEWARE, DISPATCH) for f in folders[kind].rglob('*.cpp')]),
+                *folders['rosidl_generator_py'].rglob('*.c'),
+                *folders[INTROSPECTION].rglob('*.c'),
+                dispatch(name, source, work / f'{name}_dispatch.c')]),
+            joined(work / f'{name}_middleware.cpp', folders[MIDDLEWARE].rglob('*.cpp')),
             *map(str, sorted(descriptions))],
         'include_dirs': [
             *(str(folder.parent) for folder in folders.values()), np.get_include(),
