@@ -15,7 +15,7 @@ PREFIX = next((p for entry in sys.path for p in Path(entry).resolve().parents
                if (p / 'share' / 'rosidl_generator_py').is_dir()), None)
 """Where pip has put the generators."""
 if PREFIX is None:
-    raise RuntimeError('rosidl_generator_py is not in the build environment: build with `pip install`')
+    raise RuntimeError('rosidl_generator_py is not in the build environment: use `pip install`')
 
 SOURCE = Path(__file__).resolve().parent
 DISPATCH = 'rosidl_typesupport_c'

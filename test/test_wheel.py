@@ -17,13 +17,13 @@ from support.bundled import NETWORK_FILE, ROOT, vehicle_path
 
 NAME = 'straight_car_fast_left'
 RUNNING_VERSION = f'{sys.version_info.major}.{sys.version_info.minor}'
-VERSIONS = sorted({'3.10', '3.13', RUNNING_VERSION}, key=lambda v: int(v.partition('.')[2]))
+VERSIONS = sorted({'3.11', '3.14', RUNNING_VERSION}, key=lambda v: int(v.partition('.')[2]))
 SHARE = 'mag_tracking-0.1.0.data/data/share'
 METADATA = {f'mag_tracking-0.1.0.dist-info/{name}' for name in (
     'METADATA', 'WHEEL', 'RECORD', 'entry_points.txt', 'top_level.txt', 'licenses/LICENSE')}
 CORE_SOURCES = sorted(str(p.relative_to(ROOT)) for p in (ROOT / 'mag_tracking').rglob('core.cpp'))
 UNRELATED_FILES = (
-    'mag_tracking/notes.txt', 'mag_tracking/physics/__pycache__/dipole.cpython-310.pyc',
+    'mag_tracking/notes.txt', 'mag_tracking/physics/__pycache__/dipole.cpython-311.pyc',
     'test/test_new.py', 'mag_tracking.egg-info/PKG-INFO', 'out/summary.json',
     'config/backup.yaml~')
 SITE_NETWORK = '''

@@ -155,7 +155,7 @@ def install_run(installer):
 
 def install_extras(installer, *extras):
     """The requirements of extras of the installed mag_tracking, which is not built again."""
-    marks = {f'extra == "{extra}"' for extra in extras} | {f"extra == '{extra}'" for extra in extras}
+    marks = {f'extra == {quote}{extra}{quote}' for extra in extras for quote in '\'"'}
     installer.install(*sorted({r.partition(';')[0].strip() for r in requires('mag_tracking')
                                if r.partition(';')[2].strip() in marks}))
 

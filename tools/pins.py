@@ -40,9 +40,9 @@ def constraints(text):
                and 'platform_python_implementation' not in part]
         lines.append(' ; '.join([re.sub(r'\[.*?\]', '', name), *([' and '.join(own)] * bool(own))]))
     return '\n'.join([
-        '# Exact versions of all that is installed here: to run, to test, to build the messages, and',
-        '# colcon. Written by `make lock` for Linux on x86_64 with Python 3.11 to 3.14. After that run',
-        '# `make test` and `make colcon`.', *sorted(lines, key=str.lower)])
+        '# Exact versions of all that is installed here: to run, to test, to build the messages,',
+        '# and colcon. Written by `make lock` for Linux on x86_64 with Python 3.11 to 3.14. After',
+        '# that run `make test` and `make colcon`.', *sorted(lines, key=str.lower)])
 
 
 if __name__ == '__main__':

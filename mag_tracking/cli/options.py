@@ -132,7 +132,7 @@ def utc_timestamp() -> str:
     str
         Time in UTC, ISO 8601.
     """
-    return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds')
 
 
 def add_report(parser: argparse.ArgumentParser) -> None:
