@@ -70,6 +70,7 @@ test: $(TEST)  ## check style, layers, types, behaviour and documentation
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
+	$(BIN)/clang-format --dry-run -Werror $$(find mag_tracking test -name '*.[ch]pp')
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m 'not alone and not study'
 	@# Four workers: tests of nodes wait more than they compute.
 	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(BIN)/python -m pytest -q -n 4 --dist loadfile --no-loadscope-reorder -m 'alone and not study'
