@@ -11,8 +11,7 @@
 #if defined(MAG_TRACKING_PROCESSOR)
 #define FOR_PROCESSORS __attribute__((target("arch=" MAG_TRACKING_PROCESSOR)))
 #else
-#define FOR_PROCESSORS \
-    __attribute__((target_clones("default", "arch=x86-64-v3", "arch=x86-64-v4")))
+#define FOR_PROCESSORS __attribute__((target_clones("default", "arch=x86-64-v3", "arch=x86-64-v4")))
 #endif
 #else
 #define FOR_PROCESSORS
