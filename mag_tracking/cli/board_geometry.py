@@ -86,7 +86,7 @@ def _geometry(args: argparse.Namespace) -> int:
     box = _checked_box(args)
     network = read_network(args.network) if args.sensors is None else board_of(args.sensors)
     settings = replace(GeometrySettings(), read_parameter_file(args.params) if args.params else {})
-    date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
+    date = datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds')
     unknowns = "magnet's poses and the geometry" if box else 'geometry'
     # Ctrl-C ends the estimation immediately: nothing has been written yet.
     with _elapsed_time(f'estimating the {unknowns} of {quantity(len(network), "sensor")}'):

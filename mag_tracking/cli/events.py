@@ -2,7 +2,7 @@
 
 import argparse
 import signal
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -98,5 +98,5 @@ def line_of(event: PassEvent) -> str:
 
 def _time_of(stamp_ns: int) -> str:
     """Time of day of a timestamp."""
-    time = datetime.fromtimestamp(stamp_ns / NS, tz=timezone.utc)
+    time = datetime.fromtimestamp(stamp_ns / NS, tz=UTC)
     return f'{time:%H:%M:%S}.{time.microsecond // 10000:02d}'

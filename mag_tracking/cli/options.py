@@ -80,7 +80,7 @@ def distinct_names(paths: Iterable[Path]) -> list[str]:
 
 def utc_timestamp() -> str:
     """Current time (UTC, ISO 8601), for use as the date of a calibration."""
-    return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds')
 
 
 def add_report(parser: argparse.ArgumentParser) -> None:

@@ -4,7 +4,7 @@ import argparse
 import signal
 from collections import Counter
 from collections.abc import Sequence
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -190,7 +190,7 @@ def _print(name: str, result: TrafficResult,
 def line_of(vehicle: CountedVehicle) -> str:
     """Describe a passage in one line."""
     p = vehicle.passage
-    time = datetime.fromtimestamp(p.stamp_ns / NS, tz=timezone.utc)
+    time = datetime.fromtimestamp(p.stamp_ns / NS, tz=UTC)
     error = '' if np.isnan(p.direction_error) else f' (error probability {p.direction_error:.3f})'
     vehicle_class = f'{p.vehicle_class} ({p.class_probabilities.max():.0%})'
     length = f', {p.length:.1f} m' if p.length else ''

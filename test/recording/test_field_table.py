@@ -119,7 +119,7 @@ def test_the_same_readings_are_read_from_every_layout(layout, tmp_path):
 def utc(form):
     """Format times as dates."""
     return lambda t: datetime.datetime.fromtimestamp(
-        EPOCH_S, datetime.timezone.utc).__add__(datetime.timedelta(seconds=t)).strftime(form)
+        EPOCH_S, datetime.UTC).__add__(datetime.timedelta(seconds=t)).strftime(form)
 
 
 MIDNIGHT_S = 86395

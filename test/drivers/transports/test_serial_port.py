@@ -198,7 +198,7 @@ def test_a_device_can_be_reopened_after_it_was_plugged_in_again(device, port):
 
 def test_the_error_of_a_missing_port_lists_the_available_ports(monkeypatch):
     port = SerialPort(SerialSettings(port='/dev/ttyNONE0'))
-    monkeypatch.setattr(serial_port.list_ports, 'comports', lambda: [])
+    monkeypatch.setattr(serial_port.list_ports, 'comports', list)
     assert '/dev/ttyNONE0: not found; no ports' in open_error(port)
 
     class Known:
