@@ -15,8 +15,8 @@ import pytest
 
 import mag_tracking as mt
 from mag_tracking.cli import main
-from mag_tracking.recording.fit_folder import FIT_COLUMNS, FitFolder
-from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
+from mag_tracking.results.fit_folder import FIT_COLUMNS, FitFolder
+from mag_tracking.results.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
 from support.bundled import NETWORK_FILE, QUICK, ROOT, vehicle_path
 
 NAME = 'straight_car_fast_left'

@@ -2,8 +2,8 @@
 
 from mag_tracking.drivers.configuration import settings_by_kind
 from mag_tracking.pipeline import Settings, settings_for
-from mag_tracking.recording.archive_tables import TABLES
-from mag_tracking.recording.traffic_tables import tables_of
+from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.traffic_tables import tables_of
 from mag_tracking.settings import flatten
 from mag_tracking.stages.track.doubts import MEANINGS
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
-from mag_tracking.recording.archive_folder import common_columns
+from mag_tracking.results.archive_folder import common_columns
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.units import NS
 

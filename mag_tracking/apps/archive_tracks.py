@@ -14,12 +14,12 @@ from mag_tracking.apps.pass_fitter import fitted_vehicles
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.apps.replay import TrackHistory
 from mag_tracking.record_receiver import RecordReceiver
-from mag_tracking.recording.archive_folder import common_columns
-from mag_tracking.recording.archive_tables import TABLES
-from mag_tracking.recording.fit_folder import pass_rows
-from mag_tracking.recording.parquet_table import TableWriter
 from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.results.archive_folder import common_columns
+from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.fit_folder import pass_rows
+from mag_tracking.results.parquet_table import TableWriter
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.settings import TrackSettings
 

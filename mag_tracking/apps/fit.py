@@ -13,9 +13,9 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.fit_folder import FIT_COLUMNS, pass_rows
 from mag_tracking.recording.interruptible import Progress
-from mag_tracking.report.dataframes import STATE_UNITS, dataframe
+from mag_tracking.results.dataframes import STATE_UNITS, dataframe
+from mag_tracking.results.fit_folder import FIT_COLUMNS, pass_rows
 from mag_tracking.run import RunReport, Source, run
 
 if TYPE_CHECKING:

@@ -15,14 +15,14 @@ from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.records import Detection, Readings, SmoothedPose, Track
-from mag_tracking.report.dataframes import (
+from mag_tracking.report.metrics import Truth, interpolate_truth
+from mag_tracking.report.track_log import TrackLog
+from mag_tracking.results.dataframes import (
     detections_dataframe,
     poses_dataframe,
     smoothed_dataframe,
 )
-from mag_tracking.report.metrics import Truth, interpolate_truth
-from mag_tracking.report.result_arrays import detection_array, pose_array, smoothed_array
-from mag_tracking.report.track_log import TrackLog
+from mag_tracking.results.result_arrays import detection_array, pose_array, smoothed_array
 from mag_tracking.run import RecordingSource, RunReport, run
 
 if TYPE_CHECKING:

@@ -30,9 +30,9 @@ from mag_tracking.inference.log_normal_classes import UNKNOWN
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.fleet_file import FleetPass, read_fleet, write_fleet
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.traffic_tables import (
+from mag_tracking.results.fleet_file import FleetPass, read_fleet, write_fleet
+from mag_tracking.results.traffic_tables import (
     DIRECTIONS,
     passage_row,
     summary_rows,

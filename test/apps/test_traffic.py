@@ -14,8 +14,8 @@ import mag_tracking as mt
 from mag_tracking.cli import main
 from mag_tracking.errors import SettingsError
 from mag_tracking.messages.types import MAGNETIC_FIELD
-from mag_tracking.recording.traffic_tables import tables_of
 from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.results.traffic_tables import tables_of
 from support.bundled import DATA, NETWORK_FILE, QUICK, vehicle_path
 from support.busy_recordings import correctly_counted, network_of_recording
 from support.samples import field_dict

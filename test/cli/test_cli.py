@@ -9,8 +9,8 @@ import sys
 import pytest
 
 from mag_tracking.cli import main
-from mag_tracking.recording.fit_folder import FIT_COLUMNS
-from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
+from mag_tracking.results.fit_folder import FIT_COLUMNS
+from mag_tracking.results.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
 from support.bundled import DATA, NETWORK_FILE, QUICK, parameter_file, vehicle_path
 from support.cli_runs import NAME, quick_file, replay_one
 from support.permissions import enforced_permissions

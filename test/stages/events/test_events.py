@@ -13,8 +13,8 @@ from mag_tracking.inference.driving_direction import rotation_of_pass
 from mag_tracking.messages.schema import pass_event_dict
 from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.event_tables import EVENT_COLUMNS
 from mag_tracking.records import Readings
+from mag_tracking.results.event_tables import EVENT_COLUMNS
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.events.single_sensor_pass import closest_point
 from mag_tracking.stages.events.stage import Events

@@ -1,6 +1,6 @@
 """Tables of an archive: columns with type, unit and meaning."""
 
-from mag_tracking.recording.parquet_table import Column, columns_of
+from mag_tracking.results.parquet_table import Column, columns_of
 
 
 def _axes(prefix: str, unit: str, meaning: str) -> tuple[Column, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import TrafficSummary, VehiclePassage
 from mag_tracking.files import new_text_file, output_folder
-from mag_tracking.recording.parquet_table import Column, TableWriter, columns_of
+from mag_tracking.results.parquet_table import Column, TableWriter, columns_of
 
 DIRECTIONS = {True: 'forward', False: 'backward'}
 

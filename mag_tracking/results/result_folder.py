@@ -16,12 +16,12 @@ from mag_tracking.files import new_text_file, output_folder
 from mag_tracking.network import SensorNetwork
 from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.recording import core
-from mag_tracking.recording.track_recording import TrackRecording
 from mag_tracking.recording.writer import check_no_other_recording
 from mag_tracking.records import Detection, FieldFrame, Hypotheses, SmoothedPose, Track
 from mag_tracking.report.json_text import without_nan
 from mag_tracking.report.page import REPORT
-from mag_tracking.report.rerun_file import RERUN_FILE
+from mag_tracking.results.rerun_file import RERUN_FILE
+from mag_tracking.results.track_recording import TrackRecording
 
 POSE_COLUMNS = ('stamp_ns', 'track_id', 'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z',
                 'sd_vx', 'sd_vy', 'sd_vz', 'mx', 'my', 'mz', 'weight', 'ambiguous',
