@@ -15,8 +15,8 @@ import pytest
 
 import mag_tracking as mt
 from mag_tracking.cli import main
-from mag_tracking.recording.fit_folder import FIT_COLUMNS, FitFolder
-from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
+from mag_tracking.results.columns import DETECTIONS, FITS, POSES, SMOOTHED, names_of
+from mag_tracking.results.fit_folder import FitFolder
 from support.bundled import NETWORK_FILE, QUICK, ROOT, vehicle_path
 
 NAME = 'straight_car_fast_left'
@@ -168,16 +168,16 @@ def test_settings_override_the_defaults(recorded, result):
 
 def test_dataframes_have_units(result):
     for frame, columns, extra in (
-            (result.poses_dataframe(), POSE_COLUMNS, ()),
-            (result.smoothed_dataframe(), SMOOTHED_COLUMNS, ('complete',)),
-            (result.detections_dataframe(), DETECTION_COLUMNS, ())):
+            (result.poses_dataframe(), names_of(POSES), ()),
+            (result.smoothed_dataframe(), names_of(SMOOTHED), ('complete',)),
+            (result.detections_dataframe(), names_of(DETECTIONS), ())):
         assert tuple(frame.columns) == (*columns, *extra)
         assert set(frame.attrs['units']) <= set(frame.columns)
     units = result.poses_dataframe().attrs['units']
     assert units['stamp_ns'] == 'ns' and units['sd_y'] == 'm' and units['vx'] == 'm/s'
     assert units['mz'] == 'A m^2'
     dimensionless = {'track_id', 'weight', 'ambiguous', 'kind', 'kind_weight', 'doubts'}
-    assert set(units) == set(POSE_COLUMNS) - dimensionless
+    assert set(units) == set(names_of(POSES)) - dimensionless
 
 
 def test_result_arrays_have_the_fields_of_the_records(result):
@@ -347,7 +347,7 @@ def test_the_fit_dataframe_equals_the_table_of_the_command(tmp_path):
     fitted_pass, = found.passes
     assert not found.report.warnings() and fitted_pass.chosen.n_dipoles == 3
     frame = found.to_dataframe()
-    assert tuple(frame.columns) == FIT_COLUMNS and len(frame) == 2
+    assert tuple(frame.columns) == names_of(FITS) and len(frame) == 2
     assert frame.attrs['units']['sd_mx'] == 'A m^2' and frame.attrs['units']['cpa_time'] == 's'
     with FitFolder(tmp_path) as folder:
         folder.add(fitted_pass)
@@ -362,7 +362,7 @@ def test_a_recording_without_a_pass_gives_an_empty_fit(tmp_path):
     cut.write_bytes(content[:len(content) // 8])
     found = mt.fit(cut, NETWORK_FILE)
     assert found.passes == () and found.report.warnings()[0] in repr(found)
-    assert tuple(found.to_dataframe().columns) == FIT_COLUMNS and len(found.to_dataframe()) == 0
+    assert tuple(found.to_dataframe().columns) == names_of(FITS) and len(found.to_dataframe()) == 0
 
 
 @pytest.mark.parametrize('arguments, text', [

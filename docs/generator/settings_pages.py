@@ -2,8 +2,8 @@
 
 from mag_tracking.drivers.configuration import settings_by_kind
 from mag_tracking.pipeline import Settings, settings_for
-from mag_tracking.recording.archive_tables import TABLES
-from mag_tracking.recording.traffic_tables import tables_of
+from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.columns import EVENTS, FITS, RESULT_TABLES, SIGNATURES, traffic_tables
 from mag_tracking.settings import USER, flatten
 from mag_tracking.stages.track.doubts import MEANINGS
 
@@ -41,6 +41,12 @@ Columns of the Parquet tables that `mag-tracking archive` writes ({doc}`/guides/
 values are null, and NaN in a covariance. The unit and the meaning of each column are also stored in
 the metadata of the files.
 """
+RESULTS = """# Tables of results
+
+Columns of the CSV files that `mag-tracking replay`, `fit` and `events` write, and of the DataFrames
+in Python. Numbers in files of `replay` and `fit` are read back exactly. A fit that is not trusted
+as a whole has only its trusted quantities. Standard deviations of fits include model errors.
+"""
 TRAFFIC = """# Tables of traffic
 
 Columns of the CSV and Parquet files that `mag-tracking traffic` writes ({doc}`/guides/traffic`).
@@ -50,7 +56,11 @@ Columns of the CSV and Parquet files that `mag-tracking traffic` writes ({doc}`/
 def settings_pages():
     """{file name: Markdown} of the pages of settings and table columns."""
     return {'parameters.md': parameters(), 'drivers.md': drivers(), 'doubts.md': doubts(),
-            'archive_tables.md': archive_tables(), 'traffic_tables.md': traffic_tables()}
+            'result_tables.md': table_page(RESULTS, {
+                **RESULT_TABLES, 'fits.csv': FITS, 'events.csv': EVENTS,
+                'signatures.csv': SIGNATURES}),
+            'archive_tables.md': table_page(ARCHIVE, TABLES),
+            'traffic_tables.md': table_page(TRAFFIC, traffic_tables(('<class>',), True))}
 
 
 def parameters():
@@ -107,18 +117,10 @@ def doubts():
         [DOUBTS, *(f'| `{name}` | {meaning} |' for name, meaning in MEANINGS.items())]) + '\n'
 
 
-def archive_tables():
-    """Markdown: the columns of the tables of an archive."""
-    lines = [ARCHIVE]
-    for table, columns in TABLES.items():
-        lines += [f'## {table}', '', *column_rows(columns), '']
-    return '\n'.join(lines)
-
-
-def traffic_tables():
-    """Markdown: the columns of the tables of `mag-tracking traffic`."""
-    lines = [TRAFFIC]
-    for table, columns in tables_of(('<class>',), True).items():
+def table_page(text, tables):
+    """Markdown: an introduction, and the columns of tables."""
+    lines = [text]
+    for table, columns in tables.items():
         lines += [f'## {table}', '', *column_rows(columns), '']
     return '\n'.join(lines)
 

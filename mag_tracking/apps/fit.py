@@ -13,24 +13,14 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.fit_folder import FIT_COLUMNS, pass_rows
 from mag_tracking.recording.interruptible import Progress
-from mag_tracking.report.dataframes import STATE_UNITS, dataframe
+from mag_tracking.results.columns import FITS, names_of
+from mag_tracking.results.dataframes import dataframe
+from mag_tracking.results.fit_folder import pass_rows
 from mag_tracking.run import RunReport, Source, run
 
 if TYPE_CHECKING:
     import pandas as pd
-
-FIT_UNITS = {
-    **STATE_UNITS, **dict.fromkeys(('sd_mx', 'sd_my', 'sd_mz'), 'A m^2'),
-    **dict.fromkeys(('speed', 'sd_speed'), 'm/s'),
-    **dict.fromkeys(('heading_deg', 'sd_heading_deg'), 'deg'),
-    **dict.fromkeys(('cpa_time', 'sd_cpa_time'), 's'),
-    **dict.fromkeys(('cpa_range', 'sd_cpa_range'), 'm'),
-    **dict.fromkeys(('rate', 'sd_rate'), '1/s'),
-    **dict.fromkeys(('delay_speed', 'sd_delay_speed'), 'm/s'),
-    **dict.fromkeys(('delay_heading_deg', 'sd_delay_heading_deg'), 'deg')}
-"""Units of the columns of `fits.csv`: {column: unit}."""
 
 
 def fit_source(source: Source, network: SensorNetwork, settings: Settings, orders: Sequence[int],
@@ -72,9 +62,8 @@ class FitResult:
         """
         rows = [row for fitted in self.passes for row in pass_rows(fitted)]
         # A fit without an estimate has an empty string in this column.
-        columns = {c: [np.nan if c == 'ambiguous' and row[c] == '' else row[c] for row in rows]
-                   for c in FIT_COLUMNS}
-        return dataframe(columns, FIT_UNITS)
+        return dataframe(FITS, {c: [np.nan if c == 'ambiguous' and row[c] == '' else row[c]
+                                    for row in rows] for c in names_of(FITS)})
 
 
 def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[str],

@@ -19,9 +19,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings
 from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.result_folder import ResultFolder, figure_name
 from mag_tracking.recording.truth import read_truth_table
-from mag_tracking.recording.tum_file import write_tum
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.report.metrics import (
     MAGNET_SKIP,
@@ -33,6 +31,8 @@ from mag_tracking.report.metrics import (
     unflagged_poses,
 )
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.results.result_folder import ResultFolder, figure_name
+from mag_tracking.results.tum_file import write_tum
 from mag_tracking.run import RecordingSource, RunReport, Source, run
 from mag_tracking.stages.align.frame_period import frame_period_warning
 from mag_tracking.stages.track.plausibility import lane_note

@@ -15,14 +15,11 @@ from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.records import Detection, Readings, SmoothedPose, Track
-from mag_tracking.report.dataframes import (
-    detections_dataframe,
-    poses_dataframe,
-    smoothed_dataframe,
-)
 from mag_tracking.report.metrics import Truth, interpolate_truth
-from mag_tracking.report.result_arrays import detection_array, pose_array, smoothed_array
 from mag_tracking.report.track_log import TrackLog
+from mag_tracking.results.columns import COMPLETE, DETECTIONS, POSES, SMOOTHED
+from mag_tracking.results.dataframes import array_dataframe
+from mag_tracking.results.result_arrays import detection_array, pose_array, smoothed_array
 from mag_tracking.run import RecordingSource, RunReport, run
 
 if TYPE_CHECKING:
@@ -81,7 +78,7 @@ class TrackingResult:
         MissingDependencyError
             If pandas is not installed.
         """
-        return poses_dataframe(self.poses)
+        return array_dataframe(POSES, self.poses)
 
     def smoothed_dataframe(self) -> 'pd.DataFrame':
         """Convert `smoothed` to a table.
@@ -96,7 +93,7 @@ class TrackingResult:
         MissingDependencyError
             If pandas is not installed.
         """
-        return smoothed_dataframe(self.smoothed)
+        return array_dataframe((*SMOOTHED, *COMPLETE), self.smoothed)
 
     def detections_dataframe(self) -> 'pd.DataFrame':
         """Convert `detections` to a table.
@@ -111,7 +108,7 @@ class TrackingResult:
         MissingDependencyError
             If pandas is not installed.
         """
-        return detections_dataframe(self.detections)
+        return array_dataframe(DETECTIONS, self.detections)
 
     def errors(self, track_id: int | None = None) -> dict[str, Any] | None:
         """Compute the errors of a track relative to the best-matching target of the ground truth.

@@ -21,8 +21,8 @@ from mag_tracking.errors import OutputError
 from mag_tracking.event_records import PassEvent
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.event_tables import write_events
 from mag_tracking.recording.reader import Recording
+from mag_tracking.results.event_tables import write_events
 from mag_tracking.run import RecordingSource
 from mag_tracking.stages.events.stage import MAX_DURATION_S
 from mag_tracking.units import NS

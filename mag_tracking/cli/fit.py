@@ -31,8 +31,8 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0
 from mag_tracking.pipeline import settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.fit_folder import FitFolder
 from mag_tracking.recording.reader import Recording
+from mag_tracking.results.fit_folder import FitFolder
 from mag_tracking.run import RecordingSource
 from mag_tracking.settings import read_parameter_file
 

@@ -26,7 +26,7 @@ from mag_tracking.pipeline import Settings
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.report.page import WARNING
-from mag_tracking.report.rerun_file import RERUN_FILE, check_rerun, write_rerun
+from mag_tracking.results.rerun_file import RERUN_FILE, check_rerun, write_rerun
 from mag_tracking.stages.track.doubts import MEANINGS
 
 _REPLAY_HELP = '''

@@ -30,15 +30,10 @@ from mag_tracking.inference.log_normal_classes import UNKNOWN
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.fleet_file import FleetPass, read_fleet, write_fleet
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.traffic_tables import (
-    DIRECTIONS,
-    passage_row,
-    summary_rows,
-    tables_of,
-    write_traffic,
-)
+from mag_tracking.results.columns import DIRECTIONS, traffic_tables
+from mag_tracking.results.fleet_file import FleetPass, read_fleet, write_fleet
+from mag_tracking.results.traffic_tables import passage_row, summary_rows, write_traffic
 from mag_tracking.run import RecordingSource
 from mag_tracking.units import NS
 
@@ -105,7 +100,8 @@ def _traffic(args: argparse.Namespace) -> int:
             tables['intervals'] += [row for s in result.summaries for row in summary_rows(name, s)]
             if args.out is not None:
                 # Written after each recording, so that an interruption loses nothing.
-                write_traffic(args.out, tables, tables_of(result.class_names, fleet is not None))
+                write_traffic(args.out, tables,
+                              traffic_tables(result.class_names, fleet is not None))
     if args.enrol is not None and not signals:
         _enrol(args, network, enrolled)
     if args.out is not None:

@@ -15,7 +15,7 @@ from mag_tracking.analysis.pass_trust import (
     trusted_quantities,
 )
 from mag_tracking.apps.fit import fit
-from mag_tracking.recording.fit_folder import fit_row
+from mag_tracking.results.fit_folder import fit_row
 from support.bundled import VEHICLES, vehicle_path
 from support.close_pairs import estimates_of, pass_of, readings_of
 from support.passes import NOISE, ROAD, measured, random_path, superposed

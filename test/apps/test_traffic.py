@@ -14,8 +14,8 @@ import mag_tracking as mt
 from mag_tracking.cli import main
 from mag_tracking.errors import SettingsError
 from mag_tracking.messages.types import MAGNETIC_FIELD
-from mag_tracking.recording.traffic_tables import tables_of
 from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.results.columns import traffic_tables
 from support.bundled import DATA, NETWORK_FILE, QUICK, vehicle_path
 from support.busy_recordings import correctly_counted, network_of_recording
 from support.counters import count_of
@@ -129,7 +129,7 @@ def test_tables_without_rows_have_their_columns(tmp_path, capsys):
 
 def test_every_column_is_described():
     """The reference documentation is generated from these descriptions."""
-    for columns in tables_of((), True).values():
+    for columns in traffic_tables((), True).values():
         assert [c.name for c in columns if not c.meaning] == []
 
 

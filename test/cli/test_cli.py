@@ -9,8 +9,7 @@ import sys
 import pytest
 
 from mag_tracking.cli import main
-from mag_tracking.recording.fit_folder import FIT_COLUMNS
-from mag_tracking.recording.result_folder import DETECTION_COLUMNS, POSE_COLUMNS, SMOOTHED_COLUMNS
+from mag_tracking.results.columns import DETECTIONS, FITS, POSES, SMOOTHED, names_of
 from support.bundled import DATA, NETWORK_FILE, QUICK, parameter_file, vehicle_path
 from support.cli_runs import NAME, quick_file, replay_one
 from support.permissions import enforced_permissions
@@ -27,9 +26,9 @@ def test_replay_writes_all_documented_files(tmp_path, capsys):
     head = (out / 'poses.csv').read_text().splitlines()[0]
     assert head == ('stamp_ns,track_id,x,y,z,vx,vy,vz,sd_x,sd_y,sd_z,sd_vx,sd_vy,sd_vz,'
                     'mx,my,mz,weight,ambiguous,kind,kind_weight,length,sd_length,doubts'
-                    ) == ','.join(POSE_COLUMNS)
-    assert (out / 'poses_smoothed.csv').read_text().splitlines()[0] == ','.join(SMOOTHED_COLUMNS)
-    assert (out / 'detections.csv').read_text().splitlines()[0] == ','.join(DETECTION_COLUMNS)
+                    ) == ','.join(names_of(POSES))
+    assert (out / 'poses_smoothed.csv').read_text().splitlines()[0] == ','.join(names_of(SMOOTHED))
+    assert (out / 'detections.csv').read_text().splitlines()[0] == ','.join(names_of(DETECTIONS))
     track = json.loads((out / 'summary.json').read_text())['tracks'][0]
     assert track['arrival'] == 'left' and track['verdict'] == 'unique'
     assert {'speed', 'moment', 'poses', 'truth', 'smoothed', 'kind'} <= set(track)
@@ -213,7 +212,7 @@ def test_fit_writes_all_documented_files(tmp_path, capsys):
                                                *(f'{n}_pass_1.png' for n in names)}
     assert not (tmp_path / 'elsewhere').exists()
     lines = (out / 'fits.csv').read_text().splitlines()
-    assert lines[0] == ','.join(FIT_COLUMNS) and len(lines) == 5
+    assert lines[0] == ','.join(names_of(FITS)) and len(lines) == 5
     content = json.loads((out / 'fits.json').read_text())
     assert content['iron'] is None and not content['interrupted']
     car, turn = content['fits'][1], content['fits'][3]

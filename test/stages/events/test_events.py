@@ -13,8 +13,8 @@ from mag_tracking.inference.driving_direction import rotation_of_pass
 from mag_tracking.messages.schema import pass_event_dict
 from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.event_tables import EVENT_COLUMNS
 from mag_tracking.records import Readings
+from mag_tracking.results.columns import EVENTS, names_of
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.events.single_sensor_pass import closest_point
 from mag_tracking.stages.events.stage import Events
@@ -284,7 +284,7 @@ def test_the_events_command_prints_counts_and_writes_tables(tmp_path, capsys):
     assert ' m/s' not in out and 'unique' not in out
     with open(tmp_path / 'out' / 'events.csv', newline='') as stream:
         rows = list(csv.DictReader(stream))
-    assert tuple(rows[0]) == EVENT_COLUMNS and {r['sensor'] for r in rows} == {'mag_1', 'mag_2'}
+    assert tuple(rows[0]) == names_of(EVENTS) and {r['sensor'] for r in rows} == {'mag_1', 'mag_2'}
     with open(tmp_path / 'out' / 'signatures.csv', newline='') as stream:
         assert len(list(csv.DictReader(stream))) == 66
     assert main(['events', str(vehicle_path('straight_car_right')), '--network', str(NETWORK_FILE),

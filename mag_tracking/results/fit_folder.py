@@ -15,25 +15,9 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import OutputError
 from mag_tracking.files import new_text_file, output_folder
 from mag_tracking.report.json_text import without_nan
+from mag_tracking.results.columns import FITS, names_of
 
-FIT_COLUMNS = (
-    'recording', 'pass', 'vehicle', 'n_vehicles', 'n_dipoles', 'chosen', 'reason', 'stamp_ns',
-    'n_values', 'n_unknowns', 'normalised_cost', 'explained', 'residual_elsewhere',
-    'velocity_change',
-    'trusted', 'ambiguous',
-    'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz',
-    'speed', 'sd_speed', 'heading_deg', 'sd_heading_deg', 'length', 'sd_length',
-    'mx', 'my', 'mz', 'sd_mx', 'sd_my', 'sd_mz', 'cpa_time', 'sd_cpa_time',
-    'cpa_range', 'sd_cpa_range', 'rate', 'sd_rate',
-    'delay_speed', 'sd_delay_speed', 'delay_heading_deg', 'sd_delay_heading_deg', 'no_delay')
-"""Columns of `fits.csv`. Standard deviations are from `PassFit.robust_covariance`, those of
-positions from `PassFit.position_covariance`. The closest point of approach (CPA) refers to the
-centre of the sensors; its time is in seconds after `stamp_ns`. `rate` is the speed divided by the
-CPA range, which a single sensor can observe; the corresponding directions are in `fits.json`. For a
-fit that is not trusted as a whole, only the trusted quantities (speed, heading, time of the CPA)
-are written, and only if the fit is reported for its pass. Jointly fitted vehicles share their
-unknowns and costs. The speed and heading from the delays between sensors are model-free and equal
-for all fits of a pass."""
+_NAMES = names_of(FITS)
 
 
 class _FittedPass(Protocol):
@@ -64,7 +48,7 @@ def fit_row(fit: PassFit, is_reported: bool = True) -> dict[str, Any]:
 
     A fit that is neither trusted nor reported for its pass lacks its trusted quantities too.
     """
-    row: dict[str, Any] = dict.fromkeys(FIT_COLUMNS[FIT_COLUMNS.index('stamp_ns'):], math.nan)
+    row: dict[str, Any] = dict.fromkeys(_NAMES[_NAMES.index('stamp_ns'):], math.nan)
     row |= {'ambiguous': '', 'trusted': '', 'n_dipoles': fit.n_dipoles, 'reason': fit.reason,
             'stamp_ns': fit.data.stamp_ns, 'n_values': fit.data.n_values,
             'n_unknowns': fit.n_unknowns}
@@ -110,7 +94,7 @@ def _trusted_quantities(fit: PassFit, centre: FloatArray) -> dict[str, float]:
 
 
 def pass_rows(fitted_pass: _FittedPass) -> list[dict[str, Any]]:
-    """Rows of a fitted pass with `FIT_COLUMNS`, one per fit."""
+    """Rows of a fitted pass with the columns `FITS`, one per fit."""
     chosen, reported, c = fitted_pass.chosen, fitted_pass.reported, fitted_pass.correlated
     delay = {'delay_speed': c.speed, 'sd_delay_speed': c.speed_std,
              'delay_heading_deg': math.degrees(c.heading),
@@ -137,7 +121,7 @@ class FitFolder:
         except OSError as error:
             raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
         self._writer = csv.writer(self._stream)
-        self._writer.writerow(FIT_COLUMNS)
+        self._writer.writerow(_NAMES)
 
     def __enter__(self) -> 'FitFolder':
         return self
@@ -154,8 +138,7 @@ class FitFolder:
         for fit, row in zip(fitted_pass.fits, pass_rows(fitted_pass), strict=True):
             self.rows.append(row | {'notes': list(fitted_pass.notes),
                                     'bearing': _bearing(fit.bearing)})
-            self._writer.writerow([repr(v) if isinstance(v, float) else v
-                                   for v in (row[c] for c in FIT_COLUMNS)])
+            self._writer.writerow([row[name] for name in _NAMES])
         self._stream.flush()
 
 
