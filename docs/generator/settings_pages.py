@@ -41,7 +41,8 @@ the metadata of the files.
 """
 TRAFFIC = """# Tables of traffic
 
-Columns of the CSV and Parquet files that `mag-tracking traffic` writes ({doc}`/guides/traffic`).
+Columns of the CSV and Parquet files that `mag-tracking replay --tables passages` writes
+({doc}`/guides/traffic`).
 """
 
 
@@ -100,7 +101,7 @@ def archive_tables():
 
 
 def traffic_tables():
-    """Markdown: the columns of the tables of `mag-tracking traffic`."""
+    """Markdown: the columns of the table `passages` of `mag-tracking replay`."""
     lines = [TRAFFIC]
     for table, columns in tables_of(('<class>',), True).items():
         lines += [f'## {table}', '', *column_rows(columns), '']

@@ -1,4 +1,4 @@
-"""Command `mag-tracking board-geometry`."""
+"""Command `mag-tracking calibrate board`."""
 
 import argparse
 import datetime
@@ -44,8 +44,8 @@ quantity):
 {settings}
 
 examples:
-  mag-tracking board-geometry poses.csv --sensors positions.csv --moment 0.264 --out board.yaml
-  mag-tracking board-geometry poses.csv --network board.yaml --moment 0.264 --unknown-poses \\
+  mag-tracking calibrate board poses.csv --sensors positions.csv --moment 0.264 --out board.yaml
+  mag-tracking calibrate board poses.csv --network board.yaml --moment 0.264 --unknown-poses \\
       --low -0.05 -0.05 0.03 --high 0.2 0.22 0.3 --out calibrated.yaml --figure board.png
 '''
 
@@ -54,7 +54,7 @@ def add(commands: Commands) -> None:
     """Register the command."""
     settings = '\n'.join(f'  {p.name}: {p.value}  # {p.doc}{f" [{p.unit}]" if p.unit else ""}'
                          for p in flatten(GeometrySettings()))
-    p = add_command(commands, 'board-geometry', _geometry,
+    p = add_command(commands, 'calibrate board', _geometry,
                     _GEOMETRY_HELP.replace('{settings}', settings))
     p.add_argument('table', type=Path, metavar='TABLE', help='readings and poses (.csv)')
     geometry = p.add_mutually_exclusive_group(required=True)
@@ -82,7 +82,7 @@ def add(commands: Commands) -> None:
 
 
 def _geometry(args: argparse.Namespace) -> int:
-    """Run `mag-tracking board-geometry`."""
+    """Run `mag-tracking calibrate board`."""
     box = _checked_box(args)
     network = read_network(args.network) if args.sensors is None else board_of(args.sensors)
     settings = replace(GeometrySettings(), read_parameter_file(args.params) if args.params else {})
