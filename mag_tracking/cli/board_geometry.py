@@ -1,7 +1,6 @@
 """Command `mag-tracking calibrate board`."""
 
 import argparse
-import datetime
 import signal
 import sys
 import threading
@@ -20,8 +19,14 @@ from mag_tracking.apps.board_geometry import (
     survey_geometry,
 )
 from mag_tracking.arrays import FloatArray
-from mag_tracking.cli.options import Commands, add_command, add_network
-from mag_tracking.errors import OutputError, SettingsError
+from mag_tracking.cli.options import (
+    Commands,
+    add_command,
+    add_network,
+    check_writable,
+    utc_timestamp,
+)
+from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import read_network, write_network
 from mag_tracking.quantities import quantity
@@ -86,12 +91,11 @@ def _geometry(args: argparse.Namespace) -> int:
     box = _checked_box(args)
     network = read_network(args.network) if args.sensors is None else board_of(args.sensors)
     settings = replace(GeometrySettings(), read_parameter_file(args.params) if args.params else {})
-    date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
     unknowns = "magnet's poses and the geometry" if box else 'geometry'
     # Ctrl-C ends the estimation immediately: nothing has been written yet.
     with _elapsed_time(f'estimating the {unknowns} of {quantity(len(network), "sensor")}'):
-        survey = survey_geometry(args.table, network, args.moment, settings, date, box,
-                                 args.noise_std)
+        survey = survey_geometry(args.table, network, args.moment, settings, utc_timestamp(),
+                                 box, args.noise_std)
     _print(survey, box is not None)
     if not survey.geometry.converged:
         print(f'mag-tracking: calibration rejected: {survey.geometry.reason}; nothing was written',
@@ -133,8 +137,7 @@ def _checked_box(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[fl
         raise SettingsError(f'--high: expected values above {args.low} in x, y and z, got '
                             f'{args.high}')
     for path in (args.out, args.figure):
-        if path is not None and not path.absolute().parent.is_dir():
-            raise OutputError(f'cannot write {path}: the folder {path.parent} does not exist')
+        check_writable(path)
     return corners if args.unknown_poses else None
 
 

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from mag_tracking.analysis.correlated_motion import contradicts_delays
 from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, Bearing, PassFit
-from mag_tracking.apps.fit import check_cpa_range, check_orders, fit_source
+from mag_tracking.apps.fit import check_cpa_range, check_orders
 from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import (
@@ -36,7 +36,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.fit_folder import FitFolder
 from mag_tracking.recording.reader import Recording
-from mag_tracking.run import RecordingSource, RunReport
+from mag_tracking.run import RecordingSource, RunReport, run
 from mag_tracking.settings import read_parameter_file
 from mag_tracking.units import NS
 
@@ -81,7 +81,7 @@ def add(commands: Commands) -> None:
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
-    p.add_argument('--orders', nargs='+', type=int, default=list(ORDERS), metavar='N',
+    p.add_argument('--orders', nargs='+', type=int, default=ORDERS, metavar='N',
                    help='numbers of dipoles to try (default: 1 2 3 4)')
     p.add_argument('--cpa-range', nargs=2, type=float, metavar=('RANGE', 'STD'),
                    help='range at the closest point of approach and its standard deviation [m], '
@@ -103,22 +103,27 @@ class Fits:
 
     def __init__(self, args: argparse.Namespace, network: SensorNetwork,
                  stopped: Callable[[], bool], stack: ExitStack) -> None:
-        self._verbose, self._stopped = args.verbose, stopped
-        self._folder = stack.enter_context(FitFolder(args.out))
+        self._args, self._stopped = args, stopped
+        self.folder = stack.enter_context(FitFolder(args.out))
+        self.passes: list[FittedPass] = []
 
     def sink(self, name: str, pipeline: Pipeline) -> PassFitter:
         """Print the header of a recording and return its sink."""
         print(f'{name}:\n{HEADER}')
-        return PassFitter(name, pipeline, ORDERS, None, self._add, self._stopped)
+        return PassFitter(name, pipeline, self._args.orders, self._args.cpa_range, self._add,
+                          self._stopped)
 
     def _add(self, fitted_pass: FittedPass) -> None:
-        """Write and print a fitted pass."""
-        self._folder.add(fitted_pass)
-        print_pass(fitted_pass, self._verbose)
+        """Write and print a fitted pass; draw it for the command `fit`."""
+        self.folder.add(fitted_pass)
+        self.passes.append(fitted_pass)
+        _print_pass(fitted_pass, self._args.verbose)
+        if self._args.command == 'fit' and not self._args.no_figures:
+            _draw(fitted_pass, self._args.out)
 
     def finish(self, name: str, report: RunReport, out: Path | None) -> None:
         """Complete the content of `fits.json`, which is written at the end of all recordings."""
-        self._folder.summary = {'iron': None, 'interrupted': report.interrupted}
+        self.folder.summary = {'iron': None, 'interrupted': report.interrupted}
 
 
 def _fit(args: argparse.Namespace) -> int:
@@ -130,27 +135,24 @@ def _fit(args: argparse.Namespace) -> int:
     sources = [RecordingSource(Recording(path), network) for path in args.recordings]
     if any(source.recording.lies_in(args.out) for source in sources):
         raise OutputError(f'--out: {args.out} is the folder of a recording; choose another one')
-    passes: list[FittedPass] = []
     warnings: list[str] = []
-    with recorded_signals(signal.SIGINT) as signals, FitFolder(args.out) as folder:
-        for source in sources:
-            print(f'{source.stem}:\n{HEADER}')
-            with progress_bar(source) as bar:
-                def report(fitted_pass: FittedPass) -> None:
-                    folder.add(fitted_pass)
-                    passes.append(fitted_pass)
-                    print_pass(fitted_pass, args.verbose)
-                    if not args.no_figures:
-                        _draw(fitted_pass, args.out)
+    with recorded_signals(signal.SIGINT) as signals, ExitStack() as stack:
+        def stopped() -> bool:
+            return bool(signals)
 
-                run_report = fit_source(source, network, settings, args.orders, args.cpa_range,
-                                        report, bar.update, lambda: bool(signals))
-            print_diagnoses(run_report.diagnoses)
-            warnings += [f'{source.name}: {line}' for line in run_report.warnings()]
+        fits = Fits(args, network, stopped, stack)
+        for source in sources:
+            pipeline = Pipeline(network, settings, Fits.upto)
+            with progress_bar(source) as bar:
+                report = run(source, pipeline, [fits.sink(source.stem, pipeline)], bar.update,
+                             stopped)
+            print_diagnoses(report.diagnoses)
+            warnings += [f'{source.name}: {line}' for line in report.warnings()]
             if signals:
                 break
+        passes = fits.passes
         iron = _iron(passes, network) if args.same_vehicle else None
-        folder.summary = {'iron': iron, 'interrupted': bool(signals)}
+        fits.folder.summary = {'iron': iron, 'interrupted': bool(signals)}
     # Imported here because it loads matplotlib.
     from mag_tracking.apps.fit_report import write_report
 
@@ -173,7 +175,7 @@ def _check(args: argparse.Namespace, network: SensorNetwork) -> None:
                             'iron cannot be separated without it')
 
 
-def print_pass(fitted_pass: FittedPass, verbose: bool) -> None:
+def _print_pass(fitted_pass: FittedPass, verbose: bool) -> None:
     """Print the row of a fitted pass above the progress bar, warnings and, on request, details."""
     fit = fitted_pass.chosen
     with tqdm.external_write_mode():

@@ -45,11 +45,6 @@ def add_page(parser: argparse._ActionsContainer, port: bool = True) -> None:
                         f'the page (default: {LOOPBACK})')
 
 
-def _print_flushed(line: str) -> None:
-    """Print a line and flush stdout."""
-    print(line, flush=True)
-
-
 def show_recording(path: Path, network: SensorNetwork, settings: 'Settings', rate: float,
                    host: str, port: int) -> int:
     """Track a recording in real time on the live page until Ctrl-C; return the exit status."""
@@ -63,11 +58,11 @@ def show_recording(path: Path, network: SensorNetwork, settings: 'Settings', rat
     scene.subtitle = f'{quantity(len(network), "sensor")}, frame {network.frame}'
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals, \
             PageServer(scene, host, port) as server:
-        _print_flushed(f'live page: {server.url}')
+        print(f'live page: {server.url}')
         view(recording, network, settings, scene, rate,
              lambda: bool(signals) or not server.is_serving)
         if not signals:
-            _print_flushed('end of the recording; the page remains available until Ctrl-C')
+            print('end of the recording; the page remains available until Ctrl-C')
         while not signals and server.is_serving:
             time.sleep(0.1)
         return 0 if server.is_serving else 1
@@ -79,7 +74,7 @@ def watch(args: argparse.Namespace) -> int:
     from mag_tracking.nodes import page_node
 
     end_of_input = _end_of_input_event() if args.until_eof else None
-    return page_node.watch(args.host, args.port, _print_flushed, args.ros_arguments,
+    return page_node.watch(args.host, args.port, print, args.ros_arguments,
                            end_of_input.is_set if end_of_input is not None
                            else lambda: False)
 

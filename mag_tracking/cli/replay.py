@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 from tqdm import tqdm
@@ -16,7 +16,7 @@ from mag_tracking.apps.replay_notes import notes_of
 from mag_tracking.apps.replay_report import write_report
 from mag_tracking.apps.traffic import check_vehicles
 from mag_tracking.cli.events import Events
-from mag_tracking.cli.fit import Fits
+from mag_tracking.cli.fit import ORDERS, Fits
 from mag_tracking.cli.live_page import add_page, show_recording
 from mag_tracking.cli.options import (
     Commands,
@@ -42,7 +42,7 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.report.page import WARNING
 from mag_tracking.report.rerun_file import RERUN_FILE, check_rerun, write_rerun
 from mag_tracking.report.track_log import TrackLog
-from mag_tracking.run import RecordingSource, RunReport, Sink, run
+from mag_tracking.run import RecordingSource, Sink, run
 from mag_tracking.stages.track.doubts import MEANINGS
 
 _REPLAY_HELP = '''
@@ -95,23 +95,7 @@ settings. Example:
 '''
 
 
-class Table(Protocol):
-    """Table of one or more recordings, besides that of the poses."""
-
-    upto: str
-    """Last stage of the pipeline that the table needs."""
-
-    def __init__(self, args: argparse.Namespace, network: SensorNetwork,
-                 stopped: Callable[[], bool], stack: ExitStack) -> None:
-        """Check the options of the table."""
-
-    def sink(self, name: str, pipeline: Pipeline) -> Sink:
-        """Return the sink of a recording."""
-
-    def finish(self, name: str, report: RunReport, out: Path | None) -> None:
-        """Print and write the results of a recording with the folder `out`."""
-
-
+Table: TypeAlias = Passages | Events | Fits
 POSES = 'poses'
 TABLES: dict[str, type[Table]] = {'passages': Passages, 'events': Events, 'fits': Fits}
 """Tables of --tables besides `POSES`."""
@@ -160,6 +144,7 @@ def add(commands: Commands) -> None:
                       'live page instead of writing files; Ctrl-C ends the command')
     live.add_argument('--rate', type=float, default=1.0, help='playback speed (default: 1)')
     add_page(live)
+    p.set_defaults(orders=ORDERS, cpa_range=None)
 
 
 def _tables(text: str) -> list[str]:
@@ -222,12 +207,11 @@ def _check_folders(args: argparse.Namespace, sources: Iterable[RecordingSource],
     """Create the output folder; raises OutputError if it is the folder of a recording."""
     if args.out is None:
         return
-    shared = [args.out] if {'passages', 'fits'} & {*args.tables} else []
-    for source, own in zip(sources, folders, strict=True):
-        if any(folder is not None and source.recording.lies_in(folder)
-               for folder in (own, *shared)):
-            raise OutputError(f'--out: {args.out} is the folder of the recording; choose another '
-                              'output folder')
+    shared = {args.out} if {'passages', 'fits'} & {*args.tables} else set()
+    if any(source.recording.lies_in(folder) for source, own in zip(sources, folders, strict=True)
+           for folder in (own, *shared) if folder is not None):
+        raise OutputError(f'--out: {args.out} is the folder of the recording; choose another '
+                          'output folder')
     output_folder(args.out)
 
 

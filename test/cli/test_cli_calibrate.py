@@ -54,7 +54,7 @@ def test_calibrate_writes_a_network_that_replay_accepts(tmp_path, capsys):
     params = parameter_file(tmp_path / 'quick.yaml', QUICK)
     assert main(['replay', str(RECORDING), '--network', str(out), '--params', str(params), '--out',
                  str(tmp_path / 'run'), '--no-figures']) == 0
-    assert ': 1 track (' in capsys.readouterr().out
+    assert ' 1 track (' in capsys.readouterr().out
 
 
 def test_a_repeated_calibration_adds_no_information(tmp_path):
@@ -91,7 +91,7 @@ def test_replay_warns_of_a_large_orientation_uncertainty(tmp_path, capsys, std):
                  '--no-figures']) == 0
     output = capsys.readouterr().out
     assert ('1 sensor has an orientation uncertainty of more than 15 degrees' in output
-            and ': 1 track (' in output)
+            and ' 1 track (' in output)
     angles = json.loads((tmp_path / 'run' / 'summary.json').read_text())['tracks'][0]['mounting']
     # Tracking limits the uncertainty to 15 degrees.
     assert 5.0 < max(angles['mag_1']['std_deg']) <= 15.0
