@@ -304,6 +304,6 @@ def no_track_reason(counts: Mapping[str, int]) -> str | None:
     """Explain, from the counts of the tracker, why a single sensor tracked nothing, else None."""
     if counts.get(NO_SCALE, 0) or counts.get(NO_SCALE_FRAMES, 0) and not counts.get('tracks', 0):
         return ('no track: the scale is not observable with a single sensor. Use `mag-tracking '
-                'events` to describe the passes without scale, or set track.single_sensor_prior: '
-                'true if the vehicles match the settings')
+                'replay --tables events` to describe the passes without scale, or set '
+                'track.single_sensor_prior: true if the vehicles match the settings')
     return None

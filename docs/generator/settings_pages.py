@@ -49,7 +49,8 @@ as a whole has only its trusted quantities. Standard deviations of fits include 
 """
 TRAFFIC = """# Tables of traffic
 
-Columns of the CSV and Parquet files that `mag-tracking traffic` writes ({doc}`/guides/traffic`).
+Columns of the CSV and Parquet files that `mag-tracking replay --tables passages` writes
+({doc}`/guides/traffic`).
 """
 
 

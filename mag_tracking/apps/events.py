@@ -1,7 +1,7 @@
 """Description of the passes at each sensor of a network, without tracking."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
@@ -14,7 +14,6 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.record_receiver import RecordReceiver, Step
-from mag_tracking.recording.interruptible import Progress
 from mag_tracking.records import Readings
 from mag_tracking.run import RunReport, Source, run
 from mag_tracking.stages.calibrate.stage import Calibrate
@@ -73,36 +72,37 @@ def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLi
     return find_events(source_of(recording, network), network, settings_for('vehicle', settings))
 
 
-def find_events(source: Source, network: SensorNetwork, settings: Settings,
-                progress: Progress | None = None,
-                stopped: Callable[[], bool] | None = None) -> EventsResult:
+def find_events(source: Source, network: SensorNetwork, settings: Settings) -> EventsResult:
     """Describe the passes in a source."""
     pipeline = Pipeline(network, settings, 'calibrate')
-    sink = _EventSink(pipeline)
-    report = run(source, pipeline, [sink], progress, stopped)
-    return EventsResult(tuple(_with_timestamp_error(event, pipeline.calibrate)
-                              for event in sink.events), report)
+    sink = EventSink(pipeline)
+    return sink.result(run(source, pipeline, [sink]))
 
 
-class _EventSink(RecordReceiver):
+class EventSink(RecordReceiver):
     """Collects the events in calibrated readings."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         settings = pipeline.settings
         self._calibrate = pipeline.calibrate
         self._stage = Events(pipeline.network, settings.align, settings.detect, settings.track)
-        self.events: list[PassEvent] = []
+        self._events: list[PassEvent] = []
 
     def add(self, step: Step) -> None:
         """Find the events in the calibrated readings of a step."""
         self.receive(step.records)
         if step.is_last:
-            self.events += self._stage.flush()
+            self._events += self._stage.flush()
 
     def add_calibrated(self, readings: Readings) -> None:
         """Find the events in calibrated readings."""
         self._stage.set_relearnt(self._calibrate.backgrounds())
-        self.events += self._stage.feed(readings)
+        self._events += self._stage.feed(readings)
+
+    def result(self, report: RunReport) -> EventsResult:
+        """Return the events after a run."""
+        return EventsResult(tuple(_with_timestamp_error(event, self._calibrate)
+                                  for event in self._events), report)
 
 
 def _with_timestamp_error(event: PassEvent, calibrate: Calibrate) -> PassEvent:

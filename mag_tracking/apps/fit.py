@@ -1,6 +1,6 @@
 """Offline fits of the passes in a recording."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from typing import TYPE_CHECKING, Any
@@ -11,26 +11,15 @@ from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
 from mag_tracking.apps.readings import network_of, source_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, Settings, settings_for
+from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.interruptible import Progress
 from mag_tracking.results.columns import FITS, names_of
 from mag_tracking.results.dataframes import dataframe
 from mag_tracking.results.fit_folder import pass_rows
-from mag_tracking.run import RunReport, Source, run
+from mag_tracking.run import RunReport, run
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-def fit_source(source: Source, network: SensorNetwork, settings: Settings, orders: Sequence[int],
-               cpa_range: tuple[float, float] | None, report: Callable[[FittedPass], object],
-               progress: Progress | None = None, stopped: Callable[[], bool] | None = None
-               ) -> RunReport:
-    """Fit every pass in a source, and pass each result to `report`."""
-    pipeline = Pipeline(network, settings, 'track')
-    fitter = PassFitter(source.stem, pipeline, orders, cpa_range, report, stopped)
-    return run(source, pipeline, [fitter], progress, stopped)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +92,10 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
     check_orders('orders', orders)
     check_cpa_range('cpa_range', cpa_range, network)
     passes: list[FittedPass] = []
-    report = fit_source(source_of(recording, network), network, settings_for('vehicle', settings),
-                        orders, cpa_range, passes.append)
+    source = source_of(recording, network)
+    pipeline = Pipeline(network, settings_for('vehicle', settings), 'track')
+    fitter = PassFitter(source.stem, pipeline, orders, cpa_range, passes.append)
+    report = run(source, pipeline, [fitter])
     return FitResult(tuple(passes), report)
 
 

@@ -1,6 +1,6 @@
 """Offline replay of a recording through all stages, with tables, a summary and figures."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -33,7 +33,7 @@ from mag_tracking.report.metrics import (
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.results.result_folder import ResultFolder, figure_name
 from mag_tracking.results.tum_file import write_tum
-from mag_tracking.run import RecordingSource, RunReport, Source, run
+from mag_tracking.run import RecordingSource, RunReport, Sink, Source, run
 from mag_tracking.stages.align.frame_period import frame_period_warning
 from mag_tracking.stages.track.plausibility import lane_note
 from mag_tracking.stages.track.settings import acceleration_density
@@ -60,6 +60,8 @@ class Run:
 
     summary: dict[str, Any]
     """Content of `summary.json`."""
+    report: RunReport
+    """What was lost, rejected or missing, and why."""
     logs: dict[int, TrackLog] = field(default_factory=dict)
     """{track id: history of the track}."""
     smoothed: dict[int, SmoothedLog] = field(default_factory=dict)
@@ -71,7 +73,8 @@ class Run:
 def replay(recording: Recording, network: SensorNetwork, settings: Settings,
            out: str | PathLike[str], progress: Callable[[int], object] | None = None,
            stopped: Callable[[], bool] | None = None,
-           report: Callable[[str], object] | None = None, truth: str | None = None) -> Run:
+           report: Callable[[str], object] | None = None, truth: str | None = None,
+           more_sinks: Callable[[Pipeline], Sequence[Sink]] = lambda pipeline: ()) -> Run:
     """Track the targets in a recording and write the results to the folder `out`.
 
     Raises RecordingError if the recording has none of the network's topics or the ground truth
@@ -85,6 +88,7 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     report : called with a message if the results of an earlier run are replaced
     truth : a CSV file (`recording.truth`), or a topic with messages of type PoseStamped,
         PoseWithCovarianceStamped or Odometry; by default all topics below /ground_truth
+    more_sinks : called with the pipeline; returns more sinks of the run
     """
     if recording.lies_in(out):
         raise OutputError(f'{out} is the folder of the recording; choose another output folder')
@@ -97,11 +101,12 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     with ResultFolder(out, network) as results:
         if results.replaces_earlier and report is not None:
             report(f'replacing the results of an earlier run in {out}')
-        run_report = run(source, pipeline, [results, history], progress, stopped)
+        run_report = run(source, pipeline, [results, history, *more_sinks(pipeline)],
+                         progress, stopped)
         truth_arrays = source.reader.truth_arrays() if table is None else table
         summary = summarise(source, pipeline, history, truth_arrays, run_report)
         results.write_summary(summary)
-    return Run(summary, history.logs, history.smoothed, truth_arrays)
+    return Run(summary, run_report, history.logs, history.smoothed, truth_arrays)
 
 
 class TrackHistory(RecordReceiver):

@@ -1,7 +1,7 @@
 """Traffic in a recording: passages of vehicles across counting lines, and summaries."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -21,7 +21,6 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.record_receiver import RecordReceiver
-from mag_tracking.recording.interruptible import Progress
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.run import RunReport, Source, run
 from mag_tracking.units import NS
@@ -96,29 +95,35 @@ def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathL
     return count_traffic(source_of(recording, network), network, settings_for('vehicle', settings))
 
 
-def count_traffic(source: Source, network: SensorNetwork, settings: Settings,
-                  progress: Progress | None = None,
-                  stopped: Callable[[], bool] | None = None) -> TrafficResult:
+def count_traffic(source: Source, network: SensorNetwork, settings: Settings) -> TrafficResult:
     """Count the vehicles in a source; raises SettingsError if the target is not a vehicle."""
+    pipeline = Pipeline(network, settings)
+    sink = TrafficSink(pipeline)
+    return sink.result(run(source, pipeline, [sink]))
+
+
+def check_vehicles(settings: Settings) -> None:
+    """Raise SettingsError if the target is not a vehicle."""
     if settings.track.target != 'vehicle':
-        raise SettingsError('traffic counts only vehicles; set the target to vehicle instead of '
-                            f'{settings.track.target}')
-    sink = _TrafficSink(network)
-    report = run(source, Pipeline(network, settings), [sink], progress, stopped)
-    return TrafficResult(tuple(c.name for c in settings.traffic.classes), tuple(sink.vehicles),
-                         tuple(sink.summaries), report)
+        raise SettingsError('only vehicles are counted and fitted; set the target to vehicle '
+                            f'instead of {settings.track.target}')
 
 
-class _TrafficSink(RecordReceiver):
-    """Collects passages and summaries; stores the frames of tracks to compute the delays."""
+class TrafficSink(RecordReceiver):
+    """Collects passages and summaries; stores the frames of tracks to compute the delays.
 
-    def __init__(self, network: SensorNetwork) -> None:
-        self._network = network
+    Raises SettingsError if the target is not a vehicle.
+    """
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        check_vehicles(pipeline.settings)
+        self._network = pipeline.network
+        self._class_names = tuple(c.name for c in pipeline.settings.traffic.classes)
         self._frame: FieldFrame | None = None
         self._tracks_before_jump: set[int] = set()
         self._frames: dict[int, list[FieldFrame]] = {}
-        self.vehicles: list[CountedVehicle] = []
-        self.summaries: list[TrafficSummary] = []
+        self._vehicles: list[CountedVehicle] = []
+        self._summaries: list[TrafficSummary] = []
 
     def add_frame(self, frame: FieldFrame) -> None:
         """Store the frame of the following poses."""
@@ -133,11 +138,16 @@ class _TrafficSink(RecordReceiver):
 
     def add_passage(self, passage: VehiclePassage) -> None:
         """Add a passage with the velocity from the delays."""
-        self.vehicles.append(CountedVehicle(passage, self._delay_motion(passage.track_id)))
+        self._vehicles.append(CountedVehicle(passage, self._delay_motion(passage.track_id)))
 
     def add_traffic(self, summary: TrafficSummary) -> None:
         """Add a summary."""
-        self.summaries.append(summary)
+        self._summaries.append(summary)
+
+    def result(self, report: RunReport) -> TrafficResult:
+        """Return the counted vehicles after a run."""
+        return TrafficResult(self._class_names, tuple(self._vehicles), tuple(self._summaries),
+                             report)
 
     def _drop_old(self, now_ns: int) -> None:
         """Drop frames of tracks that ended before a time jump, or more than `RETENTION_S` ago."""

@@ -29,7 +29,7 @@ def view(recording: Recording, network: SensorNetwork, settings: Settings, scene
          rate: float, stopped: Callable[[], bool]) -> None:
     """Track a recording in real time (`rate` 1) until it ends or `stopped()` returns true."""
     source, pipeline = _PacedSource(recording, network, rate, stopped), Pipeline(network, settings)
-    run(source, pipeline, [_SceneSink(scene, pipeline, source)], stopped=stopped)
+    run(source, pipeline, [_SceneSink(scene, pipeline, source, stopped)], stopped=stopped)
 
 
 class _PacedSource(RecordingSource):
@@ -72,8 +72,10 @@ def _joined(messages: Iterable[tuple[Readings, int]]) -> Iterator[tuple[Readings
 class _SceneSink(RecordReceiver):
     """Adds frames, poses, tracks smoothed over their whole length, and the health to a scene."""
 
-    def __init__(self, scene: LiveScene, pipeline: Pipeline, source: Source) -> None:
+    def __init__(self, scene: LiveScene, pipeline: Pipeline, source: Source,
+                 stopped: Callable[[], bool]) -> None:
         self._scene, self._pipeline, self._source = scene, pipeline, source
+        self._stopped = stopped
         self._health_due, self._smoothed = 0.0, dict[int, list[FloatArray]]()
 
     def add(self, step: Step) -> None:
@@ -83,7 +85,7 @@ class _SceneSink(RecordReceiver):
         for track_id, points in self._smoothed.items():
             self._scene.add_smoothed(track_id, np.array(points))
         if step.is_last:
-            self._update_health([Note(NOTE, 'end of the recording')])
+            self._update_health([] if self._stopped() else [Note(NOTE, 'end of the recording')])
         elif time.monotonic() >= self._health_due:
             self._health_due = time.monotonic() + HEALTH_INTERVAL_S
             self._update_health([])

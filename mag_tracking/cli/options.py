@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 # Quoted because the class is not generic at run time.
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
-"""Subparsers of the main parser, to which each command is added."""
+"""Subparsers of the main parser or of a command, to which each command is added."""
 
 FIGURE_SUFFIXES = ('.png', '.pdf', '.svg')
 """File name extensions accepted for figures."""
@@ -30,13 +30,13 @@ FIGURE_SUFFIXES = ('.png', '.pdf', '.svg')
 
 def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace], int],
                 text: str = '') -> argparse.ArgumentParser:
-    """Add the parser of a command; `name` is a key in `COMMANDS`.
+    """Add the parser of a command or subcommand; `name` is a key in `COMMANDS`.
 
     `run` takes the parsed arguments and returns the exit status. `text`, with the description and
     examples, is printed after the options.
     """
-    _, summary, aliases = COMMANDS[name]
-    parser = commands.add_parser(name, aliases=aliases, help=summary, description=summary,
+    summary = COMMANDS[name].summary
+    parser = commands.add_parser(name.rpartition(' ')[2], help=summary, description=summary,
                                  epilog=text,
                                  formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.set_defaults(run_command=run, ros_arguments=[])
@@ -87,6 +87,12 @@ def add_report(parser: argparse.ArgumentParser) -> None:
     """Add --report."""
     parser.add_argument('--report', type=Path, metavar='FILE.html',
                         help='write an HTML report to FILE.html')
+
+
+def add_verbose(parser: argparse.ArgumentParser) -> None:
+    """Add --verbose."""
+    parser.add_argument('-v', '--verbose', action='store_true',
+                        help='print the details of each vehicle')
 
 
 def check_writable(path: Path | None) -> None:

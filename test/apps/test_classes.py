@@ -155,7 +155,8 @@ def test_units_are_converted_or_refused(tables, tmp_path, capsys):
 def test_signatures_of_events_can_be_classified(tmp_path, capsys):
     """Signatures of events have no values before the first and after the last reading."""
     recording, network = str(ROAD / 'two_way_road.mcap'), str(NETWORK_FILE)
-    assert main(['events', recording, '--network', network, '--out', str(tmp_path)]) == 0
+    assert main(['replay', recording, '--network', network, '--tables', 'events',
+                 '--out', str(tmp_path)]) == 0
     found = labelled_signatures(tmp_path / 'signatures.csv', is_labelled=False)
     usable = examples_of(found)
     assert len(usable.labels) > 0.9 * len(found) and usable.unit == 'T'

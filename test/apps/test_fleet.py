@@ -29,7 +29,7 @@ def recordings(tmp_path_factory):
 
 
 def command(*arguments):
-    return main(['traffic', *arguments, '--network', str(NETWORK_FILE)])
+    return main(['replay', *arguments, '--network', str(NETWORK_FILE), '--tables', 'passages'])
 
 
 def vehicles_of(folder):
@@ -79,6 +79,7 @@ def test_enrolment_requires_an_earth_field(tmp_path, capsys):
     network = tmp_path / 'network.yaml'
     network.write_text('sensors:\n  mag_1: {position: [0, -4.5, 0]}\n'
                        '  mag_2: {position: [0, 4.5, 0]}\n')
-    assert main(['traffic', str(vehicle_path('straight_car_right')), '--network', str(network),
-                 '--fleet', str(tmp_path / 'f.json'), '--enrol', 'car']) == 1
+    assert main(['replay', str(vehicle_path('straight_car_right')), '--network', str(network),
+                 '--tables', 'passages', '--fleet', str(tmp_path / 'f.json'), '--enrol',
+                 'car']) == 1
     assert 'add earth_field' in capsys.readouterr().err

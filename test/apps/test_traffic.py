@@ -1,4 +1,4 @@
-"""`mag-tracking traffic`: counts, directions, speeds, classes and tables, against the truth."""
+"""`replay --tables passages`: counts, directions, speeds, classes and tables against the truth."""
 
 import csv
 import dataclasses
@@ -22,6 +22,7 @@ from support.counters import count_of
 from support.samples import field_dict
 
 ROAD = DATA / 'two_way_road'
+OPTIONS = ['--network', str(NETWORK_FILE), '--tables', 'passages']
 
 
 @cache
@@ -75,8 +76,8 @@ def test_speeds_of_track_and_delay_agree_along_a_road():
 
 
 def test_tables_contain_every_vehicle_and_interval(tmp_path, capsys):
-    arguments = ['traffic', str(vehicle_path('straight_car_right')),
-                 str(vehicle_path('straight_truck_right')), '--network', str(NETWORK_FILE)]
+    arguments = ['replay', str(vehicle_path('straight_car_right')),
+                 str(vehicle_path('straight_truck_right')), *OPTIONS]
     assert main([*arguments, '--out', str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert len(re.findall(r': 1 vehicle\n', printed)) == 2 and 'truck (' in printed
@@ -103,11 +104,11 @@ def test_invalid_input_is_reported(tmp_path, capsys):
     recording = vehicle_path('straight_car_right')
     with pytest.raises(SettingsError, match='track.target'):
         mt.traffic(recording, NETWORK_FILE, {'track.target': 'magnet'})
-    arguments = ['traffic', str(recording), '--network', str(NETWORK_FILE)]
+    arguments = ['replay', str(recording), *OPTIONS]
     assert main([*arguments, '--target', 'magnet']) == 1
     assert 'only vehicles' in capsys.readouterr().err
-    assert main(['traffic', str(tmp_path / 'none.mcap'), '--network', str(NETWORK_FILE)]) == 1
-    assert main(['traffic', str(recording), *arguments[1:]]) == 1
+    assert main(['replay', str(tmp_path / 'none.mcap'), *OPTIONS]) == 1
+    assert main(['replay', str(recording), *arguments[1:]]) == 1
     assert 'several recordings' in capsys.readouterr().err
 
 
@@ -117,7 +118,8 @@ def test_tables_without_rows_have_their_columns(tmp_path, capsys):
     one_sensor = tmp_path / 'one_sensor.yaml'
     one_sensor.write_text('sensors:\n  mag_1: {position: [0, -4.5, 0]}\n')
     for network, n in ((str(NETWORK_FILE), 1), (str(one_sensor), 0)):
-        assert main(['traffic', recording, '--network', network, '--out', str(tmp_path)]) == 0
+        assert main(['replay', recording, '--network', network, '--tables', 'passages',
+                     '--out', str(tmp_path)]) == 0
         printed = capsys.readouterr().out
         assert re.search(rf': {n} vehicles?\n', printed)
         assert ('single sensor' in printed) == (n == 0)
@@ -138,12 +140,11 @@ def test_invalid_input_is_reported_before_the_run(tmp_path, capsys):
     other = tmp_path / 'other.mcap'
     with RecordingWriter(other) as writer:
         writer.write('/elsewhere', MAGNETIC_FIELD, field_dict(0, 'mag_9', np.ones(3)), 0)
-    assert main(['traffic', valid_recording, str(other), '--network', str(NETWORK_FILE)]) == 1
+    assert main(['replay', valid_recording, str(other), *OPTIONS]) == 1
     out, errors = capsys.readouterr()
     assert '1 vehicle' not in out and 'mag-tracking: ' in errors
     (tmp_path / 'file').write_text('')
-    assert main(['traffic', valid_recording, '--network', str(NETWORK_FILE), '--out',
-                 str(tmp_path / 'file')]) == 1
+    assert main(['replay', valid_recording, *OPTIONS, '--out', str(tmp_path / 'file')]) == 1
     out, errors = capsys.readouterr()
     assert '1 vehicle' not in out and 'mag-tracking: ' in errors
 

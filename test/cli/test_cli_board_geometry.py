@@ -1,4 +1,4 @@
-"""The command `mag-tracking board-geometry`."""
+"""The command `mag-tracking calibrate board`."""
 
 import signal
 import subprocess
@@ -26,7 +26,7 @@ def calibrated(tmp_path_factory):
     write_network(folder / 'nominal.yaml', nominal)
     table = write_table(folder / 'poses.csv', field[::2], positions[::2], axes[::2])
     run = subprocess.run(
-        [sys.executable, '-m', 'mag_tracking.cli', 'board-geometry', table, '--network',
+        [sys.executable, '-m', 'mag_tracking.cli', 'calibrate', 'board', table, '--network',
          folder / 'nominal.yaml', '--moment', str(MOMENT), '--out', folder / 'board.yaml',
          '--figure', folder / 'board.png'], capture_output=True, text=True, check=True)
     return read_network(folder / 'board.yaml'), run.stdout, folder
@@ -220,7 +220,7 @@ def test_unknown_poses_are_estimated(tmp_path, capsys):
 
 def test_ctrl_c_ends_the_command_without_files(tmp_path):
     process = subprocess.Popen(
-        [sys.executable, '-m', 'mag_tracking.cli', 'board-geometry', FOLDER / 'poses.csv',
+        [sys.executable, '-m', 'mag_tracking.cli', 'calibrate', 'board', FOLDER / 'poses.csv',
          '--sensors',
          POSITIONS_FILE, '--moment', str(MOMENT), '--unknown-poses', '--low', *map(str, BOX[0]),
          '--high', *map(str, BOX[1]), '--out', tmp_path / 'out.yaml'],

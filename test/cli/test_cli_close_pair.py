@@ -36,7 +36,7 @@ def pair(tmp_path_factory):
 def test_fit_reports_speed_and_direction_by_two_methods(pair, tmp_path, capsys):
     recording, network, velocity = pair
     assert main(['fit', recording, '--network', network, '--out', str(tmp_path), '--no-figures',
-                 '--orders', '2', '3']) == 0
+                 '--orders', '2', '3', '-v']) == 0
     output = capsys.readouterr().out
     assert 'delay between' in output and 'contradict' not in output
     with open(tmp_path / 'fits.csv', encoding='utf-8') as stream:
@@ -55,7 +55,7 @@ def test_replay_reports_the_delay_of_the_track(pair, tmp_path, capsys):
     recording, network, velocity = pair
     params = parameter_file(tmp_path / 'params.yaml', QUICK)
     assert main(['replay', recording, '--network', network, '--params', str(params), '--out',
-                 str(tmp_path), '--no-figures']) == 0
+                 str(tmp_path), '--no-figures', '-v']) == 0
     assert 'delay between' in capsys.readouterr().out
     summary = json.loads((tmp_path / 'summary.json').read_text())
     assert summary['frames_too_long'] is None

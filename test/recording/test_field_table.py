@@ -350,11 +350,11 @@ def test_a_table_without_times_is_tumbled(tmp_path, capsys):
     table, network = tmp_path / 'hand.csv', tmp_path / 'network.yaml'
     table.write_text(text([[f'{b:.3f}' for b in row] for row in B], ['Mag X', 'Mag Y', 'Mag Z']))
     network.write_text('sensors: {mag_7: {position: [0, 0, 0]}}\n')
-    assert main(['tumble', str(table), '--unit', 'uT', '--network', str(network), '--out',
-                 str(tmp_path / 'tumbled.yaml')]) == 0
+    assert main(['calibrate', 'tumble', str(table), '--unit', 'uT', '--network', str(network),
+                 '--out', str(tmp_path / 'tumbled.yaml')]) == 0
     offset = re.search(r'mag_7: .*offset (\S+) \S+ (\S+) \S+ (\S+)', capsys.readouterr().out)
     assert [float(v) for v in offset.groups()] == pytest.approx([3.0, -5.0, 2.0], abs=0.01)
     network.write_text('sensors: {a: {position: [0, 0, 0]}, b: {position: [1, 0, 0]}}\n')
-    assert main(['tumble', str(table), '--unit', 'uT', '--network', str(network), '--out',
-                 str(tmp_path / 'tumbled.yaml')]) == 1
+    assert main(['calibrate', 'tumble', str(table), '--unit', 'uT', '--network', str(network),
+                 '--out', str(tmp_path / 'tumbled.yaml')]) == 1
     assert 'mag_1' in capsys.readouterr().err

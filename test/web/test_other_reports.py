@@ -81,7 +81,7 @@ def test_a_plan_report_shows_its_maps(chromium, tmp_path, capsys):
 
 def test_a_calibration_report_shows_each_sensor(chromium, tmp_path):
     path = tmp_path / 'found.html'
-    assert run('calibrate', RECORDINGS[0], '--out', tmp_path / 'network.yaml',
+    assert run('calibrate', 'network', RECORDINGS[0], '--out', tmp_path / 'network.yaml',
                '--report', path) == 0
     page = open_page(chromium, path)
     cells = page.value('[...document.querySelectorAll("tbody tr")].map(r => r.cells[0].innerText)')

@@ -83,7 +83,7 @@ def rate_findings(name: str, rate: float, network: SensorNetwork,
     fault = low_rate_fault(rate, network, settings)
     if fault is not None:
         yield Finding(True, name, fault, 'raise the rate of the sensor; for parked vehicles, use '
-                      'mag-tracking events', Cause.RATE_TOO_LOW)
+                      'mag-tracking replay --tables events', Cause.RATE_TOO_LOW)
 
 
 def source_findings(name: str, lost: Mapping[str, int],

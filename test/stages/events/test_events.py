@@ -276,9 +276,10 @@ def test_the_event_of_a_target_that_stays_has_not_ended():
     assert len(events) == 2 and not any(e.ended for e in events)
 
 
-def test_the_events_command_prints_counts_and_writes_tables(tmp_path, capsys):
-    assert main(['events', str(vehicle_path('straight_car_right')), '--network', str(NETWORK_FILE),
-                 '--out', str(tmp_path / 'out')]) == 0
+def test_replay_prints_counts_and_writes_tables(tmp_path, capsys):
+    command = ['replay', str(vehicle_path('straight_car_right')), '--network', str(NETWORK_FILE),
+               '--tables', 'events', '--out']
+    assert main([*command, str(tmp_path / 'out')]) == 0
     out = capsys.readouterr().out
     assert 'mag_1: 1 event, mag_2: 1 event' in out and 'right (98%)' in out
     assert ' m/s' not in out and 'unique' not in out
@@ -287,8 +288,8 @@ def test_the_events_command_prints_counts_and_writes_tables(tmp_path, capsys):
     assert tuple(rows[0]) == names_of(EVENTS) and {r['sensor'] for r in rows} == {'mag_1', 'mag_2'}
     with open(tmp_path / 'out' / 'signatures.csv', newline='') as stream:
         assert len(list(csv.DictReader(stream))) == 66
-    assert main(['events', str(vehicle_path('straight_car_right')), '--network', str(NETWORK_FILE),
-                 '--out', str(vehicle_path('straight_car_right').parent)]) == 1
+    assert {p.name for p in (tmp_path / 'out').iterdir()} == {'events.csv', 'signatures.csv'}
+    assert main([*command, str(vehicle_path('straight_car_right').parent)]) == 1
 
 
 def test_events_from_python_match_the_command():
