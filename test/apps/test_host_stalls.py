@@ -21,7 +21,8 @@ def diagnoses(received, sensors=2, seconds=30.0, rate=100.0, n_kept=None):
     `n_kept` is the number of messages that a queue holds while the computer does not read it.
     """
     network = line_network(sensors)
-    doctor, rng = Doctor(Pipeline(network, settings_for('vehicle'), 'calibrate')), np.random.default_rng(0)
+    doctor = Doctor(Pipeline(network, settings_for('vehicle'), 'calibrate'))
+    rng = np.random.default_rng(0)
     messages = []
     for j, name in enumerate(network.names):
         t = np.arange(int(seconds * rate)) / rate + 0.0031 * j

@@ -22,8 +22,9 @@ CONFIGURED = dataclasses.replace(NETWORK, noise_std=(np.full(3, 1e-8),) * 2, bac
 
 def reason_of(*faults, network=NETWORK, readings=None, **settings):
     readings = recorded('straight_small_left').readings if readings is None else readings
-    return mt.track(spoiler.apply(readings, *faults), network, settings={
-        name.replace('__', '.'): value for name, value in settings.items()}).report.no_detection_reason
+    changes = {name.replace('__', '.'): value for name, value in settings.items()}
+    result = mt.track(spoiler.apply(readings, *faults), network, settings=changes)
+    return result.report.no_detection_reason
 
 
 def test_no_reason_is_given_after_a_detection():

@@ -80,7 +80,8 @@ def test_an_interrupt_does_not_wait_for_the_next_batch(tmp_path, monkeypatch):
     assert not waited and summary_of(tmp_path)['interrupted'] is True
 
 
-@pytest.mark.parametrize('step', ['summarise', 'add_track', 'errors_against_truth', 'write_figures'])
+@pytest.mark.parametrize(
+    'step', ['summarise', 'add_track', 'errors_against_truth', 'write_figures'])
 def test_an_interrupt_while_writing_loses_no_results(tmp_path, monkeypatch, capsys, step):
     """SIGINT arrives during the first and second call of a step that updates or writes results."""
     from mag_tracking.apps import replay as app

@@ -67,7 +67,8 @@ def write_ros1_bag(source, path):
 def assert_equal_results(result, expected):
     for table in ('poses', 'smoothed', 'detections'):
         np.testing.assert_array_equal(getattr(result, table), getattr(expected, table), table)
-    assert result.errors() == expected.errors() and result.report.rejected == expected.report.rejected
+    assert result.errors() == expected.errors()
+    assert result.report.rejected == expected.report.rejected
 
 
 @pytest.mark.parametrize('kind', ['folder', 'db3', 'bag'])

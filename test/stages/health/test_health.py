@@ -242,7 +242,8 @@ def test_the_doctor_compares_sensors_with_the_earth_field():
 def test_a_background_in_the_file_does_not_hide_a_flipped_axis():
     network = line_network(3)
     backgrounds = tuple(network.R_sw[j] @ network.earth_field for j in range(3))
-    doctor = Doctor(Pipeline(replace(network, background=backgrounds), settings_for('vehicle'), 'calibrate'))
+    doctor = Doctor(Pipeline(replace(network, background=backgrounds), settings_for('vehicle'),
+                             'calibrate'))
     rng = np.random.default_rng(6)
     for k in range(600):
         for j, name in enumerate(network.names):
@@ -299,8 +300,8 @@ def test_the_doctor_reports_frozen_relearnt_and_missing_backgrounds():
 
 @pytest.mark.parametrize('name', VEHICLES)
 def test_the_doctor_finds_no_faults_in_the_bundled_recordings(name, road_network):
-    doctor, lost = examine(RecordingSource(Recording(vehicle_path(name)), road_network, by_message=True),
-                           road_network, settings_for('vehicle'))
+    source = RecordingSource(Recording(vehicle_path(name)), road_network, by_message=True)
+    doctor, lost = examine(source, road_network, settings_for('vehicle'))
     findings = [str(d) for d in ranked(doctor.findings())]
     assert not lost and not findings
 
