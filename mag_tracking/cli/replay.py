@@ -149,7 +149,7 @@ def add(commands: Commands) -> None:
 
 def _tables(text: str) -> list[str]:
     """Parse --tables."""
-    names = text.split(',')
+    names = list(dict.fromkeys(text.split(',')))
     if not {*names} <= {POSES, *TABLES}:
         raise argparse.ArgumentTypeError(f'expected names from {", ".join((POSES, *TABLES))}, '
                                          f'separated by commas; got {text!r}')
