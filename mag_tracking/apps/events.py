@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.apps.readings import network_of, source_of
+from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.event_records import PassEvent
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, settings_for
@@ -44,16 +44,24 @@ class EventsResult:
         return f'EventsResult({quantity(len(self.events), "event")}: {counts or "none"})'
 
 
-def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[str],
-           settings: Mapping[str, Any] | None = None) -> EventsResult:
+def events(source: UserSource, network: SensorNetwork | str | PathLike[str],
+           settings: Mapping[str, Any] | None = None,
+           time_unit: str | None = None) -> EventsResult:
     """Describe the passes that each sensor of a network detects.
 
     Parameters
     ----------
-    recording : path
+    source : path, Readings, RecordedReadings, DataFrame or mapping
+        A recording is read in batches and need not fit into memory. A DataFrame, in tesla, has one
+        row per reading (columns `sensor`, x, y, z) or per time (columns such as `mag_1_x`), and the
+        times in a column `time` or `stamp_ns` or in the index. A mapping is {sensor: (times (n,),
+        fields (n, 3), T)}.
     network : SensorNetwork or path of a network file
     settings : {name: value}, optional
         Settings that differ from the defaults for a vehicle.
+    time_unit : 's', 'ms', 'us' or 'ns', optional
+        Unit of the times of a DataFrame or mapping; required for floats. The default for integers
+        is 'ns'.
 
     Returns
     -------
@@ -61,6 +69,8 @@ def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLi
 
     Raises
     ------
+    ReadingsError
+        If a table or arrays are incomplete, not in order, or of a wrong type.
     RecordingError
         If the recording cannot be read, or has none of the network's topics.
     NetworkError
@@ -69,7 +79,8 @@ def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLi
         If a setting is invalid.
     """
     network = network_of(network)
-    return find_events(source_of(recording, network), network, settings_for('vehicle', settings))
+    return find_events(source_of(source, network, time_unit), network,
+                       settings_for('vehicle', settings))
 
 
 def find_events(source: Source, network: SensorNetwork, settings: Settings) -> EventsResult:

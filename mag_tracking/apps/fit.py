@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
-from mag_tracking.apps.readings import network_of, source_of
+from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, settings_for
@@ -55,17 +55,20 @@ class FitResult:
                                     for row in rows] for c in names_of(FITS)})
 
 
-def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[str],
+def fit(source: UserSource, network: SensorNetwork | str | PathLike[str],
         settings: Mapping[str, Any] | None = None, orders: Sequence[int] = (1, 2, 3, 4),
-        cpa_range: tuple[float, float] | None = None) -> FitResult:
+        cpa_range: tuple[float, float] | None = None, time_unit: str | None = None) -> FitResult:
     """Fit every pass in a recording as a row of dipoles at constant velocity.
 
     Up to three simultaneous vehicles are fitted together.
 
     Parameters
     ----------
-    recording : path
-        An .mcap, .db3 or .bag file, or a rosbag2 folder.
+    source : path, Readings, RecordedReadings, DataFrame or mapping
+        A recording is read in batches and need not fit into memory. A DataFrame, in tesla, has one
+        row per reading (columns `sensor`, x, y, z) or per time (columns such as `mag_1_x`), and the
+        times in a column `time` or `stamp_ns` or in the index. A mapping is {sensor: (times (n,),
+        fields (n, 3), T)}.
     network : SensorNetwork or path of a network file
     settings : {name: value}, optional
         Settings that differ from the defaults for a vehicle.
@@ -74,6 +77,9 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
     cpa_range : (range, std), m, optional
         Range at the closest point of approach, only for a network of one sensor; see
         `analysis.pass_fit.fit_pass`.
+    time_unit : 's', 'ms', 'us' or 'ns', optional
+        Unit of the times of a DataFrame or mapping; required for floats. The default for integers
+        is 'ns'.
 
     Returns
     -------
@@ -81,6 +87,8 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
 
     Raises
     ------
+    ReadingsError
+        If a table or arrays are incomplete, not in order, or of a wrong type.
     RecordingError
         If the recording cannot be read, or has none of the network's topics.
     NetworkError
@@ -92,10 +100,10 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
     check_orders('orders', orders)
     check_cpa_range('cpa_range', cpa_range, network)
     passes: list[FittedPass] = []
-    source = source_of(recording, network)
+    opened = source_of(source, network, time_unit)
     pipeline = Pipeline(network, settings_for('vehicle', settings), 'track')
-    fitter = PassFitter(source.stem, pipeline, orders, cpa_range, passes.append)
-    report = run(source, pipeline, [fitter])
+    fitter = PassFitter(opened.stem, pipeline, orders, cpa_range, passes.append)
+    report = run(opened, pipeline, [fitter])
     return FitResult(tuple(passes), report)
 
 

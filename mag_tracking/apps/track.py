@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
-from mag_tracking.apps.readings import RecordedReadings, network_of, source_of
+from mag_tracking.apps.readings import RecordedReadings, UserSource, network_of, source_of
 from mag_tracking.apps.replay import TrackHistory, errors_against_truth
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.errors import UnknownTrackError
@@ -14,7 +14,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.record_receiver import RecordReceiver
-from mag_tracking.records import Detection, Readings, SmoothedPose, Track
+from mag_tracking.records import Detection, SmoothedPose, Track
 from mag_tracking.report.metrics import Truth, interpolate_truth
 from mag_tracking.report.track_log import TrackLog
 from mag_tracking.results.columns import COMPLETE, DETECTIONS, POSES, SMOOTHED
@@ -239,22 +239,29 @@ class TrackingResult:
         return self.tracks[track_id]
 
 
-def track(source: Readings | RecordedReadings | str | PathLike[str],
+def track(source: UserSource,
           network: SensorNetwork | str | PathLike[str], target: str = 'vehicle',
-          settings: Mapping[str, Any] | None = None) -> TrackingResult:
+          settings: Mapping[str, Any] | None = None,
+          time_unit: str | None = None) -> TrackingResult:
     """Track the targets in readings or in a recording.
 
     The stages are the same as in `mag-tracking replay` and the ROS nodes. No files are written.
 
     Parameters
     ----------
-    source : Readings, RecordedReadings, or path of a recording
-        A recording is read in batches and need not fit into memory.
+    source : path, Readings, RecordedReadings, DataFrame or mapping
+        A recording is read in batches and need not fit into memory. A DataFrame, in tesla, has one
+        row per reading (columns `sensor`, x, y, z) or per time (columns such as `mag_1_x`), and the
+        times in a column `time` or `stamp_ns` or in the index. A mapping is {sensor: (times (n,),
+        fields (n, 3), T)}.
     network : SensorNetwork or path of a network file
     target : 'vehicle', 'magnet' (in a hand) or 'bench' (a magnet on a bench)
     settings : {name: value}, optional
         Settings that differ from the defaults of the target, such as {'track.iterations': 5};
         config/default.yaml lists those of users, the reference all.
+    time_unit : 's', 'ms', 'us' or 'ns', optional
+        Unit of the times of a DataFrame or mapping; required for floats. The default for integers
+        is 'ns'.
 
     Returns
     -------
@@ -274,7 +281,7 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
     network = network_of(network)
     pipeline, poses, history = Pipeline(network, settings_for(target, settings)), _Poses(), \
         TrackHistory()
-    opened = source_of(source, network)
+    opened = source_of(source, network, time_unit)
     report = run(opened, pipeline, [poses, history])
     truth = source.truth if isinstance(source, RecordedReadings) else \
         opened.reader.truth_arrays() if isinstance(opened, RecordingSource) else {}

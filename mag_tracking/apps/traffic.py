@@ -14,7 +14,7 @@ from mag_tracking.analysis.correlated_motion import (
     correlated_motion,
 )
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.apps.readings import network_of, source_of
+from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import TrafficSummary, VehiclePassage
 from mag_tracking.network import SensorNetwork
@@ -66,17 +66,25 @@ class TrafficResult:
                 f'{lines or "no line was crossed"})')
 
 
-def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[str],
-            settings: Mapping[str, Any] | None = None) -> TrafficResult:
+def traffic(source: UserSource, network: SensorNetwork | str | PathLike[str],
+            settings: Mapping[str, Any] | None = None,
+            time_unit: str | None = None) -> TrafficResult:
     """Count the vehicles that cross the counting lines of a network.
 
     Parameters
     ----------
-    recording : path
+    source : path, Readings, RecordedReadings, DataFrame or mapping
+        A recording is read in batches and need not fit into memory. A DataFrame, in tesla, has one
+        row per reading (columns `sensor`, x, y, z) or per time (columns such as `mag_1_x`), and the
+        times in a column `time` or `stamp_ns` or in the index. A mapping is {sensor: (times (n,),
+        fields (n, 3), T)}.
     network : SensorNetwork or path of a network file
     settings : {name: value}, optional
-        Settings that differ from the defaults for a vehicle; `traffic.line_*` define the counting
-        lines.
+        Settings that differ from the defaults for a vehicle; `traffic.lines` is the table of the
+        counting lines.
+    time_unit : 's', 'ms', 'us' or 'ns', optional
+        Unit of the times of a DataFrame or mapping; required for floats. The default for integers
+        is 'ns'.
 
     Returns
     -------
@@ -84,6 +92,8 @@ def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathL
 
     Raises
     ------
+    ReadingsError
+        If a table or arrays are incomplete, not in order, or of a wrong type.
     RecordingError
         If the recording cannot be read, or has none of the network's topics.
     NetworkError
@@ -92,7 +102,8 @@ def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathL
         If a setting is invalid, or the target is not a vehicle.
     """
     network = network_of(network)
-    return count_traffic(source_of(recording, network), network, settings_for('vehicle', settings))
+    return count_traffic(source_of(source, network, time_unit), network,
+                         settings_for('vehicle', settings))
 
 
 def count_traffic(source: Source, network: SensorNetwork, settings: Settings) -> TrafficResult:
