@@ -14,10 +14,10 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from mag_tracking.analysis.fitted_pass import FittedPass
     from mag_tracking.analysis.placement import PlannedTarget, Sampling
     from mag_tracking.apps.events import EventsResult, events
     from mag_tracking.apps.fit import FitResult, fit
-    from mag_tracking.apps.pass_fitter import FittedPass
     from mag_tracking.apps.plan import Plan
     from mag_tracking.apps.plan_inputs import plan
     from mag_tracking.apps.readings import RecordedReadings, read_recording, readings_from_arrays
@@ -49,10 +49,10 @@ __all__ = [
 # Public names by module. The modules are imported on first use, because every command and node
 # imports `mag_tracking` at startup, and the compiled code and the figures take seconds to load.
 _MODULES = {
+    'analysis.fitted_pass': ('FittedPass',),
     'analysis.placement': ('PlannedTarget', 'Sampling'),
     'apps.events': ('EventsResult', 'events'),
     'apps.fit': ('FitResult', 'fit'),
-    'apps.pass_fitter': ('FittedPass',),
     'apps.plan': ('Plan',),
     'apps.plan_inputs': ('plan',),
     'apps.readings': ('RecordedReadings', 'read_recording', 'readings_from_arrays'),

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
+from mag_tracking.analysis.fitted_pass import FittedPass
+from mag_tracking.apps.pass_fitter import PassFitter
 from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork

@@ -11,9 +11,10 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.analysis.correlated_motion import contradicts_delays
+from mag_tracking.analysis.fitted_pass import FittedPass
 from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, Bearing, PassFit
 from mag_tracking.apps.fit import check_cpa_range, check_orders
-from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
+from mag_tracking.apps.pass_fitter import PassFitter
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import (
     Commands,

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mag_tracking.analysis.fitted_pass import FittedPass
 from mag_tracking.apps.fit import fit
-from mag_tracking.apps.pass_fitter import FittedPass
 from mag_tracking.apps.readings import read_recording
 from support.busy_recordings import BUSY, network_of_recording
 from support.live_runs import fits_of
