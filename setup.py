@@ -34,16 +34,15 @@ GENERATION = '''
 #include <stdio.h>
 int main(void) {
     puts(__builtin_cpu_supports("x86-64-v4") ? "x86-64-v4"
-         : __builtin_cpu_supports("x86-64-v3") ? "x86-64-v3" : "x86-64");
+         : __builtin_cpu_supports("x86-64-v3") ? "x86-64-v3" : "");
     return 0;
 }
 '''
 
 
 def native_macros():
-    """With MAG_TRACKING_PROCESSOR=native: the macro to compile only for this computer.
-
-    Wheels may run on others, so they contain versions for several generations of processors.
+    """With MAG_TRACKING_PROCESSOR=native: the macro to compile for this computer's generation of
+    processors besides the oldest one. Wheels contain versions for all generations.
     """
     if os.environ.get('MAG_TRACKING_PROCESSOR') != 'native':
         return []
@@ -55,7 +54,8 @@ def native_macros():
             output = subprocess.run([program], check=True, capture_output=True, text=True).stdout
         except (OSError, subprocess.CalledProcessError):
             return []
-    return [('MAG_TRACKING_PROCESSOR', f'"{output.strip()}"')]
+    generation = output.strip()
+    return [('MAG_TRACKING_PROCESSOR', f'"{generation}"')] if generation else []
 
 
 def included(path):

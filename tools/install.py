@@ -144,9 +144,7 @@ def install_run(installer):
     cache = cache_folder()
     wheel = messages_wheel(installer, cache)
     say('mag_tracking and what it needs to run (compiled in part, about a minute the first time)')
-    variables = {'MAG_TRACKING_PROCESSOR': 'native'}
-    if cache:
-        variables['MAG_TRACKING_CACHE'] = str(cache / 'cores')
+    variables = {'MAG_TRACKING_CACHE': str(cache / 'cores')} if cache else {}
     installer.install('--reinstall-package' if installer.uv else '--force-reinstall',
                       *(['mag-tracking-msgs', wheel] if installer.uv else ['--no-deps', wheel]))
     # setuptools warns about every editable package outside src/.

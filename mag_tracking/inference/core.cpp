@@ -74,7 +74,6 @@ Size best(Array x, Array P, Array log_w, Integers label, Integers kind, double n
 
 PYBIND11_MODULE(core, m) {
     using namespace mag_tracking;
-    check_processor();
     m.doc() = "Compiled functions of inference that run for every frame.";
     m.def("energies", &energies, IN(y), IN(C), IN(energy), IN(axes));
     m.def("smallest_pivots", &smallest_pivots, IN(y), IN(C), IN(out));

@@ -283,7 +283,6 @@ double residual(const Array& t, const Array& y, double time, double scale) {
 
 PYBIND11_MODULE(core, module) {
     using namespace mag_tracking;
-    check_processor();
     module.doc() = "Compiled physics, used by the modules of this package.";
     module.attr("K_DIPOLE") = K_DIPOLE;
     module.attr("PATH") = py::tuple(py::cast(std::vector<std::string>(PATH, PATH + N_PATH)));

@@ -213,7 +213,6 @@ Magnet magnet(Vector density, double angular_density) {
 
 PYBIND11_MODULE(core, module) {
     using namespace mag_tracking;
-    check_processor();
     module.doc() =
         "Compiled filters and pass fit of the tracker; see bank_filter.py and pass_samples.py.";
     add_filter(module, "RowVehicleFilter", row_vehicle);
