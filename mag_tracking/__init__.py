@@ -6,8 +6,8 @@ The names in `__all__` are the public Python interface (the gallery has more exa
 
     result = mt.track('recording.mcap', 'network.yaml')
     result.poses['position'], result.poses['covariance']
-    result.poses_dataframe()
-    result.map_figure()
+    result.to_dataframe()
+    result.figure()
 """
 
 import importlib
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from mag_tracking.network import SensorNetwork
     from mag_tracking.network.file import read_network
     from mag_tracking.records import Readings
+    from mag_tracking.run import RunReport
     from mag_tracking.settings import read_parameter_file
 
 __version__: str
@@ -42,7 +43,7 @@ __version__: str
 __all__ = [
     'EventsResult', 'FitResult', 'FittedPass', 'MagTrackingError', 'MissingDependencyError',
     'NetworkError', 'Plan', 'PlannedTarget', 'Readings', 'ReadingsError', 'RecordedReadings',
-    'RecordingError', 'Sampling', 'SensorNetwork', 'SettingsError', 'TrackingResult',
+    'RecordingError', 'RunReport', 'Sampling', 'SensorNetwork', 'SettingsError', 'TrackingResult',
     'TrafficResult', 'UnknownTrackError', 'events', 'fit', 'plan', 'read_network',
     'read_parameter_file', 'read_recording', 'readings_from_arrays', 'track', 'traffic']
 
@@ -63,6 +64,7 @@ _MODULES = {
     'network': ('SensorNetwork',),
     'network.file': ('read_network',),
     'records': ('Readings',),
+    'run': ('RunReport',),
     'settings': ('read_parameter_file',)}
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

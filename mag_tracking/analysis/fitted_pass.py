@@ -37,6 +37,11 @@ class FittedPass:
         return f'pass {self.number}' + (f', vehicle {self.vehicle}' if self.n_vehicles > 1 else '')
 
     @property
+    def drawn(self) -> PassFit | None:
+        """Chosen fit or, without one, the fit with the most dipoles; None if nothing was fitted."""
+        return self.chosen or next((f for f in reversed(self.fits) if len(f.x)), None)
+
+    @property
     def chosen(self) -> PassFit | None:
         """Fit with the number of dipoles that the measurements support; None if it is rejected."""
         return choose_order(self.fits)

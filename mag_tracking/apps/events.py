@@ -4,10 +4,11 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
 from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.event_records import PassEvent
 from mag_tracking.network import SensorNetwork
@@ -15,13 +16,19 @@ from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.record_receiver import RecordReceiver, Step
 from mag_tracking.records import Readings
+from mag_tracking.results.columns import EVENTS, row_of
+from mag_tracking.results.dataframes import rows_dataframe
 from mag_tracking.run import RunReport, Source, run
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.events.stage import Events
 
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
 
 @dataclass(frozen=True, eq=False)
-class EventsResult:
+class EventsResult(DisplayedResult):
     """Pass events in a recording."""
 
     events: tuple[PassEvent, ...]
@@ -38,6 +45,36 @@ class EventsResult:
             {sensor: number of events}.
         """
         return dict(Counter(event.sensor for event in self.events))
+
+    def to_dataframe(self) -> 'pd.DataFrame':
+        """Convert the events to a table.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns of `events.csv`, indexed by the time of the closest point (UTC).
+
+        Raises
+        ------
+        MissingDependencyError
+            If pandas is not installed.
+        """
+        return rows_dataframe(EVENTS, [row_of(EVENTS, event) for event in self.events],
+                              'closest_ns')
+
+    def figure(self) -> 'Figure':
+        """Draw the largest field of each event over time.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        # Imported here because it loads matplotlib.
+        from mag_tracking.report.time_figures import time_figure
+
+        return time_figure(np.array([e.closest_ns for e in self.events], dtype=np.int64),
+                           np.array([1e9 * np.sqrt(np.nansum(e.peak**2)) for e in self.events]),
+                           None, [e.sensor for e in self.events], 'largest field [nT]')
 
     def __repr__(self) -> str:
         counts = ', '.join(f'{n} of {name}' for name, n in self.counts().items())
@@ -87,7 +124,8 @@ def find_events(source: Source, network: SensorNetwork, settings: Settings) -> E
     """Describe the passes in a source."""
     pipeline = Pipeline(network, settings, 'calibrate')
     sink = EventSink(pipeline)
-    return sink.result(run(source, pipeline, [sink]))
+    with shown_progress(source) as progress:
+        return sink.result(run(source, pipeline, [sink], progress))
 
 
 class EventSink(RecordReceiver):

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mag_tracking.analysis.fitted_pass import FittedPass
+from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
 from mag_tracking.apps.pass_fitter import PassFitter
 from mag_tracking.apps.readings import UserSource, network_of, source_of
-from mag_tracking.errors import SettingsError
+from mag_tracking.errors import SettingsError, UnknownTrackError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.quantities import quantity
@@ -21,10 +22,11 @@ from mag_tracking.run import RunReport, run
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
-class FitResult:
+class FitResult(DisplayedResult):
     """Fitted passes of a recording."""
 
     passes: tuple[FittedPass, ...]
@@ -54,6 +56,32 @@ class FitResult:
         # A fit without an estimate has an empty string in this column.
         return dataframe(FITS, {c: [np.nan if c == 'ambiguous' and row[c] == '' else row[c]
                                     for row in rows] for c in names_of(FITS)})
+
+
+    def figure(self, number: int = 0) -> 'Figure':
+        """Draw the measured and fitted field of a pass.
+
+        Parameters
+        ----------
+        number : int, optional
+            Index in `passes`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        UnknownTrackError
+            If there is no such pass, or nothing could be fitted to it.
+        """
+        # Imported here because it loads matplotlib.
+        from mag_tracking.report.fit_figures import pass_figure
+
+        drawn = self.passes[number].drawn if 0 <= number < len(self.passes) else None
+        if drawn is None:
+            raise UnknownTrackError(f'no fit of pass {number}; passes: {len(self.passes)}')
+        return pass_figure(drawn, self.passes[number].label)
 
 
 def fit(source: UserSource, network: SensorNetwork | str | PathLike[str],
@@ -104,7 +132,8 @@ def fit(source: UserSource, network: SensorNetwork | str | PathLike[str],
     opened = source_of(source, network, time_unit)
     pipeline = Pipeline(network, settings_for('vehicle', settings), 'track')
     fitter = PassFitter(opened.stem, pipeline, orders, cpa_range, passes.append)
-    report = run(opened, pipeline, [fitter])
+    with shown_progress(opened) as progress:
+        report = run(opened, pipeline, [fitter], progress)
     return FitResult(tuple(passes), report)
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
+from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
 from mag_tracking.apps.readings import RecordedReadings, UserSource, network_of, source_of
 from mag_tracking.apps.replay import TrackHistory, errors_against_truth
 from mag_tracking.arrays import FloatArray, StructArray
@@ -18,7 +19,7 @@ from mag_tracking.records import Detection, SmoothedPose, Track
 from mag_tracking.report.metrics import Truth, interpolate_truth
 from mag_tracking.report.track_log import TrackLog
 from mag_tracking.results.columns import COMPLETE, DETECTIONS, POSES, SMOOTHED
-from mag_tracking.results.dataframes import array_dataframe
+from mag_tracking.results.dataframes import array_dataframe, with_time_index
 from mag_tracking.results.result_arrays import detection_array, pose_array, smoothed_array
 from mag_tracking.run import RecordingSource, RunReport, run
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class TrackingResult:
+class TrackingResult(DisplayedResult):
     """Tracks, poses and detections of a recording or of readings.
 
     Arrays are structured, in SI units and in chronological order; they are empty without targets.
@@ -64,6 +65,36 @@ class TrackingResult:
                    quantity(int(self.detections['onset'].sum()), 'detection'))
         return (f'TrackingResult({", ".join(numbers)}'
                 + (f'; {"; ".join(notes)}' if notes else '') + ')')
+
+    def to_dataframe(self) -> 'pd.DataFrame':
+        """Convert the published poses to a table.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns of `poses.csv`, indexed by time (UTC).
+
+        Raises
+        ------
+        MissingDependencyError
+            If pandas is not installed.
+        """
+        return with_time_index(self.poses_dataframe(), 'stamp_ns')
+
+    def figure(self) -> 'Figure':
+        """Draw the pass of the first vehicle, or the map of the first magnet.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        UnknownTrackError
+            If nothing was tracked.
+        """
+        return self.pass_figure() if self.settings.track.target == 'vehicle' \
+            else self.map_figure()
 
     def poses_dataframe(self) -> 'pd.DataFrame':
         """Convert `poses` to a table.
@@ -282,7 +313,8 @@ def track(source: UserSource,
     pipeline, poses, history = Pipeline(network, settings_for(target, settings)), _Poses(), \
         TrackHistory()
     opened = source_of(source, network, time_unit)
-    report = run(opened, pipeline, [poses, history])
+    with shown_progress(opened) as progress:
+        report = run(opened, pipeline, [poses, history], progress)
     truth = source.truth if isinstance(source, RecordedReadings) else \
         opened.reader.truth_arrays() if isinstance(opened, RecordingSource) else {}
     return TrackingResult(network, pipeline.settings, pose_array(poses.poses),

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from mag_tracking.analysis.correlated_motion import (
     correlated_motion,
 )
 from mag_tracking.analysis.pass_data import PassData
+from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
 from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import TrafficSummary, VehiclePassage
@@ -22,8 +23,15 @@ from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.records import FieldFrame, Track
+from mag_tracking.results.columns import traffic_tables
+from mag_tracking.results.dataframes import rows_dataframe
+from mag_tracking.results.traffic_tables import passage_row
 from mag_tracking.run import RunReport, Source, run
 from mag_tracking.units import NS
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 RETENTION_S = 300.0
 """Time for which frames of an ended track are kept, because its passage is reported later [s]."""
@@ -39,6 +47,12 @@ class CountedVehicle:
     """Velocity from the delays, independent of the tracker; `reason` explains a missing value."""
 
     @property
+    def delays(self) -> dict[str, float | bool]:
+        """Columns of the speed from the delays in the table `passages`."""
+        return {'delay_speed': self.delay.speed, 'sd_delay_speed': self.delay.speed_std,
+                'speeds_contradict': self.speeds_contradict}
+
+    @property
     def speeds_contradict(self) -> bool:
         """Whether the speed or direction of the track contradicts the delays."""
         p = self.passage
@@ -47,7 +61,7 @@ class CountedVehicle:
 
 
 @dataclass(frozen=True)
-class TrafficResult:
+class TrafficResult(DisplayedResult):
     """Counted vehicles and traffic summaries of a recording."""
 
     class_names: tuple[str, ...]
@@ -59,6 +73,40 @@ class TrafficResult:
     report: RunReport
     """What was lost, rejected or missing, and why; `report.counts['traffic']` counts passages,
     tracks that crossed no line, and other events."""
+
+    def to_dataframe(self) -> 'pd.DataFrame':
+        """Convert the counted vehicles to a table.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns of the table `passages`, indexed by time (UTC).
+
+        Raises
+        ------
+        MissingDependencyError
+            If pandas is not installed.
+        """
+        columns = [c for c in traffic_tables(self.class_names, False)['passages']
+                   if c.name != 'recording']
+        return rows_dataframe(columns, [passage_row('', v.passage, self.class_names, v.delays, {})
+                                        for v in self.vehicles], 'stamp_ns')
+
+    def figure(self) -> 'Figure':
+        """Draw the speed of each vehicle over time, by class.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        # Imported here because it loads matplotlib.
+        from mag_tracking.report.time_figures import time_figure
+
+        passages = [v.passage for v in self.vehicles]
+        return time_figure(np.array([p.stamp_ns for p in passages], dtype=np.int64),
+                           np.array([p.speed for p in passages]),
+                           np.array([p.speed_std for p in passages]),
+                           [p.vehicle_class for p in passages], 'speed [m/s]')
 
     def __repr__(self) -> str:
         lines = dict(Counter(v.passage.line for v in self.vehicles))
@@ -110,7 +158,8 @@ def count_traffic(source: Source, network: SensorNetwork, settings: Settings) ->
     """Count the vehicles in a source; raises SettingsError if the target is not a vehicle."""
     pipeline = Pipeline(network, settings)
     sink = TrafficSink(pipeline)
-    return sink.result(run(source, pipeline, [sink]))
+    with shown_progress(source) as progress:
+        return sink.result(run(source, pipeline, [sink], progress))
 
 
 def check_vehicles(settings: Settings) -> None:

@@ -348,8 +348,8 @@ def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
 
 
 def _draw(fitted_pass: FittedPass, out: Path) -> None:
-    """Draw the chosen fit of a pass or, without a chosen fit, the fit with the most dipoles."""
-    fit = fitted_pass.chosen or next((f for f in reversed(fitted_pass.fits) if len(f.x)), None)
+    """Draw the fit of a pass."""
+    fit = fitted_pass.drawn
     if fit is None:
         return
     # Imported here because it loads matplotlib.

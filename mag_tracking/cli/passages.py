@@ -52,7 +52,7 @@ class Passages:
                            for v in result.vehicles]
         _print(name, result, identifications)
         self._tables['passages'] += [
-            passage_row(name, v.passage, result.class_names, _delay(v), _vehicle(identification))
+            passage_row(name, v.passage, result.class_names, v.delays, _vehicle(identification))
             for v, identification in zip(result.vehicles, identifications, strict=True)]
         self._tables['intervals'] += [row for s in result.summaries
                                       for row in summary_rows(name, s)]
@@ -94,12 +94,6 @@ def _vehicle(identification: Identification | None) -> dict[str, Any]:
     return {} if identification is None else {
         'vehicle': identification.name,
         'p_vehicle': identification.probabilities.get(identification.name, np.nan)}
-
-
-def _delay(vehicle: CountedVehicle) -> dict[str, Any]:
-    """Return the table columns of the speed from the delay between sensors."""
-    return {'delay_speed': vehicle.delay.speed, 'sd_delay_speed': vehicle.delay.speed_std,
-            'speeds_contradict': vehicle.speeds_contradict}
 
 
 def _print(name: str, result: TrafficResult,

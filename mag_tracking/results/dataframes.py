@@ -3,7 +3,7 @@
 `DataFrame.attrs['units']` contains the units by column; columns without a unit are dimensionless.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,21 @@ def dataframe(columns: Iterable[Column], values: Mapping[str, Any]) -> 'pd.DataF
     frame = pd.DataFrame({c.name: values[c.name] for c in columns})
     frame.attrs['units'] = {c.name: c.unit for c in columns if c.unit}
     return frame
+
+
+def rows_dataframe(columns: Iterable[Column], rows: Sequence[Mapping[str, Any]],
+                   time: str = '') -> 'pd.DataFrame':
+    """Create a DataFrame from rows by column, indexed by the UTC times of the column `time`."""
+    columns = tuple(columns)
+    frame = dataframe(columns, {c.name: [row[c.name] for row in rows] for c in columns})
+    return with_time_index(frame, time) if time else frame
+
+
+def with_time_index(frame: 'pd.DataFrame', column: str) -> 'pd.DataFrame':
+    """Index a DataFrame by the UTC times of a column in ns since 1970, which remains."""
+    import pandas as pd
+
+    return frame.set_index(pd.to_datetime(frame[column].astype('int64'), utc=True).rename('time'))
 
 
 def array_dataframe(columns: Iterable[Column], rows: StructArray) -> 'pd.DataFrame':
