@@ -8,15 +8,11 @@ to which T10 section 6.3 decimates before its fits. The published costs refer to
 """
 
 import argparse
-import dataclasses
 from pathlib import Path
 
-from mag_tracking.apps.fit import RecordingFit
+from mag_tracking.apps.fit import fit
 from mag_tracking.network.file import read_network
-from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.reader import Recording
 from mag_tracking.report.fit_figures import order_figure
-from mag_tracking.settings import replace
 
 ROOT = Path(__file__).resolve().parents[1]
 VEHICLES = ('straight_small_left', 'straight_car_right', 'straight_car_fast_left',
@@ -29,13 +25,11 @@ PUBLISHED = {'cars': ((10.0, 51.0), (1.3, 1.6)), 'large': ((142.0, 360.0), (76.7
 
 def fit_passes(rate, orders=(1, 2, 3, 4, 5)):
     """Fit the pass in each recording, at a rate of `RATES`; return one `FittedPass` per pass."""
-    network, settings = read_network(ROOT / 'config/network.yaml'), settings_for('vehicle')
-    settings = dataclasses.replace(settings, calibrate=replace(
-        settings.calibrate, {'decimate_to_hz': RATES[rate]}))
+    network = read_network(ROOT / 'config/network.yaml')
     found = []
     for name in VEHICLES:
-        recording = Recording(ROOT / 'test/data/vehicles' / f'{name}.mcap')
-        found += RecordingFit(recording, network, settings, orders).passes()
+        recording = ROOT / 'test/data/vehicles' / f'{name}.mcap'
+        found += fit(recording, network, {'calibrate.decimate_to_hz': RATES[rate]}, orders).passes
         costs = ', '.join(f'{f.normalised_cost:.2f}' for f in found[-1].fits)
         print(f'{rate}, {name}: {costs}')
     return found

@@ -6,18 +6,18 @@ The names in `__all__` are the public Python interface (the gallery has more exa
 
     result = mt.track('recording.mcap', 'network.yaml')
     result.poses['position'], result.poses['covariance']
-    result.poses_dataframe()
-    result.map_figure()
+    result.to_dataframe()
+    result.figure()
 """
 
 import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from mag_tracking.analysis.fitted_pass import FittedPass
     from mag_tracking.analysis.placement import PlannedTarget, Sampling
     from mag_tracking.apps.events import EventsResult, events
     from mag_tracking.apps.fit import FitResult, fit
-    from mag_tracking.apps.pass_fitter import FittedPass
     from mag_tracking.apps.plan import Plan
     from mag_tracking.apps.plan_inputs import plan
     from mag_tracking.apps.readings import RecordedReadings, read_recording, readings_from_arrays
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from mag_tracking.network import SensorNetwork
     from mag_tracking.network.file import read_network
     from mag_tracking.records import Readings
+    from mag_tracking.run import RunReport
     from mag_tracking.settings import read_parameter_file
 
 __version__: str
@@ -42,17 +43,17 @@ __version__: str
 __all__ = [
     'EventsResult', 'FitResult', 'FittedPass', 'MagTrackingError', 'MissingDependencyError',
     'NetworkError', 'Plan', 'PlannedTarget', 'Readings', 'ReadingsError', 'RecordedReadings',
-    'RecordingError', 'Sampling', 'SensorNetwork', 'SettingsError', 'TrackingResult',
+    'RecordingError', 'RunReport', 'Sampling', 'SensorNetwork', 'SettingsError', 'TrackingResult',
     'TrafficResult', 'UnknownTrackError', 'events', 'fit', 'plan', 'read_network',
     'read_parameter_file', 'read_recording', 'readings_from_arrays', 'track', 'traffic']
 
 # Public names by module. The modules are imported on first use, because every command and node
 # imports `mag_tracking` at startup, and the compiled code and the figures take seconds to load.
 _MODULES = {
+    'analysis.fitted_pass': ('FittedPass',),
     'analysis.placement': ('PlannedTarget', 'Sampling'),
     'apps.events': ('EventsResult', 'events'),
     'apps.fit': ('FitResult', 'fit'),
-    'apps.pass_fitter': ('FittedPass',),
     'apps.plan': ('Plan',),
     'apps.plan_inputs': ('plan',),
     'apps.readings': ('RecordedReadings', 'read_recording', 'readings_from_arrays'),
@@ -63,6 +64,7 @@ _MODULES = {
     'network': ('SensorNetwork',),
     'network.file': ('read_network',),
     'records': ('Readings',),
+    'run': ('RunReport',),
     'settings': ('read_parameter_file',)}
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -25,7 +25,9 @@ class Numbers {
 
   private:
     struct Delete {
-        void operator()(double* p) const { ::operator delete[](p, std::align_val_t(sizeof(Eight))); }
+        void operator()(double* p) const {
+            ::operator delete[](p, std::align_val_t(sizeof(Eight)));
+        }
     };
     std::unique_ptr<double[], Delete> data_;
 };

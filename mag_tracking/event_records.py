@@ -120,7 +120,7 @@ class VehiclePassage:
     vehicle_class: str
     """Most probable class. `unknown` if the vehicle is improbable under every class."""
     class_probabilities: FloatArray
-    """Probability of each class, (n_classes,), in the order of `traffic.class_names`."""
+    """Probability of each class, (n_classes,), in the order of `traffic.classes.names`."""
     headway: float
     """Time since the previous passage across this line in this direction, s. NaN for the first
     passage, or if the passages are not in chronological order."""

@@ -1,8 +1,9 @@
 """The settings tree and the chain of processing stages, shared by nodes and offline programs."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, TypeAlias
 
 from mag_tracking.errors import SettingsError
@@ -16,7 +17,6 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
-from mag_tracking.stages.events.settings import EventsSettings
 from mag_tracking.stages.stage import Stage, rejected
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.stages.track.manager import TrackManager
@@ -32,7 +32,6 @@ class Settings:
     calibrate: CalibrateSettings = field(default_factory=CalibrateSettings)
     align: AlignSettings = field(default_factory=AlignSettings)
     detect: DetectSettings = field(default_factory=DetectSettings)
-    events: EventsSettings = field(default_factory=EventsSettings)
     track: TrackSettings = field(default_factory=TrackSettings)
     traffic: TrafficSettings = field(default_factory=TrafficSettings)
     survey: SurveySettings = field(default_factory=SurveySettings)
@@ -92,79 +91,137 @@ def settings_for(target: str, changes: Mapping[str, Any] | None = None) -> Setti
     return replace(replace(Settings(), defaults), changes)
 
 
-Output: TypeAlias = (FieldFrame | Detection | Track | SmoothedPose | Disturbance | VehiclePassage
-                     | TrafficSummary)
-"""Records that the pipeline returns."""
+Output: TypeAlias = (Readings | FieldFrame | Detection | Track | SmoothedPose | Disturbance
+                     | VehiclePassage | TrafficSummary)
+"""Records that the pipeline returns; `Readings` are calibrated."""
+STAGES = ('calibrate', 'align', 'detect', 'track', 'traffic')
+"""Stages in order of processing."""
 
 
 class Pipeline:
     """Chain of stages that converts raw readings to frames, detections, tracks and passages.
 
-    The chain depends neither on ROS nor on a clock.
+    The chain depends neither on ROS nor on a clock. The stages after `upto` are not used.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : Settings
+    upto : str
+        Last stage, one of `STAGES`.
+
+    Raises
+    ------
+    SettingsError
+        If `upto` is unknown, or the settings do not suit the network.
     """
 
-    def __init__(self, network: SensorNetwork, settings: Settings) -> None:
-        self.network = network
-        self.settings = settings
-        self.calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
-        self.align = Align(network, settings.align)
-        self.detect = Detect(network, settings.detect)
-        self.track = TrackManager(network, settings.track)
-        self.traffic = Traffic(network, settings.traffic, settings.track.target == 'vehicle')
-        # Aliases with protocol types, so that a type checker verifies each stage.
-        self._calibrate: Stage[Readings, Readings] = self.calibrate
-        self._align: Stage[Readings, FieldFrame] = self.align
-        self._detect: Stage[FieldFrame, FieldFrame | Detection] = self.detect
-        self._track: Stage[FieldFrame, Track | SmoothedPose | Disturbance] = self.track
-        self._traffic: Stage[TrackedFrame, VehiclePassage | TrafficSummary] = self.traffic
+    def __init__(self, network: SensorNetwork, settings: Settings, upto: str = 'traffic') -> None:
+        if upto not in STAGES:
+            raise SettingsError(f'upto: expected {" or ".join(STAGES)}, got {upto!r}')
+        self.network, self.settings = network, settings
+        self._names = STAGES[:STAGES.index(upto) + 1]
+        # Settings that do not suit the network are reported before the first reading.
+        self._stages()
+
+    @cached_property
+    def calibrate(self) -> Calibrate:
+        """Stage from raw to calibrated readings."""
+        return Calibrate(self.network, self.settings.calibrate, survey=self.settings.survey)
+
+    @cached_property
+    def align(self) -> Align:
+        """Stage from calibrated readings to frames."""
+        return Align(self.network, self.settings.align)
+
+    @cached_property
+    def detect(self) -> Detect:
+        """Stage from frames to frames with the result of the detection."""
+        return Detect(self.network, self.settings.detect)
+
+    @cached_property
+    def track(self) -> TrackManager:
+        """Stage from frames to poses."""
+        return TrackManager(self.network, self.settings.track)
+
+    @cached_property
+    def traffic(self) -> Traffic:
+        """Stage from poses to passages of vehicles."""
+        return Traffic(self.network, self.settings.traffic,
+                       self.settings.track.target == 'vehicle')
 
     def feed(self, readings: Readings) -> list[Output]:
-        """Process raw readings, and return the resulting records in order of processing.
+        """Process raw readings; return the resulting records in order of processing.
 
         The records do not depend on how the readings are split into batches.
         """
-        calibrated = self._calibrate.feed(readings)
-        self.track.set_input_doubts(self.calibrate.input_doubts())
-        return self._process_calibrated(calibrated)
+        batches = self.calibrate.feed(readings)
+        self._pass_doubts()
+        return [record for batch in batches for record in self._process_calibrated(batch)]
 
     def flush(self) -> list[Output]:
-        """Process and return all records that are still buffered at the end of the input."""
-        out = [*self._process_calibrated(self._calibrate.flush()),
-               *self._process_frames(self._align.flush()),
-               *self._process_detected(self._detect.flush())]
-        tracked = self._track.flush()
-        return [*out, *tracked, *self._traffic.feed(TrackedFrame(None, tracked)),
-                *self._traffic.flush()]
+        """Process all records that are still buffered at the end of the input."""
+        return [*self.drain(), *self.close()]
 
-    def _stages(self) -> dict[str, Stage[Any, Any]]:
-        """Stages by name, in order of processing."""
-        return {'calibrate': self._calibrate, 'align': self._align, 'detect': self._detect,
-                'track': self._track, 'traffic': self._traffic}
-
-    def _process_calibrated(self, batches: Iterable[Readings]) -> list[Output]:
-        """Align calibrated readings, and process the resulting frames."""
-        return self._process_frames([f for b in batches for f in self._align.feed(b)])
-
-    def _process_frames(self, frames: Iterable[FieldFrame]) -> list[Output]:
-        """Run the detection on frames, and process the results."""
-        return self._process_detected([r for f in frames for r in self._detect.feed(f)])
-
-    def _process_detected(self, records: Iterable[FieldFrame | Detection]) -> list[Output]:
-        """Track targets in the frames; return each record and the records that result from it."""
-        out: list[Output] = []
-        for record in records:
-            out.append(record)
-            if isinstance(record, FieldFrame):
-                tracked = self._track.feed(record)
-                out += [*tracked, *self._traffic.feed(TrackedFrame(record, tracked))]
+    def drain(self) -> list[Output]:
+        """Process the readings and frames that are still buffered at the end of the input."""
+        batches = self.calibrate.flush()
+        self._pass_doubts()
+        out = [record for batch in batches for record in self._process_calibrated(batch)]
+        if 'align' in self._names:
+            out += [r for frame in self.align.flush() for r in self._process_frame(frame)]
+        if 'detect' in self._names:
+            out += [r for record in self.detect.flush() for r in self._process_detected(record)]
         return out
 
+    def close(self) -> list[Output]:
+        """End the tracks and the summaries after `drain`."""
+        tracked = self.track.flush() if 'track' in self._names else []
+        out: list[Output] = [*tracked]
+        if 'traffic' in self._names:
+            out += [*self.traffic.feed(TrackedFrame(None, tracked)), *self.traffic.flush()]
+        return out
+
+    def _pass_doubts(self) -> None:
+        """Tell the tracker when the readings of sensors are doubtful."""
+        if 'track' in self._names:
+            self.track.set_input_doubts(self.calibrate.input_doubts())
+
+    def _stages(self) -> dict[str, Stage[Any, Any]]:
+        """Used stages by name, in order of processing."""
+        return {name: getattr(self, name) for name in self._names}
+
+    def _process_calibrated(self, batch: Readings) -> Iterator[Output]:
+        """Yield a batch of calibrated readings and the records that result from it."""
+        yield batch
+        if 'align' in self._names:
+            for frame in self.align.feed(batch):
+                yield from self._process_frame(frame)
+
+    def _process_frame(self, frame: FieldFrame) -> Iterator[Output]:
+        """Yield the records that result from a frame."""
+        if 'detect' not in self._names:
+            yield frame
+            return
+        for record in self.detect.feed(frame):
+            yield from self._process_detected(record)
+
+    def _process_detected(self, record: FieldFrame | Detection) -> Iterator[Output]:
+        """Yield a record of the detection and, for a frame, the tracks and passages."""
+        yield record
+        if 'track' not in self._names or not isinstance(record, FieldFrame):
+            return
+        tracked = self.track.feed(record)
+        yield from tracked
+        if 'traffic' in self._names:
+            yield from self.traffic.feed(TrackedFrame(record, tracked))
+
     def counts(self) -> dict[str, dict[str, int]]:
-        """Counters of all stages, by name of the stage."""
+        """Counters of the stages: {stage: {event: number}}."""
         return {name: dict(sorted(stage.counts.items())) for name, stage in self._stages().items()}
 
     def rejections(self) -> dict[str, int]:
-        """Number of rejections by cause, summed over all stages."""
+        """Number of rejections, summed over the stages: {cause: number}."""
         total: Counter[str] = Counter()
         for stage in self._stages().values():
             total.update(rejected(stage.counts))

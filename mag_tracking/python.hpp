@@ -73,8 +73,8 @@ const T* input_of(const ArrayOf<T>& array, const char* name, const std::vector<S
 template <class T>
 Size length_of(const ArrayOf<T>& array, const char* name, int dimensions) {
     if (array.ndim() != dimensions)
-        throw py::value_error(std::string(name) + ": must have " + std::to_string(dimensions)
-                              + " dimensions");
+        throw py::value_error(
+            std::string(name) + ": must have " + std::to_string(dimensions) + " dimensions");
     return array.shape(0);
 }
 

@@ -7,12 +7,15 @@ declarations.
 import dataclasses
 import difflib
 import math
+import re
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
 from os import PathLike
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, TypeVar
 
 from mag_tracking.errors import SettingsError
+from mag_tracking.former_settings import FORMER_SETTINGS
 from mag_tracking.yaml_file import is_utf8_encodable, read_yaml, short_repr
 
 if TYPE_CHECKING:
@@ -22,25 +25,12 @@ Scalar: TypeAlias = bool | int | float | str
 Value: TypeAlias = Scalar | tuple[Scalar, ...]
 """Type of the value of a setting."""
 
-REPLACED_SETTINGS = {'track.vehicle.soft_iron': 'track.vehicle.induced_share',
-                     'track.vehicle.soft_iron_std': 'track.vehicle.induced_share_std'}
-"""Former settings, and the current settings that replace them in another unit."""
+USER, EXPERT = 'user', 'expert'
+"""Levels: settings that describe the site, the targets and the wanted results; and settings of the
+methods, which rarely change."""
 
-RENAMED_SETTINGS = {
-    'stated_std_deg': 'nominal_std_deg',
-    'jump_ahead_s': 'max_forward_jump_s', 'jump_back_s': 'max_backward_jump_s',
-    'resume_s': 'max_resume_gap_s', 'ahead_s': 'max_clock_jump_s', 'most_pending': 'max_buffered',
-    'most_sensors': 'max_sensors', 'most_together': 'max_joint_targets',
-    'most_hypotheses': 'max_hypotheses', 'most_at_start': 'max_initial_hypotheses',
-    'relinearise_most': 'relinearise_max_hypotheses', 'smooth_longest_s': 'max_smoothing_s',
-    'explained_ratio': 'min_bayes_factor', 'second_opinion': 'cross_check',
-    'farthest': 'max_start_distance', 'reach': 'start_margin',
-    'longest_clock_offset_s': 'max_clock_offset_s', 'most_accelerations': 'max_accelerations',
-    'longest_retry_s': 'max_retry_s', 'gather_s': 'batch_s', 'silent_s': 'silence_timeout_s',
-    'shortest_delay_s': 'min_delay_s', 'longest_delay_s': 'max_delay_s',
-    'least_step_s': 'min_step_s', 'most_drift_ppm': 'max_drift_ppm', 'longest': 'max_length',
-    'longest_message': 'max_message', 'most_failures': 'max_failures', 'in_turn': 'sequential'}
-"""Former names of settings, and their current names within the same group."""
+_ROW_NAME = re.compile(r'(?!names$)\w[\w -]*')
+"""Permitted names of the rows of a table."""
 
 _Class: TypeAlias = type[object]
 _Default = TypeVar('_Default')
@@ -48,12 +38,17 @@ _Settings = TypeVar('_Settings', bound='DataclassInstance')
 
 
 def param(default: _Default, doc: str, unit: str = '', range: tuple[float, float] | None = None,
-          live: bool = False, length: int | None = None, choices: tuple[str, ...] = ()) -> _Default:
-    """Declare one setting of a frozen dataclass.
+          live: bool = False, length: int | None = None, choices: tuple[str, ...] = (),
+          level: str = EXPERT) -> _Default:
+    """Declare one setting of a frozen dataclass, or a table.
+
+    A table is a tuple of dataclass instances, its rows, with a `name` and settings as columns. Its
+    settings are `<table>.names` and `<table>.<name>.<column>`; a row that is added to the names has
+    the defaults of the columns.
 
     Parameters
     ----------
-    default : float, int, bool, str, or tuple of float or str
+    default : float, int, bool, str, or tuple of float, str or rows
     doc : str
         Description for the reference and the ROS descriptor.
     unit : str, optional
@@ -65,6 +60,8 @@ def param(default: _Default, doc: str, unit: str = '', range: tuple[float, float
         Required length of a tuple. None allows any length except zero.
     choices : tuple of str, optional
         Permitted values of a string.
+    level : str, optional
+        USER or EXPERT.
 
     Returns
     -------
@@ -72,7 +69,7 @@ def param(default: _Default, doc: str, unit: str = '', range: tuple[float, float
     """
     return dataclasses.field(default=default, metadata={
         'doc': doc, 'unit': unit, 'range': range, 'live': live, 'length': length,
-        'choices': choices})
+        'choices': choices, 'level': level})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +96,10 @@ class Parameter:
     """Required length of a tuple, or None."""
     choices: tuple[str, ...]
     """Permitted values of a string. Empty if any string is allowed."""
+    level: str
+    """USER or EXPERT."""
+    row: str = ''
+    """Name of the row, if the setting is a column of a table."""
 
 
 def _types_of_hint(hint: Any) -> tuple[_Class, _Class | None]:
@@ -116,7 +117,12 @@ def _is_group(value: object) -> 'TypeGuard[DataclassInstance]':
     return dataclasses.is_dataclass(value)
 
 
-def flatten(settings: 'DataclassInstance', prefix: str = '') -> list[Parameter]:
+def _is_table(value: object) -> 'TypeGuard[tuple[Any, ...]]':
+    """Whether the value of a field is a table of settings."""
+    return isinstance(value, tuple) and any(map(_is_group, value))
+
+
+def flatten(settings: 'DataclassInstance', prefix: str = '', row: str = '') -> list[Parameter]:
     """List all settings of a tree.
 
     Parameters
@@ -124,6 +130,8 @@ def flatten(settings: 'DataclassInstance', prefix: str = '') -> list[Parameter]:
     settings : dataclass instance
     prefix : str, optional
         Prefix of the names.
+    row : str, optional
+        Name of the row, if `settings` is a row of a table.
 
     Returns
     -------
@@ -136,9 +144,14 @@ def flatten(settings: 'DataclassInstance', prefix: str = '') -> list[Parameter]:
         name, value = prefix + f.name, getattr(settings, f.name)
         if _is_group(value):
             out += flatten(value, name + '.')
-        else:
+        elif _is_table(value):
+            out.append(Parameter(f'{name}.names', tuple(r.name for r in value), tuple, str,
+                                 **f.metadata))
+            for r in value:
+                out += flatten(r, f'{name}.{r.name}.', r.name)
+        elif f.metadata:
             kind, element = _types_of_hint(hints[f.name])
-            out.append(Parameter(name, value, kind, element, **f.metadata))
+            out.append(Parameter(name, value, kind, element, **f.metadata, row=row))
     return out
 
 
@@ -175,6 +188,8 @@ def _validated(p: Parameter, value: object) -> Value:
             raise SettingsError(f'{p.name}: expected at least one value, got none')
     else:
         values = (_scalar(p.name, value, p.type),)
+    if p.name.endswith('.names'):
+        _check_rows(p.name, values)
     for v in values:
         if p.choices and v not in p.choices:
             raise SettingsError(f'{p.name}: expected {", ".join(p.choices[:-1])} or '
@@ -187,6 +202,16 @@ def _validated(p: Parameter, value: object) -> Value:
             raise SettingsError(f'{p.name}: {v} is outside {p.range[0]} .. {p.range[1]}'
                                 f'{" " + p.unit if p.unit else ""}')
     return values if p.element is not None else values[0]
+
+
+def _check_rows(name: str, rows: Sequence[Any]) -> None:
+    """Raise SettingsError if the names of the rows of a table are invalid."""
+    for row in rows:
+        if not _ROW_NAME.fullmatch(row):
+            raise SettingsError(f'{name}: {short_repr(row)} is not a valid name: use letters, '
+                                'digits, _, - and spaces')
+    if len(set(rows)) < len(rows):
+        raise SettingsError(f'{name}: a name is duplicated in {rows}')
 
 
 def _flattened(mapping: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
@@ -231,15 +256,20 @@ def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
         If a name is unknown (the message suggests the closest known name), or a value has a wrong
         type, a wrong length, or is out of range.
     """
-    parameters = {p.name: p for p in flatten(settings)}
-    checked = {}
-    for name, value in _flattened(changes).items():
-        if value == {} and any(k.startswith(f'{name}.') for k in parameters):
-            continue
-        if name not in parameters:
-            raise SettingsError(_unknown_message(name, value, parameters))
-        checked[name] = _validated(parameters[name], value)
-    return _rebuild(settings, checked, '')
+    flat = _flattened(changes)
+    # The names of rows come first, because they determine which other settings exist.
+    names_of_rows = {k: v for k, v in flat.items() if k.endswith('.names')}
+    for part in (names_of_rows, {k: v for k, v in flat.items() if k not in names_of_rows}):
+        parameters = {p.name: p for p in flatten(settings)}
+        checked = {}
+        for name, value in part.items():
+            if value == {} and any(k.startswith(f'{name}.') for k in parameters):
+                continue
+            if name not in parameters:
+                raise SettingsError(_unknown_message(name, value, parameters))
+            checked[name] = _validated(parameters[name], value)
+        settings = _rebuild(settings, checked, '')
+    return settings
 
 
 def _unknown_message(name: str, value: object, names: Iterable[str]) -> str:
@@ -252,19 +282,20 @@ def _unknown_message(name: str, value: object, names: Iterable[str]) -> str:
 
 
 def _suggestion(name: str, names: Iterable[str]) -> str:
-    """Suggestion for an unknown setting: its replacement, its new name or the closest known name.
+    """Suggestion for an unknown setting: its current name or the closest known name.
 
     Empty if there is no suggestion.
     """
     names = list(names)
-    group, dot, leaf = name.rpartition('.')
-    if name in REPLACED_SETTINGS:
-        return f'; it was replaced by {REPLACED_SETTINGS[name]}, which has another unit'
-    renamed = f'{group}{dot}{RENAMED_SETTINGS.get(leaf)}'
-    if renamed in names:
-        return f'; it was renamed to {renamed}'
+    group, _, leaf = name.rpartition('.')
+    if name in FORMER_SETTINGS:
+        current = FORMER_SETTINGS[name]
+        return f'; it is now {current}' if current else '; it is now a constant'
     if group in names:
         return f'; {group} is a single setting'
+    table, _, row = group.rpartition('.')
+    if f'{table}.names' in names and not any(k.startswith(f'{group}.') for k in names):
+        return f'; {row} is not in {table}.names'
     if group and not any(k.startswith(f'{group}.') for k in names):
         return _group_suggestion(group, leaf, names)
     if not group:
@@ -313,6 +344,12 @@ def _rebuild(settings: _Settings, checked: Mapping[str, Value], prefix: str) -> 
         name, value = prefix + f.name, getattr(settings, f.name)
         if _is_group(value):
             changes[f.name] = _rebuild(value, checked, name + '.')
+        elif _is_table(value):
+            rows = {row.name: row for row in value}
+            changes[f.name] = tuple(
+                _rebuild(rows.get(row) or type(value[0])(row), checked, f'{name}.{row}.')
+                for row in map(str, typing.cast('tuple[str, ...]', checked.get(
+                    f'{name}.names', tuple(rows)))))
         elif name in checked:
             changes[f.name] = checked[name]
     return dataclasses.replace(settings, **changes)
@@ -404,12 +441,14 @@ def _yaml_value(value: Value) -> str:
     return str(value) if isinstance(value, int) else f"'{value}'"
 
 
-def to_yaml(settings: 'DataclassInstance', node: str = '/**') -> str:
+def to_yaml(settings: 'DataclassInstance', level: str = '', node: str = '/**') -> str:
     """Format settings as a ROS parameter file with comments.
 
     Parameters
     ----------
     settings : dataclass instance
+    level : str, optional
+        Only settings of this level.
     node : str, optional
         Name of the node, or a wildcard.
 
@@ -418,19 +457,33 @@ def to_yaml(settings: 'DataclassInstance', node: str = '/**') -> str:
     str
     """
     lines = ['# Generated from the settings by `make config`; do not edit.',
+             *[f'# The {level} settings; the reference lists all.'] * bool(level),
              f'{node}:', '  ros__parameters:']
-    previous_group = None
-    for p in flatten(settings):
-        group_name, _, leaf = p.name.rpartition('.')
-        if group_name != previous_group:
-            lines += [''] if previous_group is not None else []
-            lines += [f'    {group_name}:'] if group_name else []
-            previous_group = group_name
-        indent = '      ' if group_name else '    '
-        notes = [p.unit] if p.unit else []
-        notes += [f'{p.range[0]} .. {p.range[1]}'] if p.range else []
-        notes += [', '.join(p.choices)] if p.choices else []
-        notes += ['live'] if p.live else []
-        lines.append(f'{indent}# {p.doc}' + (f' [{"; ".join(notes)}]' if notes else ''))
-        lines.append(f'{indent}{leaf}: {_yaml_value(p.value)}')
+    previous_group = previous_row = ''
+    chosen = (p for p in flatten(settings) if level in ('', p.level))
+    for (group, row), grouped in groupby(chosen, lambda p: (p.name.rpartition('.')[0], p.row)):
+        members = {p.name.rpartition('.')[2]: p for p in grouped}
+        group = group.removesuffix(f'.{row}')
+        if group != previous_group:
+            lines += [''] if previous_group else []
+            lines += [f'    {group}:'] if group else []
+        indent = '      ' if group else '    '
+        if not row:
+            for leaf, p in members.items():
+                lines += [f'{indent}# {_comment(p)}', f'{indent}{leaf}: {_yaml_value(p.value)}']
+        else:
+            if not previous_row:
+                lines += [f'{indent}# {leaf}: {_comment(p)}' for leaf, p in members.items()]
+            lines.append(f'{indent}{row}: {{' + ', '.join(
+                f'{leaf}: {_yaml_value(p.value)}' for leaf, p in members.items()) + '}')
+        previous_group, previous_row = group, row
     return '\n'.join(lines) + '\n'
+
+
+def _comment(p: Parameter) -> str:
+    """Description of a setting with its unit, range and choices."""
+    notes = [p.unit] if p.unit else []
+    notes += [f'{p.range[0]} .. {p.range[1]}'] if p.range else []
+    notes += [', '.join(p.choices)] if p.choices else []
+    notes += ['live'] if p.live else []
+    return p.doc + (f' [{"; ".join(notes)}]' if notes else '')

@@ -1,11 +1,10 @@
-"""Lets pip build mag_tracking_msgs: run the CMake build, put what it installs into a wheel.
+"""Lets pip build mag_tracking_msgs: the Python classes of the messages and the code they need.
 
 For people without a ROS from apt: the generators are then wheels of the build environment.
 """
 
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
@@ -17,62 +16,42 @@ NAME = 'mag_tracking_msgs'
 SOURCE = Path(__file__).resolve().parent
 PROJECTS = {NAME: SOURCE, **{name: SOURCE / 'standard' / name for name in (
     'tf2_msgs', 'vision_msgs')}}
-"""{package: folder of its CMakeLists.txt}: ours, and those of others that PyPI does not have."""
+"""{package: folder of its definitions}: ours, and those of others that PyPI does not have."""
 
 
-def ros_prefix():
-    """The prefix under which pip has put the generators (`<prefix>/share/ament_cmake`)."""
-    for entry in sys.path:
-        for prefix in Path(entry).resolve().parents:
-            if (prefix / 'share' / 'ament_cmake').is_dir():
-                return prefix
-    raise RuntimeError('ament_cmake is not in the build environment: build with `pip install`')
+def extension(name):
+    """The extension module of a package; its sources are added when they have been generated.
+
+    Everything is resolved on import, so that a missing symbol fails there. From
+    <prefix>/lib/pythonX.Y/site-packages/NAME the libraries of ROS are in <prefix>/lib.
+    """
+    return Extension(
+        f'{name}.{name}_s__rosidl_typesupport_c', [], language='c++',
+        define_macros=[('NDEBUG', None)], extra_compile_args=['-O1', '-g0', '-Wno-cpp'],
+        extra_link_args=['-Wl,--as-needed', '-Wl,-z,now', '-Wl,-rpath,$ORIGIN/../../..'])
 
 
-class CMakeBuild(build_ext):
-    """Build with CMake in place of a compiler call; an extension makes the wheel platform's own."""
+class GenerateAndBuild(build_ext):
+    """Generate the classes and the code before the compilation."""
 
     def run(self):
-        self.distribution.data_files = []
-        for name, source in PROJECTS.items():
-            self._build(name, source)
-
-    def _build(self, name, source):
-        work = Path(self.build_temp).resolve() / name
-        installed = work / 'install'
-        # An older CMake cache would name an older build environment, which pip has removed.
+        sys.path.insert(0, str(SOURCE))
+        import python_build
+        work = Path(self.build_temp).resolve() / 'generated'
         shutil.rmtree(work, ignore_errors=True)
-        self._cmake(source, work / 'build', installed)
-
-        package = Path(self.build_lib) / name
-        shutil.rmtree(package, ignore_errors=True)
-        shutil.copytree(installed / 'python' / name, package)
-        # Libraries and the ament index go below the environment's prefix, where rclpy looks.
-        self.distribution.data_files += [
-            (str(file.parent.relative_to(installed)), [str(file)])
-            for folder in ('lib', 'share')
-            for file in sorted((installed / folder).rglob('*'))
-            if file.is_file()
-        ]
-
-    def _cmake(self, source, build, installed):
-        prefix = ros_prefix()
-        env = {**os.environ, 'AMENT_PREFIX_PATH': str(prefix), 'CMAKE_PREFIX_PATH': str(prefix)}
-        options = {
-            'CMAKE_BUILD_TYPE': 'Release',
-            'CMAKE_INSTALL_PREFIX': installed,
-            'PYTHON_INSTALL_DIR': 'python',
-            'Python3_EXECUTABLE': sys.executable,
-            'BUILD_TESTING': 'OFF',
-            # From <prefix>/lib to itself, and from <prefix>/lib/pythonX.Y/site-packages/NAME.
-            'CMAKE_INSTALL_RPATH': '$ORIGIN;$ORIGIN/../../..',
-        }
-        defines = [f'-D{key}={value}' for key, value in options.items()]
-        for command in (
-            ['cmake', '-G', 'Ninja', '-S', source, '-B', build, *defines],
-            ['cmake', '--build', build, '--target', 'install'],
-        ):
-            subprocess.run(command, env=env, check=True)
+        self.distribution.data_files = []
+        for (name, source), module in zip(PROJECTS.items(), self.extensions, strict=True):
+            python_build.generate(name, source, work)
+            for option, values in python_build.extension_options(name, source, work).items():
+                getattr(module, option).extend(values)
+            for folder, files in python_build.shared_files(name, source, work).items():
+                self.distribution.data_files.append((folder, files))
+            package = Path(self.build_lib) / name
+            shutil.rmtree(package, ignore_errors=True)
+            shutil.copytree(work / 'rosidl_generator_py' / name, package,
+                            ignore=shutil.ignore_patterns('*.c'))
+            (package / '__init__.py').touch()
+        super().run()
 
     def get_source_files(self):
         return []
@@ -87,10 +66,11 @@ setup(
     description='ROS 2 messages and services of mag_tracking',
     author='The mag_tracking authors',
     license='Apache-2.0',
-    python_requires='>=3.10',
+    python_requires='>=3.11',
     packages=[],
-    ext_modules=[Extension(NAME, sources=[])],
-    cmdclass={'build_ext': CMakeBuild},
+    ext_modules=[extension(name) for name in PROJECTS],
+    options={'build_ext': {'parallel': os.cpu_count()}},
+    cmdclass={'build_ext': GenerateAndBuild},
     # The libraries of these are what ours are linked to.
     install_requires=[
         'numpy',

@@ -1,15 +1,18 @@
 """Settings: generated files, validation of values, and parameter files."""
 
+import dataclasses
 import importlib.util
+import re
 
 import pytest
 import yaml
 
-from mag_tracking.drivers.configuration import settings_by_kind
 from mag_tracking.errors import SettingsError
+from mag_tracking.former_settings import FORMER_SETTINGS
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.settings import (
-    RENAMED_SETTINGS,
+    EXPERT,
+    USER,
     flatten,
     read_parameter_file,
     replace,
@@ -43,14 +46,12 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
 
 
 @pytest.mark.parametrize('changes, message', [
-    ({'track.vehicle.soft_iron': 4.0}, 'it was replaced by track.vehicle.induced_share'),
-    ({'track.explained_ratio': 4.0}, 'it was renamed to track.min_bayes_factor'),
-    ({'calibrate.jump_back_s': 4.0}, 'it was renamed to calibrate.max_backward_jump_s'),
+    ({'calibrate.guard_s': 4.0}, 'unknown setting calibrate.guard_s; it is now a constant'),
     ({'align': {'perod_s': 0.1}}, 'unknown setting align.perod_s; did you mean align.period_s'),
     ({'trak': {'x': 1}}, 'unknown setting trak.x; there is no group trak; did you mean track'),
     ({'trak': {'iteration': 1}}, r'there is no group trak; did you mean track.iterations\?'),
     ({'track.vehicel.x': 1}, r'no group track.vehicel; did you mean track.vehicle\?'),
-    ({'foo': {'x': 1}}, 'no group foo; the groups are calibrate, align, detect, events, track, '),
+    ({'foo': {'x': 1}}, 'no group foo; the groups are calibrate, align, detect, track, traffic'),
     ({'relearn_s': 3}, r'unknown setting relearn_s; did you mean calibrate.relearn_s\?'),
     ({'calibrate.relearn_s': {'x': 3}}, 'calibrate.relearn_s is a single setting'),
     ({'trak': {}}, r'unknown setting trak; did you mean track\?'),
@@ -66,8 +67,16 @@ def test_every_setting_is_documented_and_its_default_is_in_range():
     ({'track.vehicle.speeds': []}, 'at least one'),
     ({'track.vehicle.speeds': 5.0}, 'expected a list'),
     ({'track.vehicle.speeds': [5.0, 1e9]}, 'outside'),
-    ({'track.vehicle.kinds': ['small', 'c\ud800r', 'truck']},
-     r"track.vehicle.kinds: 'c\\ud800r' is not text: it contains an unpaired surrogate"),
+    ({'track.vehicle.kinds': {'names': ['small', 'c\ud800r', 'truck']}},
+     r"track.vehicle.kinds.names: 'c\\ud800r' is not text: it contains an unpaired surrogate"),
+    ({'track.vehicle.kinds': ['car']}, 'kinds is a group of settings, such as .*kinds.names'),
+    ({'track.vehicle.kinds.names': ['car', 'car']}, 'kinds.names: a name is duplicated'),
+    ({'track.vehicle.kinds.names': ['a.b']}, "kinds.names: 'a.b' is not a valid name"),
+    ({'track.vehicle.kinds.names': ['names']}, "kinds.names: 'names' is not a valid name"),
+    ({'track.vehicle.kinds.names': []}, 'kinds.names: expected at least one value'),
+    ({'track.vehicle.kinds.bus.height': 1.0}, 'bus is not in track.vehicle.kinds.names'),
+    ({'track.vehicle.kinds.car.hight': 1.0}, r'did you mean track.vehicle.kinds.car.height\?'),
+    ({'track.vehicle.heights': [1.0]}, 'it is now track.vehicle.kinds.car.height'),
     ({'track.vehicle.arrival_names': ['left', 'right', '\udcff']}, 'arrival_names: .* surrogate'),
 ])
 def test_errors_name_the_invalid_setting(changes, message):
@@ -80,6 +89,15 @@ def test_each_arrival_needs_a_heading(road_network):
     settings = settings_for('vehicle', {'track.vehicle.arrival_headings_deg': [0.0, 90.0]})
     with pytest.raises(SettingsError, match='arrival_headings_deg: expected 3 values'):
         Pipeline(road_network, settings)
+
+
+def test_rows_of_a_table_are_added_and_removed():
+    bus = {'length': 8.0, 'height': 1.2}
+    changed = replace(Settings(), {'track': {'vehicle': {'kinds': {
+        'names': ['bus', 'truck'], 'bus': bus, 'truck': {'moment': 2000.0}}}}}).track.vehicle.kinds
+    default = {kind.name: kind for kind in Settings().track.vehicle.kinds}
+    assert changed == (dataclasses.replace(default['car'], name='bus', **bus),
+                       dataclasses.replace(default['truck'], moment=2000.0))
 
 
 def test_the_targets_in_parameters_and_call_must_agree():
@@ -96,7 +114,7 @@ def test_parameter_files_are_read_and_checked(tmp_path):
     assert read_parameter_file(path) == {'track.iterations': 2, 'align.period_s': 0.1}
     path.write_text('track: {vehicle: {moment: 100.0}}')
     assert read_parameter_file(path) == {'track.vehicle.moment': 100.0}
-    path.write_text('base: &b {iterations: 2, prune_ratio: 0.1}\n'
+    path.write_text('base: &b {iterations: 2, end_nis: 9.0}\n'
                     'track: {<<: *b, iterations: 3}\n')
     assert read_parameter_file(path)['track.iterations'] == 3
     path.write_text('')
@@ -119,26 +137,45 @@ def test_parameter_files_are_read_and_checked(tmp_path):
         read_parameter_file(tmp_path / 'nowhere.yaml')
 
 
-def test_the_default_file_is_plain_yaml_with_floats():
-    content = yaml.safe_load((ROOT / 'config/default.yaml').read_text())
-    assert content['/**']['ros__parameters']['track']['background_std'] == 2e-8
+def declared(settings, prefix=''):
+    """{name: level} of the settings, in which a table counts as one."""
+    out = {}
+    for f in dataclasses.fields(settings):
+        if f.metadata:
+            out[prefix + f.name] = f.metadata['level']
+        else:
+            out |= declared(getattr(settings, f.name), f'{prefix}{f.name}.')
+    return out
+
+
+def test_settings_are_few_and_the_guide_names_those_of_users():
+    levels = declared(Settings())
+    of_users = {name for name, level in levels.items() if level == USER}
+    assert len(of_users) <= 22 and len(levels) <= 75 and set(levels.values()) == {USER, EXPERT}
+    guide = (ROOT / 'docs/guides/settings.md').read_text(encoding='utf-8')
+    assert set(re.findall(r'`((?:\w+\.)+\w+)`', guide)) - {'config/default.yaml'} == of_users
+
+
+def test_the_default_file_is_plain_yaml_with_the_settings_of_users():
+    content = yaml.safe_load((ROOT / 'config/default.yaml').read_text(encoding='utf-8'))
+    assert content['/**']['ros__parameters']['calibrate']['max_field'] == 1e-3
+    parameters = flatten(Settings())
+    assert read_parameter_file(ROOT / 'config/default.yaml') == {
+        p.name: list(p.value) if isinstance(p.value, tuple) else p.value
+        for p in parameters if p.level == USER}
 
 
 @pytest.mark.parametrize('changes, message', [
-    ({'track.vehicle.lengths': [0.0, 3.0]}, r'lengths: expected 3 values \(one per kind\), got 2'),
     ({'track.vehicle.arrival_names': ['a']},
      r'arrival_headings_deg: expected 1 value \(one per arrival name\), got 3'),
-    ({'track.vehicle.kinds': ['car', 'car', 'truck']}, 'kinds: a name is duplicated'),
-    ({'track.vehicle.length_stds': [1.0, 1.0, 3.0]}, 'length_stds: 1 for small, which is a point'),
-    ({'track.vehicle.difference_stds': [9.0, 30.0, 120.0]}, 'difference_stds: 9 for small')])
+    ({'track.vehicle.kinds.small.length_std': 1.0}, 'small.length_std: 1 for a point'),
+    ({'track.vehicle.kinds.small.difference_std': 9.0}, 'small.difference_std: 9 for a point')])
 def test_related_lists_are_checked_against_each_other(road_network, changes, message):
     with pytest.raises(SettingsError, match=message):
         TrackManager(road_network, settings_for('vehicle', changes).track)
 
 
 def test_every_former_name_has_a_current_setting():
-    """The current names are looked up in the settings of the pipeline and of the drivers."""
-    known = {p.name.rpartition('.')[2] for group in (Settings(), *settings_by_kind().values())
-             for p in flatten(group)}
-    assert set(RENAMED_SETTINGS.values()) - known == set()
-    assert set(RENAMED_SETTINGS) & known == set()
+    known = {p.name for p in flatten(Settings())}
+    assert set(FORMER_SETTINGS.values()) - known - {''} == set()
+    assert set(FORMER_SETTINGS) & known == set()

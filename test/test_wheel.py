@@ -9,6 +9,7 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -17,13 +18,14 @@ from support.bundled import NETWORK_FILE, ROOT, vehicle_path
 
 NAME = 'straight_car_fast_left'
 RUNNING_VERSION = f'{sys.version_info.major}.{sys.version_info.minor}'
-VERSIONS = sorted({'3.10', '3.13', RUNNING_VERSION}, key=lambda v: int(v.partition('.')[2]))
-SHARE = 'mag_tracking-0.1.0.data/data/share'
-METADATA = {f'mag_tracking-0.1.0.dist-info/{name}' for name in (
+VERSIONS = sorted({'3.11', '3.14', RUNNING_VERSION}, key=lambda v: int(v.partition('.')[2]))
+VERSION = ElementTree.parse(ROOT / 'package.xml').findtext('version')
+SHARE = f'mag_tracking-{VERSION}.data/data/share'
+METADATA = {f'mag_tracking-{VERSION}.dist-info/{name}' for name in (
     'METADATA', 'WHEEL', 'RECORD', 'entry_points.txt', 'top_level.txt', 'licenses/LICENSE')}
 CORE_SOURCES = sorted(str(p.relative_to(ROOT)) for p in (ROOT / 'mag_tracking').rglob('core.cpp'))
 UNRELATED_FILES = (
-    'mag_tracking/notes.txt', 'mag_tracking/physics/__pycache__/dipole.cpython-310.pyc',
+    'mag_tracking/notes.txt', 'mag_tracking/physics/__pycache__/dipole.cpython-311.pyc',
     'test/test_new.py', 'mag_tracking.egg-info/PKG-INFO', 'out/summary.json',
     'config/backup.yaml~')
 SITE_NETWORK = '''
@@ -129,20 +131,24 @@ def interpreter(version):
     pytest.skip(f'python{version} with venv is neither on PATH nor installed by pyenv')
 
 
+@pytest.mark.timeout(900)
 def test_the_wheel_contains_all_required_files_and_no_others(tmp_path, tree_copy):
     """The wheel is built without build isolation, which would need a network."""
     pytest.importorskip('setuptools', minversion='70.1', reason='builds wheels from 70.1 on')
     for name in UNRELATED_FILES:
         (tree_copy / name).parent.mkdir(parents=True, exist_ok=True)
         (tree_copy / name).write_text('')
-    # The compiled modules are not run, so they are built without optimisation, which is faster.
+    # The compiled modules are not run, so they are built without optimisation and for one
+    # processor, which is faster.
     compiler = tmp_path / 'compiler'
     compiler.write_text('#!/bin/sh\nexec c++ "$@" -O0\n')
     compiler.chmod(0o755)
     run(sys.executable, '-c', 'import sys, setuptools.build_meta as b; b.build_wheel(sys.argv[1])',
-        tmp_path, cwd=tree_copy, CC=str(compiler), CXX=str(compiler))
+        tmp_path, cwd=tree_copy, CC=str(compiler), CXX=str(compiler),
+        MAG_TRACKING_PROCESSOR='native')
     wheel, = tmp_path.glob('*.whl')
-    assert re.fullmatch(r'mag_tracking-0\.1\.0-cp3\d+-cp3\d+-linux_\w+\.whl', wheel.name)
+    assert re.fullmatch(rf'mag_tracking-{re.escape(VERSION)}-cp3\d+-cp3\d+-linux_\w+\.whl',
+                        wheel.name)
     assert contained_files(wheel) == expected_files()
     assert {'mag_tracking/py.typed', 'mag_tracking/nodes/fastdds.xml',
             f'{SHARE}/mag_tracking/config/network.yaml',

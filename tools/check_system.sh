@@ -32,9 +32,9 @@ if [ "$(uname -s)" != Linux ] || [ "$(uname -m)" != x86_64 ]; then
 fi
 
 if command -v "$python" >/dev/null; then
-    # The pins of constraints.txt have wheels for 3.10 to 3.13.
-    "$python" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' ||
-        fail "$python is $("$python" --version 2>&1); Python 3.10 to 3.13 is required." \
+    # The pins of constraints.txt have wheels for 3.11 to 3.14.
+    "$python" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' ||
+        fail "$python is $("$python" --version 2>&1); Python 3.11 to 3.14 is required." \
              'Select another interpreter: make setup PYTHON=python3.12'
 elif [ "$python" != python3 ]; then
     fail "$python is not installed."

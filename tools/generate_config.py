@@ -1,4 +1,4 @@
-"""Generate the files in config/ that contain every setting with its default.
+"""Generate the files in config/ that contain every user setting with its default.
 
 `make config` runs it; a test compares the files with its output.
 """
@@ -6,7 +6,7 @@
 from pathlib import Path
 
 from mag_tracking.pipeline import TARGET_DEFAULTS, Settings, settings_for
-from mag_tracking.settings import to_yaml
+from mag_tracking.settings import USER, to_yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -15,8 +15,8 @@ def generated():
     """Contents of all generated files: {path: content}."""
     # A bench differs from a magnet in a hand by a few settings, which the documentation lists.
     assert set(TARGET_DEFAULTS) == {'vehicle', 'magnet', 'bench'}
-    return {ROOT / 'config' / 'default.yaml': to_yaml(Settings()),
-            ROOT / 'config' / 'magnet.yaml': to_yaml(settings_for('magnet'))}
+    return {ROOT / 'config' / 'default.yaml': to_yaml(Settings(), USER),
+            ROOT / 'config' / 'magnet.yaml': to_yaml(settings_for('magnet'), USER)}
 
 
 if __name__ == '__main__':

@@ -18,9 +18,9 @@ from mag_tracking.errors import ClusterError, MagTrackingError, OutputError, Rec
 from mag_tracking.files import checked_path
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings
-from mag_tracking.recording.archive_folder import ArchiveFolder, common_columns, recording_state
-from mag_tracking.recording.parquet_table import import_pyarrow
 from mag_tracking.recording.reader import SUFFIXES
+from mag_tracking.results.archive_folder import ArchiveFolder, common_columns, recording_state
+from mag_tracking.results.parquet_table import import_pyarrow
 
 _Cluster = Cluster[tuple[str, Job]]
 
@@ -113,7 +113,7 @@ def archive(recordings: Iterable[str | PathLike[str]],
     Parameters
     ----------
     recordings : recordings, folders and glob patterns
-    out : folder of the dataset, laid out as in `recording.archive_folder`
+    out : folder of the dataset, laid out as in `results.archive_folder`
     workers : number of processes on this machine
     scheduler : address of a Dask scheduler, such as tcp://10.0.0.5:8786, used instead of `workers`;
         its workers need this package, and the recordings and `out` under the same paths

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
-from mag_tracking.recording.archive_folder import common_columns
+from mag_tracking.results.archive_folder import common_columns
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.units import NS
 
@@ -51,11 +50,7 @@ class HealthRows:
                    'accepted': total[0] - previous[0], 'rejected': total[1] - previous[1],
                    'times_relearnt': background.n_relearnt, 'ready': background.ready,
                    'stuck': background.stuck, 'doubtful': background.doubtful,
-                   **_axis_columns('background', level), **_axis_columns('drift', background.drift),
-                   **_axis_columns('noise', noise)}
-
-
-def _axis_columns(name: str, values: FloatArray) -> dict[str, float | None]:
-    """Columns `name_x`, `name_y` and `name_z` of a vector; None replaces NaN."""
-    return {f'{name}_{axis}': None if np.isnan(v) else float(v)
-            for axis, v in zip('xyz', values, strict=True)}
+                   **{f'{name}_{axis}': float(v)
+                      for name, values in (('background', level), ('drift', background.drift),
+                                           ('noise', noise))
+                      for axis, v in zip('xyz', values, strict=True)}}

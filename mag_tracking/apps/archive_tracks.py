@@ -1,25 +1,23 @@
 """Tracks and passes of one segment of a recording, as rows of archive tables."""
 
-import math
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.apps.archive_segments import FrameChunk
 from mag_tracking.apps.pass_fitter import fitted_vehicles
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
-from mag_tracking.apps.replay import RunCollector
-from mag_tracking.event_records import Disturbance
-from mag_tracking.recording.archive_folder import common_columns
-from mag_tracking.recording.archive_tables import TABLES
-from mag_tracking.recording.fit_folder import pass_rows
-from mag_tracking.recording.parquet_table import TableWriter
-from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
+from mag_tracking.apps.replay import TrackHistory
+from mag_tracking.record_receiver import RecordReceiver
+from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.results.archive_folder import common_columns
+from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.columns import MOMENT, names_of, row_of
+from mag_tracking.results.fit_folder import pass_rows
+from mag_tracking.results.parquet_table import TableWriter
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.settings import TrackSettings
 
@@ -27,7 +25,7 @@ SEGMENT_TABLES = ('tracks', 'poses', 'smoothed', 'passes')
 """Tables that are filled from the segments."""
 
 
-class SegmentTables:
+class SegmentTables(RecordReceiver):
     """Writes the tracks and passes of a segment to tables; a context manager.
 
     `paths` are the files of `SEGMENT_TABLES`. `n_dipoles` in the row model a vehicle; a joint fit
@@ -42,7 +40,7 @@ class SegmentTables:
         self._files = ExitStack()
         self._tables = {name: self._files.enter_context(TableWriter(paths[name], TABLES[name]))
                         for name in SEGMENT_TABLES}
-        self._collector = RunCollector(self)
+        self._history = TrackHistory()
         self.n_tracks = self.n_passes = 0
 
     def __enter__(self) -> 'SegmentTables':
@@ -58,52 +56,40 @@ class SegmentTables:
                 tracker.set_input_doubts(doubts)
             records = tracker.feed(frame)
             self._tracks.add(records)
-            self._collector.add([frame, *records])
-        for log in [log for log in self._collector.logs.values() if log.ended]:
+            for receiver in (self, self._history):
+                receiver.receive([frame, *records])
+        for log in [log for log in self._history.logs.values() if log.ended]:
             self._add_track_row(log)
         for numbered_pass in chunk.passes:
             self._add_pass(*numbered_pass)
 
     def finish(self, tracker: TrackManager) -> None:
         """End the segment and write the remaining tracks."""
-        self._collector.add(tracker.flush())
-        for log in list(self._collector.logs.values()):
+        records = tracker.flush()
+        for receiver in (self, self._history):
+            receiver.receive(records)
+        for log in list(self._history.logs.values()):
             self._add_track_row(log)
-
-    def add_frame(self, frame: FieldFrame) -> None:
-        """Ignore a frame, because frames have no table."""
-
-    def add_detection(self, detection: Detection) -> None:
-        """Ignore a detection, because detections have no table."""
-
-    def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Ignore a disturbance, because disturbances have no table."""
 
     def add_track(self, track: Track) -> None:
         """Write the row of a pose; the closing record of a track has no row."""
         if not track.ended:
-            self._tables['poses'].add(self._pose_columns(track) | {
-                'weight': track.weight, 'kind_weight': _nullable(track.kind_weight),
-                'arrival': track.arrival, 'doubts': ' '.join(track.doubts)})
+            self._add_pose('poses', track)
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
         """Write the row of a pose smoothed over a whole track; fixed-lag poses have no row."""
         if pose.complete:
-            self._tables['smoothed'].add(self._pose_columns(pose))
+            self._add_pose('smoothed', pose)
 
-    def _pose_columns(self, pose: Track | SmoothedPose) -> dict[str, Any]:
-        """Columns common to published and smoothed poses."""
-        sd = np.sqrt(np.diagonal(pose.covariance))
-        values = np.concatenate([pose.position, pose.velocity, sd, pose.moment]).tolist()
-        return {**common_columns(self._recording, pose.stamp_ns), 'track_id': pose.id,
-                **dict(zip(_STATE_COLUMNS, map(_nullable, values), strict=True)),
-                'covariance': pose.covariance.ravel().tolist(), 'kind': pose.kind,
-                'length': _nullable(pose.length), 'ambiguous': pose.ambiguous}
+    def _add_pose(self, table: str, pose: Track | SmoothedPose) -> None:
+        """Write the row of a published or smoothed pose."""
+        self._tables[table].add(row_of(TABLES[table], pose, common_columns(
+            self._recording, pose.stamp_ns)))
 
     def _add_track_row(self, log: TrackLog) -> None:
         """Write the row of a track that has ended, and discard the history of the track."""
-        del self._collector.logs[log.id]
-        smoothed = self._collector.smoothed.pop(log.id, None)
+        del self._history.logs[log.id]
+        smoothed = self._history.smoothed.pop(log.id, None)
         self.n_tracks += 1
         self._tables['tracks'].add(
             common_columns(self._recording, log.stamp_ns[0]) | {'track_id': log.id}
@@ -119,32 +105,18 @@ class SegmentTables:
             row = next((row for row in rows if row['chosen']), rows[-1])
             self.n_passes += 1
             self._tables['passes'].add(
-                {name: _nullable(value) if isinstance(value, float) else value
-                 for name, value in row.items() if name not in ('recording', 'pass')}
-                | common_columns(self._recording, row['stamp_ns'])
-                | {'number': number, 'notes': '; '.join(vehicle.notes)})
-
-
-_STATE_COLUMNS = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy',
-                  'sd_vz', 'mx', 'my', 'mz')
+                row | common_columns(self._recording, row['stamp_ns']) | {
+                    'number': number, 'notes': '; '.join(vehicle.notes)})
 
 
 def _track_columns(log: TrackLog, smoothed: SmoothedLog | None) -> dict[str, Any]:
     """Columns of a track in the table `tracks`."""
     summary = log.summary()
-    columns = {name: summary[name] for name in (
-        'end_ns', 'poses', 'arrival', 'kind', 'verdict', 'kind_weight', 'ambiguous_share',
-        'nis_per_axis', 'length', 'smallest_sd', 'speed', 'heading_deg', 'moment_size')}
-    columns |= dict(zip(('mx', 'my', 'mz'), summary['moment'], strict=True))
-    columns |= {'doubts': ' '.join(summary['doubts']),
-                'arrival_weight': summary['arrival_weights'][summary['arrival']]}
+    columns = summary | dict(zip(names_of(MOMENT), summary['moment'], strict=True)) | {
+        'doubts': ' '.join(summary['doubts']),
+        'arrival_weight': summary['arrival_weights'][summary['arrival']]}
     if smoothed is not None:
         values = smoothed.summary()
         columns |= {'smoothed_speed': values['speed'],
                     'smoothed_moment_size': values['moment_size']}
-    return {name: _nullable(v) if isinstance(v, float) else v for name, v in columns.items()}
-
-
-def _nullable(value: float) -> float | None:
-    """Replace NaN by None, which is stored as null."""
-    return None if math.isnan(value) else value
+    return columns

@@ -9,14 +9,12 @@ import json
 import secrets
 import shutil
 import tempfile
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.apps.archive_health import HealthRows
 from mag_tracking.apps.archive_result import (
     ClockComparisonHistory,
@@ -27,17 +25,17 @@ from mag_tracking.apps.archive_result import (
 from mag_tracking.apps.archive_segments import SegmentWriter, read_segment, work_file_errors
 from mag_tracking.apps.archive_tracks import SEGMENT_TABLES, SegmentTables
 from mag_tracking.apps.pass_collector import PassCollector
-from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.errors import OutputError
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Settings
-from mag_tracking.recording.archive_folder import common_columns, join_tables, recording_key
-from mag_tracking.recording.archive_tables import TABLES
-from mag_tracking.recording.parquet_table import TableWriter, check_row
+from mag_tracking.pipeline import Pipeline, Settings
+from mag_tracking.record_receiver import Step
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame
+from mag_tracking.results.archive_folder import common_columns, join_tables, recording_key
+from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.parquet_table import TableWriter, check_row
+from mag_tracking.run import RecordingSource, run
 from mag_tracking.stages.track.manager import TrackManager
 
 N_DIPOLES = 3
@@ -126,14 +124,12 @@ def _rename(temporary: Path, final: Path) -> None:
 
 
 class _Segmenter:
-    """Processes a recording with the stages before the tracker and writes its segments."""
+    """Sink of the stages before the tracker that writes segments, passes and sensor health."""
 
     def __init__(self, job: Job, folder: Path, health: TableWriter) -> None:
-        self._recording, self._path = Recording(job.recording), job.recording
-        self._reader = SampleReader(self._recording, job.network)
-        self._passes = PassCollector(job.network, job.settings, self._add_frame)
-        prescan_of(self._recording, job.network, job.settings.calibrate).apply(
-            self._passes.calibrate)
+        self._source = RecordingSource(Recording(job.recording), job.network)
+        self._path, self._pipeline = job.recording, Pipeline(job.network, job.settings, 'detect')
+        self._passes = PassCollector(self._pipeline)
         self._writer = SegmentWriter(folder, job.settings.track.lookback_s)
         self._health, self._health_table = HealthRows(job.recording, job.network), health
         self._first_ns: int | None = None
@@ -142,30 +138,27 @@ class _Segmenter:
 
     def read(self) -> dict[str, Any]:
         """Write the segments and the health table; return columns of the table `recordings`."""
-        for readings in self._reader.readings():
-            self._add_passes(self._passes.feed(readings))
-        self._add_passes(self._passes.flush())
+        report = run(self._source, self._pipeline, [self])
         self._writer.close()
         if self._last_ns is not None:
-            self._add_health(self._health.rows(self._last_ns, self._passes.calibrate))
-        missing_topics = self._reader.missing_topics()
+            self._add_health(self._health.rows(self._last_ns, self._pipeline.calibrate))
         return {
             **common_columns(self._path, self._first_ns), 'end_ns': self._last_ns,
             'frames': self._writer.n_frames, 'segments': self._writer.n_segments,
-            'size': self._recording.size, 'lost': _format_counts(self._recording.losses),
-            'rejected': _format_counts(self._reader.rejected + Counter(self._passes.rejected)),
-            'missing_topics': ' '.join(missing_topics),
-            'no_detection_reason': self._passes.no_detection_reason(missing_topics) or ''}
+            'size': self._source.recording.size, 'lost': _format_counts(report.lost),
+            'rejected': _format_counts(report.rejected),
+            'missing_topics': ' '.join(report.missing_topics),
+            'no_detection_reason': report.no_detection_reason or ''}
 
-    def _add_frame(self, frame: FieldFrame) -> None:
-        """Write a frame with its detection result, and the health rows that are due."""
-        self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
-        self._last_ns = frame.stamp_ns
-        self._writer.add_frame(frame, self._passes.calibrate.input_doubts())
-        self._add_health(self._health.due_rows(frame.stamp_ns, self._passes.calibrate))
-
-    def _add_passes(self, passes: Iterable[tuple[PassData, tuple[str, ...]]]) -> None:
-        """Assign indices to completed passes and write the passes."""
+    def add(self, step: Step) -> None:
+        """Write the frames and the passes of a step, and the health rows that are due."""
+        calibrate, passes = self._pipeline.calibrate, self._passes.passes(step)
+        for frame in step.records:
+            if isinstance(frame, FieldFrame):
+                self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
+                self._last_ns = frame.stamp_ns
+                self._writer.add_frame(frame, calibrate.input_doubts())
+                self._add_health(self._health.due_rows(frame.stamp_ns, calibrate))
         for data, notes in passes:
             self._n_passes += 1
             self._writer.add_pass(self._n_passes, data, notes)

@@ -1,4 +1,4 @@
-"""Geometry calibration of a sensor board, for the command `mag-tracking board-geometry`."""
+"""Geometry calibration of a sensor board, for `mag-tracking calibrate board`."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

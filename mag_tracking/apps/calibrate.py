@@ -1,4 +1,4 @@
-"""Calibration of a network from a recording, for the command `mag-tracking calibrate`."""
+"""Calibration of a network from a recording, for the command `mag-tracking calibrate network`."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace

@@ -17,20 +17,19 @@ from mag_tracking.analysis.signature_classifier import (
     feature_table,
     train,
 )
-from mag_tracking.apps.prescan import prescan_of
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import LabelsError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import settings_for
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.signature_tables import (
     LabelledInterval,
     read_intervals,
     read_signatures,
 )
 from mag_tracking.records import Readings
-from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.run import RecordingSource, run
 
 
 @dataclass(frozen=True)
@@ -118,15 +117,23 @@ def _signatures(path: Path, readings: Readings, names: Any,
                             f'row {interval.row}')
 
 
+class _CalibratedReadings(RecordReceiver):
+    """Collects calibrated readings."""
+
+    def __init__(self) -> None:
+        self.batches: list[Readings] = []
+
+    def add_calibrated(self, readings: Readings) -> None:
+        """Store a batch."""
+        self.batches.append(readings)
+
+
 def _calibrated_readings(path: Path, network: SensorNetwork) -> Readings:
     """Read a recording and return its calibrated readings."""
-    settings = settings_for('vehicle')
-    recording = Recording(path)
-    calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
-    prescan_of(recording, network, settings.calibrate).apply(calibrate)
-    parts = [part for batch in SampleReader(recording, network).readings()
-             for part in calibrate.feed(batch)]
-    return Readings.joined([*parts, *calibrate.flush()])
+    sink = _CalibratedReadings()
+    run(RecordingSource(Recording(path), network),
+        Pipeline(network, settings_for('vehicle'), 'calibrate'), [sink])
+    return Readings.joined(sink.batches)
 
 
 def train_classes(examples: Examples) -> SignatureModel:

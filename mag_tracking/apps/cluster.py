@@ -21,7 +21,10 @@ if TYPE_CHECKING:
     from tornado.ioloop import IOLoop
 
 CONNECT_TIMEOUT_S = 15.0
-"""Maximum time to wait for a response of a scheduler, and then for its first worker [s]."""
+"""Maximum time to wait for a response of a scheduler [s]."""
+FIRST_WORKER_TIMEOUT_S = 60.0
+"""Maximum time to wait for the first worker of a scheduler [s]. On a busy computer, a worker needs
+more than 15 s to start."""
 THREAD_START_TIMEOUT_S = 60.0
 """Maximum time for a thread to start [s]."""
 NO_WORKERS_TIMEOUT_S = 180.0
@@ -260,7 +263,7 @@ def _remote_client(distributed: Any, address: str) -> 'Client':
     except (OSError, TypeError, ValueError) as error:
         raise ClusterError(f'{address}: no response from a Dask scheduler ({error})') from error
     try:
-        client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
+        client.wait_for_workers(1, timeout=FIRST_WORKER_TIMEOUT_S)
     except _TIMEOUT_ERRORS as error:
         client.close()
         raise ClusterError(f'{address}: the scheduler has no workers') from error

@@ -1,43 +1,40 @@
 """Description of the passes at each sensor of a network, without tracking."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mag_tracking.apps.input_findings import input_findings
-from mag_tracking.apps.prescan import prescan_of
-from mag_tracking.apps.readings import network_of
+from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
+from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.event_records import PassEvent
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Settings, settings_for
+from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
-from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.record_receiver import RecordReceiver, Step
+from mag_tracking.records import Readings
+from mag_tracking.results.columns import EVENTS, row_of
+from mag_tracking.results.dataframes import rows_dataframe
+from mag_tracking.run import RunReport, Source, run
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.events.stage import Events
-from mag_tracking.stages.health.diagnosis import Diagnosis, ranked
-from mag_tracking.stages.stage import rejected
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
-class EventsResult:
+class EventsResult(DisplayedResult):
     """Pass events in a recording."""
 
     events: tuple[PassEvent, ...]
     """Events in the order in which they ended."""
-    rejections: dict[str, int]
-    """Readings that were not used: {cause: number}."""
-    sensors_without_background: tuple[str, ...]
-    """Sensors whose background was not learnt."""
-    missing_topics: tuple[str, ...]
-    """Topics of the network that are not in the recording."""
-    diagnoses: tuple[Diagnosis, ...]
-    """Diagnoses of the recording and the sensors."""
+    report: RunReport
+    """What was lost, rejected or missing, and why."""
 
     def counts(self) -> dict[str, int]:
         """Count the events of each sensor.
@@ -49,21 +46,59 @@ class EventsResult:
         """
         return dict(Counter(event.sensor for event in self.events))
 
+    def to_dataframe(self) -> 'pd.DataFrame':
+        """Convert the events to a table.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns of `events.csv`, indexed by the time of the closest point (UTC).
+
+        Raises
+        ------
+        MissingDependencyError
+            If pandas is not installed.
+        """
+        return rows_dataframe(EVENTS, [row_of(EVENTS, event) for event in self.events],
+                              'closest_ns')
+
+    def figure(self) -> 'Figure':
+        """Draw the largest field of each event over time.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        # Imported here because it loads matplotlib.
+        from mag_tracking.report.time_figures import time_figure
+
+        return time_figure(np.array([e.closest_ns for e in self.events], dtype=np.int64),
+                           np.array([1e9 * np.sqrt(np.nansum(e.peak**2)) for e in self.events]),
+                           None, [e.sensor for e in self.events], 'largest field [nT]')
+
     def __repr__(self) -> str:
         counts = ', '.join(f'{n} of {name}' for name, n in self.counts().items())
         return f'EventsResult({quantity(len(self.events), "event")}: {counts or "none"})'
 
 
-def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[str],
-           settings: Mapping[str, Any] | None = None) -> EventsResult:
+def events(source: UserSource, network: SensorNetwork | str | PathLike[str],
+           settings: Mapping[str, Any] | None = None,
+           time_unit: str | None = None) -> EventsResult:
     """Describe the passes that each sensor of a network detects.
 
     Parameters
     ----------
-    recording : path
+    source : path, Readings, RecordedReadings, DataFrame or mapping
+        A recording is read in batches and need not fit into memory. A DataFrame, in tesla, has one
+        row per reading (columns `sensor`, x, y, z) or per time (columns such as `mag_1_x`), and the
+        times in a column `time` or `stamp_ns` or in the index. A mapping is {sensor: (times (n,),
+        fields (n, 3), T)}.
     network : SensorNetwork or path of a network file
     settings : {name: value}, optional
         Settings that differ from the defaults for a vehicle.
+    time_unit : 's', 'ms', 'us' or 'ns', optional
+        Unit of the times of a DataFrame or mapping; required for floats. The default for integers
+        is 'ns'.
 
     Returns
     -------
@@ -71,6 +106,8 @@ def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLi
 
     Raises
     ------
+    ReadingsError
+        If a table or arrays are incomplete, not in order, or of a wrong type.
     RecordingError
         If the recording cannot be read, or has none of the network's topics.
     NetworkError
@@ -78,34 +115,43 @@ def events(recording: str | PathLike[str], network: SensorNetwork | str | PathLi
     SettingsError
         If a setting is invalid.
     """
-    return find_events(Recording(recording), network_of(network), settings_for('vehicle', settings))
+    network = network_of(network)
+    return find_events(source_of(source, network, time_unit), network,
+                       settings_for('vehicle', settings))
 
 
-def find_events(recording: Recording, network: SensorNetwork, settings: Settings,
-                progress: Callable[[int], object] | None = None,
-                stopped: Callable[[], bool] | None = None) -> EventsResult:
-    """Describe the passes in an open recording."""
-    reader = SampleReader(recording, network)
-    calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
-    stage = Events(network, settings.align, settings.detect, settings.track)
-    prescan_of(recording, network, settings.calibrate, stopped).apply(calibrate)
-    pass_events: list[PassEvent] = []
-    try:
-        for readings in until_stopped(reader.readings, progress, stopped):
-            for calibrated in calibrate.feed(readings):
-                stage.set_relearnt(calibrate.backgrounds())
-                pass_events += stage.feed(calibrated)
-    except ReadingStopped:
-        pass
-    for calibrated in calibrate.flush():
-        pass_events += stage.feed(calibrated)
-    pass_events += stage.flush()
-    pass_events = [_with_timestamp_error(event, calibrate) for event in pass_events]
-    return EventsResult(tuple(pass_events),
-                        dict(reader.rejected + Counter(rejected(calibrate.counts))),
-                        tuple(calibrate.unready()), tuple(reader.missing_topics()),
-                        tuple(ranked(input_findings(recording, reader, network, calibrate,
-                                                    settings.track))))
+def find_events(source: Source, network: SensorNetwork, settings: Settings) -> EventsResult:
+    """Describe the passes in a source."""
+    pipeline = Pipeline(network, settings, 'calibrate')
+    sink = EventSink(pipeline)
+    with shown_progress(source) as progress:
+        return sink.result(run(source, pipeline, [sink], progress))
+
+
+class EventSink(RecordReceiver):
+    """Collects the events in calibrated readings."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        settings = pipeline.settings
+        self._calibrate = pipeline.calibrate
+        self._stage = Events(pipeline.network, settings.align, settings.detect, settings.track)
+        self._events: list[PassEvent] = []
+
+    def add(self, step: Step) -> None:
+        """Find the events in the calibrated readings of a step."""
+        self.receive(step.records)
+        if step.is_last:
+            self._events += self._stage.flush()
+
+    def add_calibrated(self, readings: Readings) -> None:
+        """Find the events in calibrated readings."""
+        self._stage.set_relearnt(self._calibrate.backgrounds())
+        self._events += self._stage.feed(readings)
+
+    def result(self, report: RunReport) -> EventsResult:
+        """Return the events after a run."""
+        return EventsResult(tuple(_with_timestamp_error(event, self._calibrate)
+                                  for event in self._events), report)
 
 
 def _with_timestamp_error(event: PassEvent, calibrate: Calibrate) -> PassEvent:

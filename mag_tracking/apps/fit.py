@@ -1,98 +1,43 @@
 """Offline fits of the passes in a recording."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
-from mag_tracking.apps.prescan import prescan_of
-from mag_tracking.apps.readings import network_of
-from mag_tracking.errors import SettingsError
+from mag_tracking.analysis.fitted_pass import FittedPass
+from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
+from mag_tracking.apps.pass_fitter import PassFitter
+from mag_tracking.apps.readings import UserSource, network_of, source_of
+from mag_tracking.errors import SettingsError, UnknownTrackError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Settings, settings_for
+from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.fit_folder import FIT_COLUMNS, pass_rows
-from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.report.dataframes import STATE_UNITS, dataframe
-from mag_tracking.stages.calibrate.field_comparison import earth_field_findings
+from mag_tracking.results.columns import FITS, names_of
+from mag_tracking.results.dataframes import dataframe
+from mag_tracking.results.fit_folder import pass_rows
+from mag_tracking.run import RunReport, run
 
 if TYPE_CHECKING:
     import pandas as pd
-
-FIT_UNITS = {
-    **STATE_UNITS, **dict.fromkeys(('sd_mx', 'sd_my', 'sd_mz'), 'A m^2'),
-    **dict.fromkeys(('speed', 'sd_speed'), 'm/s'),
-    **dict.fromkeys(('heading_deg', 'sd_heading_deg'), 'deg'),
-    **dict.fromkeys(('cpa_time', 'sd_cpa_time'), 's'),
-    **dict.fromkeys(('cpa_range', 'sd_cpa_range'), 'm'),
-    **dict.fromkeys(('rate', 'sd_rate'), '1/s'),
-    **dict.fromkeys(('delay_speed', 'sd_delay_speed'), 'm/s'),
-    **dict.fromkeys(('delay_heading_deg', 'sd_delay_heading_deg'), 'deg')}
-"""Units of the columns of `fits.csv`: {column: unit}."""
-
-
-class RecordingFit:
-    """Fits every pass in a recording with each number of dipoles in `orders`.
-
-    `cpa_range` is the (range, std) [m] at the closest point of approach, only for a network of one
-    sensor (`analysis.pass_fit.fit_pass`).
-    """
-
-    def __init__(self, recording: Recording, network: SensorNetwork, settings: Settings,
-                 orders: Sequence[int], cpa_range: tuple[float, float] | None = None) -> None:
-        self._fitter = PassFitter(recording.path.resolve().stem, network, settings, orders,
-                                  cpa_range)
-        self._recording = recording
-        self._reader = SampleReader(recording, network)
-        self._network, self._settings = network, settings.calibrate
-
-    def passes(self, progress: Callable[[int], object] | None = None,
-               stopped: Callable[[], bool] | None = None) -> Iterator[FittedPass]:
-        """Read the recording, fit each pass, and yield the results.
-
-        `stopped` is called after every batch of readings and every fit.
-        """
-        prescan_of(self._recording, self._network, self._settings,
-                   stopped).apply(self._fitter.collector.calibrate)
-        for readings in self._reader.readings(progress):
-            if stopped is not None and stopped():
-                return
-            yield from self._fitter.feed(readings, stopped)
-        yield from self._fitter.flush(stopped)
-
-    def warnings(self) -> list[str]:
-        """Describe missing topics, backgrounds and detections, and faulty or rejected readings, one
-        a line."""
-        collector = self._fitter.collector
-        lines = [f'no messages on {topic}' for topic in self._reader.missing_topics()]
-        lines += [f'no background was learnt for {name}: its quiet intervals are too short; '
-                  'set background and noise_std in the network file'
-                  for name in collector.sensors_without_background()]
-        lines += [str(f) for f in earth_field_findings(
-            collector.calibrate.field_inconsistencies())]
-        reason = collector.no_detection_reason(self._reader.missing_topics())
-        lines += [f'nothing was detected: {reason}'] if reason else []
-        for counts in (self._reader.rejected, collector.rejected, self._recording.losses):
-            lines += [f'{cause}: {n}' for cause, n in counts.items()]
-        return lines
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
-class FitResult:
+class FitResult(DisplayedResult):
     """Fitted passes of a recording."""
 
     passes: tuple[FittedPass, ...]
     """One entry per pass and vehicle."""
-    warnings: tuple[str, ...]
-    """Warnings about missing topics, backgrounds or detections, and lost or rejected readings."""
+    report: RunReport
+    """What was lost, rejected or missing, and why."""
 
     def __repr__(self) -> str:
+        notes = self.report.warnings()
         return (f'FitResult({quantity(len(self.passes), "pass", "passes")}'
-                + (f'; warnings: {"; ".join(self.warnings)}' if self.warnings else '') + ')')
+                + (f'; {"; ".join(notes)}' if notes else '') + ')')
 
     def to_dataframe(self) -> 'pd.DataFrame':
         """Convert the fits to a table.
@@ -109,22 +54,50 @@ class FitResult:
         """
         rows = [row for fitted in self.passes for row in pass_rows(fitted)]
         # A fit without an estimate has an empty string in this column.
-        columns = {c: [np.nan if c == 'ambiguous' and row[c] == '' else row[c] for row in rows]
-                   for c in FIT_COLUMNS}
-        return dataframe(columns, FIT_UNITS)
+        return dataframe(FITS, {c: [np.nan if c == 'ambiguous' and row[c] == '' else row[c]
+                                    for row in rows] for c in names_of(FITS)})
 
 
-def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[str],
+    def figure(self, number: int = 0) -> 'Figure':
+        """Draw the measured and fitted field of a pass.
+
+        Parameters
+        ----------
+        number : int, optional
+            Index in `passes`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        UnknownTrackError
+            If there is no such pass, or nothing could be fitted to it.
+        """
+        # Imported here because it loads matplotlib.
+        from mag_tracking.report.fit_figures import pass_figure
+
+        drawn = self.passes[number].drawn if 0 <= number < len(self.passes) else None
+        if drawn is None:
+            raise UnknownTrackError(f'no fit of pass {number}; passes: {len(self.passes)}')
+        return pass_figure(drawn, self.passes[number].label)
+
+
+def fit(source: UserSource, network: SensorNetwork | str | PathLike[str],
         settings: Mapping[str, Any] | None = None, orders: Sequence[int] = (1, 2, 3, 4),
-        cpa_range: tuple[float, float] | None = None) -> FitResult:
+        cpa_range: tuple[float, float] | None = None, time_unit: str | None = None) -> FitResult:
     """Fit every pass in a recording as a row of dipoles at constant velocity.
 
     Up to three simultaneous vehicles are fitted together.
 
     Parameters
     ----------
-    recording : path
-        An .mcap, .db3 or .bag file, or a rosbag2 folder.
+    source : path, Readings, RecordedReadings, DataFrame or mapping
+        A recording is read in batches and need not fit into memory. A DataFrame, in tesla, has one
+        row per reading (columns `sensor`, x, y, z) or per time (columns such as `mag_1_x`), and the
+        times in a column `time` or `stamp_ns` or in the index. A mapping is {sensor: (times (n,),
+        fields (n, 3), T)}.
     network : SensorNetwork or path of a network file
     settings : {name: value}, optional
         Settings that differ from the defaults for a vehicle.
@@ -133,6 +106,9 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
     cpa_range : (range, std), m, optional
         Range at the closest point of approach, only for a network of one sensor; see
         `analysis.pass_fit.fit_pass`.
+    time_unit : 's', 'ms', 'us' or 'ns', optional
+        Unit of the times of a DataFrame or mapping; required for floats. The default for integers
+        is 'ns'.
 
     Returns
     -------
@@ -140,6 +116,8 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
 
     Raises
     ------
+    ReadingsError
+        If a table or arrays are incomplete, not in order, or of a wrong type.
     RecordingError
         If the recording cannot be read, or has none of the network's topics.
     NetworkError
@@ -150,10 +128,13 @@ def fit(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[
     network = network_of(network)
     check_orders('orders', orders)
     check_cpa_range('cpa_range', cpa_range, network)
-    job = RecordingFit(Recording(recording), network, settings_for('vehicle', settings), orders,
-                       cpa_range)
-    passes = tuple(job.passes())
-    return FitResult(passes, tuple(job.warnings()))
+    passes: list[FittedPass] = []
+    opened = source_of(source, network, time_unit)
+    pipeline = Pipeline(network, settings_for('vehicle', settings), 'track')
+    fitter = PassFitter(opened.stem, pipeline, orders, cpa_range, passes.append)
+    with shown_progress(opened) as progress:
+        report = run(opened, pipeline, [fitter], progress)
+    return FitResult(tuple(passes), report)
 
 
 def check_orders(name: str, orders: Sequence[int]) -> None:

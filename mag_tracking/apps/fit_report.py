@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from mag_tracking.analysis.fitted_pass import FittedPass
 from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, PassFit
-from mag_tracking.apps.pass_fitter import FittedPass
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.quantities import quantity

@@ -1,22 +1,16 @@
 """Extraction of passes: the measurements of a network around each detection."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.apps.no_detection import no_detection_reason
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.doubtful_times import DOUBTFUL_BACKGROUND, are_doubtful
 from mag_tracking.calibration.saturation import saturated_readings, with_margin
-from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Settings
+from mag_tracking.pipeline import Pipeline
+from mag_tracking.record_receiver import Step
 from mag_tracking.records import Detection, FieldFrame, Readings
-from mag_tracking.stages.align.stage import Align
-from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.detect.stage import Detect
-from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.doubts import MEANINGS
 from mag_tracking.units import NS
 
@@ -29,18 +23,14 @@ MAX_PASS_S = 60.0
 
 
 class PassCollector:
-    """Extracts passes from readings, each with notes for the user.
+    """Extracts passes from the steps of a run.
 
     A pass contains all measurements from `PAD_S` before the onset of a detection to its release.
-    `on_frame` is called with every frame that the detection stage has processed.
     """
 
-    def __init__(self, network: SensorNetwork, settings: Settings,
-                 on_frame: Callable[[FieldFrame], object] | None = None) -> None:
-        self._network, self._settings, self._on_frame = network, settings, on_frame
-        self._max_field = settings.calibrate.max_field
-        self._stages = (Calibrate(network, settings.calibrate, survey=settings.survey),
-                        Align(network, settings.align), Detect(network, settings.detect))
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._network, self._calibrate = pipeline.network, pipeline.calibrate
+        self._max_field = pipeline.settings.calibrate.max_field
         # Raw and calibrated readings, in network time, from `PAD_S` before the onset or, without a
         # detection, before the latest frame.
         self._raw: deque[Readings] = deque()
@@ -48,72 +38,33 @@ class PassCollector:
         self._onset_ns: int | None = None
         self._last_ns: int | None = None
 
-    @property
-    def calibrate(self) -> Calibrate:
-        """Calibration stage."""
-        return self._stages[0]
-
-    @property
-    def rejected(self) -> dict[str, int]:
-        """Rejected readings: {cause: number}."""
-        total: dict[str, int] = {}
-        for stage in self._stages[:2]:
-            for cause, n in rejected(stage.counts).items():
-                total[cause] = total.get(cause, 0) + n
-        return total
-
-    def no_detection_reason(self, missing_topics: Sequence[str]) -> str | None:
-        """Explain why nothing was detected (`apps.no_detection`); None if a target was."""
-        calibrate, _, detect = self._stages
-        return no_detection_reason(self._network, self._settings, calibrate, detect, missing_topics,
-                                   self.rejected)
-
-    def sensors_without_background(self) -> list[str]:
-        """Names of the sensors whose background was never learnt."""
-        return self._stages[0].unready()
-
-    def feed(self, readings: Readings) -> list[tuple[PassData, tuple[str, ...]]]:
-        """Add raw readings and return the passes that they complete, with notes for the user."""
-        calibrate, align, _ = self._stages
-        passes: list[tuple[PassData, tuple[str, ...]]] = []
-        batches = calibrate.feed(readings)
-        if len(readings) and (batches or calibrate.n_held):
+    def passes(self, step: Step) -> list[tuple[PassData, tuple[str, ...]]]:
+        """Return (measurements, notes for the user) of each pass that ends with a step."""
+        passes, readings = [], step.readings
+        if len(readings) and (self._calibrate.n_held
+                              or any(isinstance(r, Readings) for r in step.records)):
             network = self._network
             sensor = readings.rows({name: j for j, name in enumerate(network.names)})
             self._raw.append(Readings(network.names, sensor,
                                       readings.stamp_ns - network.clock_offset_ns[sensor],
                                       readings.field))
-        for calibrated in batches:
-            self._calibrated.append(calibrated)
-            for frame in align.feed(calibrated):
-                passes += self._add_frame(frame)
-        return passes
-
-    def flush(self) -> list[tuple[PassData, tuple[str, ...]]]:
-        """End the recording and return the pass that was still in progress."""
-        calibrate, align, _ = self._stages
-        passes: list[tuple[PassData, tuple[str, ...]]] = []
-        for calibrated in calibrate.flush():
-            self._calibrated.append(calibrated)
-            passes += [p for frame in align.feed(calibrated) for p in self._add_frame(frame)]
-        passes += [p for frame in align.flush() for p in self._add_frame(frame)]
-        if self._onset_ns is not None and self._last_ns is not None:
+        for record in step.records:
+            if isinstance(record, Readings):
+                self._calibrated.append(record)
+            elif isinstance(record, Detection) and record.onset:
+                self._onset_ns = record.stamp_ns
+            elif isinstance(record, Detection) and self._onset_ns is not None:
+                passes.append(self._cut(self._onset_ns, record.stamp_ns))
+            elif isinstance(record, FieldFrame):
+                passes += self._add_frame(record)
+        if step.is_last and self._onset_ns is not None and self._last_ns is not None:
             passes.append(self._cut(self._onset_ns, self._last_ns,
                                     'the recording ends before the target has passed'))
         return passes
 
     def _add_frame(self, frame: FieldFrame) -> list[tuple[PassData, tuple[str, ...]]]:
-        """Detect targets in a frame; return the passes that end with this frame."""
+        """Truncate a pass that is too long at a frame, and forget earlier readings."""
         passes = []
-        for record in self._stages[2].feed(frame):
-            if not isinstance(record, Detection):
-                if self._on_frame is not None:
-                    self._on_frame(record)
-                continue
-            if record.onset:
-                self._onset_ns = record.stamp_ns
-            elif self._onset_ns is not None:
-                passes.append(self._cut(self._onset_ns, record.stamp_ns))
         if self._onset_ns is not None and frame.stamp_ns - self._onset_ns > MAX_PASS_S * NS:
             passes.append(self._cut(self._onset_ns, frame.stamp_ns, 'the detection lasts for more '
                                     f'than {MAX_PASS_S:.0f} s; the remainder is not used'))
@@ -159,7 +110,7 @@ class PassCollector:
 
         A doubtful background is no reason, because the background of a fit is free.
         """
-        for reason, by_sensor in self.calibrate.input_doubts().items():
+        for reason, by_sensor in self._calibrate.input_doubts().items():
             names = [name for name, times in by_sensor.items() if are_doubtful(times, stamp_ns)]
             if names and reason != DOUBTFUL_BACKGROUND:
                 return f'{", ".join(names)}: {MEANINGS[reason]}'

@@ -10,6 +10,7 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import propagated_path
 from mag_tracking.records import Track
+from mag_tracking.stages.track.initiation_vehicle import CLIMB_STD
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
@@ -95,7 +96,6 @@ class PassTracks:
 
 def ground_prior(settings: TrackSettings) -> GroundPrior:
     """Prior of the height and vertical speed of vehicles from tracker settings."""
-    vehicle = settings.vehicle
-    height, std = np.array(vehicle.heights), np.array(vehicle.height_stds)
+    height, std = np.array([(k.height, k.height_std) for k in settings.vehicle.kinds]).T
     height_std = float(np.sqrt(height.var() + np.square(std).mean()))
-    return GroundPrior((float(height.mean()), height_std), vehicle.climb_std)
+    return GroundPrior((float(height.mean()), height_std), CLIMB_STD)

@@ -15,7 +15,7 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.stages.align.frame_period import frame_period
-from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
+from mag_tracking.stages.track.initiation_vehicle import CLIMB_STD, VehicleSettings
 from mag_tracking.stages.track.settings import TrackSettings
 
 NOISE_STD = 1.2e-8
@@ -167,13 +167,12 @@ def _target(track: TrackSettings, target: str | None, moment: float | None,
         return PlannedTarget(_in_range('moment', moment, 1e-6, 1e6), height, speed)
     if target == 'magnet':
         raise SettingsError('moment: required for a magnet, together with height')
-    kind = target or 'car'
-    if kind not in vehicle.kinds:
-        raise SettingsError(f'target: expected one of {", ".join(vehicle.kinds)}, magnet, got '
-                            f'{kind!r}')
-    k = vehicle.kinds.index(kind)
-    return PlannedTarget(vehicle.moments[k], vehicle.heights[k] if height is None else height,
-                         speed, vehicle.height_stds[k], vehicle.climb_std)
+    name, kinds = target or 'car', {k.name: k for k in vehicle.kinds}
+    if name not in kinds:
+        raise SettingsError(f'target: expected one of {", ".join(kinds)}, magnet, got {name!r}')
+    kind = kinds[name]
+    return PlannedTarget(kind.moment, kind.height if height is None else height, speed,
+                         kind.height_std, CLIMB_STD)
 
 
 def _lanes(vehicle: VehicleSettings, heading: Sequence[float] | None,

@@ -1,13 +1,19 @@
 """Readings as arrays, from a recording or from arrays of the user."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mag_tracking.apps.user_tables import (
+    is_table,
+    nanoseconds,
+    readings_of_arrays,
+    readings_of_table,
+)
 from mag_tracking.arrays import BoolArray
 from mag_tracking.errors import ReadingsError
 from mag_tracking.network import SensorNetwork
@@ -17,8 +23,11 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings
 from mag_tracking.report.metrics import Truth
+from mag_tracking.run import ArraySource, RecordingSource, Source
 from mag_tracking.units import LATEST_NS, NS
 
+UserSource: TypeAlias = Any
+"""Readings, RecordedReadings, path of a recording, DataFrame, or {sensor: (times, fields)}."""
 MAX_DELAY_S = 10.0
 """Delay above which a reading is considered unsorted rather than delayed [s]."""
 
@@ -86,21 +95,41 @@ def recorded_readings(recording: Recording, reader: SampleReader,
                             dict(recording.losses), tuple(reader.missing_topics()))
 
 
+def source_of(source: UserSource, network: SensorNetwork, time_unit: str | None = None) -> Source:
+    """Source for `run`: a recording, which need not fit into memory, or readings."""
+    if is_table(source):
+        source = readings_of_table(source, time_unit)
+    elif isinstance(source, Mapping):
+        source = readings_of_arrays(source, time_unit)
+    elif time_unit is not None:
+        raise ReadingsError('time_unit: only for the times of a DataFrame or of arrays')
+    if isinstance(source, Readings):
+        check_order(source)
+        source = RecordedReadings(source, {}, {}, {}, ())
+    if isinstance(source, RecordedReadings):
+        return ArraySource(checked_readings(source.readings, network), rejected=source.rejected,
+                           lost=source.lost, topics=source.missing_topics)
+    return RecordingSource(Recording(source), network)
+
+
 def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: ArrayLike,
-                         covariance: ArrayLike | None = None) -> Readings:
+                         covariance: ArrayLike | None = None,
+                         time_unit: str | None = None) -> Readings:
     """Create readings from arrays, for `track`.
 
     Parameters
     ----------
     sensor : (n,) sequence of str
         Name of the sensor of each reading, as in the network file.
-    stamp_ns : (n,) int array, ns, or datetime64 array
+    stamp_ns : (n,) int array, ns, datetime64 array, or float array
         Timestamps in ascending order; sensors may have equal timestamps. Times without a time zone
         are in UTC.
     field : (n, 3) array, T, sensor frame
         Flux density; NaN marks an axis that was not measured.
     covariance : (n, 3, 3) array, T², sensor frame, optional
         Noise covariance; NaN if unknown.
+    time_unit : 's', 'ms', 'us' or 'ns', optional
+        Unit of `stamp_ns`; required for floats.
 
     Returns
     -------
@@ -118,17 +147,10 @@ def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: Arra
     fields, C = _with_nan(field), None if covariance is None else _with_nan(covariance)
     readings = _to_standard_types(Readings(
         names, np.array([index_of[str(name)] for name in sensor], dtype=np.int64),
-        _nanoseconds(stamp_ns), fields if fields.size else fields.reshape(0, 3), C))
+        nanoseconds(stamp_ns, time_unit, 'stamp_ns'),
+        fields if fields.size else fields.reshape(0, 3), C))
     check_order(readings, 0.0)
     return readings
-
-
-def _nanoseconds(stamps: ArrayLike) -> NDArray[Any]:
-    """Convert times (datetime64 of any unit, pandas, with or without time zone) to integers."""
-    # Times of pandas with a time zone have a dtype of this name, too, and become UTC.
-    if str(getattr(stamps, 'dtype', '')).startswith('datetime64'):
-        return np.asarray(stamps, dtype='datetime64[ns]').astype(np.int64)
-    return np.asarray(stamps)
 
 
 def _with_nan(values: ArrayLike) -> NDArray[Any]:

@@ -1,7 +1,6 @@
 """Offline replay of a recording through all stages, with tables, a summary and figures."""
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -12,21 +11,16 @@ import numpy as np
 from mag_tracking.analysis.consistency import error_over_bound
 from mag_tracking.analysis.correlated_motion import contradicts_delays, correlated_motion
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.apps.no_detection import no_detection_reason
-from mag_tracking.apps.prescan import Prescan, prescan_of
-from mag_tracking.apps.replay_notes import diagnosis_entries, replay_findings
+from mag_tracking.apps.replay_notes import diagnosis_entries
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.geometry import heading_of, speed_of
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Output, Pipeline, Settings
-from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
+from mag_tracking.pipeline import Pipeline, Settings
+from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.result_folder import ResultFolder, figure_name
-from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.truth import read_truth_table
-from mag_tracking.recording.tum_file import write_tum
-from mag_tracking.records import Detection, FieldFrame, SmoothedPose, Track
+from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.report.metrics import (
     MAGNET_SKIP,
     Truth,
@@ -37,8 +31,10 @@ from mag_tracking.report.metrics import (
     unflagged_poses,
 )
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.results.result_folder import ResultFolder, figure_name
+from mag_tracking.results.tum_file import write_tum
+from mag_tracking.run import RecordingSource, RunReport, Sink, Source, run
 from mag_tracking.stages.align.frame_period import frame_period_warning
-from mag_tracking.stages.health.diagnosis import ranked
 from mag_tracking.stages.track.plausibility import lane_note
 from mag_tracking.stages.track.settings import acceleration_density
 
@@ -64,6 +60,8 @@ class Run:
 
     summary: dict[str, Any]
     """Content of `summary.json`."""
+    report: RunReport
+    """What was lost, rejected or missing, and why."""
     logs: dict[int, TrackLog] = field(default_factory=dict)
     """{track id: history of the track}."""
     smoothed: dict[int, SmoothedLog] = field(default_factory=dict)
@@ -75,7 +73,8 @@ class Run:
 def replay(recording: Recording, network: SensorNetwork, settings: Settings,
            out: str | PathLike[str], progress: Callable[[int], object] | None = None,
            stopped: Callable[[], bool] | None = None,
-           report: Callable[[str], object] | None = None, truth: str | None = None) -> Run:
+           report: Callable[[str], object] | None = None, truth: str | None = None,
+           more_sinks: Callable[[Pipeline], Sequence[Sink]] = lambda pipeline: ()) -> Run:
     """Track the targets in a recording and write the results to the folder `out`.
 
     Raises RecordingError if the recording has none of the network's topics or the ground truth
@@ -89,6 +88,7 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     report : called with a message if the results of an earlier run are replaced
     truth : a CSV file (`recording.truth`), or a topic with messages of type PoseStamped,
         PoseWithCovarianceStamped or Odometry; by default all topics below /ground_truth
+    more_sinks : called with the pipeline; returns more sinks of the run
     """
     if recording.lies_in(out):
         raise OutputError(f'{out} is the folder of the recording; choose another output folder')
@@ -96,119 +96,60 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
     is_table = truth is not None and (Path(truth).is_file() or '.' in truth)
     table = read_truth_table(truth, settings.track.magnet.axis) \
         if truth is not None and is_table else None
-    reader = SampleReader(recording, network, truth if table is None else None)
-    pipeline = Pipeline(network, settings)
-    prescan = prescan_of(recording, network, settings.calibrate, stopped)
-    prescan.apply(pipeline.calibrate)
-    interrupted = False
-
+    source = RecordingSource(recording, network, truth if table is None else None)
+    pipeline, history = Pipeline(network, settings), TrackHistory()
     with ResultFolder(out, network) as results:
         if results.replaces_earlier and report is not None:
             report(f'replacing the results of an earlier run in {out}')
-        collector = RunCollector(results)
-        try:
-            for readings in until_stopped(reader.readings, progress, stopped):
-                collector.add(pipeline.feed(readings))
-        except ReadingStopped:
-            interrupted = True
-        collector.add(pipeline.flush())
-        truth_arrays = reader.truth_arrays() if table is None else table
-        summary = summarise(recording, reader, pipeline, collector, truth_arrays, prescan)
-        summary['interrupted'] = interrupted
+        run_report = run(source, pipeline, [results, history, *more_sinks(pipeline)],
+                         progress, stopped)
+        truth_arrays = source.reader.truth_arrays() if table is None else table
+        summary = summarise(source, pipeline, history, truth_arrays, run_report)
         results.write_summary(summary)
-    return Run(summary, collector.logs, collector.smoothed, truth_arrays)
+    return Run(summary, run_report, history.logs, history.smoothed, truth_arrays)
 
 
-class Results(Protocol):
-    """Receiver of the outputs of a pipeline, such as a `ResultFolder`."""
-
-    def add_detection(self, detection: Detection, /) -> None:
-        """Add the onset or release of a detection.
-
-        Parameters
-        ----------
-        detection : Detection
-        """
-
-    def add_disturbance(self, disturbance: Disturbance, /) -> None:
-        """Add a disturbance; called when it is detected and again when it has ended.
-
-        Parameters
-        ----------
-        disturbance : Disturbance
-        """
-
-    def add_frame(self, frame: FieldFrame, /) -> None:
-        """Add a frame in which a target is present.
-
-        Parameters
-        ----------
-        frame : FieldFrame
-        """
-
-    def add_smoothed(self, pose: SmoothedPose, /) -> None:
-        """Add a smoothed pose.
-
-        Parameters
-        ----------
-        pose : SmoothedPose
-        """
-
-    def add_track(self, track: Track, /) -> None:
-        """Add a pose, or the closing record of a track.
-
-        Parameters
-        ----------
-        track : Track
-        """
-
-
-class RunCollector:
-    """Forwards the outputs of the pipeline to the results and stores the history of each track.
+class TrackHistory(RecordReceiver):
+    """Stores the history of each track.
 
     Attributes
     ----------
-    logs, smoothed : history of each track and each smoothed track, by id
-    disturbances : latest record of each disturbance, by id
+    logs : dict of int to TrackLog
+        History of each track.
+    smoothed : dict of int to SmoothedLog
+        History of each smoothed track.
+    disturbances : dict of int to Disturbance
+        Latest record of each disturbance.
     """
 
-    def __init__(self, results: Results) -> None:
-        self._results = results
+    def __init__(self) -> None:
         # The first frame, which precedes every track, sets this attribute.
         self._frame: FieldFrame
         self.logs: dict[int, TrackLog] = {}
         self.smoothed: dict[int, SmoothedLog] = {}
         self.disturbances: dict[int, Disturbance] = {}
 
-    def add(self, records: Iterable[Output]) -> None:
-        """Add the outputs of a batch of readings."""
-        for record in records:
-            if isinstance(record, FieldFrame):
-                self._frame = record
-                if record.target_present:
-                    self._results.add_frame(record)
-            elif isinstance(record, Detection):
-                self._results.add_detection(record)
-            elif isinstance(record, Disturbance):
-                self._results.add_disturbance(record)
-                self.disturbances[record.id] = record
-            elif isinstance(record, SmoothedPose):
-                self._results.add_smoothed(record)
-                if record.complete:
-                    self.smoothed.setdefault(record.id, SmoothedLog(record.id)).add(record)
-            elif isinstance(record, Track):
-                self._results.add_track(record)
-                self.logs.setdefault(record.id, TrackLog(record.id)).add(record, self._frame)
+    def add_frame(self, frame: FieldFrame) -> None:
+        """Store the frame of the following poses."""
+        self._frame = frame
+
+    def add_disturbance(self, disturbance: Disturbance) -> None:
+        """Store a disturbance."""
+        self.disturbances[disturbance.id] = disturbance
+
+    def add_smoothed(self, pose: SmoothedPose) -> None:
+        """Add a pose to the history of a smoothed track."""
+        if pose.complete:
+            self.smoothed.setdefault(pose.id, SmoothedLog(pose.id)).add(pose)
+
+    def add_track(self, track: Track) -> None:
+        """Add a pose to the history of its track."""
+        self.logs.setdefault(track.id, TrackLog(track.id)).add(track, self._frame)
 
 
-def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
-              collector: RunCollector, truth: Mapping[str, Truth],
-              prescan: Prescan) -> dict[str, Any]:
-    """Content of `summary.json` for a replay, after the whole recording has been processed.
-
-    `prescan` is the result of the first pass over the recording.
-    """
-    rejections = dict(reader.rejected + Counter(pipeline.rejections()))
+def summarise(source: Source, pipeline: Pipeline, history: TrackHistory,
+              truth: Mapping[str, Truth], report: RunReport) -> dict[str, Any]:
+    """Content of `summary.json` after a run; `truth` is {target: (stamps, positions, ...)}."""
     sensors: dict[str, dict[str, Any]] = {}
     for name, background in pipeline.calibrate.backgrounds().items():
         counts = pipeline.calibrate.counts_of(name)
@@ -216,31 +157,29 @@ def summarise(recording: Recording, reader: SampleReader, pipeline: Pipeline,
                          'ready': background.ready, 'stuck': background.stuck,
                          'times_relearnt': background.n_relearnt,
                          'doubtful_ns': [list(segment) for segment in background.doubtful_times],
-                         'quiet_stretch_s': prescan.segment_of(name)}
+                         'quiet_stretch_s': report.prescan.segment_of(name)}
         covariance = background.covariance
         if background.ready and covariance is not None and counts['accepted']:
             std = np.sqrt(np.diagonal(covariance))
             sensors[name]['noise_std'] = [None if np.isnan(v) else float(v) for v in std]
             sensors[name]['background'] = [
                 None if np.isnan(v) else float(v) for v in pipeline.calibrate.background(name)]
-    tracks = [_track_entry(log, collector.smoothed.get(log.id), pipeline, truth)
-              for log in collector.logs.values()]
-    disturbances = [asdict(d) for d in collector.disturbances.values()]
-    reason = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
-                                 pipeline.detect, reader.missing_topics(), rejections)
-    return {'recording': recording.path.name, 'target': pipeline.settings.track.target,
-            'counts': pipeline.counts(), 'rejected': rejections, 'lost': dict(recording.losses),
-            'no_detection_reason': reason,
-            'diagnoses': diagnosis_entries(ranked(
-                replay_findings(recording, reader, pipeline, reason))),
+    tracks = [_track_entry(log, history.smoothed.get(log.id), pipeline, truth)
+              for log in history.logs.values()]
+    return {'recording': source.name, 'target': pipeline.settings.track.target,
+            'counts': report.counts, 'rejected': report.rejected, 'lost': report.lost,
+            'no_detection_reason': report.no_detection_reason,
+            'diagnoses': diagnosis_entries(report.diagnoses),
             'close_network': len(pipeline.network) > 1 and pipeline.network.is_compact,
             'frames_too_long': frame_period_warning(pipeline.settings.align, pipeline.network),
             'lanes': lane_note(pipeline.settings.track.vehicle, pipeline.network),
             'clocks_apart': pipeline.track.clock_warning,
-            'missing_topics': reader.missing_topics(), 'sensors': sensors, 'tracks': tracks,
-            'disturbances': disturbances,
-            'unflagged_poses': unflagged_poses(collector.logs.values(), truth.values())
-            if truth and pipeline.settings.track.target == 'vehicle' else None}
+            'missing_topics': list(report.missing_topics), 'sensors': sensors, 'tracks': tracks,
+            'disturbances': [asdict(d) for d in history.disturbances.values()],
+            'unflagged_poses': unflagged_poses(history.logs.values(), truth.values())
+            if truth and pipeline.settings.track.target == 'vehicle' else None,
+            'interrupted': report.interrupted,
+            'not_written': [str(error) for error in report.failures]}
 
 
 def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline,

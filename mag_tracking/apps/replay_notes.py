@@ -3,38 +3,16 @@
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from mag_tracking.apps.input_findings import input_findings
 from mag_tracking.physics import bounds
-from mag_tracking.pipeline import Pipeline
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.report.page import NOTE, WARNING, Note
-from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding
-from mag_tracking.stages.stage import rejected
+from mag_tracking.run import no_track_reason
+from mag_tracking.stages.health.diagnosis import Diagnosis
 from mag_tracking.stages.track.evidence import LOST
-from mag_tracking.stages.track.manager import NO_SCALE, NO_SCALE_FRAMES, UNCERTAIN_ORIENTATIONS
+from mag_tracking.stages.track.manager import UNCERTAIN_ORIENTATIONS
 from mag_tracking.stages.track.running_track import BELOW_SENSORS
 from mag_tracking.stages.track.smoothing import NOT_SMOOTHED
 from mag_tracking.units import NS
-
-
-def replay_findings(recording: Recording, reader: SampleReader, pipeline: Pipeline,
-                    no_detection_reason: str | None) -> list[Finding]:
-    """Findings about the input of a replay and its stages, without ranking, after the whole
-    recording."""
-    found = input_findings(recording, reader, pipeline.network, pipeline.calibrate,
-                           pipeline.settings.track)
-    for stage, counts in pipeline.counts().items():
-        if stage != 'calibrate' and (causes := rejected(counts)):
-            found.append(Finding(False, stage, ', '.join(
-                f'{cause}: {n}' for cause, n in causes.items()), 'run mag-tracking doctor',
-                Cause.REJECTED))
-    if no_detection_reason:
-        found.append(Finding(False, 'detect', 'nothing was detected with the settings for a '
-                             f'{pipeline.settings.track.target}: {no_detection_reason}',
-                             'run mag-tracking doctor', Cause.NO_DETECTION))
-    return found
 
 
 def diagnosis_entries(diagnoses: Iterable[Diagnosis]) -> list[dict[str, Any]]:
@@ -58,18 +36,6 @@ def _input_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
             begin, end = s['quiet_stretch_s']
             yield Note(NOTE, f'no quiet interval at the start: the most frequent level of '
                        f'{name}, from {begin:.1f} to {end:.1f} s, is used as its background')
-
-
-def no_track_reason(counts: Mapping[str, int]) -> str | None:
-    """Explain from the tracker's counts why nothing was tracked with a single sensor.
-
-    The result is None if vehicles were tracked, or several sensors measured the target.
-    """
-    if counts.get(NO_SCALE, 0) or counts.get(NO_SCALE_FRAMES, 0) and not counts.get('tracks', 0):
-        return ('no track: the scale is not observable with a single sensor. Use `mag-tracking '
-                'events` to describe the passes without scale, or set track.single_sensor_prior: '
-                'true if the vehicles match the settings')
-    return None
 
 
 def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:

@@ -1,54 +1,35 @@
 """Tracking of the targets in a recording or in arrays of readings, with results as arrays."""
 
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
-from mag_tracking.apps.doctor import recording_findings
-from mag_tracking.apps.input_findings import sensor_findings
-from mag_tracking.apps.no_detection import no_detection_reason
-from mag_tracking.apps.prescan import prescan, prescan_of
-from mag_tracking.apps.readings import (
-    RecordedReadings,
-    check_order,
-    checked_readings,
-    network_of,
-    recorded_readings,
-)
-from mag_tracking.apps.replay import RunCollector, errors_against_truth
-from mag_tracking.apps.replay_notes import no_track_reason
+from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
+from mag_tracking.apps.readings import RecordedReadings, UserSource, network_of, source_of
+from mag_tracking.apps.replay import TrackHistory, errors_against_truth
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.errors import UnknownTrackError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import Detection, FieldFrame, Readings, SmoothedPose, Track
-from mag_tracking.report.dataframes import (
-    detections_dataframe,
-    poses_dataframe,
-    smoothed_dataframe,
-)
+from mag_tracking.record_receiver import RecordReceiver
+from mag_tracking.records import Detection, SmoothedPose, Track
 from mag_tracking.report.metrics import Truth, interpolate_truth
-from mag_tracking.report.result_arrays import detection_array, pose_array, smoothed_array
 from mag_tracking.report.track_log import TrackLog
-from mag_tracking.stages.health.diagnosis import Finding, ranked
+from mag_tracking.results.columns import COMPLETE, DETECTIONS, POSES, SMOOTHED
+from mag_tracking.results.dataframes import array_dataframe, with_time_index
+from mag_tracking.results.result_arrays import detection_array, pose_array, smoothed_array
+from mag_tracking.run import RecordingSource, RunReport, run
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
 
-_BATCH_SIZE = 4096
-"""Number of readings per batch when arrays are processed, to bound the memory for outputs."""
-
-
 @dataclass(frozen=True, eq=False)
-class TrackingResult:
+class TrackingResult(DisplayedResult):
     """Tracks, poses and detections of a recording or of readings.
 
     Arrays are structured, in SI units and in chronological order; they are empty without targets.
@@ -70,37 +51,50 @@ class TrackingResult:
     truth: dict[str, Truth]
     """{target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}; empty without
     ground truth."""
-    rejections: dict[str, int]
-    """Readings that were not used: {cause: number}."""
-    counts: dict[str, dict[str, int]]
-    """{stage: {event: number}}."""
-    lost: dict[str, int]
-    """Unreadable parts of the recording: {damage: number}."""
-    missing_topics: tuple[str, ...]
-    """Topics of the network that are not in the recording."""
-    no_detection_reason: str | None
-    """Explanation of why nothing was tracked: why nothing was detected, or else the first serious
-    fault of the input. None if a target was tracked, or the reason is unknown."""
-    sensors_without_background: tuple[str, ...]
-    """Sensors that were not used because their background was not learnt. To use them, record a
-    quiet interval, or set `background` and `noise_std` in the network file."""
+    report: RunReport
+    """What was lost, rejected or missing, and why."""
     disturbances: tuple[Disturbance, ...]
     """Field changes that are explained better by a disturbance than by a target."""
 
     def __repr__(self) -> str:
-        unused = {**self.rejections, **self.lost}
-        notes = [*(f'not used: {n} {cause}' for cause, n in unused.items()),
-                 *(f'no messages on {topic}' for topic in self.missing_topics),
-                 *([quantity(len(self.disturbances), 'disturbance')] if self.disturbances else []),
-                 *(f'no background of {name}' for name in self.sensors_without_background)]
-        if self.no_detection_reason:
-            notes.append(self.no_detection_reason if len(self.detections)
-                         else f'nothing was detected: {self.no_detection_reason}')
+        notes = self.report.warnings()
+        if self.disturbances:
+            notes.append(quantity(len(self.disturbances), 'disturbance'))
         numbers = (quantity(len(self.tracks), 'track'), quantity(len(self.poses), 'pose'),
                    quantity(len(self.smoothed), 'smoothed pose'),
                    quantity(int(self.detections['onset'].sum()), 'detection'))
         return (f'TrackingResult({", ".join(numbers)}'
                 + (f'; {"; ".join(notes)}' if notes else '') + ')')
+
+    def to_dataframe(self) -> 'pd.DataFrame':
+        """Convert the published poses to a table.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns of `poses.csv`, indexed by time (UTC).
+
+        Raises
+        ------
+        MissingDependencyError
+            If pandas is not installed.
+        """
+        return with_time_index(self.poses_dataframe(), 'stamp_ns')
+
+    def figure(self) -> 'Figure':
+        """Draw the pass of the first vehicle, or the map of the first magnet.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        UnknownTrackError
+            If nothing was tracked.
+        """
+        return self.pass_figure() if self.settings.track.target == 'vehicle' \
+            else self.map_figure()
 
     def poses_dataframe(self) -> 'pd.DataFrame':
         """Convert `poses` to a table.
@@ -115,7 +109,7 @@ class TrackingResult:
         MissingDependencyError
             If pandas is not installed.
         """
-        return poses_dataframe(self.poses)
+        return array_dataframe(POSES, self.poses)
 
     def smoothed_dataframe(self) -> 'pd.DataFrame':
         """Convert `smoothed` to a table.
@@ -130,7 +124,7 @@ class TrackingResult:
         MissingDependencyError
             If pandas is not installed.
         """
-        return smoothed_dataframe(self.smoothed)
+        return array_dataframe((*SMOOTHED, *COMPLETE), self.smoothed)
 
     def detections_dataframe(self) -> 'pd.DataFrame':
         """Convert `detections` to a table.
@@ -145,7 +139,7 @@ class TrackingResult:
         MissingDependencyError
             If pandas is not installed.
         """
-        return detections_dataframe(self.detections)
+        return array_dataframe(DETECTIONS, self.detections)
 
     def errors(self, track_id: int | None = None) -> dict[str, Any] | None:
         """Compute the errors of a track relative to the best-matching target of the ground truth.
@@ -276,22 +270,29 @@ class TrackingResult:
         return self.tracks[track_id]
 
 
-def track(source: Readings | RecordedReadings | str | PathLike[str],
+def track(source: UserSource,
           network: SensorNetwork | str | PathLike[str], target: str = 'vehicle',
-          settings: Mapping[str, Any] | None = None) -> TrackingResult:
+          settings: Mapping[str, Any] | None = None,
+          time_unit: str | None = None) -> TrackingResult:
     """Track the targets in readings or in a recording.
 
     The stages are the same as in `mag-tracking replay` and the ROS nodes. No files are written.
 
     Parameters
     ----------
-    source : Readings, RecordedReadings, or path of a recording
-        A recording is read in batches and need not fit into memory.
+    source : path, Readings, RecordedReadings, DataFrame or mapping
+        A recording is read in batches and need not fit into memory. A DataFrame, in tesla, has one
+        row per reading (columns `sensor`, x, y, z) or per time (columns such as `mag_1_x`), and the
+        times in a column `time` or `stamp_ns` or in the index. A mapping is {sensor: (times (n,),
+        fields (n, 3), T)}.
     network : SensorNetwork or path of a network file
     target : 'vehicle', 'magnet' (in a hand) or 'bench' (a magnet on a bench)
     settings : {name: value}, optional
         Settings that differ from the defaults of the target, such as {'track.iterations': 5};
-        config/default.yaml lists all settings.
+        config/default.yaml lists those of users, the reference all.
+    time_unit : 's', 'ms', 'us' or 'ns', optional
+        Unit of the times of a DataFrame or mapping; required for floats. The default for integers
+        is 'ns'.
 
     Returns
     -------
@@ -309,58 +310,29 @@ def track(source: Readings | RecordedReadings | str | PathLike[str],
         If a setting has an unknown name, a wrong type, or a value out of range.
     """
     network = network_of(network)
-    pipeline = Pipeline(network, settings_for(target, settings))
-    results = _Results()
-    collector = RunCollector(results)
-    if isinstance(source, Readings):
-        check_order(source)
-        source = RecordedReadings(source, {}, {}, {}, ())
-    if isinstance(source, RecordedReadings):
-        source = replace(source, readings=checked_readings(source.readings, network))
-        scan = prescan(_batches(source.readings), network, pipeline.settings.calibrate)
-        scan.apply(pipeline.calibrate)
-        for readings in _batches(source.readings):
-            collector.add(pipeline.feed(readings))
-        recorded, damage = source, []
-    else:
-        recording = Recording(source)
-        reader = SampleReader(recording, network)
-        scan = prescan_of(recording, network, pipeline.settings.calibrate)
-        scan.apply(pipeline.calibrate)
-        for readings in reader.readings():
-            collector.add(pipeline.feed(readings))
-        recorded = recorded_readings(recording, reader, Readings.joined([]))
-        damage = recording_findings(recording, reader)
-    collector.add(pipeline.flush())
-    found = [*damage, *sensor_findings(network, pipeline.calibrate, pipeline.settings.track,
-                                       recorded.missing_topics, scan.clocks)]
-    return _tracking_result(pipeline, results, collector.logs, recorded, found)
+    pipeline, poses, history = Pipeline(network, settings_for(target, settings)), _Poses(), \
+        TrackHistory()
+    opened = source_of(source, network, time_unit)
+    with shown_progress(opened) as progress:
+        report = run(opened, pipeline, [poses, history], progress)
+    truth = source.truth if isinstance(source, RecordedReadings) else \
+        opened.reader.truth_arrays() if isinstance(opened, RecordingSource) else {}
+    return TrackingResult(network, pipeline.settings, pose_array(poses.poses),
+                          smoothed_array(poses.smoothed), detection_array(poses.detections),
+                          history.logs, truth, report, tuple(history.disturbances.values()))
 
 
-def _batches(readings: Readings) -> Iterator[Readings]:
-    """Split readings into batches of at most `_BATCH_SIZE` readings."""
-    return (readings.part(slice(i, i + _BATCH_SIZE)) for i in range(0, len(readings), _BATCH_SIZE))
-
-
-class _Results:
-    """Collects detections, poses and disturbances."""
+class _Poses(RecordReceiver):
+    """Collects detections and poses."""
 
     def __init__(self) -> None:
         self.poses: list[Track] = []
         self.smoothed: list[SmoothedPose] = []
         self.detections: list[Detection] = []
-        self.disturbances: dict[int, Disturbance] = {}
 
     def add_detection(self, detection: Detection) -> None:
         """Add the onset or release of a detection."""
         self.detections.append(detection)
-
-    def add_disturbance(self, disturbance: Disturbance) -> None:
-        """Add a disturbance; its latest record replaces earlier ones."""
-        self.disturbances[disturbance.id] = disturbance
-
-    def add_frame(self, frame: FieldFrame) -> None:
-        """Ignore a frame, because frames are stored in the history of each track."""
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
         """Add a smoothed pose."""
@@ -369,21 +341,3 @@ class _Results:
     def add_track(self, track: Track) -> None:
         """Add a pose; omit its hypotheses, which are stored in the history of the track."""
         self.poses.append(replace(track, hypotheses=()))
-
-
-def _tracking_result(pipeline: Pipeline, results: _Results, tracks: dict[int, TrackLog],
-                     recording: RecordedReadings, found: list[Finding]) -> TrackingResult:
-    """Create a `TrackingResult` with the findings about the input; readings of `recording` are
-    unused."""
-    rejections = dict(Counter(recording.rejected) + Counter(pipeline.rejections()))
-    reason = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
-                                 pipeline.detect, recording.missing_topics, rejections)
-    if reason is None and not tracks:
-        reason = next((str(d) for d in ranked(found) if d.serious),
-                      no_track_reason(pipeline.counts()['track']))
-    return TrackingResult(
-        pipeline.network, pipeline.settings, pose_array(results.poses),
-        smoothed_array(results.smoothed), detection_array(results.detections), tracks,
-        recording.truth, rejections, pipeline.counts(), recording.lost,
-        recording.missing_topics, reason, tuple(pipeline.calibrate.unready()),
-        tuple(results.disturbances.values()))

@@ -1,10 +1,10 @@
 """Traffic in a recording: passages of vehicles across counting lines, and summaries."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,21 +14,24 @@ from mag_tracking.analysis.correlated_motion import (
     correlated_motion,
 )
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.apps.no_detection import no_detection_reason
-from mag_tracking.apps.prescan import prescan_of
-from mag_tracking.apps.readings import network_of
-from mag_tracking.apps.replay_notes import no_track_reason, replay_findings
+from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
+from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import TrafficSummary, VehiclePassage
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Output, Pipeline, Settings, settings_for
+from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
-from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.records import FieldFrame, Track
-from mag_tracking.stages.health.diagnosis import Diagnosis, ranked
+from mag_tracking.results.columns import traffic_tables
+from mag_tracking.results.dataframes import rows_dataframe
+from mag_tracking.results.traffic_tables import passage_row
+from mag_tracking.run import RunReport, Source, run
 from mag_tracking.units import NS
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 RETENTION_S = 300.0
 """Time for which frames of an ended track are kept, because its passage is reported later [s]."""
@@ -44,6 +47,12 @@ class CountedVehicle:
     """Velocity from the delays, independent of the tracker; `reason` explains a missing value."""
 
     @property
+    def delays(self) -> dict[str, float | bool]:
+        """Columns of the speed from the delays in the table `passages`."""
+        return {'delay_speed': self.delay.speed, 'sd_delay_speed': self.delay.speed_std,
+                'speeds_contradict': self.speeds_contradict}
+
+    @property
     def speeds_contradict(self) -> bool:
         """Whether the speed or direction of the track contradicts the delays."""
         p = self.passage
@@ -52,7 +61,7 @@ class CountedVehicle:
 
 
 @dataclass(frozen=True)
-class TrafficResult:
+class TrafficResult(DisplayedResult):
     """Counted vehicles and traffic summaries of a recording."""
 
     class_names: tuple[str, ...]
@@ -61,20 +70,43 @@ class TrafficResult:
     """Counted vehicles in chronological order."""
     summaries: tuple[TrafficSummary, ...]
     """One summary per line and interval."""
-    counts: dict[str, int]
-    """{event: number}, for events such as passages, or tracks that crossed no line."""
-    rejections: dict[str, int]
-    """Readings that were not used: {cause: number}."""
-    missing_topics: tuple[str, ...]
-    """Topics of the network that are not in the recording."""
-    sensors_without_background: tuple[str, ...]
-    """Sensors whose background was not learnt."""
-    no_detection_reason: str | None
-    """Explanation, in one sentence, of why nothing was detected; None if a target was detected."""
-    no_track_reason: str | None
-    """Explanation if nothing was tracked because only one sensor measured the target, else None."""
-    diagnoses: tuple[Diagnosis, ...]
-    """Diagnoses of the recording, the sensors and the stages."""
+    report: RunReport
+    """What was lost, rejected or missing, and why; `report.counts['traffic']` counts passages,
+    tracks that crossed no line, and other events."""
+
+    def to_dataframe(self) -> 'pd.DataFrame':
+        """Convert the counted vehicles to a table.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns of the table `passages`, indexed by time (UTC).
+
+        Raises
+        ------
+        MissingDependencyError
+            If pandas is not installed.
+        """
+        columns = [c for c in traffic_tables(self.class_names, False)['passages']
+                   if c.name != 'recording']
+        return rows_dataframe(columns, [passage_row('', v.passage, self.class_names, v.delays, {})
+                                        for v in self.vehicles], 'stamp_ns')
+
+    def figure(self) -> 'Figure':
+        """Draw the speed of each vehicle over time, by class.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        # Imported here because it loads matplotlib.
+        from mag_tracking.report.time_figures import time_figure
+
+        passages = [v.passage for v in self.vehicles]
+        return time_figure(np.array([p.stamp_ns for p in passages], dtype=np.int64),
+                           np.array([p.speed for p in passages]),
+                           np.array([p.speed_std for p in passages]),
+                           [p.vehicle_class for p in passages], 'speed [m/s]')
 
     def __repr__(self) -> str:
         lines = dict(Counter(v.passage.line for v in self.vehicles))
@@ -82,17 +114,25 @@ class TrafficResult:
                 f'{lines or "no line was crossed"})')
 
 
-def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathLike[str],
-            settings: Mapping[str, Any] | None = None) -> TrafficResult:
+def traffic(source: UserSource, network: SensorNetwork | str | PathLike[str],
+            settings: Mapping[str, Any] | None = None,
+            time_unit: str | None = None) -> TrafficResult:
     """Count the vehicles that cross the counting lines of a network.
 
     Parameters
     ----------
-    recording : path
+    source : path, Readings, RecordedReadings, DataFrame or mapping
+        A recording is read in batches and need not fit into memory. A DataFrame, in tesla, has one
+        row per reading (columns `sensor`, x, y, z) or per time (columns such as `mag_1_x`), and the
+        times in a column `time` or `stamp_ns` or in the index. A mapping is {sensor: (times (n,),
+        fields (n, 3), T)}.
     network : SensorNetwork or path of a network file
     settings : {name: value}, optional
-        Settings that differ from the defaults for a vehicle; `traffic.line_*` define the counting
-        lines.
+        Settings that differ from the defaults for a vehicle; `traffic.lines` is the table of the
+        counting lines.
+    time_unit : 's', 'ms', 'us' or 'ns', optional
+        Unit of the times of a DataFrame or mapping; required for floats. The default for integers
+        is 'ns'.
 
     Returns
     -------
@@ -100,6 +140,8 @@ def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathL
 
     Raises
     ------
+    ReadingsError
+        If a table or arrays are incomplete, not in order, or of a wrong type.
     RecordingError
         If the recording cannot be read, or has none of the network's topics.
     NetworkError
@@ -107,62 +149,65 @@ def traffic(recording: str | PathLike[str], network: SensorNetwork | str | PathL
     SettingsError
         If a setting is invalid, or the target is not a vehicle.
     """
-    return count_traffic(Recording(recording), network_of(network),
+    network = network_of(network)
+    return count_traffic(source_of(source, network, time_unit), network,
                          settings_for('vehicle', settings))
 
 
-def count_traffic(recording: Recording, network: SensorNetwork, settings: Settings,
-                  progress: Callable[[int], object] | None = None,
-                  stopped: Callable[[], bool] | None = None) -> TrafficResult:
-    """Count the vehicles in an open recording; raises SettingsError if the target is not a
-    vehicle."""
-    if settings.track.target != 'vehicle':
-        raise SettingsError('traffic counts only vehicles; set the target to vehicle instead of '
-                            f'{settings.track.target}')
+def count_traffic(source: Source, network: SensorNetwork, settings: Settings) -> TrafficResult:
+    """Count the vehicles in a source; raises SettingsError if the target is not a vehicle."""
     pipeline = Pipeline(network, settings)
-    reader = SampleReader(recording, network)
-    prescan_of(recording, network, settings.calibrate, stopped).apply(pipeline.calibrate)
-    collector = _TrafficCollector(network)
-    try:
-        for readings in until_stopped(reader.readings, progress, stopped):
-            collector.add(pipeline.feed(readings))
-    except ReadingStopped:
-        pass
-    collector.add(pipeline.flush())
-    rejections = dict(reader.rejected + Counter(pipeline.rejections()))
-    reason = no_detection_reason(network, settings, pipeline.calibrate, pipeline.detect,
-                                 reader.missing_topics(), rejections)
-    return TrafficResult(settings.traffic.class_names, tuple(collector.vehicles),
-                         tuple(collector.summaries), dict(pipeline.traffic.counts), rejections,
-                         tuple(reader.missing_topics()), tuple(pipeline.calibrate.unready()),
-                         reason, no_track_reason(pipeline.counts()['track']),
-                         tuple(ranked(replay_findings(recording, reader, pipeline, reason))))
+    sink = TrafficSink(pipeline)
+    with shown_progress(source) as progress:
+        return sink.result(run(source, pipeline, [sink], progress))
 
 
-class _TrafficCollector:
-    """Collects passages and summaries; stores the frames of tracks to compute the delays."""
+def check_vehicles(settings: Settings) -> None:
+    """Raise SettingsError if the target is not a vehicle."""
+    if settings.track.target != 'vehicle':
+        raise SettingsError('only vehicles are counted and fitted; set the target to vehicle '
+                            f'instead of {settings.track.target}')
 
-    def __init__(self, network: SensorNetwork) -> None:
-        self._network = network
+
+class TrafficSink(RecordReceiver):
+    """Collects passages and summaries; stores the frames of tracks to compute the delays.
+
+    Raises SettingsError if the target is not a vehicle.
+    """
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        check_vehicles(pipeline.settings)
+        self._network = pipeline.network
+        self._class_names = tuple(c.name for c in pipeline.settings.traffic.classes)
         self._frame: FieldFrame | None = None
         self._tracks_before_jump: set[int] = set()
         self._frames: dict[int, list[FieldFrame]] = {}
-        self.vehicles: list[CountedVehicle] = []
-        self.summaries: list[TrafficSummary] = []
+        self._vehicles: list[CountedVehicle] = []
+        self._summaries: list[TrafficSummary] = []
 
-    def add(self, records: Iterable[Output]) -> None:
-        """Add the outputs of a batch of readings."""
-        for record in records:
-            if isinstance(record, FieldFrame):
-                self._drop_old(record.stamp_ns)
-                self._frame = record
-            elif isinstance(record, Track) and not record.ended:
-                assert self._frame is not None, 'a pose without a frame'
-                self._frames.setdefault(record.id, []).append(self._frame)
-            elif isinstance(record, VehiclePassage):
-                self.vehicles.append(CountedVehicle(record, self._delay_motion(record.track_id)))
-            elif isinstance(record, TrafficSummary):
-                self.summaries.append(record)
+    def add_frame(self, frame: FieldFrame) -> None:
+        """Store the frame of the following poses."""
+        self._drop_old(frame.stamp_ns)
+        self._frame = frame
+
+    def add_track(self, track: Track) -> None:
+        """Store the latest frame for a track."""
+        if not track.ended:
+            assert self._frame is not None, 'a pose without a frame'
+            self._frames.setdefault(track.id, []).append(self._frame)
+
+    def add_passage(self, passage: VehiclePassage) -> None:
+        """Add a passage with the velocity from the delays."""
+        self._vehicles.append(CountedVehicle(passage, self._delay_motion(passage.track_id)))
+
+    def add_traffic(self, summary: TrafficSummary) -> None:
+        """Add a summary."""
+        self._summaries.append(summary)
+
+    def result(self, report: RunReport) -> TrafficResult:
+        """Return the counted vehicles after a run."""
+        return TrafficResult(self._class_names, tuple(self._vehicles), tuple(self._summaries),
+                             report)
 
     def _drop_old(self, now_ns: int) -> None:
         """Drop frames of tracks that ended before a time jump, or more than `RETENTION_S` ago."""

@@ -1,4 +1,4 @@
-"""Calibration of hard and soft iron by tumbling, for the command `mag-tracking tumble`."""
+"""Calibration of hard and soft iron by tumbling, for `mag-tracking calibrate tumble`."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace

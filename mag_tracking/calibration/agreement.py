@@ -60,7 +60,8 @@ _AxisChange: TypeAlias = tuple[str, tuple[int, ...], FloatArray]
 ADVICE = 'fix the sensor, its orientation in the network file, or earth_field'
 """Remedy for a misleading sensor."""
 
-OFFSET_ADVICE = 'measure the offset with mag-tracking tumble if the orientations are calibrated'
+OFFSET_ADVICE = 'measure the offset with mag-tracking calibrate tumble if the orientations are '\
+                'calibrated'
 """Remedy for a sensor with a constant offset."""
 
 

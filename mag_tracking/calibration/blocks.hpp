@@ -78,10 +78,10 @@ inline void moments(const Sensor& s, int64_t k, double* mean, double* scatter) {
     for (int a = 0; a < 3; ++a) mean[a] = count[a][a] > 0.0 ? sum[a][a] / count[a][a] : NAN;
     for (int a = 0; a < 3; ++a)
         for (int b = 0; b < 3; ++b)
-            scatter[3 * a + b] =
-                count[a][b] > 0.0 ? s.product[k][a][b] - sum[a][b] * mean[b] - sum[b][a] * mean[a]
-                                        + count[a][b] * mean[a] * mean[b]
-                                  : 0.0;
+            scatter[3 * a + b] = count[a][b] > 0.0
+                                     ? s.product[k][a][b] - sum[a][b] * mean[b]
+                                           - sum[b][a] * mean[a] + count[a][b] * mean[a] * mean[b]
+                                     : 0.0;
     for (int a = 0; a < 3; ++a) mean[a] += s.origin[k][a];
 }
 

@@ -13,7 +13,8 @@ using Structured = py::array;
 Sensor& checked(Sensor& s) {
     if (s.now < 0 || s.now > 1 || s.n_held < 0 || s.n_held > MAX_HELD + 1 || s.n_steps < 0
         || s.n_window < 0 || s.n_marks < 0 || s.n_marks > MAX_MARKS)
-        throw py::value_error("now, n_held, n_steps, n_window or n_marks of a sensor is out of range");
+        throw py::value_error(
+            "now, n_held, n_steps, n_window or n_marks of a sensor is out of range");
     return s;
 }
 
@@ -22,7 +23,8 @@ Sensor& sensor_of(Structured& sensors) { return checked(Structs<Sensor>(sensors)
 Calibrated room_of(Integers& rows, Integers& stamps, Array& fields, Array& covariances) {
     const Size n = length_of(rows, "out_rows", 1);
     return {n, data_of(rows, "out_rows", {n}), data_of(stamps, "out_stamps", {n}),
-            data_of(fields, "out_fields", {n, 3}), data_of(covariances, "out_covariances", {n, 3, 3})};
+            data_of(fields, "out_fields", {n, 3}),
+            data_of(covariances, "out_covariances", {n, 3, 3})};
 }
 
 int calibrate_readings(Structured sensors, Structured limits, Integers rows, Integers stamps,
@@ -31,14 +33,16 @@ int calibrate_readings(Structured sensors, Structured limits, Integers rows, Int
                        Array out_covariances) {
     const Size n = length_of(rows, "rows", 1);
     Structs<Sensor> all(sensors);
-    const RawReadings in{n, input_of(rows, "rows", {n}), input_of(stamps, "stamps", {n}),
-                         input_of(fields, "fields", {n, 3}), input_of(own, "own", {n}),
+    const RawReadings in{n,
+                         input_of(rows, "rows", {n}),
+                         input_of(stamps, "stamps", {n}),
+                         input_of(fields, "fields", {n, 3}),
+                         input_of(own, "own", {n}),
                          covariances.data()};
     Batch& batch = Structs<Batch>(batches).only();
     if (batch.next < 0) throw py::index_error("next: must not be negative");
     for (Size i = batch.next; i < n; ++i) {
-        if (in.rows[i] >= all.size())
-            throw py::index_error("rows: a sensor index is out of range");
+        if (in.rows[i] >= all.size()) throw py::index_error("rows: a sensor index is out of range");
         if (in.rows[i] >= 0) checked(all.data()[in.rows[i]]);
         if (in.own[i]) input_of(covariances, "covariances", {n, 3, 3});
     }
@@ -54,8 +58,9 @@ bool use_reading(Structured sensors, Structured limits, Structured batches, int6
         throw py::index_error("row: the sensor index is out of range");
     const Reading reading{stamp, input_of(field, "field", {3}), own,
                           input_of(covariance, "covariance", {3, 3})};
-    return use(checked(all.data()[row]), Structs<Limits>(limits).only(), Structs<Batch>(batches).only(), row,
-               reading, room_of(out_rows, out_stamps, out_fields, out_covariances));
+    return use(checked(all.data()[row]), Structs<Limits>(limits).only(),
+               Structs<Batch>(batches).only(), row, reading,
+               room_of(out_rows, out_stamps, out_fields, out_covariances));
 }
 
 void subtract(Structured sensors, double time, Array field, Array out) {
@@ -96,8 +101,8 @@ py::tuple line_through(Array time, Array n, Array y, double centre) {
 py::object pooled_covariance(Array scatter, Array n) {
     const Size k = length_of(scatter, "scatter", 3);
     Array out({3, 3});
-    const bool is_enough = pool(k, input_of(scatter, "scatter", {k, 3, 3}), input_of(n, "n", {k, 3}),
-                                out.mutable_data());
+    const bool is_enough = pool(k, input_of(scatter, "scatter", {k, 3, 3}),
+                                input_of(n, "n", {k, 3}), out.mutable_data());
     return is_enough ? py::object(out) : py::none();
 }
 

@@ -18,13 +18,28 @@ namespace mag_tracking {
 
 enum Reason {
     // The batch is finished, or the reading is rejected.
-    DONE, UNKNOWN_SENSOR, NO_AXIS, INFINITE, TOO_LARGE, BAD_COVARIANCE, AXIS_MISSING, TOO_FAR_AHEAD,
-    DUPLICATE, OUT_OF_ORDER, STUCK, MARKED, REPEATED,
+    DONE,
+    UNKNOWN_SENSOR,
+    NO_AXIS,
+    INFINITE,
+    TOO_LARGE,
+    BAD_COVARIANCE,
+    AXIS_MISSING,
+    TOO_FAR_AHEAD,
+    DUPLICATE,
+    OUT_OF_ORDER,
+    STUCK,
+    MARKED,
+    REPEATED,
     // To be handled before the same reading is processed again.
-    BLOCK_COMPLETE = 20, JUMPED_BACK, RESTORABLE, WINDOW_COMPLETE,
+    BLOCK_COMPLETE = 20,
+    JUMPED_BACK,
+    RESTORABLE,
+    WINDOW_COMPLETE,
     // The previous `n_spikes` readings are rejected, or the `n_released` held readings are to be
     // used.
-    SPIKES = 30, PASSED
+    SPIKES = 30,
+    PASSED
 };
 
 // Maximum difference between the correlation of two axes in a message and the measured correlation.
@@ -218,8 +233,7 @@ inline void attach_covariance(Sensor& s, const Limits& limits, Batch& batch, con
     if (own && !limits.trust_covariances && (reading.own == INVALID || !is_credible(s, C))) {
         own = false;
         ++s.n_overruled, ++batch.n_overruled;
-        for (int a = 0; a < 3; ++a)
-            s.stated_std[a] = C[4 * a] >= 0.0 ? std::sqrt(C[4 * a]) : NAN;
+        for (int a = 0; a < 3; ++a) s.stated_std[a] = C[4 * a] >= 0.0 ? std::sqrt(C[4 * a]) : NAN;
     }
     for (int a = 0; a < 3; ++a) {
         for (int b = 0; b < 3; ++b) out[3 * a + b] = own ? C[3 * a + b] : s.noise[a][b];
@@ -273,8 +287,8 @@ inline void correct_covariance(const Sensor& s, const double* C, double* out) {
         for (int b = 0; b < 3; ++b)
             for (int c = 0; c < 3; ++c)
                 for (int d = 0; d < 3; ++d)
-                    out[3 * a + b] +=
-                        product(s.correction[a][c] * s.correction[b][d], C[3 * c + d]);
+                    out[3 * a + b] += product(s.correction[a][c] * s.correction[b][d],
+                                              C[3 * c + d]);
 }
 
 // Calibrate readings from `next` on, until the batch is finished or Python is required.
@@ -288,8 +302,10 @@ inline Reason calibrate(Sensor* sensors, const Limits& limits, const RawReadings
         const int64_t stamp = batch.stamp_ns = in.stamps[i] - s.clock_offset_ns;
         const bool is_duplicate = stamp == s.last_ns;
         const Reason reason = check(s, limits, stamp, in.fields + 3 * i, in.own[i], raw, field);
-        if (reason >= BLOCK_COMPLETE) batch.next = i;
-        else note_raw(s, stamp, in.fields + 3 * i, is_duplicate);
+        if (reason >= BLOCK_COMPLETE)
+            batch.next = i;
+        else
+            note_raw(s, stamp, in.fields + 3 * i, is_duplicate);
         if (reason != DONE) return reason;
         if (in.own[i]) correct_covariance(s, in.covariances + 9 * i, C);
         const Reading reading{stamp, field, in.own[i], C};

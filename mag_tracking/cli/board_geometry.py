@@ -1,7 +1,6 @@
-"""Command `mag-tracking board-geometry`."""
+"""Command `mag-tracking calibrate board`."""
 
 import argparse
-import datetime
 import signal
 import sys
 import threading
@@ -20,8 +19,14 @@ from mag_tracking.apps.board_geometry import (
     survey_geometry,
 )
 from mag_tracking.arrays import FloatArray
-from mag_tracking.cli.options import Commands, add_command, add_network
-from mag_tracking.errors import OutputError, SettingsError
+from mag_tracking.cli.options import (
+    Commands,
+    add_command,
+    add_network,
+    check_writable,
+    utc_timestamp,
+)
+from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import read_network, write_network
 from mag_tracking.quantities import quantity
@@ -44,8 +49,8 @@ quantity):
 {settings}
 
 examples:
-  mag-tracking board-geometry poses.csv --sensors positions.csv --moment 0.264 --out board.yaml
-  mag-tracking board-geometry poses.csv --network board.yaml --moment 0.264 --unknown-poses \\
+  mag-tracking calibrate board poses.csv --sensors positions.csv --moment 0.264 --out board.yaml
+  mag-tracking calibrate board poses.csv --network board.yaml --moment 0.264 --unknown-poses \\
       --low -0.05 -0.05 0.03 --high 0.2 0.22 0.3 --out calibrated.yaml --figure board.png
 '''
 
@@ -54,7 +59,7 @@ def add(commands: Commands) -> None:
     """Register the command."""
     settings = '\n'.join(f'  {p.name}: {p.value}  # {p.doc}{f" [{p.unit}]" if p.unit else ""}'
                          for p in flatten(GeometrySettings()))
-    p = add_command(commands, 'board-geometry', _geometry,
+    p = add_command(commands, 'calibrate board', _geometry,
                     _GEOMETRY_HELP.replace('{settings}', settings))
     p.add_argument('table', type=Path, metavar='TABLE', help='readings and poses (.csv)')
     geometry = p.add_mutually_exclusive_group(required=True)
@@ -82,16 +87,15 @@ def add(commands: Commands) -> None:
 
 
 def _geometry(args: argparse.Namespace) -> int:
-    """Run `mag-tracking board-geometry`."""
+    """Run `mag-tracking calibrate board`."""
     box = _checked_box(args)
     network = read_network(args.network) if args.sensors is None else board_of(args.sensors)
     settings = replace(GeometrySettings(), read_parameter_file(args.params) if args.params else {})
-    date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
     unknowns = "magnet's poses and the geometry" if box else 'geometry'
     # Ctrl-C ends the estimation immediately: nothing has been written yet.
     with _elapsed_time(f'estimating the {unknowns} of {quantity(len(network), "sensor")}'):
-        survey = survey_geometry(args.table, network, args.moment, settings, date, box,
-                                 args.noise_std)
+        survey = survey_geometry(args.table, network, args.moment, settings, utc_timestamp(),
+                                 box, args.noise_std)
     _print(survey, box is not None)
     if not survey.geometry.converged:
         print(f'mag-tracking: calibration rejected: {survey.geometry.reason}; nothing was written',
@@ -133,8 +137,7 @@ def _checked_box(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[fl
         raise SettingsError(f'--high: expected values above {args.low} in x, y and z, got '
                             f'{args.high}')
     for path in (args.out, args.figure):
-        if path is not None and not path.absolute().parent.is_dir():
-            raise OutputError(f'cannot write {path}: the folder {path.parent} does not exist')
+        check_writable(path)
     return corners if args.unknown_poses else None
 
 

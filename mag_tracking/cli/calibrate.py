@@ -1,4 +1,4 @@
-"""Command `mag-tracking calibrate`."""
+"""Command `mag-tracking calibrate network`."""
 
 import argparse
 import signal
@@ -38,13 +38,13 @@ The network file must contain the Earth's field, as earth_field (tesla) or as si
 x_azimuth_deg is the bearing of the x axis of the world frame, clockwise from true north.
 
 example:
-  mag-tracking calibrate first_day.mcap --network site.yaml --out calibrated.yaml
+  mag-tracking calibrate network first_day.mcap --network site.yaml --out calibrated.yaml
 '''
 
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'calibrate', _calibrate, _CALIBRATE_HELP)
+    p = add_command(commands, 'calibrate network', _calibrate, _CALIBRATE_HELP)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
@@ -59,7 +59,7 @@ def add(commands: Commands) -> None:
 
 
 def _calibrate(args: argparse.Namespace) -> int:
-    """Run `mag-tracking calibrate`."""
+    """Run `mag-tracking calibrate network`."""
     network = recorded_network(args)
     settings = settings_of(args, network)
     recording = Recording(args.recording)

@@ -31,8 +31,8 @@ trained on labelled passes identifies the class of a target by the shape of its 
 LABELLED is one of:
   - a CSV table with one row per sample (label, signature, time_s, x_nt, y_nt, z_nt) or one row per
     signature (label, x0, x1, ..., y0, y1, ...). An optional column `pass` identifies the signatures
-    of one target at several sensors. signatures.csv of `mag-tracking events` is such a table
-    without labels.
+    of one target at several sensors. signatures.csv of `mag-tracking replay --tables events` is
+    such a table without labels.
   - a recording, with --network FILE and --labels FILE, a CSV table of intervals (label, begin_s,
     end_s, optional sensor; seconds since the first reading or since 1970, or begin_ns and end_ns).
 
@@ -49,21 +49,14 @@ examples:
 
 
 def add(commands: Commands) -> None:
-    """Register the command."""
-    p = add_command(commands, 'classes', _reject_missing_action, _CLASSES_HELP)
-    actions = p.add_subparsers(dest='action', metavar='ACTION', required=True)
-    for name, run, description in (
-            ('train', _train, 'Train a classifier on labelled passes.'),
-            ('evaluate', _evaluate, 'Measure accuracy and reliability.'),
-            ('predict', _predict, 'Classify signatures.')):
-        _add_action(actions, name, run, description)
+    """Register the commands."""
+    for name, run in (('train', _train), ('evaluate', _evaluate), ('predict', _predict)):
+        _add_action(commands, name, run)
 
 
-def _add_action(actions: Commands, name: str, run: Callable[[argparse.Namespace], int],
-                description: str) -> None:
-    """Register the action `train`, `evaluate` or `predict`."""
-    p = actions.add_parser(name, help=description, description=description)
-    p.set_defaults(run_command=run)
+def _add_action(commands: Commands, name: str, run: Callable[[argparse.Namespace], int]) -> None:
+    """Register `classes train`, `evaluate` or `predict`."""
+    p = add_command(commands, f'classes {name}', run, _CLASSES_HELP)
     p.add_argument('labelled', type=Path, metavar='LABELLED',
                    help='table of signatures (.csv) or recording')
     p.add_argument('--labels', type=Path, metavar='FILE',
@@ -79,11 +72,6 @@ def _add_action(actions: Commands, name: str, run: Callable[[argparse.Namespace]
     if name == 'evaluate':
         p.add_argument('--splits', type=int, default=20, metavar='N',
                        help='number of 70/30 splits, if --model is not given (default: 20)')
-
-
-def _reject_missing_action(args: argparse.Namespace) -> int:
-    """Reject a command without an action, if argparse has not rejected it."""
-    raise SettingsError('classes: expected train, evaluate or predict')
 
 
 def _examples(args: argparse.Namespace) -> Examples:

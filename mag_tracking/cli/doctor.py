@@ -5,7 +5,6 @@ import signal
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from mag_tracking.apps.doctor import Doctor, examine
 from mag_tracking.apps.doctor_report import write_report
@@ -15,12 +14,14 @@ from mag_tracking.cli.options import (
     add_recorded_network,
     add_report,
     check_report,
+    progress_bar,
     recorded_network,
 )
 from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.recording.reader import Recording
+from mag_tracking.run import RecordingSource
 from mag_tracking.stages.health.diagnosis import Finding, ranked
 from mag_tracking.stages.health.sensor_health import SensorHealth
 
@@ -66,10 +67,9 @@ def _doctor(args: argparse.Namespace) -> int:
                            args.ros_arguments) as live:
                 live.status = _report(args, live.doctor, live.findings, bool(signals))
             return live.status
-        recording = Recording(args.recording)
-        with tqdm(total=recording.size, unit='B', unit_scale=True, desc=args.recording.name,
-                  disable=None) as bar:
-            doctor, further_findings = examine(recording, network, settings, bar.update,
+        source = RecordingSource(Recording(args.recording), network, by_message=True)
+        with progress_bar(source) as bar:
+            doctor, further_findings = examine(source, network, settings, bar.update,
                                                lambda: bool(signals))
     return _report(args, doctor, further_findings, bool(signals))
 

@@ -1,8 +1,9 @@
-"""Command `mag-tracking fit`."""
+"""Command `mag-tracking fit`, and the table `fits` of `mag-tracking replay`."""
 
 import argparse
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -10,29 +11,38 @@ import numpy as np
 from tqdm import tqdm
 
 from mag_tracking.analysis.correlated_motion import contradicts_delays
+from mag_tracking.analysis.fitted_pass import FittedPass
 from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, Bearing, PassFit
-from mag_tracking.apps.fit import RecordingFit, check_cpa_range, check_orders
-from mag_tracking.apps.pass_fitter import FittedPass
+from mag_tracking.apps.fit import check_cpa_range, check_orders
+from mag_tracking.apps.pass_fitter import PassFitter
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import (
     Commands,
     add_command,
     add_recorded_network,
+    add_verbose,
     distinct_names,
+    print_diagnoses,
+    progress_bar,
     recorded_network,
 )
+from mag_tracking.cli.vehicle_rows import HEADER, UNKNOWN, time_of, vehicle_row
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.inference.iron import Iron, hard_and_soft_iron
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0
-from mag_tracking.pipeline import settings_for
+from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.recording.fit_folder import FitFolder
 from mag_tracking.recording.reader import Recording
+from mag_tracking.results.fit_folder import FitFolder
+from mag_tracking.run import RecordingSource, RunReport, run
 from mag_tracking.settings import read_parameter_file
+from mag_tracking.units import NS
 
+ORDERS = (1, 2, 3, 4)
+"""Numbers of dipoles that are tried by default."""
 P_WARNING = 1e-3
 """False-alarm probability of the chi-square test for contradictory moments of one vehicle."""
 
@@ -72,7 +82,7 @@ def add(commands: Commands) -> None:
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
     p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
-    p.add_argument('--orders', nargs='+', type=int, default=[1, 2, 3, 4], metavar='N',
+    p.add_argument('--orders', nargs='+', type=int, default=ORDERS, metavar='N',
                    help='numbers of dipoles to try (default: 1 2 3 4)')
     p.add_argument('--cpa-range', nargs=2, type=float, metavar=('RANGE', 'STD'),
                    help='range at the closest point of approach and its standard deviation [m], '
@@ -83,6 +93,38 @@ def add(commands: Commands) -> None:
     p.add_argument('--params', type=Path, metavar='FILE',
                    help='YAML file with the settings to override')
     p.add_argument('--no-figures', action='store_true', help='do not draw figures')
+    add_verbose(p)
+
+
+class Fits:
+    """Fits of the passes of all recordings, written and printed during the run."""
+
+    upto = 'track'
+    """Last stage of the pipeline that the table needs."""
+
+    def __init__(self, args: argparse.Namespace, network: SensorNetwork,
+                 stopped: Callable[[], bool], stack: ExitStack) -> None:
+        self._args, self._stopped = args, stopped
+        self.folder = stack.enter_context(FitFolder(args.out))
+        self.passes: list[FittedPass] = []
+
+    def sink(self, name: str, pipeline: Pipeline) -> PassFitter:
+        """Print the header of a recording and return its sink."""
+        print(f'{name}:\n{HEADER}')
+        return PassFitter(name, pipeline, self._args.orders, self._args.cpa_range, self._add,
+                          self._stopped)
+
+    def _add(self, fitted_pass: FittedPass) -> None:
+        """Write and print a fitted pass; draw it for the command `fit`."""
+        self.folder.add(fitted_pass)
+        self.passes.append(fitted_pass)
+        _print_pass(fitted_pass, self._args.verbose)
+        if self._args.command == 'fit' and not self._args.no_figures:
+            _draw(fitted_pass, self._args.out)
+
+    def finish(self, name: str, report: RunReport, out: Path | None) -> None:
+        """Complete the content of `fits.json`, which is written at the end of all recordings."""
+        self.folder.summary = {'iron': None, 'interrupted': report.interrupted}
 
 
 def _fit(args: argparse.Namespace) -> int:
@@ -91,31 +133,27 @@ def _fit(args: argparse.Namespace) -> int:
     settings = settings_for('vehicle', read_parameter_file(args.params) if args.params else {})
     _check(args, network)
     # All recordings are opened before a file is written.
-    recordings = [Recording(path) for path in args.recordings]
-    if any(recording.lies_in(args.out) for recording in recordings):
+    sources = [RecordingSource(Recording(path), network) for path in args.recordings]
+    if any(source.recording.lies_in(args.out) for source in sources):
         raise OutputError(f'--out: {args.out} is the folder of a recording; choose another one')
-    jobs = [RecordingFit(r, network, settings, args.orders, args.cpa_range) for r in recordings]
-    passes: list[FittedPass] = []
     warnings: list[str] = []
-    with recorded_signals(signal.SIGINT) as signals, FitFolder(args.out) as folder:
-        for path, recording, job in zip(args.recordings, recordings, jobs, strict=True):
-            with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
-                      disable=None) as bar:
-                for fitted_pass in job.passes(bar.update, lambda: bool(signals)):
-                    folder.add(fitted_pass)
-                    passes.append(fitted_pass)
-                    bar.clear()
-                    _print_pass(fitted_pass)
-                    if not args.no_figures:
-                        _draw(fitted_pass, args.out)
-            lines = [f'{path.name}: {line}' for line in job.warnings()]
-            warnings += lines
-            for line in lines:
-                print(f'  warning: {line}')
+    with recorded_signals(signal.SIGINT) as signals, ExitStack() as stack:
+        def stopped() -> bool:
+            return bool(signals)
+
+        fits = Fits(args, network, stopped, stack)
+        for source in sources:
+            pipeline = Pipeline(network, settings, Fits.upto)
+            with progress_bar(source) as bar:
+                report = run(source, pipeline, [fits.sink(source.stem, pipeline)], bar.update,
+                             stopped)
+            print_diagnoses(report.diagnoses)
+            warnings += [f'{source.name}: {line}' for line in report.warnings()]
             if signals:
                 break
+        passes = fits.passes
         iron = _iron(passes, network) if args.same_vehicle else None
-        folder.summary = {'iron': iron, 'interrupted': bool(signals)}
+        fits.folder.summary = {'iron': iron, 'interrupted': bool(signals)}
     # Imported here because it loads matplotlib.
     from mag_tracking.apps.fit_report import write_report
 
@@ -138,7 +176,40 @@ def _check(args: argparse.Namespace, network: SensorNetwork) -> None:
                             'iron cannot be separated without it')
 
 
-def _print_pass(fitted_pass: FittedPass) -> None:
+def _print_pass(fitted_pass: FittedPass, verbose: bool) -> None:
+    """Print the row of a fitted pass above the progress bar, warnings and, on request, details."""
+    fit = fitted_pass.chosen
+    with tqdm.external_write_mode():
+        print(_row(fitted_pass))
+        if verbose:
+            _print_details(fitted_pass)
+        if fit is not None and contradicts_delays(fit.speed, fit.heading, fitted_pass.correlated):
+            print('    warning: the velocities of the fit and from the delay contradict each '
+                  'other; rely on neither. Check clock offsets, positions in the network file, and '
+                  'whether the target turned')
+
+
+def _row(fitted_pass: FittedPass) -> str:
+    """Format the row of a fitted pass, with the quantities that are trusted."""
+    label = f'pass {fitted_pass.number}' + f'.{fitted_pass.vehicle}' * (fitted_pass.n_vehicles > 1)
+    fit = fitted_pass.reported
+    if fit is None:
+        return vehicle_row(label, time_of(fitted_pass.fits[0].data.stamp_ns), '', '', UNKNOWN,
+                           UNKNOWN, fitted_pass.fits[-1].reason)
+    time, _, *closest = fit.closest_approach(
+        fit.data.network.positions[fit.data.sensors].mean(axis=0))
+    known = {*fit.trusted} if fit.reason else {'speed', 'direction', 'time', 'position'}
+    return vehicle_row(
+        label, time_of(fit.data.stamp_ns + (NS * time if 'time' in known else 0)),
+        quantity(fit.n_dipoles, 'dipole'),
+        f'{np.degrees(fit.heading[0]):.0f} deg' if 'direction' in known else '',
+        fit.speed if 'speed' in known else UNKNOWN,
+        (closest[0], closest[1]) if 'position' in known else UNKNOWN,
+        fit.reason or ('ambiguous' if fit.ambiguous else 'unique')
+        + (', poor fit' if fit.normalised_cost > MAX_NORMALISED_COST else ''))
+
+
+def _print_details(fitted_pass: FittedPass) -> None:
     """Print the fits of one pass as a table, one row per number of dipoles."""
     data = fitted_pass.fits[0].data
     print(f'{fitted_pass.recording}, {fitted_pass.label}: '
@@ -195,7 +266,7 @@ def _trusted_values(fit: PassFit) -> str:
 
 
 def _print_delay(fitted_pass: FittedPass) -> None:
-    """Print the velocity from the delays between sensors; warn if the fit contradicts it."""
+    """Print the velocity from the delays between sensors."""
     c = fitted_pass.correlated
     if c.reason:
         print(f'  no velocity from the delay between sensors: {c.reason}')
@@ -203,11 +274,6 @@ def _print_delay(fitted_pass: FittedPass) -> None:
     line = ' (assumed along the line of the sensors)' if np.isnan(c.heading_std) else ''
     print(f'  velocity from the delay between sensors: {c.speed:.2f}({c.speed_std:.2f}) m/s, '
           f'heading {np.degrees(c.heading):.0f} deg{line}')
-    chosen_fit = fitted_pass.chosen
-    if chosen_fit is not None and contradicts_delays(chosen_fit.speed, chosen_fit.heading, c):
-        print('  warning: the velocities of the fit and from the delay contradict each other; rely '
-              'on neither. Check clock offsets, positions in the network file, and whether the '
-              'target turned')
 
 
 def _formatted_estimates(fit: PassFit) -> str:
@@ -282,8 +348,8 @@ def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
 
 
 def _draw(fitted_pass: FittedPass, out: Path) -> None:
-    """Draw the chosen fit of a pass or, without a chosen fit, the fit with the most dipoles."""
-    fit = fitted_pass.chosen or next((f for f in reversed(fitted_pass.fits) if len(f.x)), None)
+    """Draw the fit of a pass."""
+    fit = fitted_pass.drawn
     if fit is None:
         return
     # Imported here because it loads matplotlib.

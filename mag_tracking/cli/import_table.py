@@ -78,4 +78,4 @@ def _time_text(stamp_ns: int) -> str:
     """Date and time of a timestamp, or seconds if it is not since 1970."""
     if stamp_ns < 365 * 86400 * NS:
         return f'{stamp_ns / NS:.6g} s'
-    return f'{datetime.datetime.fromtimestamp(stamp_ns // NS, datetime.timezone.utc):%F %T} UTC'
+    return f'{datetime.datetime.fromtimestamp(stamp_ns // NS, datetime.UTC):%F %T} UTC'

@@ -1,4 +1,4 @@
-"""Commands `mag-tracking view` and `watch`, and the live page of `mag-tracking run`."""
+"""The live page of `mag-tracking replay --live`, `ros watch` and `run --web`."""
 
 import argparse
 import signal
@@ -9,53 +9,33 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from mag_tracking.apps.view import view
-from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
-from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
+from mag_tracking.network import SensorNetwork
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
-from mag_tracking.web.live_scene import LiveScene
 from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK, PageServer, check_port
 
-_PAGE_HELP = '''
+if TYPE_CHECKING:
+    from mag_tracking.pipeline import Settings
+
+WATCH_HELP = '''
+Shows the tracks of running nodes. Ctrl-C ends the page, not the nodes.
+
 Open the printed address in a browser. The page shows a map with tracks, 90% regions and
 hypotheses, the fields of the sensors, and the health of the system. The page is available on this
 machine only; --host 0.0.0.0 also serves it to other machines, which need the token in the address.
-'''
-_VIEW_HELP = f'''
-Tracks a recording in real time and shows the result on a live page. Ctrl-C ends the command.
-{_PAGE_HELP}
-example:
-  mag-tracking view junction.mcap --network config/network.yaml
-'''
-_WATCH_HELP = f'''
-Shows the tracks of running nodes. Ctrl-C ends the page, not the nodes.
-{_PAGE_HELP}
+
 examples:
-  mag-tracking watch
-  mag-tracking watch --ros-args -r __ns:=/robot1
-  mag-tracking watch --ros-args -r tracker_node/tracks:=/robot1/follower/tracks
+  mag-tracking ros watch
+  mag-tracking ros watch --ros-args -r __ns:=/robot1
+  mag-tracking ros watch --ros-args -r tracker_node/tracks:=/robot1/follower/tracks
 '''
 
 
-def add(commands: Commands) -> None:
-    """Register the commands."""
-    p = add_command(commands, 'view', _view, _VIEW_HELP)
-    p.add_argument('recording', type=Path, metavar='RECORDING',
-                   help='.mcap, .db3 or .bag file, or rosbag2 folder')
-    add_recorded_network(p)
-    add_settings(p)
-    p.add_argument('--rate', type=float, default=1.0, help='playback speed (default: 1)')
-    add_page(p)
-    p = add_command(commands, 'watch', _watch, _WATCH_HELP)
-    add_page(p)
-    p.add_argument('--until-eof', action='store_true', help=argparse.SUPPRESS)
-
-
-def add_page(parser: argparse.ArgumentParser, port: bool = True) -> None:
+def add_page(parser: argparse._ActionsContainer, port: bool = True) -> None:
     """Add --host and --port, or only --host."""
     if port:
         parser.add_argument('--port', type=int, default=DEFAULT_PORT, metavar='PORT',
@@ -65,40 +45,38 @@ def add_page(parser: argparse.ArgumentParser, port: bool = True) -> None:
                         f'the page (default: {LOOPBACK})')
 
 
-def _print_flushed(line: str) -> None:
-    """Print a line and flush stdout."""
-    print(line, flush=True)
+def show_recording(path: Path, network: SensorNetwork, settings: 'Settings', rate: float,
+                   host: str, port: int) -> int:
+    """Track a recording in real time on the live page until Ctrl-C; return the exit status."""
+    # Imported here because the pipeline is slow to import.
+    from mag_tracking.apps.view import view
+    from mag_tracking.web.live_scene import LiveScene
 
-
-def _view(args: argparse.Namespace) -> int:
-    """Run `mag-tracking view`."""
-    if not 0.0 < args.rate < float('inf'):
-        raise SettingsError(f'--rate: expected a number above 0, got {args.rate:g}')
-    network = recorded_network(args)
-    settings = settings_of(args, network)
-    recording = Recording(args.recording)
-    scene = LiveScene(args.recording.name, network)
+    if not 0.0 < rate < float('inf'):
+        raise SettingsError(f'--rate: expected a number above 0, got {rate:g}')
+    recording, scene = Recording(path), LiveScene(path.name, network)
     scene.subtitle = f'{quantity(len(network), "sensor")}, frame {network.frame}'
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals, \
-            PageServer(scene, args.host, args.port) as server:
-        _print_flushed(f'live page: {server.url}')
-        view(recording, network, settings, scene, args.rate,
+            PageServer(scene, host, port) as server:
+        print(f'live page: {server.url}')
+        view(recording, network, settings, scene, rate,
              lambda: bool(signals) or not server.is_serving)
         if not signals:
-            _print_flushed('end of the recording; the page remains available until Ctrl-C')
+            print('end of the recording; the page remains available until Ctrl-C')
         while not signals and server.is_serving:
             time.sleep(0.1)
         return 0 if server.is_serving else 1
 
 
-def _watch(args: argparse.Namespace) -> int:
-    """Run `mag-tracking watch`."""
+def watch(args: argparse.Namespace) -> int:
+    """Run `mag-tracking ros watch`."""
     # Imported here because it needs ROS.
-    from mag_tracking.nodes.page_node import watch
+    from mag_tracking.nodes import page_node
 
     end_of_input = _end_of_input_event() if args.until_eof else None
-    return watch(args.host, args.port, _print_flushed, args.ros_arguments,
-                 end_of_input.is_set if end_of_input is not None else lambda: False)
+    return page_node.watch(args.host, args.port, print, args.ros_arguments,
+                           end_of_input.is_set if end_of_input is not None
+                           else lambda: False)
 
 
 def _end_of_input_event() -> threading.Event:
@@ -122,8 +100,8 @@ def page_process(host: str, port: int, ros_arguments: Sequence[str]) -> Iterator
     check_port(host, port)
     # The page process ends when its stdin is closed, even if this process is killed.
     process = subprocess.Popen([
-        sys.executable, '-m', 'mag_tracking.cli', 'watch', '--host', host, '--port', str(port),
-        '--until-eof', *ros_arguments], stdin=subprocess.PIPE)
+        sys.executable, '-m', 'mag_tracking.cli', 'ros', 'watch', '--host', host, '--port',
+        str(port), '--until-eof', *ros_arguments], stdin=subprocess.PIPE)
     is_closing = threading.Event()
 
     def report_end() -> None:

@@ -5,7 +5,9 @@ import dataclasses
 import datetime
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, NoReturn, TypeAlias
+
+from tqdm import tqdm
 
 from mag_tracking.cli.commands import COMMANDS
 from mag_tracking.errors import OutputError, SettingsError
@@ -14,9 +16,13 @@ from mag_tracking.network.file import read_network
 from mag_tracking.network.topics import checked_namespace
 from mag_tracking.stages.health.diagnosis import Diagnosis
 
+if TYPE_CHECKING:
+    # Not every command loads the stages.
+    from mag_tracking.run import RecordingSource
+
 # Quoted because the class is not generic at run time.
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
-"""Subparsers of the main parser, to which each command is added."""
+"""Subparsers of the main parser or of a command, to which each command is added."""
 
 FIGURE_SUFFIXES = ('.png', '.pdf', '.svg')
 """File name extensions accepted for figures."""
@@ -24,13 +30,13 @@ FIGURE_SUFFIXES = ('.png', '.pdf', '.svg')
 
 def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace], int],
                 text: str = '') -> argparse.ArgumentParser:
-    """Add the parser of a command; `name` is a key in `COMMANDS`.
+    """Add the parser of a command or subcommand; `name` is a key in `COMMANDS`.
 
     `run` takes the parsed arguments and returns the exit status. `text`, with the description and
     examples, is printed after the options.
     """
-    _, summary, aliases = COMMANDS[name]
-    parser = commands.add_parser(name, aliases=aliases, help=summary, description=summary,
+    summary = COMMANDS[name].summary
+    parser = commands.add_parser(name.rpartition(' ')[2], help=summary, description=summary,
                                  epilog=text,
                                  formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.set_defaults(run_command=run, ros_arguments=[])
@@ -74,13 +80,19 @@ def distinct_names(paths: Iterable[Path]) -> list[str]:
 
 def utc_timestamp() -> str:
     """Current time (UTC, ISO 8601), for use as the date of a calibration."""
-    return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds')
 
 
 def add_report(parser: argparse.ArgumentParser) -> None:
     """Add --report."""
     parser.add_argument('--report', type=Path, metavar='FILE.html',
                         help='write an HTML report to FILE.html')
+
+
+def add_verbose(parser: argparse.ArgumentParser) -> None:
+    """Add --verbose."""
+    parser.add_argument('-v', '--verbose', action='store_true',
+                        help='print the details of each vehicle')
 
 
 def check_writable(path: Path | None) -> None:
@@ -120,6 +132,12 @@ def check_outputs(args: argparse.Namespace) -> None:
     if args.figure is not None and args.figure.suffix.lower() not in FIGURE_SUFFIXES:
         raise SettingsError(f'--figure: expected a file name ending in '
                             f'{", ".join(FIGURE_SUFFIXES)}; got {args.figure.name}')
+
+
+def progress_bar(source: 'RecordingSource') -> 'tqdm[NoReturn]':
+    """Progress bar of the bytes of a recording, shown only in a terminal."""
+    return tqdm(total=source.recording.size, unit='B', unit_scale=True, desc=source.name,
+                disable=None)
 
 
 def print_diagnoses(diagnoses: Iterable[Diagnosis]) -> None:

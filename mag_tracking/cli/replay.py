@@ -3,30 +3,46 @@
 import argparse
 import signal
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
+import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps.replay import replay, write_figures, write_trajectories
+from mag_tracking.apps.replay import Run, replay, write_figures, write_trajectories
 from mag_tracking.apps.replay_notes import notes_of
 from mag_tracking.apps.replay_report import write_report
+from mag_tracking.apps.traffic import check_vehicles
+from mag_tracking.cli.events import Events
+from mag_tracking.cli.fit import ORDERS, Fits
+from mag_tracking.cli.live_page import add_page, show_recording
 from mag_tracking.cli.options import (
     Commands,
     add_command,
     add_recorded_network,
+    add_verbose,
     distinct_names,
+    print_diagnoses,
+    progress_bar,
     recorded_network,
 )
+from mag_tracking.cli.passages import Passages
 from mag_tracking.cli.tracking_options import add_settings, settings_of
+from mag_tracking.cli.vehicle_rows import HEADER, time_of, vehicle_row
+from mag_tracking.errors import OutputError, SettingsError
+from mag_tracking.files import output_folder
+from mag_tracking.geometry import speed_of
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Settings
+from mag_tracking.pipeline import STAGES, Pipeline, Settings
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.report.page import WARNING
-from mag_tracking.report.rerun_file import RERUN_FILE, check_rerun, write_rerun
+from mag_tracking.report.track_log import TrackLog
+from mag_tracking.results.rerun_file import RERUN_FILE, check_rerun, write_rerun
+from mag_tracking.run import RecordingSource, Sink, run
 from mag_tracking.stages.track.doubts import MEANINGS
 
 _REPLAY_HELP = '''
@@ -34,27 +50,44 @@ Reads the magnetic fields on the topics of the network, learns the background of
 from a quiet interval, detects targets and tracks them with a bank of filters. ROS does not
 have to run; the ROS nodes use the same code.
 
-files written to DIR:
-  poses.csv           published poses, one row per track and frame
-  poses_smoothed.csv  smoothed poses of the tracks that have ended
-  detections.csv      onset and release of each detection
-  disturbances.csv    fields that no target explains
-  hypotheses.csv      all hypotheses of the filter bank, one row per hypothesis and frame
-  summary.json        counts, rejected samples by cause, tracks
-  tracks.mcap         poses and tracks as ROS messages (with metadata.yaml)
-  report.html         interactive report: map, time slider, curves, tables
-  *_track_N.png       figures: map, weights, measured and predicted field
+tables, selected by --tables NAME,NAME,... (default: poses), computed in one run:
+  poses     the tracks of all targets:
+              poses.csv           published poses, one row per track and frame
+              poses_smoothed.csv  smoothed poses of the tracks that have ended
+              detections.csv      onset and release of each detection
+              disturbances.csv    fields that no target explains
+              hypotheses.csv      all hypotheses of the filter bank
+              summary.json        counts, rejected samples by cause, tracks
+              tracks.mcap         poses and tracks as ROS messages (with metadata.yaml)
+              report.html         interactive report: map, time slider, curves, tables
+              *_track_N.png       figures: map, weights, measured and predicted field
+  passages  the vehicles that cross a line (default: perpendicular to the x axis, through the centre
+            of the network; the settings traffic.line_* define other lines), counted when their
+            tracks have ended; ambiguous passages are marked:
+              passages.csv        one row per vehicle: time, direction, speed, class, ...
+              intervals.csv       counts and mean speeds per interval, direction and class
+            The same tables are written as Parquet if pyarrow is installed. With --fleet, enrolled
+            vehicles are recognised by their hard and soft iron, at any heading if they were
+            enrolled at headings at least 45 degrees apart, otherwise only at the enrolled heading.
+  events    the passes at each sensor, without tracking; one sensor with one axis is sufficient. The
+            stay of a parked vehicle is one event. Distance and speed are not observable:
+              events.csv          onset, release, peak, energy, closest point of approach, direction
+              signatures.csv      shape of the field
+  fits      each pass, fitted as a whole (see mag-tracking fit): fits.csv, fits.json
 
-With several recordings, each has its own folder in DIR. Results of a previous run are replaced and
-its figures are removed; other files in the folder are kept.
+With several recordings, poses and events have a folder in DIR for each recording. Results of a
+previous run are replaced and its figures are removed; other files in the folder are kept.
 
 examples:
   mag-tracking replay junction.mcap --network config/network.yaml --out out
+  mag-tracking replay junction.mcap --network config/network.yaml --live
   mag-tracking replay magnet/ --network magnet/network.yaml --target magnet --out out
-  mag-tracking replay night.mcap --network site.yaml --params mine.yaml --out out
+  mag-tracking replay monday.mcap tuesday.mcap --network site.yaml --tables passages --out week
+  mag-tracking replay out.mcap back.mcap --network site.yaml --tables passages \\
+      --fleet fleet.json --enrol 'van 3'
 
-The file of --params contains only the settings to override; config/default.yaml describes all
-settings. Example:
+The file of --params contains only the settings to override; config/default.yaml describes those of
+users, the reference all. Example:
   track:
     vehicle:
       arrival_names: ['east', 'west']
@@ -62,6 +95,10 @@ settings. Example:
 '''
 
 
+Table: TypeAlias = Passages | Events | Fits
+POSES = 'poses'
+TABLES: dict[str, type[Table]] = {'passages': Passages, 'events': Events, 'fits': Fits}
+"""Tables of --tables besides `POSES`."""
 TRUTH_METRICS = {
     'rms': ('horizontal RMS error within 5 m of the centre of the sensors', ' m'),
     'closest': ('horizontal error at the closest point of approach', ' m'),
@@ -80,17 +117,43 @@ def add(commands: Commands) -> None:
     p.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, or rosbag2 folder')
     add_recorded_network(p)
-    p.add_argument('--out', required=True, type=Path, metavar='DIR', help='output folder')
+    p.add_argument('--out', type=Path, metavar='DIR', help='output folder; passages and events '
+                   'are only printed without it')
     add_settings(p)
-    p.add_argument('--truth', metavar='TOPIC|FILE.csv', help='ground truth: a topic '
-                   'with PoseStamped, PoseWithCovarianceStamped or Odometry, or a CSV table with '
-                   'the columns t [s] or stamp_ns, x, y, z [m], and qx, qy, qz, qw or the '
-                   'direction mx, my, mz of a magnet (default: all topics below /ground_truth)')
-    p.add_argument('--tum', action='store_true',
-                   help='also write each track as track_N.tum (time x y z qx qy qz qw)')
-    p.add_argument('--rerun', action='store_true',
-                   help='also write tracks.rrd for the Rerun viewer (needs rerun-sdk)')
-    p.add_argument('--no-figures', action='store_true', help='do not draw figures')
+    p.add_argument('--tables', type=_tables, default=[POSES], metavar='NAME,NAME,...',
+                   help=f'tables to compute: {", ".join((POSES, *TABLES))} (default: {POSES})')
+    add_verbose(p)
+    poses = p.add_argument_group('table poses')
+    poses.add_argument('--truth', metavar='TOPIC|FILE.csv', help='ground truth: a topic '
+                       'with PoseStamped, PoseWithCovarianceStamped or Odometry, or a CSV table '
+                       'with the columns t [s] or stamp_ns, x, y, z [m], and qx, qy, qz, qw or the '
+                       'direction mx, my, mz of a magnet (default: all topics below /ground_truth)')
+    poses.add_argument('--tum', action='store_true',
+                       help='also write each track as track_N.tum (time x y z qx qy qz qw)')
+    poses.add_argument('--rerun', action='store_true',
+                       help='also write tracks.rrd for the Rerun viewer (needs rerun-sdk)')
+    poses.add_argument('--no-figures', action='store_true', help='do not draw figures')
+    passages = p.add_argument_group('table passages')
+    passages.add_argument('--fleet', type=Path, metavar='FILE',
+                          help='fleet file with the enrolled vehicles (.json)')
+    passages.add_argument('--enrol', metavar='NAME',
+                          help='add the vehicle of each recording, which must be the only one, to '
+                          'the fleet file under this name')
+    live = p.add_argument_group('live page')
+    live.add_argument('--live', action='store_true', help='track the recording in real time on a '
+                      'live page instead of writing files; Ctrl-C ends the command')
+    live.add_argument('--rate', type=float, default=1.0, help='playback speed (default: 1)')
+    add_page(live)
+    p.set_defaults(orders=ORDERS, cpa_range=None)
+
+
+def _tables(text: str) -> list[str]:
+    """Parse --tables."""
+    names = list(dict.fromkeys(text.split(',')))
+    if not {*names} <= {POSES, *TABLES}:
+        raise argparse.ArgumentTypeError(f'expected names from {", ".join((POSES, *TABLES))}, '
+                                         f'separated by commas; got {text!r}')
+    return names
 
 
 def _replay(args: argparse.Namespace) -> int:
@@ -98,67 +161,133 @@ def _replay(args: argparse.Namespace) -> int:
     network = recorded_network(args)
     settings = settings_of(args, network)
     names = distinct_names(args.recordings)
+    _check(args, settings)
+    if args.live:
+        return show_recording(args.recordings[0], network, settings, args.rate, args.host,
+                              args.port)
+    sources = [RecordingSource(Recording(path), network) for path in args.recordings]
+    folders = [args.out / name if args.out and len(names) > 1 else args.out for name in names]
+    _check_folders(args, sources, folders)
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals, ExitStack() as stack:
+        def stopped() -> bool:
+            return bool(signals)
+
+        tables = [TABLES[name](args, network, stopped, stack)
+                  for name in args.tables if name != POSES]
+        for source, out in zip(sources, folders, strict=True):
+            _replay_one(source, network, settings, out, tables, stopped, args)
+            if signals:
+                break
+        if args.out is not None:
+            print(f'{"interrupted; partial results" if signals else "results"} in {args.out}')
+        elif signals:
+            print('interrupted: the results cover only the part read so far')
+    return 130 if signals else 0
+
+
+def _check(args: argparse.Namespace, settings: Settings) -> None:
+    """Check the combination of the options; raises SettingsError if it is invalid."""
+    if args.live:
+        if len(args.recordings) > 1 or args.out is not None or args.tables != [POSES]:
+            raise SettingsError('--live shows one recording and writes no files: omit the other '
+                                'recordings, --out and --tables')
+        return
+    if args.out is None and {POSES, 'fits'} & {*args.tables}:
+        raise SettingsError('add --out DIR for the results, or --live for a live page')
+    if {'passages', 'fits'} & {*args.tables}:
+        check_vehicles(settings)
+    if 'passages' not in args.tables and (args.fleet, args.enrol) != (None, None):
+        raise SettingsError('--fleet and --enrol require --tables passages')
     if args.rerun:
         check_rerun()
-    with recorded_signals(signal.SIGINT) as signals:
-        for path, name in zip(args.recordings, names, strict=True):
-            out = args.out / name if len(args.recordings) > 1 else args.out
-            _replay_one(path, network, settings, out, signals, args)
-            if signals:
-                print(f'interrupted; partial results in {out}')
-                return 130
-    return 0
 
 
-def _replay_one(path: Path, network: SensorNetwork, settings: Settings, out: Path,
-                signals: Sequence[int], args: argparse.Namespace) -> None:
-    """Replay one recording into one folder; an interrupted run leaves partial results."""
-    recording = Recording(path)
-    with tqdm(total=recording.size, unit='B', unit_scale=True, desc=path.name,
-              disable=None) as bar:
-        run = replay(recording, network, settings, out, bar.update, lambda: bool(signals),
-                     tqdm.write, args.truth)
-    _print_summary(path, run.summary, bool(run.truth))
+def _check_folders(args: argparse.Namespace, sources: Iterable[RecordingSource],
+                   folders: Iterable[Path | None]) -> None:
+    """Create the output folder; raises OutputError if it is the folder of a recording."""
+    if args.out is None:
+        return
+    shared = {args.out} if {'passages', 'fits'} & {*args.tables} else set()
+    if any(source.recording.lies_in(folder) for source, own in zip(sources, folders, strict=True)
+           for folder in (own, *shared) if folder is not None):
+        raise OutputError(f'--out: {args.out} is the folder of the recording; choose another '
+                          'output folder')
+    output_folder(args.out)
+
+
+def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Settings,
+                out: Path | None, tables: Sequence[Table], stopped: Callable[[], bool],
+                args: argparse.Namespace) -> None:
+    """Compute the tables of one recording; an interrupted run leaves partial results."""
+    def sinks_of(pipeline: Pipeline) -> list[Sink]:
+        return [table.sink(source.stem, pipeline) for table in tables]
+
+    if POSES in args.tables and out is not None:
+        with progress_bar(source) as bar:
+            result = replay(source.recording, network, settings, out, bar.update, stopped,
+                            tqdm.write, args.truth, sinks_of)
+        report = result.report
+        _print_summary(source.name, result, network, args.verbose)
+        _write(result, network, out, stopped, args)
+    else:
+        pipeline = Pipeline(network, settings,
+                            max((table.upto for table in tables), key=STAGES.index))
+        with progress_bar(source) as bar:
+            report = run(source, pipeline, sinks_of(pipeline), bar.update, stopped)
+        print_diagnoses(report.diagnoses)
+    for table in tables:
+        table.finish(source.stem, report, out)
+
+
+def _write(result: Run, network: SensorNetwork, out: Path, stopped: Callable[[], bool],
+           args: argparse.Namespace) -> None:
+    """Write the optional files of the tracks, the report and the figures."""
     if args.tum:
-        write_trajectories(run, out)
+        write_trajectories(result, out)
     if args.rerun:
-        write_rerun(out / RERUN_FILE, network, run.logs, run.smoothed)
-    write_report(run, network, out)
+        write_rerun(out / RERUN_FILE, network, result.logs, result.smoothed)
+    write_report(result, network, out)
     if not args.no_figures:
-        write_figures(run, network, out, stopped=lambda: bool(signals))
-    if not signals:
-        print(f'{_overview(path, run.summary)}; results in {out}')
+        write_figures(result, network, out, stopped=stopped)
 
 
-def _print_summary(path: Path, summary: dict[str, Any], has_truth: bool) -> None:
-    """Print counts, notes and tracks of a run."""
-    counts = summary['counts']
-    print(f'{path.name}: {quantity(counts["align"].get("frames", 0), "frame")}, '
+def _print_summary(name: str, result: Run, network: SensorNetwork, verbose: bool) -> None:
+    """Print counts and notes of a run, and a row and the warnings of each track."""
+    counts, tracks = result.summary['counts'], result.summary['tracks']
+    verdicts = Counter(t['verdict'] for t in tracks)
+    print(f'{name}: {quantity(counts["align"].get("frames", 0), "frame")}, '
           f'{quantity(counts["detect"].get("onsets", 0), "detection")}, '
-          f'{quantity(len(summary["tracks"]), "track")}')
-    for note in notes_of(summary):
+          f'{quantity(len(tracks), "track")}' + (' (' + ', '.join(
+              f'{n} {verdict}' for verdict, n in verdicts.most_common()) + ')' if tracks else ''))
+    for note in notes_of(result.summary):
         print(f'  {"warning: " if note.level == WARNING else ""}{note.text}')
-    for t in summary['tracks']:
-        _print_track(t)
-        if has_truth and 'truth' not in t:
-            print('    no ground truth during this track')
+    if tracks:
+        print(HEADER)
+    for t in tracks:
+        print(_row(t, result.logs[t['id']], network))
+        if verbose:
+            _print_details(t, bool(result.truth))
+        _print_warnings(t)
 
 
-def _overview(path: Path, summary: dict[str, Any]) -> str:
-    """Format the name of the recording and its numbers of tracks, in total and by verdict."""
-    verdicts = Counter(t['verdict'] for t in summary['tracks'])
-    counts = ', '.join(f'{n} {verdict}' for verdict, n in verdicts.most_common())
-    return (f'{path.name}: {quantity(len(summary["tracks"]), "track")}'
-            + (f' ({counts})' if counts else ''))
+def _row(t: dict[str, Any], log: TrackLog, network: SensorNetwork) -> str:
+    """Format the row of a track: time and distance at its closest pose, speed at the most certain
+    one."""
+    distances = np.linalg.norm(np.array(log.position) - network.centre, axis=1)
+    closest, best = int(np.argmin(distances)), log.most_certain()
+    return vehicle_row(
+        f'track {t["id"]}', time_of(log.stamp_ns[closest]), t['kind'], t['arrival'],
+        speed_of(log.velocity[best][:2], log.covariance[best][3:5, 3:5]),
+        (float(distances[closest]), np.nan), t['verdict'])
 
 
-def _print_track(t: dict[str, Any]) -> None:
-    """Print a track: overview, doubts, velocity from delays between sensors, mounting, errors."""
-    print(f'  track {t["id"]}: {quantity(t["poses"], "pose")}'
+def _print_details(t: dict[str, Any], has_truth: bool) -> None:
+    """Print a track: overview, doubts, velocity from delays between sensors, errors."""
+    print(f'    {quantity(t["poses"], "pose")}'
           + (f', from {t["arrival"]} ({t["arrival_weights"][t["arrival"]]:.0%})'
              if t['arrival'] else '')
           + (f', {t["kind"]} ({t["kind_weight"]:.0%})' if t['kind'] else '')
-          + f', {t["speed"]:.2f} m/s, {t["moment_size"]:.3g} A m^2, {t["verdict"]}')
+          + f', {t["speed"]:.2f} m/s, {t["moment_size"]:.3g} A m^2')
     for doubt, n in t['doubts'].items():
         print(f'    ambiguous in {n} of {quantity(t["poses"], "pose")}: {MEANINGS[doubt]} '
               f'({doubt})')
@@ -168,7 +297,17 @@ def _print_track(t: dict[str, Any]) -> None:
               f'({delay["speed_sd"]:.2f}) m/s, heading {delay["heading_deg"]:.0f} deg'
               + (' (assumed along the line of the sensors)' if delay['heading_sd_deg'] is None
                  else ''))
-    if delay.get('contradicts'):
+    truth = t.get('truth', {})
+    for name, (description, unit) in TRUTH_METRICS.items():
+        if isinstance(truth.get(name), float):
+            print(f'    against {truth["name"]}: {description}: {truth[name]:.4g}{unit}')
+    if has_truth and not truth:
+        print('    no ground truth during this track')
+
+
+def _print_warnings(t: dict[str, Any]) -> None:
+    """Print the warnings of a track."""
+    if t.get('delay', {}).get('contradicts'):
         print('    warning: the velocities of the track and from the delay contradict each other; '
               'rely on neither. Check clock offsets, positions in the network file, the frame '
               'period, and whether the target turned')
@@ -178,7 +317,3 @@ def _print_track(t: dict[str, Any]) -> None:
                   f'{max(m["angles_deg"], key=abs):+.0f} degrees about one axis: its '
                   'orientation in the network file is wrong, or the target differs from the '
                   'model')
-    truth = t.get('truth', {})
-    for name, (description, unit) in TRUTH_METRICS.items():
-        if isinstance(truth.get(name), float):
-            print(f'    against {truth["name"]}: {description}: {truth[name]:.4g}{unit}')

@@ -1,4 +1,4 @@
-"""Options that describe a table of readings, for `import` and `tumble`."""
+"""Options that describe a table of readings, for `import` and `calibrate tumble`."""
 
 import argparse
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""Command `mag-tracking tumble`."""
+"""Command `mag-tracking calibrate tumble`."""
 
 import argparse
 import signal
@@ -35,14 +35,15 @@ network file refer to uncorrected readings and are removed. The calibration of a
 if its rotation did not cover enough directions.
 
 examples:
-  mag-tracking tumble hand.mcap --network site.yaml --sensor mag_3 --out site_tumbled.yaml
-  mag-tracking tumble hand.csv --unit uT --network site.yaml --sensor mag_3 --out site_tumbled.yaml
+  mag-tracking calibrate tumble hand.mcap --network site.yaml --sensor mag_3 --out tumbled.yaml
+  mag-tracking calibrate tumble hand.csv --unit uT --network site.yaml \\
+      --sensor mag_3 --out tumbled.yaml
 '''
 
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    p = add_command(commands, 'tumble', _tumble, _TUMBLE_HELP)
+    p = add_command(commands, 'calibrate tumble', _tumble, _TUMBLE_HELP)
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help='.mcap, .db3 or .bag file, rosbag2 folder, or table of readings')
     add_recorded_network(p)
@@ -59,7 +60,7 @@ def add(commands: Commands) -> None:
 
 
 def _tumble(args: argparse.Namespace) -> int:
-    """Run `mag-tracking tumble`."""
+    """Run `mag-tracking calibrate tumble`."""
     magnitude = args.field_magnitude
     if magnitude is not None and not 1e-6 <= magnitude <= 1e-3:
         raise SettingsError(f'--field-magnitude: expected 1e-6 to 1e-3 T, got {magnitude:g}')

@@ -39,7 +39,8 @@ inline Factors factors(const Symmetric& s) {
 
 // Computes y' C^-1 y over the measured axes, and their number. Returns false if C is not positive
 // definite.
-inline bool whitened_energy(const double* y, const double* C, double& energy, std::int64_t& n_axes) {
+inline bool whitened_energy(const double* y, const double* C, double& energy,
+                            std::int64_t& n_axes) {
     const Factors f = factors(of_present_axes(y, C));
     if (!(f.e0 > 0.0 && f.e1 > 0.0 && f.e2 > 0.0)) return false;
     double v[3];

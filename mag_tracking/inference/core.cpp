@@ -29,18 +29,24 @@ void smallest_pivots(Array y, Array C, Array out) {
 double step_vectors(Array x, Array P, Array log_w, Array densities, Integers vector, Array H,
                     Array y, Array variance, double dt, double switch_s) {
     const Size n = length_of(log_w, "log_w", 2), n_strengths = log_w.shape(1);
-    const Size n_y = length_of(y, "y", 1), m = length_of(densities, "densities", 2)
-                                                   ? densities.shape(1) : 0;
+    const Size n_y = length_of(y, "y", 1),
+               m = length_of(densities, "densities", 2) ? densities.shape(1) : 0;
     length_of(x, "x", 3);
     const Size n_x = x.shape(2);
     if (n_x < m || n_x > 2 * m)
         throw py::value_error("x: must contain all levels and at most as many rates as levels");
-    const VectorBank bank{int(n), int(n_strengths), int(m), int(n_x - m),
+    const VectorBank bank{int(n),
+                          int(n_strengths),
+                          int(m),
+                          int(n_x - m),
                           data_of(x, "x", {n, n_strengths, n_x}),
-                          data_of(P, "P", {n, n_strengths, n_x, n_x}), log_w.mutable_data(),
+                          data_of(P, "P", {n, n_strengths, n_x, n_x}),
+                          log_w.mutable_data(),
                           input_of(densities, "densities", {n_strengths, m})};
-    return step(bank, {int(n_y), input_of(vector, "vector", {n_y}), input_of(H, "H", {n_y, m}),
-                       y.data(), input_of(variance, "variance", {n_y})}, dt, switch_s);
+    return step(bank,
+                {int(n_y), input_of(vector, "vector", {n_y}), input_of(H, "H", {n_y, m}), y.data(),
+                 input_of(variance, "variance", {n_y})},
+                dt, switch_s);
 }
 
 bool inverses(Array A, double least, Array out) {
@@ -59,7 +65,8 @@ Size best(Array x, Array P, Array log_w, Integers label, Integers kind, double n
         throw py::value_error("x: must contain at least one hypothesis with a position");
     return best_of({std::size_t(n), std::size_t(n_x), input_of(x, "x", {n, n_x}),
                     input_of(P, "P", {n, n_x, n_x}), input_of(log_w, "log_w", {n}),
-                    input_of(label, "label", {n}), input_of(kind, "kind", {n})}, negligible);
+                    input_of(label, "label", {n}), input_of(kind, "kind", {n})},
+                   negligible);
 }
 
 }  // namespace

@@ -55,7 +55,7 @@ inline std::ptrdiff_t densest(std::size_t n, const double* mean, const double* c
         for (std::size_t i = 0; i < n; ++i) {
             const double* m = mean + 3 * i;
             const double more = each[i].log_top - each[k].log_top
-                - 0.5 * each[i].square(at[0] - m[0], at[1] - m[1], at[2] - m[2]);
+                                - 0.5 * each[i].square(at[0] - m[0], at[1] - m[1], at[2] - m[2]);
             if (more > -NOTHING) sum += std::exp(more);
         }
         const double density = each[k].log_top + std::log(sum);
@@ -79,11 +79,13 @@ inline void keep_heaviest(std::vector<std::size_t>& rows, const std::int64_t* of
     std::map<std::int64_t, double> total;
     for (const std::size_t i : rows)
         total[of[i]] += std::isfinite(top) ? std::exp(log_w[i] - top) : 0.0;
-    const auto heaviest = std::max_element(
-        total.begin(), total.end(), [](const auto& a, const auto& b) { return a.second < b.second; });
-    rows.erase(std::remove_if(rows.begin(), rows.end(), [&](std::size_t i) {
-        return of[i] != heaviest->first;
-    }), rows.end());
+    const auto heaviest =
+        std::max_element(total.begin(), total.end(), [](const auto& a, const auto& b) {
+        return a.second < b.second;
+    });
+    rows.erase(std::remove_if(rows.begin(), rows.end(),
+                              [&](std::size_t i) { return of[i] != heaviest->first; }),
+               rows.end());
 }
 
 // Index of the hypothesis to publish; the bank must not be empty. Hypotheses lighter than the
@@ -93,12 +95,15 @@ inline std::size_t best_of(const Mixture& bank, double negligible) {
     for (std::size_t i = 0; i < bank.n; ++i) rows[i] = i;
     keep_heaviest(rows, bank.label, bank.log_w);
     keep_heaviest(rows, bank.kind, bank.log_w);
-    const std::size_t heaviest = *std::max_element(
-        rows.begin(), rows.end(),
-        [&](std::size_t a, std::size_t b) { return bank.log_w[a] < bank.log_w[b]; });
-    rows.erase(std::remove_if(rows.begin(), rows.end(), [&](std::size_t i) {
+    const std::size_t heaviest =
+        *std::max_element(rows.begin(), rows.end(), [&](std::size_t a, std::size_t b) {
+        return bank.log_w[a] < bank.log_w[b];
+    });
+    rows.erase(std::remove_if(rows.begin(), rows.end(),
+                              [&](std::size_t i) {
         return bank.log_w[i] < bank.log_w[heaviest] - negligible;
-    }), rows.end());
+    }),
+               rows.end());
     std::vector<double> mean, covariance, log_w;
     for (const std::size_t i : rows) {
         log_w.push_back(bank.log_w[i]);

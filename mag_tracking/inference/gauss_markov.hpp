@@ -95,7 +95,7 @@ INLINE double update(double* x, double* __restrict P, const double* h, int m, in
 // Predicts by `dt` [s] and updates. Returns the log-density of the measurements given the previous
 // measurements. `switch_s` is the mean time between switches of the strength.
 FOR_PROCESSORS static double step(const VectorBank& bank, const ScalarMeasurements& in, double dt,
-                          double switch_s) {
+                                  double switch_s) {
     const int n = bank.n_strengths, m = bank.m, n_x = bank.n_x();
     const double stay = std::exp(-dt / switch_s);
     std::vector<double> scratch(3 * n_x);

@@ -232,9 +232,8 @@ INLINE void before_move(double* after, const Sizes& n, const Motion& motion, con
 // Propagates the adjoint information `after` (n_x, wide) backwards over an update, in place;
 // P - P `after` P is the covariance of a smoothed state. `y` (n_sensors, 3) is NaN for missing
 // axes; `T` and `B` (3, wide) are overwritten.
-INLINE void information_before_update(double* __restrict after, const Sizes& n,
-                                      const Gains& gains, const double* y,
-                                      double* __restrict T, double* __restrict B) {
+INLINE void information_before_update(double* __restrict after, const Sizes& n, const Gains& gains,
+                                      const double* y, double* __restrict T, double* __restrict B) {
     const int wide = n.wide;
     for (int j = n.n_sensors - 1; j >= 0; --j) {
         const double *H = gains.H + j * 3 * n.n_seen(), *G = gains.G + j * 3 * wide;
@@ -256,7 +255,8 @@ INLINE void information_before_update(double* __restrict after, const Sizes& n,
             Eight* row = eights(T + a * wide);
             for (int v = 0; v < n.n_eights; ++v) {
                 Eight sum = {};
-                for (int k = 0; k < n.n_x; ++k) sum += G[a * wide + k] * eights(after + k * wide)[v];
+                for (int k = 0; k < n.n_x; ++k)
+                    sum += G[a * wide + k] * eights(after + k * wide)[v];
                 row[v] = sum;
             }
         }
@@ -271,7 +271,7 @@ INLINE void information_before_update(double* __restrict after, const Sizes& n,
             for (int a = 0; a < 3; ++a) {
                 const double b = B[a * wide + i];
                 const double by_b = M[a][0] * B[i] + M[a][1] * B[wide + i]
-                    + M[a][2] * B[2 * wide + i] - T[a * wide + i];
+                                    + M[a][2] * B[2 * wide + i] - T[a * wide + i];
                 for (int v = 0; v < n.n_eights; ++v)
                     row[v] += by_b * eights(B + a * wide)[v] - b * eights(T + a * wide)[v];
             }
@@ -281,9 +281,8 @@ INLINE void information_before_update(double* __restrict after, const Sizes& n,
 
 // Propagates the adjoint information `after` backwards over a prediction, in place: F' after F.
 // `T` (motion.n, wide) is overwritten.
-INLINE void information_before_move(double* __restrict after, const Sizes& n,
-                                    const Motion& motion, const double* decay,
-                                    double* __restrict T) {
+INLINE void information_before_move(double* __restrict after, const Sizes& n, const Motion& motion,
+                                    const double* decay, double* __restrict T) {
     // Rows, then columns: a column of F' is a row of F.
     for (int pass = 0; pass < 2; ++pass) {
         const int row = pass ? 1 : n.wide, along = pass ? n.wide : 1;

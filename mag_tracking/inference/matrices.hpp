@@ -25,7 +25,8 @@ class Inverter {
         for (std::size_t i = 0; i < n_; ++i)
             for (std::size_t k = 0; k <= i; ++k) {
                 double sum = 0.0;
-                for (std::size_t m = i; m < n_; ++m) sum += inverse_[m * n_ + i] * inverse_[m * n_ + k];
+                for (std::size_t m = i; m < n_; ++m)
+                    sum += inverse_[m * n_ + i] * inverse_[m * n_ + k];
                 out[i * n_ + k] = out[k * n_ + i] = sum * scale_[i] * scale_[k];
             }
         return true;
@@ -99,7 +100,7 @@ class Eigen {
     void rotate(double* A, std::size_t p, std::size_t q) {
         const double slope = (A[q * n_ + q] - A[p * n_ + p]) / (2.0 * A[p * n_ + q]);
         const double t = (slope >= 0.0 ? 1.0 : -1.0)
-            / (std::abs(slope) + std::sqrt(1.0 + slope * slope));
+                         / (std::abs(slope) + std::sqrt(1.0 + slope * slope));
         const double c = 1.0 / std::sqrt(1.0 + t * t), s = t * c;
         for (std::size_t i = 0; i < n_; ++i) turn(A[i * n_ + p], A[i * n_ + q], c, s);
         for (std::size_t i = 0; i < n_; ++i) turn(A[p * n_ + i], A[q * n_ + i], c, s);
@@ -151,7 +152,7 @@ class PseudoInverter {
         for (std::size_t i = 0; i < n_; ++i)
             for (std::size_t k = 0; k < n_; ++k)
                 out[i * n_ + k] += V[i * n_ + m] * V[k * n_ + m] / unit_[m * n_ + m]
-                    * (scale_[i] * scale_[k]);
+                                   * (scale_[i] * scale_[k]);
     }
 
     std::size_t n_;

@@ -163,8 +163,8 @@ struct Field {
         if (length == SEQUENCE)
             out.add_length(n);
         else if (n && n != length)
-            throw py::value_error("expected " + std::to_string(length) + " elements, got "
-                                  + std::to_string(n));
+            throw py::value_error(
+                "expected " + std::to_string(length) + " elements, got " + std::to_string(n));
         for (Size i = 0; i < (length == SEQUENCE ? n : length); ++i)
             value->add(n ? py::handle(PySequence_Fast_GET_ITEM(items.ptr(), i)) : Py_None, out);
     }
@@ -181,8 +181,8 @@ class Message : public Value {
         // A message without fields is one byte, because IDL has no empty structures.
         if (fields_.empty()) out.add(std::uint8_t(0));
         for (const Field& field : fields_) {
-            PyObject* content = value.is_none()
-                ? nullptr : PyDict_GetItemWithError(value.ptr(), field.name.ptr());
+            PyObject* content =
+                value.is_none() ? nullptr : PyDict_GetItemWithError(value.ptr(), field.name.ptr());
             check_python();
             try {
                 field.add(content == nullptr ? py::handle(Py_None) : py::handle(content), out);

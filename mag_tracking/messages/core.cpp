@@ -39,9 +39,11 @@ class Encoder {
     explicit Encoder(const std::vector<std::tuple<py::str, Size, py::object, py::object>>& fields) {
         std::vector<Field> out;
         for (const auto& [name, length, type, default_value] : fields)
-            out.push_back({name, py::isinstance<Encoder>(type)
-                                     ? type.cast<const Encoder&>().message_
-                                     : built_in(type.cast<std::string>(), default_value), length});
+            out.push_back(
+                {name,
+                 py::isinstance<Encoder>(type) ? type.cast<const Encoder&>().message_
+                                               : built_in(type.cast<std::string>(), default_value),
+                 length});
         message_ = std::make_shared<Message>(std::move(out));
     }
 

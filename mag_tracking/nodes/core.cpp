@@ -57,8 +57,9 @@ class Deadline {
   private:
     void watch() {
         std::unique_lock<std::mutex> lock(mutex_);
-        if (!changed_.wait_for(lock, std::chrono::duration<double>(seconds_),
-                               [this] { return cancelled_; }))
+        if (!changed_.wait_for(lock, std::chrono::duration<double>(seconds_), [this] {
+            return cancelled_;
+        }))
             end_process(status_, message_);
     }
 
@@ -79,13 +80,10 @@ PYBIND11_MODULE(core, m) {
         .def(py::init<double, int, const std::string&>(), py::arg("seconds"), py::arg("status"),
              py::arg("message"))
         .def("cancel", &Deadline::cancel);
-    m.def(
-        "end_within",
-        [](double seconds, int status, const std::string& message) {
-            // Never deleted, because it must outlive the interpreter.
-            new Deadline(seconds, status, message);
-        },
-        py::arg("seconds"), py::arg("status"), py::arg("message"));
+    m.def("end_within", [](double seconds, int status, const std::string& message) {
+        // Never deleted, because it must outlive the interpreter.
+        new Deadline(seconds, status, message);
+    }, py::arg("seconds"), py::arg("status"), py::arg("message"));
 }
 
 }  // namespace mag_tracking

@@ -38,6 +38,8 @@ from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.events.stage import Events
 from mag_tracking.stages.stage import Stage
 
+MAX_EVENT_SENSORS = 4
+"""Maximum number of sensors of a network for which the passes at each sensor are published."""
 EVENT_INTERVAL_S = 0.5
 """[s] Interval between searches for pass events. New frames also trigger a search; single readings
 do not, because a search takes as long as the processing of many readings."""
@@ -55,14 +57,13 @@ class DetectionNode(StageNode):
         self._tracker = tracker
         self._pending_frame: FieldFrame | None = None
         self.settings = declare_settings(self, self.settings, 'detect')
-        self.settings = declare_settings(self, self.settings, 'events')
         self._align = Align(self.network, self.settings.align)
         warning = frame_period_warning(self.settings.align, self.network)
         if warning:
             self.get_logger().warning(warning)
         self._events = Events(self.network, self.settings.align, self.settings.detect,
                               self.settings.track) \
-            if len(self.network) <= self.settings.events.max_sensors else None
+            if len(self.network) <= MAX_EVENT_SENSORS else None
         self._event_backlog: list[Readings] = []
         if self._events is not None:
             steady_timer(self, EVENT_INTERVAL_S, self._publish_events)

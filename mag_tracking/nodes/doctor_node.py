@@ -23,7 +23,7 @@ from mag_tracking.nodes.middleware import init_ros
 from mag_tracking.nodes.sensor_graph import no_message_finding, topic_findings
 from mag_tracking.nodes.shutdown import shut_down
 from mag_tracking.nodes.stage_node import SENSOR_QOS, STREAM_QOS, make_executor, spin
-from mag_tracking.pipeline import Settings
+from mag_tracking.pipeline import Pipeline, Settings
 from mag_tracking.quantities import quantity
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 
@@ -33,7 +33,7 @@ class DoctorNode(Node):
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         super().__init__('doctor', namespace=network.namespace)
-        self.doctor = Doctor(network, settings)
+        self.doctor = Doctor(Pipeline(network, settings, 'calibrate'))
         self._topics = dict(zip(network.names, map(self.resolve_topic_name, network.topics),
                                 strict=True))
         for sensor, topic in self._topics.items():

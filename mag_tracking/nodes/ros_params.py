@@ -51,15 +51,10 @@ def declare_settings(node: Node, settings: Settings, group: str) -> Settings:
     A parameter file may contain settings of other groups. Raises SettingsError if an override does
     not name a setting, or has a wrong type, length or range.
     """
-    settings_by_name = {p.name: p for p in flatten(settings)}
-    overrides = dict(node._parameter_overrides)  # rclpy has no public accessor
-    for name in overrides:
-        if name not in settings_by_name and name not in NODE_PARAMETERS \
-                and not name.startswith('qos_overrides.'):
-            replace(settings, {name: overrides[name].value})
-    changes = {name: _without_array(p.value) for name, p in overrides.items()
-               if name in settings_by_name}
-    current = replace(settings, changes)
+    overrides = node._parameter_overrides  # rclpy has no public accessor
+    current = replace(settings, {
+        name: _without_array(p.value) for name, p in overrides.items()
+        if name not in NODE_PARAMETERS and not name.startswith('qos_overrides.')})
     for p in flatten(current):
         if p.name.startswith(f'{group}.'):
             value = list(p.value) if isinstance(p.value, tuple) else p.value

@@ -82,7 +82,7 @@ def parameters(network_path: PathLike, settings: Settings, reliable: bool) -> li
            Parameter('reliable_input', value=reliable)]
     defaults = {p.name: p.value for p in flatten(settings_for(settings.track.target))}
     return out + [Parameter(p.name, value=list(p.value) if isinstance(p.value, tuple) else p.value)
-                  for p in flatten(settings) if p.value != defaults[p.name]]
+                  for p in flatten(settings) if p.value != defaults.get(p.name)]
 
 
 def driver_node(drivers_path: PathLike, network_path: PathLike, batches: bool) -> DriverNode:

@@ -9,9 +9,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from numpy.typing import ArrayLike
 from rclpy.node import Node
 
-from mag_tracking.apps.doctor import background_findings, network_findings, rate_findings
-from mag_tracking.apps.doctor_covariances import covariance_findings
-from mag_tracking.apps.doctor_rejections import driver_findings
+from mag_tracking.apps.doctor import network_findings
 from mag_tracking.apps.host_stalls import TIME_CAUSES, HostStalls, load_findings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute
@@ -20,8 +18,11 @@ from mag_tracking.nodes.sensor_graph import no_message_finding, topic_findings
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.health.covariances import covariance_findings
 from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding, ranked
+from mag_tracking.stages.health.input_findings import background_findings, rate_findings
 from mag_tracking.stages.health.reading_buffer import ReadingBuffer
+from mag_tracking.stages.health.rejections import driver_findings
 from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S, WINDOW, SensorHealth
 
 WINDOW_S = 60.0

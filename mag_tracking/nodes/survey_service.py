@@ -55,7 +55,7 @@ class SurveyService:
                 if not fields else 'no acceleration received on ' \
                 f'{", ".join(filter(None, self._imu_topics))}'
             return None
-        date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds')
+        date = datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds')
         solution = self._survey.solve(fields, date)
         surveyed = with_measured_noise(solution.network, self._stage)
         if save:

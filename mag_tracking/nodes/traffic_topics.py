@@ -18,7 +18,8 @@ class TrafficTopics:
         node.settings = declare_settings(node, node.settings, 'traffic')
         self.stage = Traffic(node.network, node.settings.traffic,
                              node.settings.track.target == 'vehicle')
-        self._classes, self._frame = node.settings.traffic.class_names, node.network.frame
+        self._classes = [c.name for c in node.settings.traffic.classes]
+        self._frame = node.network.frame
         self._passage_publisher = node.publisher(VehiclePassageMessage, '~/passages', PUBLISHER_QOS)
         self._summary_publisher = node.publisher(TrafficSummaryMessage, '~/traffic', RESULT_QOS)
 

@@ -76,8 +76,8 @@ py::tuple sensor_fields(const Array& positions, const Array& R_sw, const Array& 
     double *h_ = h.mutable_data(), *H_ = H.mutable_data(), *size = gradient.mutable_data();
     {
         py::gil_scoped_release release;
-        set_sensor_fields({std::size_t(d), std::size_t(n_t), r_, m_, dr_, dm_},
-                          std::size_t(n_hyp), positions_, R_, std::size_t(n_sensors), h_, H_, size);
+        set_sensor_fields({std::size_t(d), std::size_t(n_t), r_, m_, dr_, dm_}, std::size_t(n_hyp),
+                          positions_, R_, std::size_t(n_sensors), h_, H_, size);
     }
     return py::make_tuple(h, H, gradient);
 }
@@ -112,7 +112,7 @@ py::tuple mounted_fields(const Array& h, const Array& H, const Array& angles) {
     {
         py::gil_scoped_release release;
         rotated_fields(h_, H_, angles_, std::size_t(n_hyp * n_sensors), std::size_t(n_t), to_h,
-                      to_H);
+                       to_H);
     }
     return py::make_tuple(out_h, out_H);
 }
@@ -292,8 +292,8 @@ PYBIND11_MODULE(core, module) {
                IN(dm_dx));
     module.def("multipoles", &multipoles, IN(d), IN(moments));
     module.def("rotated_fields", &mounted_fields, IN(h), IN(H), IN(angles));
-    module.def("propagate_turn", &propagate_turn, IN(x), py::arg("dt"),
-               py::arg("mean_factor"), py::arg("final_factor"));
+    module.def("propagate_turn", &propagate_turn, IN(x), py::arg("dt"), py::arg("mean_factor"),
+               py::arg("final_factor"));
     module.def("row_dipoles", &row_dipoles, IN(x), IN(n_dipoles), IN(field_strength));
     module.def("set_moment_noise", &set_moment_noise, IN(x), IN(walk), py::arg("field_strength2"),
                IN(Q));

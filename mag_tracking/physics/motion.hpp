@@ -25,7 +25,8 @@ INLINE void integrator_noise(double* Q, int wide, int level, int rate, double de
 //
 // Bar-Shalom, Li and Kirubarajan 2001, Estimation with Applications to Tracking and Navigation,
 // section 11.7.
-INLINE void turn(const double* x, int w, double dt, double mean_factor, double final_factor, Motion& out) {
+INLINE void turn(const double* x, int w, double dt, double mean_factor, double final_factor,
+                 Motion& out) {
     const double half = 0.5 * dt * mean_factor * x[w];
     // The angle between chord and velocity is half the turn angle. The chord is shorter than the arc.
     const double c = std::cos(half), s = std::sin(half);
@@ -36,7 +37,9 @@ INLINE void turn(const double* x, int w, double dt, double mean_factor, double f
     const double by_rate = 0.5 * dt * dt * mean_factor;
     const double cc = c * c - s * s, ss = 2.0 * s * c;
     out = Motion{
-        6, 4, {0, 1, 2, 3, 4, w},
+        6,
+        4,
+        {0, 1, 2, 3, 4, w},
         {{0, 3, 4, w}, {1, 3, 4, w}, {2, 5, 2, 2}, {3, 4, w, w}, {3, 4, w, w}, {w, w, w, w}},
         {{1.0, dt * chord * c, -dt * chord * s, by_rate * (slope * along_x - chord * along_y)},
          {1.0, dt * chord * s, dt * chord * c, by_rate * (slope * along_y + chord * along_x)},

@@ -12,7 +12,7 @@ namespace mag_tracking {
 // Rotates the field `h` (3) and derivative `H` (3, n_t) of a sensor by its mounting error `angles`
 // (3) into out_h (3) and out_H (3, n_t + 3). The last columns are the derivative by the angles.
 INLINE void rotated_field(const double* h, const double* H, const double* angles, std::size_t n_t,
-                         double* out_h, double* out_H) {
+                          double* out_h, double* out_H) {
     const double a0 = angles[0], a1 = angles[1], a2 = angles[2];
     const std::size_t n = n_t + 3;
     out_h[0] = h[0] + a1 * h[2] - a2 * h[1];
@@ -33,11 +33,11 @@ INLINE void rotated_field(const double* h, const double* H, const double* angles
 
 // Rotates the fields and derivatives of `n` sensors, as `rotated_field`.
 FOR_PROCESSORS static void rotated_fields(const double* h, const double* H, const double* angles,
-                                         std::size_t n, std::size_t n_t, double* out_h,
-                                         double* out_H) {
+                                          std::size_t n, std::size_t n_t, double* out_h,
+                                          double* out_H) {
     for (std::size_t i = 0; i < n; ++i)
         rotated_field(h + 3 * i, H + 3 * n_t * i, angles + 3 * i, n_t, out_h + 3 * i,
-                     out_H + 3 * (n_t + 3) * i);
+                      out_H + 3 * (n_t + 3) * i);
 }
 
 }  // namespace mag_tracking

@@ -38,8 +38,7 @@ struct Multipole {
     // Writes the columns of dB_dm from `first` on: the fields of unit components of one order, with
     // grad P in `gradients`.
     template <int n>
-    INLINE void set_columns(int order, double s, const double (&gradients)[n][3],
-                            int first) const {
+    INLINE void set_columns(int order, double s, const double (&gradients)[n][3], int first) const {
         const double a = (2 * order + 1) * s * inv2 / order;
         for (int c = 0; c < n; ++c) {
             const double* g = gradients[c];
@@ -50,9 +49,11 @@ struct Multipole {
 
     // Adds one order with grad P = `scale` H d.
     INLINE void add_order(int order, double s, double scale, const double (&H)[6]) const {
-        add_order(order, s, {scale * (H[0] * d[0] + H[1] * d[1] + H[2] * d[2]),
-                             scale * (H[1] * d[0] + H[3] * d[1] + H[4] * d[2]),
-                             scale * (H[2] * d[0] + H[4] * d[1] + H[5] * d[2])}, H);
+        add_order(order, s,
+                  {scale * (H[0] * d[0] + H[1] * d[1] + H[2] * d[2]),
+                   scale * (H[1] * d[0] + H[3] * d[1] + H[4] * d[2]),
+                   scale * (H[2] * d[0] + H[4] * d[1] + H[5] * d[2])},
+                  H);
     }
 
     INLINE void add_dipole(const double* m, double s) const {
@@ -74,12 +75,18 @@ struct Multipole {
         const double yyz = m[6];
         const double H_xx = xxx * x + xxy * y + xxz * z, H_yy = xyy * x + yyy * y + yyz * z;
         add_order(3, s, 0.5,
-                  {H_xx, xxy * x + xyy * y + xyz * z, xxz * x + xyz * y - (xxx + xyy) * z,
-                   H_yy, xyz * x + yyz * y - (xxy + yyy) * z, -H_xx - H_yy});
+                  {H_xx, xxy * x + xyy * y + xyz * z, xxz * x + xyz * y - (xxx + xyy) * z, H_yy,
+                   xyz * x + yyz * y - (xxy + yyy) * z, -H_xx - H_yy});
         const double p = 0.5 * (x * x - z * z), q = 0.5 * (y * y - z * z);
-        set_columns(3, s, {{p, 0.0, -x * z}, {x * y, p, -y * z}, {x * z, 0.0, p},
-                           {q, x * y, -x * z}, {y * z, x * z, x * y}, {0.0, q, -y * z},
-                           {0.0, y * z, q}}, 8);
+        set_columns(3, s,
+                    {{p, 0.0, -x * z},
+                     {x * y, p, -y * z},
+                     {x * z, 0.0, p},
+                     {q, x * y, -x * z},
+                     {y * z, x * z, x * y},
+                     {0.0, q, -y * z},
+                     {0.0, y * z, q}},
+                    8);
     }
 };
 

@@ -47,16 +47,14 @@ class StraightPath {
 
     // Writes the derivative by theta of the field of `moments` (d, 3) at sample s to D
     // (3, n_theta).
-    INLINE void derivative(const Samples& samples, long s, const double* moments,
-                           double* D) const {
+    INLINE void derivative(const Samples& samples, long s, const double* moments, double* D) const {
         const double *position = samples.positions + 3 * s, *M = samples.M + 9 * s;
         const double t = samples.t[s];
         double by_place[3][3] = {}, by_turn[3][3] = {}, by_length[3] = {};
         for (int i = 0; i < row_.n; ++i) {
             const double ahead = row_.offsets[i] * length_;
             double d[3];
-            for (int a = 0; a < 3; ++a)
-                d[a] = position[a] - r_[a] - t * v_[a] - ahead * u_[a];
+            for (int a = 0; a < 3; ++a) d[a] = position[a] - r_[a] - t * v_[a] - ahead * u_[a];
             const double* m = moments + 3 * i;
             const Dipole dipole(d, {m[0], m[1], m[2]});
             for (int a = 0; a < 3; ++a) {
@@ -96,8 +94,8 @@ FOR_PROCESSORS static void set_row_bases(const double* theta, long n, int n_thet
 // Writes the derivatives by theta for the moments (n, 3 d) to D (n, 3 n_samples, n_theta).
 [[maybe_unused]]
 FOR_PROCESSORS static void set_row_derivatives(const double* theta, const double* moments, long n,
-                                               int n_theta, const Row& row,
-                                               const Samples& samples, double* D) {
+                                               int n_theta, const Row& row, const Samples& samples,
+                                               double* D) {
     for (long p = 0; p < n; ++p) {
         const StraightPath path(theta + p * n_theta, row);
         for (long s = 0; s < samples.n; ++s, D += 3 * n_theta)

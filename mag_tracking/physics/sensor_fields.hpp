@@ -11,9 +11,9 @@ namespace mag_tracking {
 
 // Dipoles of one hypothesis.
 struct Cloud {
-    std::size_t n, n_t;      // Dipoles; states.
-    const double *r, *m;     // (n, 3) positions [m] and moments [A m^2], world frame.
-    const double *dr, *dm;   // (n, 3, n_t) their derivatives by the state.
+    std::size_t n, n_t;     // Dipoles; states.
+    const double *r, *m;    // (n, 3) positions [m] and moments [A m^2], world frame.
+    const double *dr, *dm;  // (n, 3, n_t) their derivatives by the state.
 };
 
 // Writes the field h (3) [T] and its derivative H (3, n_t) in the frame of a sensor at `position`
@@ -36,8 +36,8 @@ INLINE double sensor_field(const Cloud& cloud, const double* position, const dou
             dipole.rows(R + 3 * i, g, q);
             double* __restrict row = H + i * n_t;
             for (std::size_t c = 0; c < n_t; ++c)
-                row[c] += q[0] * dm[c] + q[1] * dm[n_t + c] + q[2] * dm[2 * n_t + c]
-                    - g[0] * dr[c] - g[1] * dr[n_t + c] - g[2] * dr[2 * n_t + c];
+                row[c] += q[0] * dm[c] + q[1] * dm[n_t + c] + q[2] * dm[2 * n_t + c] - g[0] * dr[c]
+                          - g[1] * dr[n_t + c] - g[2] * dr[2 * n_t + c];
         }
     }
     for (int i = 0; i < 3; ++i)

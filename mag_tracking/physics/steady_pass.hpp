@@ -12,19 +12,21 @@ namespace mag_tracking {
 
 // Parameters of the centre of the row at time zero; the clock offsets follow.
 enum { X, Y, Z, SPEED, HEADING, CLIMB, LENGTH, ACCELERATION, TURN_RATE, TURN_ACCELERATION, N_PATH };
-constexpr const char* PATH[N_PATH] = {
-    "x",      "y",      "z",            "speed",     "heading",
-    "climb",  "length", "acceleration", "turn_rate", "turn_acceleration"};
+constexpr const char* PATH[N_PATH] = {"x",         "y",
+                                      "z",         "speed",
+                                      "heading",   "climb",
+                                      "length",    "acceleration",
+                                      "turn_rate", "turn_acceleration"};
 
 // Gauss-Legendre nodes and weights for curved paths; the error is below a micrometre for turns of
 // 90 degrees.
 constexpr int N_NODES = 6;
-constexpr double NODES[N_NODES] = {
-    -0.93246951420315202781, -0.66120938646626451366, -0.23861918608319690863,
-    0.23861918608319690863, 0.66120938646626451366, 0.93246951420315202781};
-constexpr double WEIGHTS[N_NODES] = {
-    0.17132449237917034504, 0.36076157304813860757, 0.46791393457269104739,
-    0.46791393457269104739, 0.36076157304813860757, 0.17132449237917034504};
+constexpr double NODES[N_NODES] = {-0.93246951420315202781, -0.66120938646626451366,
+                                   -0.23861918608319690863, 0.23861918608319690863,
+                                   0.66120938646626451366,  0.93246951420315202781};
+constexpr double WEIGHTS[N_NODES] = {0.17132449237917034504, 0.36076157304813860757,
+                                     0.46791393457269104739, 0.46791393457269104739,
+                                     0.36076157304813860757, 0.17132449237917034504};
 
 // Centre of the row at one time.
 struct Middle {
@@ -95,7 +97,8 @@ INLINE void steady_basis(const double* theta, const Row& row, const Samples& sam
     for (int i = 0; i < row.n; ++i) {
         const double q = row.offsets[i] * theta[LENGTH];
         set_unit_fields({p[0] - at.position[0] - q * u_x, p[1] - at.position[1] - q * u_y,
-                         p[2] - at.position[2]}, samples.M + 9 * s, A + 3 * i, 3 * row.n);
+                         p[2] - at.position[2]},
+                        samples.M + 9 * s, A + 3 * i, 3 * row.n);
     }
 }
 
@@ -112,7 +115,8 @@ INLINE void steady_derivative(const double* theta, int n, const double* moments,
         const double q = row.offsets[i] * theta[LENGTH];
         const double* m = moments + 3 * i;
         const Dipole dipole({p[0] - at.position[0] - q * u_x, p[1] - at.position[1] - q * u_y,
-                             p[2] - at.position[2]}, {m[0], m[1], m[2]});
+                             p[2] - at.position[2]},
+                            {m[0], m[1], m[2]});
         for (int a = 0; a < 3; ++a) {
             double g[3], by_moment[3];
             dipole.rows(M + 3 * a, g, by_moment);
@@ -125,7 +129,7 @@ INLINE void steady_derivative(const double* theta, int n, const double* moments,
         double* __restrict row_of_D = D + a * n;
         for (int c = 0; c < n; ++c)
             row_of_D[c] = by_place[a][0] * by[c] + by_place[a][1] * by[n + c]
-                + by_place[a][2] * by[2 * n + c] + by_heading[a] * by[3 * n + c];
+                          + by_place[a][2] * by[2 * n + c] + by_heading[a] * by[3 * n + c];
         row_of_D[LENGTH] += by_length[a];
     }
 }
@@ -142,10 +146,9 @@ FOR_PROCESSORS static void set_steady_bases(const double* theta, long n, int n_t
 
 // Writes the derivatives by theta for the moments (n, 3 d) to D (n, 3 n_samples, n_theta).
 [[maybe_unused]]
-FOR_PROCESSORS static void set_steady_derivatives(const double* theta, const double* moments,
-                                                  long n, int n_theta, const Row& row,
-                                                  const Samples& samples,
-                                                  const std::int64_t* clocks, double* D) {
+FOR_PROCESSORS static void set_steady_derivatives(
+    const double* theta, const double* moments, long n, int n_theta, const Row& row,
+    const Samples& samples, const std::int64_t* clocks, double* D) {
     std::vector<double> by(4 * std::size_t(n_theta));
     for (long p = 0; p < n; ++p)
         for (long s = 0; s < samples.n; ++s, D += 3 * n_theta)

@@ -106,20 +106,20 @@ struct Magnet {
         for (int i = 0; i < 3; ++i)
             for (int k = 0; k < 3; ++k) {
                 const double q = angular_density * dt * dt * dt / 3.0
-                    * ((i == k ? size2 : 0.0) - m[i] * m[k]);
+                                 * ((i == k ? size2 : 0.0) - m[i] * m[k]);
                 Q[(6 + i) * wide + 6 + k] = after[i][k] = q;
                 for (int a = 0; a < 6; ++a)
                     for (int b = 0; b < 6; ++b) {
                         const double term = motion.f[3 + i][a] * P[(6 + a) * wide + 6 + b]
-                            * motion.f[3 + k][b];
+                                            * motion.f[3 + k][b];
                         after[i][k] += term;
                         if (a < 3 && b < 3) before[i][k] += term;
                     }
             }
         // A zero moment cannot be rotated.
         if (!(size2 > 0.0)) return;
-        const double more = std::min(1.0, std::max(
-            0.0, second_moment(after, m, size2) - second_moment(before, m, size2)));
+        const double more = std::min(1.0, std::max(0.0, second_moment(after, m, size2)
+                                                            - second_moment(before, m, size2)));
         for (int i = 0; i < 3; ++i)
             for (int k = 0; k < 3; ++k) Q[(6 + i) * wide + 6 + k] += more * (m[i] * m[k]);
     }
@@ -192,8 +192,8 @@ INLINE double field_and_error(const Vehicles& vehicles, const double* x, const d
     for (int v = 0; v < vehicles.count; ++v) {
         const int first = v * vehicles.one.n();
         double of_one[3];
-        const double error = lengths[v] * vehicles.one.field(x + first, position, R, of_one,
-                                                             H + first, stride);
+        const double error =
+            lengths[v] * vehicles.one.field(x + first, position, R, of_one, H + first, stride);
         for (int a = 0; a < 3; ++a) field[a] += of_one[a];
         square += error * error;
     }

@@ -101,7 +101,8 @@ struct RowVehicle {
         const double speed = std::max(std::sqrt(x[3] * x[3] + x[4] * x[4]),
                                       turn_acceleration / max_turn_rate);
         const double rate = turn_acceleration / speed;
-        Q[w * wide + w] = P[w * wide + w] > 0.0 ? (1.0 - final_factor * final_factor) * rate * rate : 0.0;
+        Q[w * wide + w] = P[w * wide + w] > 0.0 ? (1.0 - final_factor * final_factor) * rate * rate
+                                                : 0.0;
     }
 
     // Positions and moments (d, 3) of the dipoles, TSP14 eq. (10b) and ICASSP11 eq. (8), and their

@@ -200,7 +200,7 @@ def _stamps(rows: _Rows, decimal: str, options: TableOptions
             raise RecordingError(
                 f'{path} has no column of the time; assign one with --columns time=..., or give '
                 'the rate of the readings with --rate HZ. For a calibration by rotation, the times '
-                'do not matter: mag-tracking tumble reads the table itself')
+                'do not matter: mag-tracking calibrate tumble reads the table itself')
         return (_at_rate(rows.keys, [0] * len(rows.keys), options.rate), [0] * len(rows.keys),
                 list(range(len(rows.keys))), [f'times from the rate, {options.rate:g} Hz'])
     where = f'{path}: {columns.time_name}'

@@ -29,12 +29,11 @@ from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
 from mag_tracking.report.metrics import Truth
 from mag_tracking.stages.health.clocks import ClockSpan
+from mag_tracking.stages.health.input_findings import ZERO_STAMP
 
 TRUTH_PREFIX = 'ground_truth/'
 """Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
 never for tracking."""
-ZERO_STAMP = 'message with header.stamp 0'
-"""Beginning of the keys in `SampleReader.rejected` for messages without a time."""
 BATCH_SIZE = 256
 """Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
 few readings. The caller can stop only between batches."""

@@ -140,7 +140,7 @@ class PageServer:
                 self._send_updates()
                 try:
                     await asyncio.wait_for(self._stop.wait(), UPDATE_INTERVAL_S)
-                except asyncio.TimeoutError:
+                except TimeoutError:
                     continue
 
     def _messages(self, get_messages: Callable[[], list[str]]) -> list[str]:

@@ -76,7 +76,7 @@ def test_sensors_side_by_side_have_no_delay():
     """A distant target passes both sensors at the same time."""
     positions = ((0.0, -0.25, 0.0), (0.0, 0.25, 0.0))
     motion = correlated_motion(simulated_pass(9.0, offset=20.0, positions=positions, noise=1e-11))
-    assert 'at the same time' in motion.reason
+    assert 'same time' in motion.reason
 
 
 def test_one_sensor_or_no_common_axis_results_in_a_reason():
@@ -87,7 +87,7 @@ def test_one_sensor_or_no_common_axis_results_in_a_reason():
     field = data.field.copy()
     field[data.sensor == 0, 0] = field[data.sensor == 1, 1:] = np.nan
     motion = correlated_motion(dataclasses.replace(data, field=field))
-    assert 'on a common axis' in motion.reason
+    assert 'common axis' in motion.reason
 
 
 def test_one_common_axis_is_sufficient():
@@ -124,7 +124,7 @@ def test_sensors_above_one_another_have_no_delay(positions):
     data = simulated_pass(9.0, positions=positions)
     clock_offset = np.where(data.sensor == 1, 0.03, 0.0)
     motion = correlated_motion(dataclasses.replace(data, t=data.t + clock_offset))
-    assert 'no pair of separate sensors' in motion.reason
+    assert 'no pair' in motion.reason
 
 
 @pytest.mark.parametrize('fault', ['first sensor constant', 'all zero', 'one infinite',

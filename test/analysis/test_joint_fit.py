@@ -251,8 +251,8 @@ def test_a_fit_that_differs_from_its_track_has_a_reason():
     # The track is three times as fast as the vehicle.
     wrong_tracks[1, 3] *= 3.0
     joint_fits = fit_joint(data, wrong_tracks, GROUND, (1,))
-    assert sorted(fit.reason for fit, in joint_fits) == [
-        '', 'the fit differs from the track in position or velocity']
+    fine, wrong = sorted(fit.reason for fit, in joint_fits)
+    assert fine == '' and 'velocity' in wrong
     assert fit_joint(data, wrong_tracks, GROUND, (1,), stopped=lambda: True) == ()
 
 

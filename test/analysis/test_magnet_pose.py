@@ -58,11 +58,11 @@ def test_a_rejected_pose_has_a_reason():
     few_readings = np.full((9, 3), np.nan)
     few_readings[:2, :2] = 1e-6
     pose = locate_magnet(network, few_readings, MOMENT, LOW, HIGH, PoseSettings())
-    assert not pose.converged and 'number of measured axes is 4' in pose.reason
+    assert not pose.converged and 'axes is 4' in pose.reason
     assert np.isnan(pose.position).all()
     pose = locate_magnet(network, reading([0.06, 0.05, 0.3], MOMENT), MOMENT, LOW, HIGH,
                          PoseSettings())
-    assert not pose.converged and 'outside the box' in pose.reason
+    assert not pose.converged and 'box' in pose.reason
     np.testing.assert_allclose(pose.position, [0.06, 0.05, 0.3], atol=1e-5)
     pose = locate_magnet(network, reading([0.06, 0.05, 0.08], 4.0 * MOMENT), MOMENT, LOW, HIGH,
                          PoseSettings())
@@ -105,7 +105,7 @@ def test_unknown_poses_and_geometry_are_estimated_jointly():
 def test_readings_without_a_magnet_are_rejected():
     network = board()
     field = 3e-5 + 1e-7 * np.random.default_rng(0).standard_normal((10, 9, 3))
-    with pytest.raises(ValueError, match='found 0 of 10 poses in the box'):
+    with pytest.raises(ValueError, match='0 of 10'):
         calibrate_geometry_blind(network, field, MOMENT, LOW, HIGH, SETTINGS)
     with pytest.raises(ValueError, match=r'expected field \(K, 9, 3\)'):
         calibrate_geometry_blind(network, field[0], MOMENT, LOW, HIGH, SETTINGS)

@@ -116,9 +116,9 @@ def test_too_few_poses_do_not_converge():
     network, field, positions, axes, _ = simulated(9)
     for K in (1, 2):
         g = calibrate_geometry(network, field[:K], positions[:K], axes[:K], MOMENT, SETTINGS)
-        assert not g.converged and f'number of poses is {K}' in g.reason
+        assert not g.converged and f'poses is {K}' in g.reason
     g = calibrate_geometry(network, field, positions, axes, MOMENT, replace(SETTINGS, iterations=1))
-    assert not g.converged and 'no minimum found (maximum number of steps: 1)' in g.reason
+    assert not g.converged and 'steps: 1' in g.reason
 
 
 def test_one_sensor_adds_almost_no_information():
@@ -133,7 +133,7 @@ def test_one_sensor_adds_almost_no_information():
     free_pose_unit = np.repeat([0.1, 0.5, 0.0], [3, 2, 3])
     g = fitted_geometry(network, scarce_field, positions[:3], axes[:3], MOMENT, SETTINGS,
                         np.zeros(12), free_pose_unit)
-    assert not g.converged and 'too few readings' in g.reason
+    assert not g.converged and 'few readings' in g.reason
     assert np.isnan(g.normalised_cost)
 
 
@@ -158,13 +158,13 @@ def test_a_magnet_of_opposite_polarity_is_rejected():
 
 @pytest.mark.parametrize('change, message', [
     ({'field': np.zeros((5, 8, 3))}, r'expected field \(K, 9, 3\)'),
-    ({'positions': np.zeros((5, 2))}, r'positions and axes \(K, 3\)'),
-    ({'axes': np.ones((5, 3))}, 'pose 0: expected a finite position and a unit axis'),
-    ({'positions': np.full((5, 3), np.nan)}, 'pose 0: expected a finite position'),
-    ({'field': np.full((5, 9, 3), np.nan)}, 'pose 0: no sensor has a reading'),
+    ({'positions': np.zeros((5, 2))}, 'positions'),
+    ({'axes': np.ones((5, 3))}, 'pose 0: .*unit axis'),
+    ({'positions': np.full((5, 3), np.nan)}, 'pose 0: .*position'),
+    ({'field': np.full((5, 9, 3), np.nan)}, 'pose 0: .*reading'),
     ({'field': np.full((5, 9, 3), np.inf)}, 'infinite'),
     ({'positions': np.full((5, 3), 0.0)},
-     r'pose 0: \[0.0, 0.0, 0.0\] m is the position of a sensor'),
+     r'pose 0: \[0.0, 0.0, 0.0\]'),
     ({'moment': 0.0}, 'moment is 0.0'), ({'moment': np.nan}, 'moment is nan'),
     ({'network': replace(board(), noise_std=(None,) * 9)}, 'sensor mag_0: noise_std is None'),
     ({'field': np.zeros((0, 9, 3)), 'positions': np.zeros((0, 3)), 'axes': np.zeros((0, 3))},

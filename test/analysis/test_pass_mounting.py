@@ -148,7 +148,7 @@ def test_covariance_of_overconfident_tracks_is_inflated():
 def test_a_track_of_another_network_is_rejected():
     t = simulated_tracks(2)
     t.tracks[1].mounting = t.tracks[1].mounting[:2]
-    with pytest.raises(ValueError, match='track 2 has mounting angles of 2 sensors, expected 3'):
+    with pytest.raises(ValueError, match='track 2 .* 2 sensors, expected 3'):
         fuse_mounting(NETWORK, PRIOR, t.tracks)
 
 
@@ -164,7 +164,7 @@ def test_network_is_rotated_about_the_world_axes():
     assert corrected.names == NETWORK.names and corrected.earth_field is NETWORK.earth_field
 
 
-CHANGES = {**POINT, 'track.field_error': 0.0, 'track.vehicle.near_field_lengths': [0.0],
+CHANGES = {**POINT, 'track.field_error': 0.0, 'track.vehicle.kinds.car.near_field_length': 0.0,
            'track.mounting_std_deg': 5.0}
 
 

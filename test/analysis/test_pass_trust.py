@@ -14,10 +14,8 @@ from mag_tracking.analysis.pass_trust import (
     residual_elsewhere,
     trusted_quantities,
 )
-from mag_tracking.apps.fit import RecordingFit
-from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.fit_folder import fit_row
-from mag_tracking.recording.reader import Recording
+from mag_tracking.apps.fit import fit
+from mag_tracking.results.fit_folder import fit_row
 from support.bundled import VEHICLES, vehicle_path
 from support.close_pairs import estimates_of, pass_of, readings_of
 from support.passes import NOISE, ROAD, measured, random_path, superposed
@@ -91,7 +89,7 @@ def test_a_single_fit_of_two_vehicles_is_not_trusted():
     both = superposed(measured(ROAD, first_path, m1, rng),
                       measured(ROAD, second_path, m2, rng, noise=1e-15))
     fit = fit_pass(both, 3)
-    assert 'not one target' in fit.reason and fit.trusted == ()
+    assert 'one target' in fit.reason and fit.trusted == ()
 
 
 def test_a_near_vehicle_is_not_rejected_for_its_residuals():
@@ -170,7 +168,5 @@ def test_each_quantity_is_trusted_according_to_its_own_std():
 
 @pytest.mark.parametrize('name', [n for n in VEHICLES if 'turns' in n])
 def test_no_fit_of_a_turn_is_trusted(name, road_network):
-    job = RecordingFit(Recording(vehicle_path(name)), road_network, settings_for('vehicle'),
-                       (1, 2, 3, 4))
-    (fitted_pass,) = job.passes()
+    (fitted_pass,) = fit(vehicle_path(name), road_network).passes
     assert fitted_pass.chosen is None and fitted_pass.reported is None

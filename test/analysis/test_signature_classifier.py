@@ -60,7 +60,7 @@ def test_training_is_reproducible_and_a_model_file_is_lossless(tmp_path):
         np.testing.assert_array_equal(model_copy.posterior(other.x), model.posterior(other.x))
         assert model_copy.names(other.x) == model.names(other.x)
     assert evaluate(stored, other.x, other.labels).accuracy[0] > 0.8
-    with pytest.raises(LabelsError, match="no classes for the labels 'tank'"):
+    with pytest.raises(LabelsError, match='tank'):
         evaluate(stored, other.x, ['tank'] * len(other.labels))
 
 
@@ -75,9 +75,9 @@ def test_two_classes_have_probabilities():
 
 
 @pytest.mark.parametrize(('labels', 'message'), [
-    (['car'] * 10, 'at least two classes, got car'), (['car'] * 9 + ['truck'], "got 1 of 'truck'"),
-    (['car'] * 5 + [''] * 5, 'labels are missing for 5'),
-    (['car'] * 5 + ['unknown'] * 5, 'rename the class')])
+    (['car'] * 10, 'got car'), (['car'] * 9 + ['truck'], "1 of 'truck'"),
+    (['car'] * 5 + [''] * 5, 'missing for 5'),
+    (['car'] * 5 + ['unknown'] * 5, 'rename')])
 def test_labels_unsuitable_for_training_are_rejected(labels, message):
     x = np.random.default_rng(0).standard_normal((10, 4))
     with pytest.raises(LabelsError, match=message):

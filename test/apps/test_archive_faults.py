@@ -21,18 +21,20 @@ from mag_tracking.cli import main
 from mag_tracking.errors import ClusterError, OutputError, RecordingError
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.archive_folder import ArchiveFolder, recording_key, recording_state
-from mag_tracking.recording.archive_tables import TABLES
-from mag_tracking.recording.parquet_table import TableWriter
+from mag_tracking.results.archive_folder import ArchiveFolder, recording_key, recording_state
+from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.parquet_table import TableWriter
 from support.archives import command, rows, same_tables, wait_for
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 from support.mqtt_broker import free_port
+
+pytestmark = pytest.mark.timeout(900)
 
 
 def test_the_tasks_of_a_lost_worker_are_repeated(tmp_path, recordings, complete_archive):
     out, runs = tmp_path / 'out', []
     before = {*psutil.Process().children(recursive=True)}
-    thread = threading.Thread(target=lambda: runs.append(archive(
+    thread = threading.Thread(daemon=True, target=lambda: runs.append(archive(
         [recordings], NETWORK_FILE, settings_for('vehicle', QUICK), out)))
     thread.start()
     wait_for(lambda: list(out.glob('unfinished/*/cut')))
@@ -43,8 +45,8 @@ def test_the_tasks_of_a_lost_worker_are_repeated(tmp_path, recordings, complete_
         with contextlib.suppress(psutil.NoSuchProcess):
             if worker.memory_info().rss > 100e6:
                 worker.kill()
-    thread.join(120)
-    assert runs and len(runs[0].done) == 3 and runs[0].lost_workers >= 1
+    thread.join()
+    assert len(runs[0].done) == 3 and runs[0].lost_workers >= 1
     assert same_tables(out, complete_archive)
 
 
@@ -53,19 +55,19 @@ def test_an_incompatible_folder_is_refused(tmp_path, recordings, complete_archiv
     paths = [recordings / 'straight_car_right.mcap']
     (tmp_path / 'taken').mkdir()
     (tmp_path / 'taken' / 'photo.jpg').write_text('')
-    with pytest.raises(OutputError, match='is not empty and is not an archive'):
+    with pytest.raises(OutputError, match='taken'):
         archive(paths, NETWORK_FILE, settings, tmp_path / 'taken')
-    with pytest.raises(OutputError, match='other values of settings'):
+    with pytest.raises(OutputError, match='of settings'):
         archive(paths, NETWORK_FILE, settings_for('vehicle'), complete_archive)
     other = tmp_path / 'network.yaml'
     other.write_text(NETWORK_FILE.read_text().replace('4.5', '4.6'))
-    with pytest.raises(OutputError, match='other values of network'):
+    with pytest.raises(OutputError, match='of network'):
         archive(paths, other, settings, complete_archive)
     old_archive = tmp_path / 'old'
     shutil.copytree(complete_archive, old_archive)
     metadata = json.loads((old_archive / 'archive.json').read_text())
     (old_archive / 'archive.json').write_text(json.dumps({**metadata, 'schema': 0}))
-    with pytest.raises(OutputError, match='tables of version 0; this program writes version 3'):
+    with pytest.raises(OutputError, match='version 0.*version 3'):
         archive(paths, NETWORK_FILE, settings, old_archive)
     (old_archive / 'archive.json').write_text('{"schema"')
     with pytest.raises(OutputError, match='cannot read'):
@@ -78,7 +80,7 @@ def test_a_second_run_into_the_same_folder_is_refused(tmp_path, recordings):
 
     def second_run():
         if not lines:
-            with pytest.raises(OutputError, match='another run is writing to'):
+            with pytest.raises(OutputError, match='another run'):
                 archive([recordings], NETWORK_FILE, settings, out)
             lines.append('refused')
         return True
@@ -89,9 +91,8 @@ def test_a_second_run_into_the_same_folder_is_refused(tmp_path, recordings):
 def test_a_scheduler_that_does_not_respond_is_reported(tmp_path, recordings, monkeypatch):
     monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT_S', 1.0)
     settings = settings_for('vehicle', QUICK)
-    for address, error in ((f'tcp://127.0.0.1:{free_port()}', 'no response from a Dask scheduler'),
-                           ('nonsense://x', 'no response from a Dask scheduler')):
-        with pytest.raises(ClusterError, match=error):
+    for address in (f'tcp://127.0.0.1:{free_port()}', 'nonsense://x'):
+        with pytest.raises(ClusterError, match=address):
             archive([recordings], NETWORK_FILE, settings, tmp_path / 'out', scheduler=address)
 
 
@@ -101,12 +102,13 @@ def test_a_scheduler_requires_workers(tmp_path, recordings, monkeypatch):
     settings = settings_for('vehicle', QUICK)
     with LocalCluster(n_workers=0, processes=True, dashboard_address=None,
                       threads_per_worker=1) as local_cluster:
-        monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT_S', 1.0)
-        with pytest.raises(ClusterError, match='the scheduler has no workers'):
+        monkeypatch.setattr(cluster, 'FIRST_WORKER_TIMEOUT_S', 1.0)
+        with pytest.raises(ClusterError, match='no workers'):
             archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
                     scheduler=local_cluster.scheduler_address)
         monkeypatch.undo()
         local_cluster.scale(1)
+        local_cluster.wait_for_workers(1)
         run = archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
                       scheduler=local_cluster.scheduler_address)
         assert len(run.done) == 3
@@ -142,7 +144,7 @@ def test_a_worker_that_is_lost_during_the_start_is_reported(tmp_path, recordings
     (tmp_path / 'sitecustomize.py').write_text(
         "import os, sys\nif '--multiprocessing-fork' in sys.argv: os._exit(1)\n")
     monkeypatch.setenv('PYTHONPATH', f'{tmp_path}:{os.environ.get("PYTHONPATH", "")}')
-    with pytest.raises(ClusterError, match='the worker processes did not start'):
+    with pytest.raises(ClusterError, match='--workers'):
         archive([recordings], NETWORK_FILE, settings_for('vehicle', QUICK), tmp_path / 'out')
 
 
@@ -164,7 +166,7 @@ def test_a_failed_client_does_not_block_the_next_one(tmp_path, recordings, monke
                       threads_per_worker=1) as local_cluster:
         gc.disable()
         try:
-            with pytest.raises(ClusterError, match='no response from a Dask scheduler'):
+            with pytest.raises(ClusterError, match='nonsense://x'):
                 archive([recordings], NETWORK_FILE, settings, tmp_path / 'out',
                         scheduler='nonsense://x')
             monkeypatch.setattr(IOLoop, 'current', current_after_collection)
@@ -207,7 +209,7 @@ def test_folders_and_patterns_select_recordings(tmp_path, recordings):
     (tmp_path / 'bag' / 'metadata.yaml').write_text('')
     assert recordings_of([tmp_path]) == [(tmp_path / 'bag').resolve()]
     for path in (tmp_path / 'none', tmp_path / '*.bag', recordings / 'notes.txt'):
-        with pytest.raises(RecordingError, match='no recording found'):
+        with pytest.raises(RecordingError, match=re.escape(str(path))):
             recordings_of([path])
 
 
@@ -215,9 +217,9 @@ def test_invalid_arguments_are_reported(tmp_path, recordings, capsys):
     arguments = ['archive', str(recordings), '--network', str(NETWORK_FILE), '--out',
                  str(tmp_path / 'out')]
     assert main([*arguments, '--workers', '0']) == 1
-    assert '--workers: expected 1 or more' in capsys.readouterr().err
+    assert '--workers: ' in capsys.readouterr().err
     assert main(['archive', str(tmp_path / 'none'), *arguments[2:]]) == 1
-    assert 'no recording found' in capsys.readouterr().err
+    assert str(tmp_path / 'none') in capsys.readouterr().err
 
 
 def test_a_recording_that_grows_during_tracking_is_tracked_again(tmp_path):
@@ -268,7 +270,7 @@ def test_a_recording_that_kills_its_workers_is_the_only_failure(tmp_path, record
     run = archive([folder], NETWORK_FILE, settings_for('vehicle', QUICK), tmp_path / 'out',
                   report=lines.append)
     assert [p.name for p in run.done] == ['good.mcap'] and run.lost_workers >= 1
-    assert 'the worker of a task was lost several times' in run.failed[folder / 'deadly.mcap']
+    assert 'lost' in run.failed[folder / 'deadly.mcap']
     assert len(rows(tmp_path / 'out', 'recordings')) == 2
 
 
@@ -335,7 +337,7 @@ def test_damaged_intermediate_results_are_reported(job):
                     content | {'field': np.array([object])},
                     content | {'text': np.array('{"doubts"')}):
         np.savez(chunk, **damaged)
-        with pytest.raises(RecordingError, match='0.npz is damaged'):
+        with pytest.raises(RecordingError, match='0.npz'):
             archive_work.track_segment(job, 0)
     np.savez(chunk, **content)
     archive_work.track_segment(job, 0)
@@ -343,10 +345,10 @@ def test_damaged_intermediate_results_are_reported(job):
     for text in ('', '[]', '{"n_tracks": 1}', result.read_text().replace('rows', 'sensors')
                  .replace('n_passes', 'passes')):
         result.write_text(text)
-        with pytest.raises(RecordingError, match='tracked.json is damaged'):
+        with pytest.raises(RecordingError, match='tracked.json'):
             archive_work.join(job)
     (job.cut_folder / 'columns.json').write_text('{"frames": 1}')
-    with pytest.raises(RecordingError, match='columns.json is damaged'):
+    with pytest.raises(RecordingError, match='columns.json'):
         archive_work.cut(job)
 
 
@@ -377,7 +379,7 @@ def test_a_recording_with_a_damaged_table_is_tracked_again(
     run = archive([recordings / '*.mcap'], NETWORK_FILE, settings_for('vehicle', QUICK), out,
                   report=lines.append)
     assert [path.stem for path in run.done] == ['straight_small_left']
-    assert lines[0] == f'{table} is damaged; straight_small_left.mcap is tracked again'
+    assert str(table) in lines[0] and 'straight_small_left.mcap' in lines[0]
     assert same_tables(out, complete_archive)
 
 
@@ -406,5 +408,5 @@ def test_a_full_disk_is_reported_even_if_the_file_has_been_created(job, monkeypa
     def no_space(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     monkeypatch.setattr(os, 'fsync', no_space)
-    with pytest.raises(OutputError, match='No space left on device'):
+    with pytest.raises(OutputError, match='No space'):
         archive_work.track_segment(job, 0)

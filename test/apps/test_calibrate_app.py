@@ -162,7 +162,7 @@ def test_a_recording_without_topics_of_the_network_is_refused():
     truth = truth_of('straight_car_right')
     network = nominal_network({**truth, 'sensors_m': [[0.0, 0.0, 0.0]]})
     object.__setattr__(network, 'topics', ('/nowhere/mag',))
-    with pytest.raises(RecordingError, match='has none of the network'):
+    with pytest.raises(RecordingError, match='topics'):
         calibrate(Recording(FILES['straight_car_right']), network, settings_for('vehicle'), DATE)
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mag_tracking.apps.doctor import Doctor
-from mag_tracking.apps.prescan import prescan
-from mag_tracking.pipeline import settings_for
+from mag_tracking.pipeline import Pipeline, settings_for
+from mag_tracking.stages.calibrate.prescan import prescan
 from mag_tracking.stages.health.diagnosis import ranked
 from support.marks import studied
 from support.random_passes import SIMULATORS
@@ -30,7 +30,7 @@ def clean_recording(simulator, seed):
 def test_the_doctor_finds_no_error_in_a_clean_recording(simulator, seed):
     network, readings = clean_recording(simulator, seed)
     settings = settings_for('vehicle')
-    doctor = Doctor(network, settings)
+    doctor = Doctor(Pipeline(network, settings, 'calibrate'))
     prescan([readings], network, settings.calibrate).apply(doctor.calibrate)
     for k in range(0, len(readings), 1000):
         doctor.feed(readings.part(slice(k, k + 1000)))

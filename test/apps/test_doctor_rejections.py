@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from mag_tracking.apps.doctor import Doctor
-from mag_tracking.apps.doctor_rejections import ADVICE, rejection_findings
-from mag_tracking.pipeline import settings_for
+from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.stages.calibrate.rejections import REJECTIONS
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.diagnosis import Cause
+from mag_tracking.stages.health.rejections import ADVICE, rejection_findings
 from support.networks import line_network
 from support.samples import MagSample, one
 
@@ -86,7 +86,7 @@ def test_held_readings_are_identified_as_spikes():
 
 def test_the_doctor_gives_the_advice():
     network = line_network(1)
-    doctor = Doctor(network, settings_for('vehicle'))
+    doctor = Doctor(Pipeline(network, settings_for('vehicle'), 'calibrate'))
     for sample in changed(quiet(510, network), 499, field=np.full(3, 2e-4)):
         doctor.feed(one(sample))
     assert any('1 reading rejected: spike' in f.fault

@@ -70,7 +70,7 @@ def test_wrong_log_times_do_not_become_the_duration(log_times, tmp_path, capsys)
     path = write(tmp_path / 'a.mcap', t, log_times(t))
     assert main(['info', str(path)]) == 0
     out = capsys.readouterr().out
-    assert '  13.99 s by the timestamps' in out and 'warning: the log times span' in out
+    assert '  13.99 s' in out and 'warning: the log' in out
     assert '1400  100 Hz' in out
 
 

@@ -14,6 +14,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Readings
+from mag_tracking.run import RecordingSource
 from mag_tracking.stages.health.diagnosis import Cause, ranked
 from support.bundled import NETWORK_FILE
 from support.spoilt_runs import recorded
@@ -81,10 +82,13 @@ def spoilt(request, tmp_path_factory):
 def test_every_program_names_the_cause_first(spoilt, tmp_path):
     """No pose is unambiguous if its timestamps are wrong."""
     cause, path = spoilt
-    doctor, damage = examine(Recording(path), NETWORK, SETTINGS)
+    def source(**options):
+        return RecordingSource(Recording(path), NETWORK, **options)
+
+    doctor, damage = examine(source(by_message=True), NETWORK, SETTINGS)
     results = [ranked(damage + doctor.findings()),
-               count_traffic(Recording(path), NETWORK, SETTINGS).diagnoses,
-               find_events(Recording(path), NETWORK, SETTINGS).diagnoses]
+               count_traffic(source(), NETWORK, SETTINGS).report.diagnoses,
+               find_events(source(), NETWORK, SETTINGS).report.diagnoses]
     for diagnoses in results:
         # Timestamps of zero are replaced by the log time.
         assert diagnoses[0].serious == (cause is not Cause.ZERO_STAMPS)

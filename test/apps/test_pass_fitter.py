@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.apps.pass_fitter import PassFitter
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.pipeline import settings_for
+from mag_tracking.stages.track.initiation_vehicle import CLIMB_STD
 from support.busy_fits import assigned_fits, fits_of_recording, fits_of_world
 from support.busy_worlds import busy
+from support.live_runs import fits_of
 from support.passes import ROAD
 from support.random_passes import SIMULATORS
 from support.track_records import NS, track_pose
@@ -31,7 +32,7 @@ def test_two_vehicles_are_fitted_together(scenario, simulator):
     matches = assigned_fits(passes, [(world.t, position) for position in world.positions])
     assert sorted(match.vehicle for match in matches) == [0, 1]
     for match in matches:
-        assert '2 vehicles were fitted together' in match.fitted_pass.notes[-1]
+        assert '2 vehicles' in match.fitted_pass.notes[-1]
         # Three standard deviations are allowed, because a driver may brake.
         found, std = match.fitted_pass.chosen.speed
         assert abs(found - match.speed) < max(0.1 * match.speed, 3.0 * std)
@@ -39,8 +40,7 @@ def test_two_vehicles_are_fitted_together(scenario, simulator):
 
 def test_a_stopped_run_returns_no_fits():
     world = busy('meeting', 2, 'clouds', 3, n=1)
-    fitter = PassFitter('x', world.network, settings_for('vehicle'), (1, 2))
-    assert [*fitter.feed(world.readings, lambda: True), *fitter.flush(lambda: True)] == []
+    assert fits_of(world.network, world.readings, (1, 2), stopped=lambda: True) == []
 
 
 @pytest.mark.study
@@ -122,9 +122,10 @@ def test_magnets_are_not_vehicles():
 
 def test_the_ground_prior_combines_the_heights_of_all_kinds():
     settings = settings_for('vehicle', {
-        'track.vehicle.heights': [0.4, 0.4, 1.0], 'track.vehicle.height_stds': [0.3, 0.3, 0.3],
-        'track.vehicle.climb_std': 0.2})
+        f'track.vehicle.kinds.{kind}.{column}': value for kind, height in (
+            ('small', 0.4), ('car', 0.4), ('truck', 1.0))
+        for column, value in (('height', height), ('height_std', 0.3))})
     ground = ground_prior(settings.track)
     # Variance of the means plus mean of the variances.
     assert ground.height == pytest.approx((0.6, np.sqrt(0.08 + 0.09)))
-    assert ground.climb_std == 0.2
+    assert ground.climb_std == CLIMB_STD

@@ -10,9 +10,9 @@ def test_an_unknown_track_is_reported_with_the_tracks_of_the_result():
     result = mt.track(vehicle_path('straight_car_right'), NETWORK_FILE, settings=QUICK)
     assert result.errors(1) == result.errors()
     with pytest.raises(mt.UnknownTrackError,
-                       match='^track 7 is not in the result; tracks in the result: 1$'):
+                       match='^track 7 .*: 1$'):
         result.errors(7)
     result.tracks.clear()
     for track_id in (None, 1):
-        with pytest.raises(mt.UnknownTrackError, match='^the result contains no tracks$'):
+        with pytest.raises(mt.UnknownTrackError, match='no tracks'):
             result.errors(track_id)

@@ -1,4 +1,4 @@
-"""`mag-tracking traffic`: counts, directions, speeds, classes and tables, against the truth."""
+"""`replay --tables passages`: counts, directions, speeds, classes and tables against the truth."""
 
 import csv
 import dataclasses
@@ -14,13 +14,15 @@ import mag_tracking as mt
 from mag_tracking.cli import main
 from mag_tracking.errors import SettingsError
 from mag_tracking.messages.types import MAGNETIC_FIELD
-from mag_tracking.recording.traffic_tables import tables_of
 from mag_tracking.recording.writer import RecordingWriter
+from mag_tracking.results.columns import traffic_tables
 from support.bundled import DATA, NETWORK_FILE, QUICK, vehicle_path
 from support.busy_recordings import correctly_counted, network_of_recording
+from support.counters import count_of
 from support.samples import field_dict
 
 ROAD = DATA / 'two_way_road'
+OPTIONS = ['--network', str(NETWORK_FILE), '--tables', 'passages']
 
 
 @cache
@@ -54,8 +56,8 @@ def test_summaries_cover_all_vehicles_and_the_whole_recording():
     result = road()
     assert sum(c.count for s in result.summaries for c in s.counts) == 30
     assert sum(s.observed_s for s in result.summaries) == pytest.approx(360.0, abs=5.0)
-    assert len(result.summaries) == 7 and result.counts['passages'] == 30
-    assert result.no_detection_reason is None and '30 vehicles' in repr(result)
+    assert len(result.summaries) == 7 and result.report.counts['traffic']['passages'] == 30
+    assert result.report.no_detection_reason is None and '30 vehicles' in repr(result)
 
 
 def test_speeds_of_track_and_delay_agree_along_a_road():
@@ -74,8 +76,8 @@ def test_speeds_of_track_and_delay_agree_along_a_road():
 
 
 def test_tables_contain_every_vehicle_and_interval(tmp_path, capsys):
-    arguments = ['traffic', str(vehicle_path('straight_car_right')),
-                 str(vehicle_path('straight_truck_right')), '--network', str(NETWORK_FILE)]
+    arguments = ['replay', str(vehicle_path('straight_car_right')),
+                 str(vehicle_path('straight_truck_right')), *OPTIONS]
     assert main([*arguments, '--out', str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert len(re.findall(r': 1 vehicle\n', printed)) == 2 and 'truck (' in printed
@@ -102,12 +104,12 @@ def test_invalid_input_is_reported(tmp_path, capsys):
     recording = vehicle_path('straight_car_right')
     with pytest.raises(SettingsError, match='track.target'):
         mt.traffic(recording, NETWORK_FILE, {'track.target': 'magnet'})
-    arguments = ['traffic', str(recording), '--network', str(NETWORK_FILE)]
+    arguments = ['replay', str(recording), *OPTIONS]
     assert main([*arguments, '--target', 'magnet']) == 1
-    assert 'traffic counts only vehicles' in capsys.readouterr().err
-    assert main(['traffic', str(tmp_path / 'none.mcap'), '--network', str(NETWORK_FILE)]) == 1
-    assert main(['traffic', str(recording), *arguments[1:]]) == 1
-    assert 'several recordings are named' in capsys.readouterr().err
+    assert 'only vehicles' in capsys.readouterr().err
+    assert main(['replay', str(tmp_path / 'none.mcap'), *OPTIONS]) == 1
+    assert main(['replay', str(recording), *arguments[1:]]) == 1
+    assert 'several recordings' in capsys.readouterr().err
 
 
 def test_tables_without_rows_have_their_columns(tmp_path, capsys):
@@ -116,10 +118,11 @@ def test_tables_without_rows_have_their_columns(tmp_path, capsys):
     one_sensor = tmp_path / 'one_sensor.yaml'
     one_sensor.write_text('sensors:\n  mag_1: {position: [0, -4.5, 0]}\n')
     for network, n in ((str(NETWORK_FILE), 1), (str(one_sensor), 0)):
-        assert main(['traffic', recording, '--network', network, '--out', str(tmp_path)]) == 0
+        assert main(['replay', recording, '--network', network, '--tables', 'passages',
+                     '--out', str(tmp_path)]) == 0
         printed = capsys.readouterr().out
         assert re.search(rf': {n} vehicles?\n', printed)
-        assert ('the scale is not observable with a single sensor' in printed) == (n == 0)
+        assert ('single sensor' in printed) == (n == 0)
         csv_rows, rows = (read(tmp_path / f'passages.{kind}') for read, kind in (
             (pd.read_csv, 'csv'), (pd.read_parquet, 'parquet')))
         assert list(csv_rows.columns) == list(rows.columns) and len(rows) == n
@@ -128,7 +131,7 @@ def test_tables_without_rows_have_their_columns(tmp_path, capsys):
 
 def test_every_column_is_described():
     """The reference documentation is generated from these descriptions."""
-    for columns in tables_of((), True).values():
+    for columns in traffic_tables((), True).values():
         assert [c.name for c in columns if not c.meaning] == []
 
 
@@ -137,18 +140,18 @@ def test_invalid_input_is_reported_before_the_run(tmp_path, capsys):
     other = tmp_path / 'other.mcap'
     with RecordingWriter(other) as writer:
         writer.write('/elsewhere', MAGNETIC_FIELD, field_dict(0, 'mag_9', np.ones(3)), 0)
-    assert main(['traffic', valid_recording, str(other), '--network', str(NETWORK_FILE)]) == 1
+    assert main(['replay', valid_recording, str(other), *OPTIONS]) == 1
     out, errors = capsys.readouterr()
     assert '1 vehicle' not in out and 'mag-tracking: ' in errors
     (tmp_path / 'file').write_text('')
-    assert main(['traffic', valid_recording, '--network', str(NETWORK_FILE), '--out',
-                 str(tmp_path / 'file')]) == 1
+    assert main(['replay', valid_recording, *OPTIONS, '--out', str(tmp_path / 'file')]) == 1
     out, errors = capsys.readouterr()
     assert '1 vehicle' not in out and 'mag-tracking: ' in errors
 
 
 def test_lines_without_crossings_count_no_vehicles():
     result = mt.traffic(vehicle_path('straight_car_right'), NETWORK_FILE, {
-        **QUICK, 'traffic.line_offsets': (500.0,)})
-    assert result.vehicles == () and result.counts['tracks that crossed no line'] == 1
-    assert 'no line was crossed' in repr(result)
+        **QUICK, 'traffic.lines.road.offset': 500.0})
+    assert result.vehicles == ()
+    assert count_of(result.report.counts['traffic'], 'no line') == 1
+    assert 'no line' in repr(result)

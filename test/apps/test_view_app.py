@@ -56,7 +56,7 @@ def test_tracks_equal_a_replay(road_network):
     np.testing.assert_array_equal([p.stamp_ns for p in poses], expected.poses['stamp_ns'])
     np.testing.assert_allclose([p.position for p in poses], expected.poses['position'], atol=1e-9)
     assert scene.tracks[-1].ended and len(scene.smoothed) == 1
-    assert scene.notes == ['end of the recording']
+    assert ['end' in note for note in scene.notes] == [True]
     recording = Recording(vehicle_path(NAME))
     assert seconds > 0.9 * (recording.end_ns - recording.start_ns) / 1e9 / 4.0
     assert json.loads(scene.snapshot()[-1])['tables'][0]['rows'][0][1] == 'ready'
@@ -90,7 +90,7 @@ def test_a_wrong_timestamp_does_not_stop_the_view(road_network, tmp_path, wrong_
             lambda k, ns: ns + (wrong_ns if k == 900 else 0))
     scene, seconds = view_recording(path, road_network, 20.0)
     assert seconds < 60.0
-    assert scene.notes[0] == 'end of the recording' and len(scene.notes) > 1
+    assert 'end of' in scene.notes[0] and len(scene.notes) > 1
     assert len([t for t in scene.tracks if not t.ended]) > 20
 
 
@@ -104,4 +104,4 @@ def test_the_view_ends_when_stopped(road_network):
     scene = StoringScene(road_network)
     view(Recording(vehicle_path(NAME)), road_network, settings_for('vehicle', QUICK), scene, 1.0,
          stopped)
-    assert 'end of the recording' not in scene.notes
+    assert not any('end of' in note for note in scene.notes)

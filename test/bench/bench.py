@@ -178,7 +178,7 @@ def bank_case(n_sensors, n_hyp, rng, has_mounting):
     network = SensorNetwork(names, positions, np.ascontiguousarray(np.swapaxes(R_sw, 1, 2)),
                             names, earth_field=EARTH)
     settings = settings_for('vehicle', {
-        **POINT, 'track.vehicle.near_field_lengths': [0.0], 'track.field_error': 0.0,
+        **POINT, 'track.vehicle.kinds.car.near_field_length': 0.0, 'track.field_error': 0.0,
         'track.model_error_time_s': 0.0,
         'track.mounting_std_deg': 5.0 if has_mounting else 0.0}).track
     n_mounting = 3 * n_sensors if has_mounting else 0

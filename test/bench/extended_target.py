@@ -28,10 +28,9 @@ from support.samples import one, recorded, simulate
 
 ROOT = FilePath(__file__).resolve().parents[2]
 NETWORK = ROOT / 'config' / 'network.yaml'
-POINT = {f'track.vehicle.{name}': [value] for name, value in {
-    'kinds': 'car', 'lengths': 0.0, 'length_stds': 0.0, 'moments': 400.0, 'moment_stds': 150.0,
-    'difference_stds': 0.0, 'heights': 0.5, 'height_stds': 0.2,
-    'near_field_lengths': 1.0}.items()}
+POINT = {'track.vehicle.kinds.names': ['car'], 'track.vehicle.kinds.car.length': 0.0,
+         'track.vehicle.kinds.car.length_std': 0.0, 'track.vehicle.kinds.car.difference_std': 0.0,
+         'track.vehicle.kinds.car.near_field_length': 1.0}
 UNCALIBRATED = SensorErrorModel(1.2e-8, 1e-6, 4e-9, np.deg2rad(5), 0.015)
 STUDIES = (
     ('cars, as points, 12.5 Hz, perfect sensors', 'car', POINT, SensorErrorModel()),

@@ -60,7 +60,7 @@ class Figures:
 
 def run_facts():
     """Commit, date, machine and Python version of a run."""
-    return {'date': datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds'),
+    return {'date': datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds'),
             'commit': commit(), 'machine': machine(), 'python': platform.python_version()}
 
 

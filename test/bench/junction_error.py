@@ -14,7 +14,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from bench.figures import Figures
-from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.replay import replay
 from mag_tracking.network.file import read_network
 from mag_tracking.physics.dipole import MU0, dipole_field
@@ -22,13 +21,16 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from support.bundled import NETWORK_FILE, vehicle_path
+from support.live_runs import passes_of
 from support.samples import one, recorded
 
 NAME = 'junction_left_turns_to_rear'
 NOISE = 1.2e-8
 POINT, ROW = (0.0,), (-1.0, 0.0, 1.0)
 """Positions of the dipoles along the body, in half lengths."""
-SETTINGS = {'iron three times as uneven': {'track.vehicle.difference_stds': [0.0, 90.0, 360.0]},
+SETTINGS = {'iron three times as uneven': {
+                'track.vehicle.kinds.car.difference_std': 90.0,
+                'track.vehicle.kinds.truck.difference_std': 360.0},
             'speeds of 5 m/s only': {'track.vehicle.speeds': [5.0]},
             'acceleration 0.3': {'track.vehicle.acceleration': 0.3},
             'field error 0.01': {'track.field_error': 0.01}}
@@ -81,9 +83,7 @@ def magnetic_centre(network, row):
     Returns (centre (3,) [m] in the body frame, half length [m], moments [A m²], normalised cost).
     """
     reader = SampleReader(Recording(vehicle_path(NAME)), network)
-    collector = PassCollector(network, settings_for('vehicle'))
-    passes = [p for s in recorded(reader) for p in collector.feed(one(s))] + collector.flush()
-    (data, _), = passes
+    (data, _), = passes_of(network, map(one, recorded(reader)))
     body_position, R = true_motion(data, next(iter(replay_recording(network, {}).truth.values())))
     y = np.einsum('nij,nj->ni', network.R_ws[data.sensor], data.field).ravel() / NOISE
     field_strength = network.earth_field / MU0

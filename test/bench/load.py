@@ -154,7 +154,7 @@ def open_pages(n):
     Returns ({name: server process}, viewer process).
     """
     server = subprocess.Popen(
-        [Path(sys.executable).with_name('mag-tracking'), 'watch', '--port', '0'],
+        [Path(sys.executable).with_name('mag-tracking'), 'ros', 'watch', '--port', '0'],
         stdout=subprocess.PIPE, text=True)
     url = server.stdout.readline().split()[-1]
     viewers = subprocess.Popen([sys.executable, '-m', 'support.page_viewers', url, str(n)],

@@ -31,41 +31,45 @@ NETWORK = SensorNetwork(
     np.tile(np.eye(3), (2, 1, 1)), ('/mag_1/imu/mag', '/mag_2/imu/mag'),
     earth_field=np.array([2e-6, 1.55e-5, -4.9e-5]))
 MATCHED = {'track.mounting_std_deg': 0.0, 'track.model_error_time_s': 0.0,
-           'track.end_std': 1e6, 'track.end_nis': 1e12,
-           'track.field_error': 0.0, 'track.vehicle.near_field_lengths': [0.0],
-           'track.vehicle.kinds': ['car'], 'track.vehicle.moments': [400.0],
-           'track.vehicle.moment_stds': [150.0], 'track.vehicle.heights': [0.5],
-           'track.vehicle.height_stds': [0.2],
+           'track.end_std': 1e6, 'track.end_nis': 1e12, 'track.field_error': 0.0,
            'track.vehicle.arrival_names': ['left'], 'track.vehicle.arrival_headings_deg': [0.0],
            'track.vehicle.turn_acceleration': 0.0,
            'track.vehicle.speeds': [7.0, 10.0, 14.0], 'track.vehicle.induced_share': 0.0,
            'track.vehicle.induced_share_std': 0.1, 'track.background_std': 1e-8,
            'track.background_drift': 1e-9, 'track.vehicle.acceleration': 0.3,
-           'track.vehicle.moment_drift': 0.01, 'track.vehicle.difference_drift': 0.005}
-TARGETS = {
-    'point': {**MATCHED, 'track.vehicle.lengths': [0.0], 'track.vehicle.length_stds': [0.0],
-              'track.vehicle.difference_stds': [0.0]},
-    'row of three': {**MATCHED, 'track.vehicle.dipoles': 3, 'track.vehicle.lengths': [3.0],
-                     'track.vehicle.length_stds': [0.5], 'track.vehicle.difference_stds': [30.0]}}
+           'track.vehicle.moment_drift': 0.01, 'track.vehicle.difference_drift': 0.005,
+           'track.vehicle.kinds.names': ['car']}
+
+
+def car(length, length_std, difference_std):
+    """Settings of the only kind of vehicle, whose model is exact."""
+    values = {'length': length, 'length_std': length_std, 'difference_std': difference_std,
+              'near_field_length': 0.0}
+    return MATCHED | {f'track.vehicle.kinds.car.{name}': v for name, v in values.items()}
+
+
+TARGETS = {'point': car(0.0, 0.0, 0.0),
+           'row of three': {**car(3.0, 0.5, 30.0), 'track.vehicle.dipoles': 3}}
 
 
 def prior_of(settings, n_t):
     """Mean and covariance of the prior: the target starts 12 m before the sensors, along x."""
     v = settings.vehicle
+    kind, = v.kinds
     x, P = np.zeros(n_t + 6), np.zeros((n_t + 6, n_t + 6))
     assert v.induced_share == 0.0
     d = vehicle_model(v, NETWORK).n_dipoles
     hard = 6 + 3 * d
-    x[[0, 2, 3]] = -12.0, v.heights[0], 10.0
-    x[hard + 3:n_t] = v.lengths[0]
-    std = np.r_[2.0, 2.0, v.height_stds[0], 3.0, 0.5, 0.05]
+    x[[0, 2, 3]] = -12.0, kind.height, 10.0
+    x[hard + 3:n_t] = kind.length
+    std = np.r_[2.0, 2.0, kind.height_std, 3.0, 0.5, 0.05]
     P[:6, :6] = np.diag(std**2)
     mean = np.full((d, d), 1.0 / d)
-    P[6:hard, 6:hard] = np.kron(v.moments[0]**2 / 3.0 / d * mean
-                                + v.difference_stds[0]**2 * (np.eye(d) - mean), np.eye(3))
-    soft_iron_std = v.induced_share_std * v.moments[0] * MU0 / REFERENCE_FIELD
+    P[6:hard, 6:hard] = np.kron(kind.moment**2 / 3.0 / d * mean
+                                + kind.difference_std**2 * (np.eye(d) - mean), np.eye(3))
+    soft_iron_std = v.induced_share_std * kind.moment * MU0 / REFERENCE_FIELD
     P[hard:hard + 3, hard:hard + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
-    P[hard + 3:n_t, hard + 3:n_t] = v.length_stds[0]**2
+    P[hard + 3:n_t, hard + 3:n_t] = kind.length_std**2
     P[n_t:, n_t:] = settings.background_std**2 * np.eye(6)
     return x, P
 

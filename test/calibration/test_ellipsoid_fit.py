@@ -92,7 +92,7 @@ def test_a_fit_of_half_a_recording_corrects_the_other_half(recordings, name, lim
 
 def test_a_recording_of_a_sensor_at_rest_is_rejected(recordings):
     fit = fit_ellipsoid(recordings['counts'][:3000])
-    assert not fit.converged and 'a sensor at rest' in fit.reason
+    assert not fit.converged and 'at rest' in fit.reason
 
 
 @settings(derandomize=True, deadline=None, max_examples=25)
@@ -225,7 +225,7 @@ def test_outliers_are_bounded_and_counted(factor):
     y[::25] = OFFSET + factor * (y[::25] - OFFSET)
     fit = fit_ellipsoid(y)
     assert fit.converged and fit.n_outliers == 80 and fit.n_readings == 2000
-    assert fit.warnings[-1] == 'the fraction of outliers is 0.04'
+    assert 'outliers is 0.04' in fit.warnings[-1]
     assert (np.abs(fit.offset - OFFSET) < 4.0 * fit.offset_std).all()
     assert (fit.offset_std < 1.5 * clean.offset_std).all()
     assert fit.residual == pytest.approx(spread(fit.correct(y)), rel=1e-12)
@@ -247,7 +247,8 @@ def test_missing_readings_are_excluded_and_counted():
     gaps = np.insert(y, range(0, 1000, 10), y[::10] * [np.nan, 1.0, 1.0], axis=0)
     fit, expected = fit_ellipsoid(gaps), fit_ellipsoid(y)
     assert fit.n_missing == 100 and fit.n_readings == 1000 and fit.converged
-    assert fit.warnings == ('readings excluded because of a missing axis: 100',)
+    (warning,) = fit.warnings
+    assert warning.endswith('missing axis: 100')
     np.testing.assert_array_equal(fit.offset, expected.offset)
     assert fit.residual == expected.residual and fit.residual_before == expected.residual_before
 
@@ -270,7 +271,7 @@ def test_saturated_readings_are_excluded_and_reported():
     fit = fit_ellipsoid(y)
     assert fit.n_readings + fit.n_missing + fit.n_saturated == 20000 and fit.n_missing == 400
     assert fit.converged and fit.n_saturated > (y[:, 1] == limit).sum() > 1000
-    assert fit.warnings[1] == f'readings excluded because of saturation of y: {fit.n_saturated}'
+    assert fit.warnings[1].endswith(f' y: {fit.n_saturated}')
     assert (np.abs(fit.offset - OFFSET) < 4.0 * fit.offset_std).all()
     assert fit.residual == pytest.approx(spread(fit.correct(y[~np.isnan(y[:, 0])])), rel=1e-12)
 
@@ -291,26 +292,26 @@ LONG = np.diag([1.0, 1.0, 8.0])
     (np.zeros((0, 3)), '^0 valid readings, minimum 50'),
     (readings(EVEN[:49]), '^49 valid readings, minimum 50'),
     (np.full((100, 3), np.nan), '^0 valid readings, minimum 50'),
-    (np.zeros((100, 3)), '^all 100 readings are equal'),
-    (readings(np.tile(EVEN[0], (900, 1))), 'a sensor at rest'),
-    (readings(RING, 0.0), 'in a plane: relative thickness .* minimum 0.05'),
-    (readings(RING), 'in a plane: relative thickness .* minimum 0.05'),
+    (np.zeros((100, 3)), '100 .*equal'),
+    (readings(np.tile(EVEN[0], (900, 1))), 'at rest'),
+    (readings(RING, 0.0), 'plane: .* 0.05'),
+    (readings(RING), 'plane: .* 0.05'),
     (readings(0.9 * RING + [0.0, 0.0, np.sqrt(0.19)]),
-     'in a plane: relative thickness .* minimum 0.05'),
-    (readings(U[np.abs(U[:, 2]) < 0.3]), r'^the coverage is 0.00.*, minimum 0.01; .*: none'),
+     'plane: .* 0.05'),
+    (readings(U[np.abs(U[:, 2]) < 0.3]), r'coverage is 0.00.*0.01; .*: none'),
     (readings(U[U[:, 2] > 0.0]),
-     r'^the coverage is 0.00.*, minimum 0.01; .*: \+x\+y-z, \+x-y-z, -x\+y-z, -x-y-z$'),
-    (readings(U[U[:, 0] < 0.0], 0.0), r'^the coverage is 0.00.*, minimum 0.01'),
-    (readings(U[U @ [0.6, 0.0, 0.8] > 0.6], 0.0), r'^the coverage is .*e-05, minimum 0.01'),
+     r'coverage is 0.00.*0.01; .*: \+x\+y-z, \+x-y-z, -x\+y-z, -x-y-z$'),
+    (readings(U[U[:, 0] < 0.0], 0.0), 'coverage is 0.00.*0.01'),
+    (readings(U[U @ [0.6, 0.0, 0.8] > 0.6], 0.0), 'coverage is .*e-05.*0.01'),
     (readings(U[U @ [0.6, 0.0, 0.8] > 0.6]),
-     'readings in .* directions|differ by a factor|not lie on an ellips'),
+     'directions|factor|ellips'),
     (readings(EVEN, correction=LONG), 'ratio of 0.73 to 5.8, maximum 1 to 5'),
     (readings(U) * np.where(np.arange(3000) % 12 == 0, 3.0, 1.0)[:, None],
-     'scatter about the ellipsoid is 0.* of the radius, maximum 0.1'),
-    (readings(ball(3000)), 'scatter about the ellipsoid is 0.* of the radius, maximum 0.1'),
+     'scatter .*0.1'),
+    (readings(ball(3000)), 'scatter .*0.1'),
     (readings(POSES, 1e-4), '^readings in 15 directions, minimum 18'),
     (readings(EVEN) * np.where(np.arange(1500) % 25 == 0, 100.0, 1.0)[:, None],
-     'fraction of outliers is 0.96, maximum 0.2')])
+     'outliers is 0.96.*0.2')])
 def test_readings_that_cannot_be_fitted_are_rejected(y, reason):
     fit = fit_ellipsoid(y)
     print(fit.reason)
@@ -335,7 +336,7 @@ def test_an_accepted_fit_is_near_the_truth(seed):
 def test_an_uncertain_offset_is_rejected():
     fit = fit_ellipsoid(readings(U[U[:, 2] > -0.3][:60], 0.06, seed=4))
     print(fit.reason)
-    assert not fit.converged and 'the standard deviation of the offset is 0.' in fit.reason
+    assert not fit.converged and 'offset is 0.' in fit.reason
 
 
 def test_least_squares_without_convergence_are_rejected(monkeypatch):
@@ -343,16 +344,16 @@ def test_least_squares_without_convergence_are_rejected(monkeypatch):
     monkeypatch.setattr(ellipsoid_refinement, 'least_squares',
                         lambda *a, **k: solve(*a, **(k | {'max_nfev': 1})))
     fit = fit_ellipsoid(readings(EVEN))
-    assert not fit.converged and 'least squares did not converge' in fit.reason
+    assert not fit.converged and 'converge' in fit.reason
 
 
 @pytest.mark.parametrize('y, warning', [
-    (readings(U[np.abs(U[:, 2]) < 0.5]), 'the coverage is 0.0.*, recommended at least 0.1'),
-    (readings(U[(U < 0.0).any(axis=1)]), r'octants with few or no readings: \+x\+y\+z$'),
-    (readings(EVEN, 0.08), 'the residual after correction is 0.0.*, recommended at most 0.05')])
+    (readings(U[np.abs(U[:, 2]) < 0.5]), 'coverage is 0.0.*0.1'),
+    (readings(U[(U < 0.0).any(axis=1)]), r'octants .*: \+x\+y\+z$'),
+    (readings(EVEN, 0.08), 'residual .*0.0.*0.05')])
 def test_readings_of_poor_quality_raise_a_warning(y, warning):
     fit = fit_ellipsoid(y)
-    assert fit.converged and len(fit.warnings) == 1 and re.match(warning, fit.warnings[0])
+    assert fit.converged and len(fit.warnings) == 1 and re.search(warning, fit.warnings[0])
 
 
 def test_coverage_equals_the_known_values():
@@ -364,13 +365,13 @@ def test_coverage_equals_the_known_values():
 
 
 @pytest.mark.parametrize('y, size, message', [
-    (np.zeros((5, 2)), None, r'readings must have the shape \(n, 3\), got \(5, 2\)'),
-    (np.zeros(3), None, r'readings must have the shape \(n, 3\), got \(3,\)'),
+    (np.zeros((5, 2)), None, r'readings .*\(5, 2\)'),
+    (np.zeros(3), None, r'readings .*\(3,\)'),
     (np.where(np.arange(1500)[:, None] == 7, -np.inf, EVEN), None, 'reading 7 is infinite'),
-    (EVEN, 0.0, 'field_magnitude must be positive and finite, got 0.0'),
-    (EVEN, -1.0, 'field_magnitude must be positive and finite, got -1.0'),
-    (EVEN, np.nan, 'field_magnitude must be positive and finite, got nan'),
-    (EVEN, np.inf, 'field_magnitude must be positive and finite, got inf')])
+    (EVEN, 0.0, 'field_magnitude .*0.0'),
+    (EVEN, -1.0, 'field_magnitude .*-1.0'),
+    (EVEN, np.nan, 'field_magnitude .*nan'),
+    (EVEN, np.inf, 'field_magnitude .*inf')])
 def test_invalid_arguments_raise_value_error(y, size, message):
     with pytest.raises(ValueError, match=message):
         fit_ellipsoid(y, size)

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mag_tracking.apps.prescan import prescan
 from mag_tracking.records import Readings
 from mag_tracking.settings import replace
+from mag_tracking.stages.calibrate.prescan import prescan
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from support.calibration_runs import EARTH, SIGMA
@@ -117,10 +117,9 @@ def test_a_sensor_that_never_changes_has_no_background(value):
     assert stage.feed(constant) == [] and stage.unready() == ['mag_1']
 
 
-def test_no_level_is_searched_for_a_given_background_or_without_look_ahead():
+def test_no_level_is_searched_for_a_given_background():
     given = dataclasses.replace(NETWORK, background=(EARTH,))
     assert prescan_of(passing(1.0), network=given).levels == {}
-    assert prescan_of(passing(1.0), replace(SETTINGS, {'look_ahead_s': 0.0})).levels == {}
 
 
 def test_a_recording_of_only_a_target_has_no_level():

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.calibration.saturation import N_MARGIN, saturated_readings, with_margin
-from mag_tracking.pipeline import settings_for
+from support.live_runs import passes_of
 from support.passes import ROAD, measured, random_path, unknowns_at
 from support.samples import MagSample, one
 
@@ -98,13 +97,10 @@ def test_a_saturated_segment_is_excluded_from_a_pass_and_reported():
     data = measured(ROAD, path, moments, rng, seconds=16.0)
     limit = np.abs(data.field[data.sensor == 0]).max() / 3.0
     field = np.where((data.sensor == 0)[:, None], np.clip(data.field, -limit, limit), data.field)
-    collector, passes = PassCollector(ROAD, settings_for('vehicle')), []
-    for k in np.argsort(data.t, kind='stable'):
-        j = data.sensor[k]
-        passes += collector.feed(one(MagSample(int(round(1e9 * (20.0 + data.t[k]))), ROAD.names[j],
-                                               field[k] + ROAD.R_sw[j] @ ROAD.earth_field)))
-    passes += collector.flush()
-    (clipped, notes), = passes
+    batches = (one(MagSample(int(round(1e9 * (20.0 + data.t[k]))), ROAD.names[data.sensor[k]],
+                             field[k] + ROAD.R_sw[data.sensor[k]] @ ROAD.earth_field))
+               for k in np.argsort(data.t, kind='stable'))
+    (clipped, notes), = passes_of(ROAD, batches)
     assert any('mag_1' in n and 'saturated' in n and 'not used' in n for n in notes)
     fit = fit_pass(clipped, 1)
     assert not fit.reason

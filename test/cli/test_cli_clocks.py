@@ -46,7 +46,7 @@ def replay(recording, folder, offset, capsys):
 def test_the_reported_offset_corrects_the_clock(recording, tmp_path, capsys):
     output, summary = replay(recording, tmp_path / 'wrong', 0.0, capsys)
     assert f'warning: {summary["clocks_apart"]}' in output
-    assert 'the clock of mag_2 is' in output and 'clocks_apart' in summary['tracks'][-1]['doubts']
+    assert 'of mag_2' in output and 'clocks_apart' in summary['tracks'][-1]['doubts']
     offset = float(re.search(r'increase clock_offset of mag_2 by (\S+) s', output).group(1))
     assert offset == pytest.approx(0.2, abs=0.05)
     output, summary = replay(recording, tmp_path / 'right', offset, capsys)

@@ -80,13 +80,14 @@ def test_an_interrupt_does_not_wait_for_the_next_batch(tmp_path, monkeypatch):
     assert not waited and summary_of(tmp_path)['interrupted'] is True
 
 
-@pytest.mark.parametrize('step', ['summarise', 'add', 'errors_against_truth', 'write_figures'])
+@pytest.mark.parametrize(
+    'step', ['summarise', 'add_track', 'errors_against_truth', 'write_figures'])
 def test_an_interrupt_while_writing_loses_no_results(tmp_path, monkeypatch, capsys, step):
     """SIGINT arrives during the first and second call of a step that updates or writes results."""
     from mag_tracking.apps import replay as app
     from mag_tracking.cli import replay
 
-    module = {'write_figures': replay, 'add': app.RunCollector}.get(step, app)
+    module = {'write_figures': replay, 'add_track': app.TrackHistory}.get(step, app)
     original, calls = getattr(module, step), []
 
     def interrupted(*args, **keywords):
@@ -97,8 +98,8 @@ def test_an_interrupt_while_writing_loses_no_results(tmp_path, monkeypatch, caps
 
     monkeypatch.setattr(module, step, interrupted)
     assert replay_one(tmp_path) == 130
-    assert summary_of(tmp_path)['interrupted'] is (step == 'add')
-    assert 'interrupted; partial results in' in capsys.readouterr().out
+    assert summary_of(tmp_path)['interrupted'] is (step == 'add_track')
+    assert 'interrupted; ' in capsys.readouterr().out
     assert not list(tmp_path.glob('*.png'))
 
 

@@ -22,10 +22,10 @@ def test_fit_writes_rows_and_a_figure_of_each_vehicle(tmp_path, capsys):
     write_network(tmp_path / 'network.yaml', a_world.network)
     out = tmp_path / 'fits'
     assert main(['fit', str(tmp_path / 'pair.mcap'), '--network', str(tmp_path / 'network.yaml'),
-                 '--orders', '1', '2', '--out', str(out)]) == 0
+                 '--orders', '1', '2', '-v', '--out', str(out)]) == 0
     output = capsys.readouterr().out
     assert 'pair, pass 1, vehicle 1:' in output and 'pair, pass 1, vehicle 2:' in output
-    assert output.count('2 vehicles were fitted together') == 2
+    assert output.count('2 vehicles were') == 2
     with open(out / 'fits.csv', encoding='utf-8') as stream:
         rows = list(csv.DictReader(stream))
     assert [(r['pass'], r['vehicle'], r['n_vehicles'], r['n_dipoles']) for r in rows] == [

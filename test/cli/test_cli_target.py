@@ -34,7 +34,7 @@ def test_a_target_in_the_parameters_is_used(tmp_path, capsys):
     params = tmp_path / 'mine.yaml'
     params.write_text('track: {target: magnet}')
     assert chosen(read_network(NETWORK_FILE), params=params) == settings_for('magnet')
-    with pytest.raises(SettingsError, match='remove one of them'):
+    with pytest.raises(SettingsError, match='remove one'):
         chosen(board(), 'vehicle', params)
     assert capsys.readouterr().out == ''
 

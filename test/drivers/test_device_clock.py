@@ -594,8 +594,8 @@ def test_the_arrival_clock_returns_the_arrival_time():
 
 
 @pytest.mark.parametrize('changes, text', [
-    ({'min_step_s': 2.0, 'max_delay_s': 1.0}, 'min_step_s: 2 s is longer than'),
-    ({'wrap': 256, 'tick_s': 1e-3}, 'wrap: the counter wraps every 0.256 s')])
+    ({'min_step_s': 2.0, 'max_delay_s': 1.0}, 'min_step_s: 2 s '),
+    ({'wrap': 256, 'tick_s': 1e-3}, 'wrap: .*0.256 s')])
 def test_contradictory_settings_are_refused(changes, text):
     with pytest.raises(SettingsError, match=text):
         clock_of(**changes)

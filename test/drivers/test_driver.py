@@ -14,6 +14,7 @@ from mag_tracking.drivers.sequence import MAX_REMEMBERED, SequenceCheck
 from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample
+from support.counters import assert_counts, count_of
 from support.samples import MagSample, samples_of
 
 WALL_OFFSET_NS = 1_700_000_000_000_000_000
@@ -105,7 +106,7 @@ def test_units_are_converted_to_tesla(unit, tesla):
     ({'unit': 'furlong'}, "unit: 'furlong' is neither"), ({'unit': '1090'}, '1090/G'),
     ({'unit': '0'}, 'unit'), ({'unit': 'nan'}, 'unit'),
     ({'acceleration_unit': 'G'}, 'acceleration_unit'),
-    ({'stamp_by': 'sundial'}, 'stamp_by: expected one of auto, ticks')])
+    ({'stamp_by': 'sundial'}, 'stamp_by: ')])
 def test_invalid_settings_are_refused(settings, message):
     with pytest.raises(SettingsError, match=message):
         driver_of([], settings)
@@ -129,7 +130,7 @@ def test_a_lost_device_is_reopened_with_back_off():
     np.testing.assert_allclose(waits[:6], [0.1, 0.2, 0.4, 0.8, 1.0, 1.0], atol=0.011)
     np.testing.assert_allclose(waits[6:], [0.1, 0.2], atol=0.011)
     assert driver.fault == ''
-    assert driver.counts()['failed attempts to open'] == 7
+    assert count_of(driver.counts(), 'open') == 7
     assert driver.counts()['connections lost'] == 1
     # A device that failed to open is also closed, because it may hold resources.
     assert device.calls.count('close') == 8
@@ -151,7 +152,7 @@ def test_a_silent_device_is_reopened():
     while device.calls.count('open') < 2:
         driver.poll(0.2)
     assert 3.0 <= (machine.now_ns - begin) / 1e9 <= 3.6
-    assert driver.counts()['reopened after silence'] == 1
+    assert count_of(driver.counts(), 'silence') == 1
     patient, device, machine = driver_of([], {'silence_timeout_s': 0.0})
     for _ in range(1000):
         patient.poll(0.2)
@@ -168,7 +169,7 @@ def test_steps_of_the_host_clock_shift_timestamps_and_are_counted():
         stamps.append(poll_samples(driver, 0.1)[0].stamp_ns)
     assert stamps[1] - stamps[0] == pytest.approx(1_000_000, abs=2)
     assert stamps[2] - stamps[1] == pytest.approx(3_600_001_000_000, abs=2)
-    assert driver.counts()['steps of the host clock'] == 1
+    assert count_of(driver.counts(), 'host clock') == 1
 
 
 def test_stamp_by_selects_the_source_of_timestamps():
@@ -192,7 +193,7 @@ def test_stamp_by_selects_the_source_of_timestamps():
     assert auto == by_arrival
     driver, mixed = stamps({}, [with_ticks[0], Reading('', field), with_ticks[2]])
     assert len(mixed) == 2
-    assert driver.counts()['readings without a device time'] == 1
+    assert count_of(driver.counts(), 'device time') == 1
 
 
 @pytest.mark.parametrize('ticks, clock', [
@@ -220,7 +221,7 @@ def test_each_source_has_its_own_clock_and_name():
     assert [(s.sensor, s.field[0]) for s in samples] == [('mag_1', 1.0), ('mag_2', 2.0)]
     assert samples[0].stamp_ns == samples[1].stamp_ns
     assert set(driver.clocks()) == {'road/a', 'road/b'}
-    assert driver.counts()['readings of unknown sensors: road/c'] == 1
+    assert count_of(driver.counts(), 'road/c') == 1
     # A sensor name in the reading has precedence over the source.
     driver, _, _ = driver_of([[(Reading('A', (1.0, 0.0, 0.0)), 'road/b')]],
                              sensors={'A': 'mag_1', 'road/b': 'mag_2'})
@@ -236,7 +237,7 @@ def test_an_unexpected_error_of_a_device_is_a_fault():
     driver, device, machine = driver_of([])
     driver.poll(0.01)
     driver.fail(ZeroDivisionError('division by zero'))
-    assert driver.fault == 'ZeroDivisionError: division by zero' and not driver.is_open
+    assert driver.fault.startswith('ZeroDivisionError: ') and not driver.is_open
     assert driver.counts()['errors'] == 1
     machine.now_ns += 200_000_000
     driver.poll(0.01)
@@ -269,7 +270,7 @@ def test_losses_are_counted_by_sequence_number():
     assert check_sequence([0, 1, 4, 2, 5]) == ([True] * 5, {'lost': 1, 'late arrivals': 1})
     assert check_sequence([254, 255, 0, 1], wrap=256) == ([True] * 4, {})
     assert check_sequence([250, 3, 255], wrap=256) == ([True] * 3, {'lost': 7, 'late arrivals': 1})
-    assert check_sequence([0, 300, -1], wrap=256)[1] == {'sequence numbers out of range': 2}
+    assert_counts(check_sequence([0, 300, -1], wrap=256)[1], {'range': 2})
     assert check_sequence([0, 1000, 1001])[1] == {'lost': 999}
     # A corrupt number is not counted as a loss.
     assert check_sequence([0, 1, 2**64 - 1, 2, 3]) == (
@@ -338,14 +339,14 @@ def test_an_infinite_field_is_dropped_but_its_acceleration_is_kept():
                              Reading('', (1.0, 2.0, 3.0))]])
     field, acceleration = poll_samples(driver, 0.1)
     assert field.field.tolist() == [1.0, 2.0, 3.0] and isinstance(acceleration, AccelerationSample)
-    assert driver.counts()['readings that overflow in tesla'] == 1
+    assert count_of(driver.counts(), 'overflow') == 1
 
 
 def test_a_single_sensor_accepts_only_its_first_name():
     driver, *_ = driver_of([[Reading('A', (1.0, 0.0, 0.0)), Reading('B', (2.0, 0.0, 0.0)),
                              Reading('A', (3.0, 0.0, 0.0))]])
     assert [s.field[0] for s in poll_samples(driver, 0.1)] == [1.0, 3.0]
-    assert driver.counts()['readings of unknown sensors: B'] == 1
+    assert count_of(driver.counts(), ' B') == 1
 
 
 def contested(sensors, *sources, seconds=30):
@@ -428,10 +429,10 @@ def test_the_number_of_counted_unknown_names_is_bounded():
     driver, *_ = driver_of([readings, [readings[0], readings[-1]]], sensors={'A': 'mag_1'})
     assert poll_samples(driver, 0.1) == []
     assert len(driver.counts()) == 21
-    assert driver.counts()['readings of unknown sensors (and others)'] == 980
+    assert count_of(driver.counts(), 'others)') == 980
     assert poll_samples(driver, 0.1) == []
-    assert len(driver.counts()) == 21 and driver.counts()['readings of unknown sensors: x0'] == 2
-    assert driver.counts()['readings of unknown sensors (and others)'] == 981
+    assert len(driver.counts()) == 21 and count_of(driver.counts(), ' x0') == 2
+    assert count_of(driver.counts(), 'others)') == 981
 
 
 def test_a_device_that_fails_to_close_is_reopened():
@@ -441,10 +442,10 @@ def test_a_device_that_fails_to_close_is_reopened():
         raise OSError('stuck')
     device.close = close
     driver.poll(0.1)
-    assert not driver.is_open and 'gone; closing failed as well: OSError: stuck' in driver.fault
+    assert not driver.is_open and 'gone; ' in driver.fault and 'OSError: stuck' in driver.fault
     machine.now_ns += 10**9
     driver.poll(0.1)
-    assert driver.is_open and driver.counts()['failed attempts to close'] == 1
+    assert driver.is_open and count_of(driver.counts(), 'close') == 1
     # The fault remains until a reading arrives.
     assert driver.fault
 
@@ -460,7 +461,7 @@ def test_errors_in_processing_do_not_close_the_device():
             raise ValueError('unexpected value')
     serve(driver, process, lambda: len(processed) == 3)
     assert device.calls == ['open', 'close']
-    assert driver.counts()['errors while processing readings: ValueError: unexpected value'] == 1
+    assert count_of(driver.counts(), 'ValueError') == 1
 
 
 class DigitFraming:
@@ -500,7 +501,7 @@ def test_frames_are_assembled_from_a_stream():
     # The connection is lost within a frame. The start of this frame is not joined with later bytes.
     device.open()
     assert [a.reading.field[0] for a in device.read(0.0)] == [4.0]
-    assert device.counts == {'dropped': 2, 'bytes of truncated frames': 1}
+    assert_counts(device.counts, {'dropped': 2, 'truncated': 1})
 
 
 def test_messages_are_not_joined():
@@ -508,7 +509,7 @@ def test_messages_are_not_joined():
                           DigitFraming())
     arrivals = device.read(0.0) + device.read(0.0)
     assert [(a.source, a.reading.field[0]) for a in arrivals] == [('a', 1.0), ('b', 3.0)]
-    assert device.counts == {'dropped': 2, 'bytes between frames': 1}
+    assert_counts(device.counts, {'dropped': 2, 'between': 1})
 
 
 def test_numbers_skipped_while_closed_are_not_lost():

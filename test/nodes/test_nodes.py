@@ -46,7 +46,7 @@ from mag_tracking.recording.reader import Recording
 from support.bundled import NETWORK_FILE, VEHICLES, vehicle_path
 from support.busy_recordings import BUSY, network_of_recording
 from support.marks import studied
-from support.node_processes import MAX_S, call, start, stop, without_info_lines
+from support.node_processes import MAX_S, call, start, stop, until_quiet, without_info_lines
 from support.shared_memory import orphaned_segments, segments_of
 
 pytestmark = pytest.mark.timeout(600)
@@ -305,10 +305,7 @@ def test_replay_services_pause_seek_and_resume(ros):
         begin = Recording(vehicle_path('straight_car_right')).start_ns
         assert 4.0 <= (first - begin) / 1e9 < 5.5
         assert call(ros, Trigger, '/replay_node/pause', Trigger.Request()).success
-        spin_until(lambda: False, 0.5)
-        n = len(fields)
-        spin_until(lambda: False, 0.5)
-        assert len(fields) == n
+        n = until_quiet(spin_until, fields)
         assert call(ros, Seek, '/replay_node/seek', Seek.Request(offset=13.5)).success
         assert not call(ros, Seek, '/replay_node/seek', Seek.Request(offset=99.0)).success
         assert call(ros, Trigger, '/replay_node/resume', Trigger.Request()).success

@@ -128,11 +128,11 @@ def test_messages_lost_in_the_queue_are_counted(ros, record, monkeypatch):
     assert session.recorder.counts[FIELDS[0]] > n and session.node.lost == before
     lines = list(summary(session.recorder, Selection(FIELDS, topics=('/gone',)), session.node.lost,
                          {'/odd': 'odd_msgs/msg/Odd is not installed'}))
-    assert f'  warning: {FIELDS[0]}: messages lost before recording: ' \
-           f'{session.node.lost[FIELDS[0]]}' in lines
-    assert [x for x in lines if 'no messages on' in x] == [
-        f'  warning: no messages on {FIELDS[1]}', '  warning: no messages on /gone']
-    assert '  warning: /odd was not recorded: odd_msgs/msg/Odd is not installed' in lines
+    n_lost = session.node.lost[FIELDS[0]]
+    assert any(x.startswith(f'  warning: {FIELDS[0]}: ') and x.endswith(f': {n_lost}')
+               for x in lines)
+    assert [x.split()[-1] for x in lines if 'no messages' in x] == [FIELDS[1], '/gone']
+    assert any('/odd was' in x and 'odd_msgs/msg/Odd' in x for x in lines)
 
 
 def test_a_restarted_or_second_publisher_is_no_loss(ros, record):
@@ -199,5 +199,6 @@ def test_other_types_are_reported(record):
     finally:
         node.destroy_node()
         context.shutdown()
-    assert session.reports == [f'{FIELDS[0]} as std_msgs/msg/Header is not recorded: the topic has '
-                               'type sensor_msgs/msg/MagneticField']
+    (report,) = session.reports
+    assert all(part in report for part in (
+        f'{FIELDS[0]} ', 'std_msgs/msg/Header', 'sensor_msgs/msg/MagneticField'))

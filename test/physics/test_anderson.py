@@ -124,13 +124,13 @@ def test_coefficients_of_a_known_pass_are_exact():
 def test_invalid_arguments_raise_value_error():
     r0, v0, m = [-3.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]
     for v in ([0.0, 0.0, 0.0], [math.nan, 0.0, 0.0], [math.inf, 0.0, 0.0]):
-        with pytest.raises(ValueError, match='v0 must be finite and non-zero'):
+        with pytest.raises(ValueError, match='v0'):
             closest_approach(r0, v)
-        with pytest.raises(ValueError, match='v0 must be finite and non-zero'):
+        with pytest.raises(ValueError, match='v0'):
             anderson_coefficients([0.0, 1.0, 0.0], v, m)
-    with pytest.raises(ValueError, match='r_cpa must be perpendicular to v0'):
+    with pytest.raises(ValueError, match='r_cpa .*perpendicular'):
         anderson_coefficients(r0, v0, m)
-    with pytest.raises(ValueError, match=r'r0 must have shape \(3,\), got \(1, 3\)'):
+    with pytest.raises(ValueError, match=r'r0 .*\(1, 3\)'):
         closest_approach([r0], v0)
-    with pytest.raises(ValueError, match=r'm must have shape \(3,\), got \(2,\)'):
+    with pytest.raises(ValueError, match=r'm .*\(2,\)'):
         anderson_field(0.0, r0, v0, m[:2])

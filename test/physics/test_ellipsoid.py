@@ -77,7 +77,7 @@ def test_factors_keep_the_shape():
 
 @pytest.mark.parametrize('aspect', [0.0, -2.0, math.nan, math.inf, [1.0, 0.0]])
 def test_an_invalid_aspect_is_rejected(aspect):
-    with pytest.raises(ValueError, match='aspect must be between 1e-100 and 1e100, got'):
+    with pytest.raises(ValueError, match='aspect .*1e-100 and 1e100'):
         demagnetisation_factors(aspect)
 
 
@@ -144,10 +144,10 @@ def test_moment_broadcasts():
 def test_invalid_arguments_raise_value_error():
     B0 = np.array([0.0, 2e-5, -4e-5])
     for semi_axes in ((0.0, 1.0), (1.0, -1.0), (math.nan, 1.0), (1.0, math.inf)):
-        with pytest.raises(ValueError, match=r'semi_axes must be positive and finite, got '):
+        with pytest.raises(ValueError, match='semi_axes'):
             ellipsoid_moment(semi_axes, 10.0, 0.0, B0)
     for mu_r in (0.99, math.nan, math.inf):
-        with pytest.raises(ValueError, match=f'mu_r must be at least 1 and finite, got {mu_r}'):
+        with pytest.raises(ValueError, match=f'mu_r .*{mu_r}'):
             ellipsoid_moment((2.0, 1.0), mu_r, 0.0, B0)
-    with pytest.raises(ValueError, match=r'last axis of length 3, got shape \(2,\)'):
+    with pytest.raises(ValueError, match=r'length 3.*\(2,\)'):
         ellipsoid_moment((2.0, 1.0), 10.0, 0.0, B0[:2])

@@ -212,7 +212,7 @@ def test_shapes_broadcast_and_read_only_arrays_are_accepted():
 
 
 def test_invalid_arguments_raise_value_error():
-    with pytest.raises(ValueError, match='r requires a last axis of length 3'):
+    with pytest.raises(ValueError, match='r .*length 3'):
         multipole_field(np.zeros((4, 2)), np.zeros(3))
     with pytest.raises(ValueError, match=r'3, 8 or 15, got shape \(5,\)'):
         multipole_field(np.ones(3), np.zeros(5))

@@ -195,7 +195,7 @@ def test_model_of_a_stationary_vehicle_is_finite(name):
 
 def test_states_of_another_model_are_rejected():
     with pytest.raises(ValueError,
-                       match=r'3 dipoles need 19 states, got an array of shape \(2, 10\)'):
+                       match=r'3 dipoles .*19 states.*\(2, 10\)'):
         EXAMPLES['RowVehicle'].dipoles(np.zeros((2, 10)))
 
 

@@ -17,6 +17,7 @@ from mag_tracking.recording.background_file import (
 )
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
+from support.counters import count_of
 from support.networks import line_network
 from support.samples import MagSample, fed
 
@@ -98,7 +99,7 @@ def test_a_background_of_another_time_is_not_resumed(tmp_path, begin_s, max_resu
     stage = Calibrate(network, CalibrateSettings(max_resume_gap_s=max_resume_gap_s))
     stage.resume(stored)
     assert not [c for s in readings(begin_s, 2.0, 1) for c in fed(stage, s)]
-    assert stage.counts['outdated backgrounds not restored'] == 1
+    assert count_of(stage.counts, 'outdated') == 1
     assert stage.stored('mag_1') is None
 
 
@@ -158,7 +159,7 @@ def test_a_confirmed_background_is_kept_without_relearning(tmp_path):
 def test_a_background_of_another_network_file_is_refused(tmp_path, change):
     network, _ = write_and_read_back(tmp_path / 'kept.json')
     stored, refused = read_backgrounds(tmp_path / 'kept.json', replace(network, **change), SETTINGS)
-    assert stored == {} and 'another network file' in refused['mag_1']
+    assert stored == {} and 'another network' in refused['mag_1']
 
 
 def test_a_background_of_other_settings_is_refused(tmp_path):
@@ -171,9 +172,9 @@ def test_a_background_of_other_settings_is_refused(tmp_path):
 
 @pytest.mark.parametrize('change, message', [
     (lambda c: 'not json', 'Expecting value'), (lambda c: '[' * 100_000, 'recursion'),
-    (lambda c: json.dumps([1]), 'is not a background file of version'),
-    (lambda c: json.dumps({**c, 'version': 2}), 'background file of version 1'),
-    (lambda c: json.dumps({'version': 1}), 'is not a background file of version')])
+    (lambda c: json.dumps([1]), 'of version'),
+    (lambda c: json.dumps({**c, 'version': 2}), 'version 1'),
+    (lambda c: json.dumps({'version': 1}), 'of version')])
 def test_an_invalid_file_is_refused(tmp_path, change, message):
     path = tmp_path / 'kept.json'
     network, _ = write_and_read_back(path)
@@ -184,9 +185,9 @@ def test_an_invalid_file_is_refused(tmp_path, change, message):
 
 @pytest.mark.parametrize('key, value, reason', [
     ('background', [1.0, 2.0], 'not valid: the background'),
-    ('covariance', [[0.0] * 3] * 3, 'not positive definite'), ('stamp_ns', None, 'ns None'),
-    ('made_of', None, 'another network file'), ('covariance', ..., 'entry has no covariance'),
-    ('background', {}, 'the stored entry is not valid')])
+    ('covariance', [[0.0] * 3] * 3, 'definite'), ('stamp_ns', None, 'ns None'),
+    ('made_of', None, 'another network'), ('covariance', ..., 'no covariance'),
+    ('background', {}, 'entry is')])
 def test_an_invalid_entry_affects_no_other(tmp_path, key, value, reason):
     path = tmp_path / 'kept.json'
     network, stage = learnt_stage()
@@ -220,7 +221,7 @@ def test_an_axis_without_enough_readings_is_not_stored(tmp_path):
 
 def test_an_unwritable_path_is_reported(tmp_path):
     (tmp_path / 'file').write_text('')
-    with pytest.raises(OutputError, match='Not a directory|File exists'):
+    with pytest.raises(OutputError, match='directory|exists'):
         write_backgrounds(tmp_path / 'file' / 'kept.json', {})
     with pytest.raises(OutputError):
         write_backgrounds('/', {})

@@ -17,6 +17,7 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.messages.types import MAGNETIC_FIELD, definition
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.reader import Recording
+from support.counters import count_of
 
 EPOCH_S, N = 1_790_000_000, 240
 NAMES = ('mag_1', 'a', 'ab', 'abc')
@@ -120,7 +121,7 @@ def vector(time_ns, name, field):
     ('cdr', ('geometry_msgs/msg/Vector3Stamped', 'ros2msg', b''), vector, 'Vector3Stamped'),
     ('cdr', ROS2, lambda *m: cdr(*m, kind=9, extra=bytes(8)), 'XCDR2 with delimiters'),
     ('cdr', ROS2, lambda *m: cdr(*m, kind=3), 'parameter lists'),
-    ('json', ROS2, without('header'), 'without header.stamp or timestamp on /mag_1/imu/mag'),
+    ('json', ROS2, without('header'), 'header.stamp or timestamp .*/mag_1/imu/mag'),
     ('json', ROS2, without('magnetic_field'), 'without magnetic_field on /mag_1/imu/mag')])
 def test_another_encoding_is_refused_by_its_name(encoding, schema, serialise, cause, tmp_path):
     path = write(tmp_path / 'a.mcap', encoding, schema, serialise)
@@ -143,9 +144,9 @@ def test_a_compressed_rosbag2_folder_is_read_or_its_compression_is_named(plugin,
             writer.write(connections[name], time_ns, cdr(time_ns, name, field))
     if mode == CompressionMode.FILE:
         file, = (tmp_path / 'bag').glob('*.zstd')
-        with pytest.raises(RecordingError, match='compressed with zstd'):
+        with pytest.raises(RecordingError, match='zstd'):
             Recording(tmp_path / 'bag')
-        with pytest.raises(RecordingError, match='compressed with zstd'):
+        with pytest.raises(RecordingError, match='zstd'):
             Recording(file)
         # As after the command in the error.
         with open(file, 'rb') as source, open(file.with_suffix(''), 'wb') as target:
@@ -165,11 +166,10 @@ def test_messages_without_a_timestamp_are_read_with_their_log_time(tmp_path):
                  if t % 7 else cdr(0, n, b))
     found = mt.read_recording(path, network())
     n_zero = sum(t % 7 == 0 and n != 'ab' for t, n, _ in readings())
-    assert N // 4 == found.rejected.pop(
-        'message with header.stamp 0 on /ab/imu/mag, read with its log time')
-    assert sum(found.rejected.values()) == n_zero > 0
-    assert set(found.rejected) == {f'message with header.stamp 0 on /{n}/imu/mag'
-                                   for n in NAMES if n != 'ab'}
+    assert count_of(found.rejected, '/ab/imu/mag, ') == N // 4
+    assert sum(found.rejected.values()) == N // 4 + n_zero > N // 4
+    assert len(found.rejected) == len(NAMES) and all(
+        count_of(found.rejected, f'/{name}/imu/mag') for name in NAMES)
     assert len(found.readings) == N - n_zero
     # The first message of a simulation has the timestamp 0.
     path = write(tmp_path / 'c.mcap', 'cdr', ROS2, lambda t, n, b: cdr(t - EPOCH_S * 10**9, n, b))

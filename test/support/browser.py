@@ -60,7 +60,7 @@ class Page:
         """Evaluate a JavaScript expression or function in the page, and return its value."""
         return self.page.evaluate(expression, argument)
 
-    def wait(self, expression, seconds=60.0):
+    def wait(self, expression, seconds=240.0):
         """Wait until a JavaScript expression is true; fail after `seconds`."""
         # Playwright's wait function uses `eval`, which the security policy of the page forbids.
         end = time.monotonic() + seconds

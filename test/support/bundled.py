@@ -9,10 +9,9 @@ DATA = ROOT / 'test' / 'data'
 VEHICLES = sorted(p.stem for p in (DATA / 'vehicles').glob('*.mcap'))
 NETWORK_FILE = ROOT / 'config' / 'network.yaml'
 
-POINT = {f'track.vehicle.{name}': [value] for name, value in {
-    'kinds': 'car', 'lengths': 0.0, 'length_stds': 0.0, 'moments': 400.0, 'moment_stds': 150.0,
-    'difference_stds': 0.0, 'heights': 0.5, 'height_stds': 0.2,
-    'near_field_lengths': 1.0}.items()} | {'track.vehicle.turn_acceleration': 0.0}
+POINT = {'track.vehicle.kinds.names': ['car'], 'track.vehicle.kinds.car.length': 0.0,
+         'track.vehicle.kinds.car.length_std': 0.0, 'track.vehicle.kinds.car.difference_std': 0.0,
+         'track.vehicle.kinds.car.near_field_length': 1.0, 'track.vehicle.turn_acceleration': 0.0}
 """Settings of a tracker that models only point targets on straight paths."""
 LINEARISED_ONCE = {'track.relinearise_window_s': 0.0}
 """Settings without relinearisation, which takes most of the computing time."""

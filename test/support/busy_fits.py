@@ -4,12 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mag_tracking.apps.fit import RecordingFit
-from mag_tracking.apps.pass_fitter import FittedPass, PassFitter
+from mag_tracking.analysis.fitted_pass import FittedPass
+from mag_tracking.apps.fit import fit
 from mag_tracking.apps.readings import read_recording
-from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.reader import Recording
 from support.busy_recordings import BUSY, network_of_recording
+from support.live_runs import fits_of
 
 ORDERS = (1, 2, 3, 4)
 MAX_ASSIGNMENT_M = 8.0
@@ -29,15 +28,13 @@ class AssignedFit(NamedTuple):
 
 def fits_of_world(a_world, orders=ORDERS):
     """Fit all passes of a `World`; return [FittedPass]."""
-    fitter = PassFitter('world', a_world.network, settings_for('vehicle'), orders)
-    return [*fitter.feed(a_world.readings), *fitter.flush()]
+    return fits_of(a_world.network, a_world.readings, orders)
 
 
 def fits_of_recording(name, folder=BUSY, orders=ORDERS):
     """Fit a recording of several vehicles; return ([FittedPass], [AssignedFit])."""
     network = network_of_recording(name, folder)
-    recording = Recording(folder / f'{name}.mcap')
-    passes = list(RecordingFit(recording, network, settings_for('vehicle'), orders).passes())
+    passes = fit(folder / f'{name}.mcap', network, orders=orders).passes
     truth = read_recording(folder / f'{name}.mcap', network).truth
     return passes, assigned_fits(passes, [
         (stamps / 1e9, position[:, :2]) for stamps, position, _ in truth.values()])

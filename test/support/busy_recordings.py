@@ -9,13 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mag_tracking.apps.prescan import prescan_of
-from mag_tracking.apps.readings import recorded_readings
 from mag_tracking.event_records import VehiclePassage
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import Readings, SmoothedPose, Track
+from mag_tracking.records import SmoothedPose, Track
+from mag_tracking.run import RecordingSource, run
 from support.bundled import DATA
 from support.busy_worlds import Score, score
 from support.passes import network_of
@@ -42,19 +40,25 @@ def network_of_recording(name, folder=BUSY):
                    earth_field=np.array(truth['earth_field_T']))
 
 
+class _Records:
+    """Sink that collects all records."""
+
+    def __init__(self, records):
+        self._records = records
+
+    def add(self, step):
+        self._records += step.records
+
+
 def tracked_recording(name, folder=BUSY, changes=None):
     """Track a recording; return a `TrackedRecording`."""
     network = network_of_recording(name, folder)
     pipeline = Pipeline(network, settings_for('vehicle', changes))
-    recording = Recording(folder / f'{name}.mcap')
-    reader = SampleReader(recording, network)
-    prescan_of(recording, network, pipeline.settings.calibrate).apply(pipeline.calibrate)
-    records = [r for readings in reader.readings() for r in pipeline.feed(readings)]
-    records += pipeline.flush()
+    source, records = RecordingSource(Recording(folder / f'{name}.mcap'), network), []
+    run(source, pipeline, [_Records(records)])
     poses = [r for r in records if isinstance(r, Track) and not r.ended]
-    vehicles = [(stamps / 1e9, position[:, :2]) for stamps, position, _ in
-                recorded_readings(recording, reader,
-                                  Readings.joined([])).truth.values()]
+    vehicles = [(stamps / 1e9, position[:, :2])
+                for stamps, position, _ in source.reader.truth_arrays().values()]
     return TrackedRecording(score(poses, vehicles), poses, pipeline,
                             [r for r in records if isinstance(r, SmoothedPose) and r.complete],
                             [r for r in records if isinstance(r, VehiclePassage)])

@@ -12,12 +12,12 @@ import numpy as np
 from mag_tracking.analysis.correlated_motion import CorrelatedMotion, correlated_motion
 from mag_tracking.analysis.model_order import choose_order
 from mag_tracking.analysis.pass_fit import fit_pass
-from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.simulation.scenario import Path
 from support import spoiler
 from support.box_vehicles import UNCALIBRATED, box_car
+from support.live_runs import passes_of
 from support.passes import network_of
 from support.samples import scenario
 
@@ -59,8 +59,7 @@ def _velocity_along_x(pose):
 @cache
 def pass_of(seed):
     """Collect the `PassData` of a random pass."""
-    collector = PassCollector(PAIR, settings_for('vehicle'))
-    passes = collector.feed(readings_of(seed)[0]) + collector.flush()
+    passes = passes_of(PAIR, [readings_of(seed)[0]])
     return max((data for data, _ in passes), key=lambda data: data.n_values)
 
 

@@ -1,4 +1,4 @@
-"""The command `mag-tracking board-geometry` with its input and output files."""
+"""The command `mag-tracking calibrate board` with its input and output files."""
 
 import csv
 
@@ -24,7 +24,7 @@ def write_table(path, field, positions, axes):
 
 def command(table, *options, out):
     """Run `board-geometry` on a pose table; return its exit status."""
-    return main(['board-geometry', str(table), '--moment', str(MOMENT), '--out', str(out),
+    return main(['calibrate', 'board', str(table), '--moment', str(MOMENT), '--out', str(out),
                  *map(str, options)])
 
 

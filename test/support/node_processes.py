@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 
 from mag_tracking.nodes.middleware import PROFILE_VARIABLE
 
@@ -20,6 +21,19 @@ def scaled(limit_s, start_s):
     """Extend a time limit for an idle machine in proportion to the measured start-up time
     `start_s`."""
     return limit_s * max(1.0, start_s / USUAL_START_S)
+
+
+def until_quiet(spin_until, received, seconds=0.5):
+    """Wait until no message has been appended to `received` for `seconds`; return their number.
+
+    On a busy machine, messages arrive long after their publisher was stopped.
+    """
+    n, end = -1, time.monotonic() + MAX_S
+    while n != len(received):
+        assert time.monotonic() < end, 'messages continue to arrive'
+        n = len(received)
+        spin_until(lambda: False, seconds)
+    return n
 
 
 def start(module, *arguments, home=None):

@@ -111,7 +111,8 @@ class PlainCalibration:
         self.decimators = {n: Decimator(settings.decimate_to_hz) for n in network.names}
         s, n = settings, len(network)
         self.backgrounds = {name: FedBackground(
-            s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std, s.relearn_s,
+            s.learn_s, calibrate.MEMORY_S, calibrate.GUARD_S, calibrate.BLOCK_S,
+            calibrate.FREEZE_STD, s.relearn_s,
             network.background[i], network.noise_std[i],
             phase=i / n if n > calibrate.MAX_SYNCHRONOUS else None)
             for i, name in enumerate(network.names)}
@@ -181,13 +182,13 @@ class PlainCalibration:
     def timestamp_fault(self, sample):
         name, stamp, last = sample.sensor, sample.stamp_ns, self.last_ns.get(sample.sensor)
         if last is not None:
-            longest = self.settings.max_forward_jump_s * NS
+            longest = calibrate.MAX_FORWARD_JUMP_S * NS
             before = self.unconfirmed.pop(name, None)
             if stamp - last > longest:
                 self.unconfirmed[name] = stamp
                 if before is None or not 0 < stamp - before <= longest:
                     return 'timestamp too far ahead'
-            if stamp <= last and last - stamp <= self.settings.max_backward_jump_s * NS:
+            if stamp <= last and last - stamp <= calibrate.MAX_BACKWARD_JUMP_S * NS:
                 return 'duplicate timestamp' if stamp == last else 'out of order'
             if stamp <= last:
                 self.backgrounds[name].forget()

@@ -7,9 +7,9 @@ import numpy as np
 
 import mag_tracking as mt
 from mag_tracking.apps.doctor import Doctor
-from mag_tracking.apps.prescan import prescan
-from mag_tracking.pipeline import settings_for
+from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.report.metrics import interpolate_truth
+from mag_tracking.stages.calibrate.prescan import prescan
 from support.bundled import DATA, NETWORK_FILE, vehicle_path
 from support.spoiler import apply
 
@@ -77,7 +77,7 @@ def findings(name, *faults):
     network = mt.read_network(ROADS[name][1] if name in ROADS else NETWORK_FILE)
     settings = settings_for('vehicle')
     readings = apply(recorded(name).readings, *faults)
-    doctor = Doctor(network, settings)
+    doctor = Doctor(Pipeline(network, settings, 'calibrate'))
     prescan([readings], network, settings.calibrate).apply(doctor.calibrate)
     doctor.feed(readings)
     return [str(f) for f in doctor.findings()]

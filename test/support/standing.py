@@ -3,9 +3,9 @@ backgrounds."""
 
 import numpy as np
 
-from mag_tracking.apps.prescan import prescan
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
+from mag_tracking.stages.calibrate.prescan import prescan
 from support.random_passes import SIMULATORS, errors_of
 from support.situations import simulated_world, wrong_of
 

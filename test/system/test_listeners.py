@@ -82,8 +82,8 @@ def listeners_of(arguments, environment, expected):
 
 @pytest.mark.alone
 @pytest.mark.parametrize('name, options, page, drivers', [
-    ('view', [RECORDING, *NETWORK, '--port'], True, False),
-    ('watch', ['--port'], True, False),
+    ('replay', [RECORDING, *NETWORK, '--live', '--port'], True, False),
+    ('ros watch', ['--port'], True, False),
     ('listen', [], False, True),
     ('run', [*NETWORK, '--drivers', 'drivers.yaml', '--web'], True, True),
     ('record', [*NETWORK, '--out', 'out'], False, False)])
@@ -93,7 +93,7 @@ def test_a_command_that_waits_listens_only_as_requested(
     (tmp_path / 'drivers.yaml').write_text(DRIVERS.format(port=device_port))
     monkeypatch.chdir(tmp_path)
     expected = {('tcp', LOOPBACK, port)} if page else set()
-    arguments = [name, *options] + [str(port)] * page
+    arguments = [*name.split(), *options] + [str(port)] * page
     if name == 'listen':
         arguments.append('drivers.yaml')
     if drivers:
@@ -123,7 +123,7 @@ sys.addaudithook(lambda event, arguments: event in ('socket.bind', 'socket.liste
                  and print('opened:', event, arguments))
 from mag_tracking.cli import main
 for arguments in json.loads(sys.argv[1]):
-    print('status of', arguments[0], main(arguments))
+    print(f'status of {arguments[0]}:', main([*arguments[0].split(), *arguments[1:]]))
 '''
 
 
@@ -134,22 +134,25 @@ def test_commands_that_end_by_themselves_do_not_listen(tmp_path, environment):
         ('car,' + ','.join(map(str, range(20))) + '\ntruck,' + ','.join(['1', '2'] * 10) + '\n')
         * 8))
     arguments_of = {
-        'replay': [RECORDING, *NETWORK, *params, '--out', 'replay'],
-        'events': [RECORDING, *NETWORK, *params], 'traffic': [RECORDING, *NETWORK, *params],
-        'classes': ['evaluate', 'passes.csv'], 'doctor': [*NETWORK, '--live', '2'],
-        'calibrate': [RECORDING, *NETWORK, '--out', 'calibrated.yaml', '--report', 'c.html'],
-        'tumble': [RECORDING, *NETWORK, '--out', 'tumbled.yaml'],
-        'board-geometry': [str(magnet), *NETWORK, '--moment', '1', '--out', 'board.yaml'],
+        'replay': [RECORDING, *NETWORK, *params, '--out', 'replay', '--tables',
+                   'poses,passages,events'],
+        'classes train': ['passes.csv', '--out', 'classes.json'],
+        'classes evaluate': ['passes.csv'], 'doctor': [*NETWORK, '--live', '2'],
+        'calibrate network': [RECORDING, *NETWORK, '--out', 'calibrated.yaml', '--report',
+                              'c.html'],
+        'calibrate tumble': [RECORDING, *NETWORK, '--out', 'tumbled.yaml'],
+        'calibrate board': [str(magnet), *NETWORK, '--moment', '1', '--out', 'board.yaml'],
         'fit': [RECORDING, *NETWORK, '--out', 'fit'],
         'plan': [*NETWORK, '--target', 'car', '--grid', '9', '--out', 'plan'],
         'repair': [RECORDING], 'info': [RECORDING],
         'import': [str(magnet), '--background',
                    str(magnet.with_name('lisa_data1_background.csv')), '--out', 'magnet'],
-        'topics': [], 'echo': ['/none', '--count', '1'], 'param': ['none'], 'lifecycle': ['none']}
-    assert {*arguments_of, 'view', 'watch', 'listen', 'run', 'record', 'archive'} == {*COMMANDS}
+        'ros topics': [], 'ros echo': ['/none', '--count', '1'], 'ros param': ['none'],
+        'ros lifecycle': ['none'], 'classes predict': ['passes.csv', '--model', 'classes.json']}
+    assert {*arguments_of, 'ros watch', 'listen', 'run', 'record', 'archive'} == {*COMMANDS}
     finished = subprocess.run(
         [sys.executable, '-c', ONE_BY_ONE, json.dumps([[n, *a] for n, a in arguments_of.items()])],
         cwd=tmp_path, env=environment, capture_output=True, text=True)
-    statuses = re.findall(r'status of (\S+) \d', finished.stdout)
+    statuses = re.findall(r'status of (.+): \d', finished.stdout)
     assert statuses == [*arguments_of], finished.stderr
     assert 'opened:' not in finished.stdout

@@ -8,7 +8,7 @@ import pytest
 
 from mag_tracking.apps.replay import replay
 from mag_tracking.cli import main
-from mag_tracking.errors import NetworkError, OutputError, SettingsError
+from mag_tracking.errors import NetworkError, OutputError
 from mag_tracking.messages.schema import odometry_dict, pose_covariance
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
@@ -17,18 +17,16 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Detection, FieldFrame, Track
-from mag_tracking.settings import replace
 from mag_tracking.simulation.scenario import Path, point_body
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.detect.settings import DetectSettings
-from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.manager import TrackManager
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 from support.calibration_runs import EARTH, SIGMA, feed, running, sample, stage
+from support.counters import assert_counts, count_of
 from support.marks import studied
 from support.networks import line_network
 from support.samples import MagSample, fed, one, recorded
@@ -40,13 +38,13 @@ NAME = 'straight_car_right'
 def test_a_replay_does_not_overwrite_its_recording(tmp_path, road_network):
     path = tmp_path / 'tracks.mcap'
     path.write_bytes(vehicle_path(NAME).read_bytes())
-    with pytest.raises(OutputError, match='folder of the recording'):
+    with pytest.raises(OutputError, match='recording'):
         replay(Recording(path), road_network, settings_for('vehicle'), tmp_path)
     assert path.read_bytes() == vehicle_path(NAME).read_bytes()
     (tmp_path / 'links').mkdir()
     link = tmp_path / 'links' / 'tracks.mcap'
     link.symlink_to(path)
-    with pytest.raises(OutputError, match='folder of the recording'):
+    with pytest.raises(OutputError, match='recording'):
         replay(Recording(link), road_network, settings_for('vehicle'), tmp_path / 'links')
     with RecordingWriter(tmp_path / 'other' / 'a.mcap'):
         pass
@@ -60,7 +58,7 @@ def test_recordings_of_the_same_name_are_refused(tmp_path, capsys):
     other.write_bytes(vehicle_path(NAME).read_bytes())
     assert main(['replay', str(vehicle_path(NAME)), str(other), '--network', str(NETWORK_FILE),
                  '--out', str(tmp_path / 'out')]) == 1
-    assert 'several recordings are named' in capsys.readouterr().err
+    assert 'several recordings' in capsys.readouterr().err
 
 
 def test_a_looped_recording_gives_the_same_track_again(road_network):
@@ -76,12 +74,6 @@ def test_a_looped_recording_gives_the_same_track_again(road_network):
     common = sorted(set(a) & set(b))
     assert len(common) >= len(a) - 2
     np.testing.assert_allclose([a[k] for k in common], [b[k] for k in common], rtol=1e-9)
-
-
-def test_a_release_probability_below_that_of_the_onset_is_refused():
-    with pytest.raises(SettingsError, match='release_probability'):
-        Detect(line_network(2), replace(DetectSettings(), {
-            'false_alarm_probability': 0.2, 'release_probability': 1e-3}))
 
 
 @pytest.mark.parametrize('step', [0.0, 2e-6])
@@ -112,8 +104,8 @@ def test_a_missing_covariance_between_nodes_is_replaced_or_rejected():
     align = Align(dataclasses.replace(line_network(1), noise_std=(None,)), AlignSettings())
     align.feed(one(MagSample(0, 'mag_1', np.zeros(3), None)))
     align.feed(one(MagSample(1, 'mag_1', np.full(3, np.inf), None)))
-    assert sorted(rejected(align.counts)) == [
-        'no finite field', 'unknown covariance, and no noise_std in the network']
+    finite, unknown = sorted(rejected(align.counts))
+    assert 'finite' in finite and 'noise_std' in unknown
 
 
 def test_an_axis_with_occasional_dropouts_is_learnt():
@@ -143,14 +135,14 @@ def test_a_present_axis_never_has_an_unknown_covariance():
     for r in out:
         present = ~np.isnan(r.field)
         assert present.any() and np.isfinite(r.covariance[np.ix_(present, present)]).all()
-    assert s.counts['axes held back while learning'] > 0
+    assert count_of(s.counts, 'axes held') > 0
 
 
 def test_a_corrupt_timestamp_rejects_a_single_sample():
     s = stage()
     for t in (1.0, 1.1, 3601.0, 1.2, 1.3):
         fed(s, sample(t))
-    assert rejected(s.counts) == {'timestamp too far ahead': 1}
+    assert_counts(rejected(s.counts), {'ahead': 1})
     assert s.counts['calibrated'] == 4
     # A real gap is confirmed by the next sample.
     assert fed(s, sample(7200.0)) == [] and len(fed(s, sample(7200.1))) == 1
@@ -173,13 +165,13 @@ def test_a_pass_causes_no_second_detection(seed):
 
 @pytest.mark.parametrize('content, message', [
     (b'sensors: {"m\xff": 1}', 'not valid YAML'),
-    (b'sensors:\n  "m 1": {position: [0, 0, 0]}', 'is not a valid sensor name'),
-    (b'sensors:\n  1abc: {position: [0, 0, 0]}', 'is not a valid ROS topic'),
-    (b'frame:\nsensors:\n  a: {position: [0, 0, 0]}', 'frame: expected a name'),
-    (b'sensors:\n  a: {position: [0, 0, 0], noise_std: 12.0}', 'below a millitesla'),
+    (b'sensors:\n  "m 1": {position: [0, 0, 0]}', 'm 1'),
+    (b'sensors:\n  1abc: {position: [0, 0, 0]}', '1abc'),
+    (b'frame:\nsensors:\n  a: {position: [0, 0, 0]}', 'frame: '),
+    (b'sensors:\n  a: {position: [0, 0, 0], noise_std: 12.0}', 'millitesla'),
     (b'sensors:\n  a: {position: [0, 0, 0], background: [15.0, 0, 0]}', 'microtesla'),
-    (b'sensors:\n  a: {position: [0, 0, ' + b'9' * 400 + b']}', 'not a finite number'),
-    (b'sensors:\n  [a]: {position: [0, 0, 0]}', 'is not a valid key'),
+    (b'sensors:\n  a: {position: [0, 0, ' + b'9' * 400 + b']}', 'finite'),
+    (b'sensors:\n  [a]: {position: [0, 0, 0]}', 'valid key'),
 ])
 def test_invalid_network_files_are_refused(tmp_path, content, message):
     path = tmp_path / 'network.yaml'
@@ -193,7 +185,7 @@ def test_a_full_disk_is_reported(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(result_folder, 'new_text_file', lambda *_, **__: open('/dev/full', 'w'))
     assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE),
                  '--out', str(out), '--no-figures']) == 1
-    assert 'No space left' in capsys.readouterr().err
+    assert 'No space' in capsys.readouterr().err
 
 
 def test_a_summary_with_non_finite_numbers_is_valid_json(tmp_path):

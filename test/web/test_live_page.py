@@ -1,7 +1,5 @@
-"""Live page in Chromium without ROS: values, delay, reconnection and memory."""
+"""Live page in Chromium without ROS: values, reconnection and memory."""
 
-import threading
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +13,6 @@ from support.browser import Page as Opened
 from support.browser import needs_browser
 from support.live_records import feed, poses
 
-MAX_DELAY_MS = 200.0
-"""[ms] Maximum median delay from the timestamp of a pose to the drawing of the pose."""
 SECOND_NS = 1_000_000_000
 
 
@@ -106,40 +102,6 @@ def test_a_phone_shows_map_and_curves_without_scrolling(chromium, scene, server,
         box = page.value(f'document.querySelector("{selector}").getBoundingClientRect().toJSON()')
         assert 0 <= box['top'] and box['bottom'] <= bottom, selector
     assert page.value('document.querySelectorAll(".modebar-btn").length') == 0
-    page.page.close()
-
-
-@needs_browser
-@pytest.mark.alone
-def test_the_median_delay_of_a_pose_is_below_200_ms(chromium, scene, server, records):
-    page = Opened(chromium, server.url)
-    page.wait('magTracking.connected')
-    page.value('''() => { window.delays = []; let before = 0; const look = () => {
-        if (magTracking.drawn !== before && magTracking.latestDrawn) {
-          before = magTracking.drawn;
-          window.delays.push(Date.now() - Number(magTracking.latestDrawn) / 1e6); }
-        requestAnimationFrame(look); }; look(); }''')
-    template = [r for r in records if isinstance(r, FieldFrame)][-1]
-    pose, stop = poses(records)[30], threading.Event()
-
-    def publish():
-        while not stop.wait(0.08):
-            now = time.time_ns()
-            scene.add_frame(replace(template, stamp_ns=now))
-            scene.add_track(replace(pose, stamp_ns=now))
-
-    thread = threading.Thread(target=publish)
-    thread.start()
-    try:
-        page.wait('window.delays.length > 80')
-    finally:
-        stop.set()
-        thread.join()
-    # The first delays include the drawing of the whole scene.
-    delays = np.array(page.value('window.delays'))[20:]
-    print(f'from timestamp to drawing: median {np.median(delays):.0f} ms, '
-          f'90 % {np.quantile(delays, 0.9):.0f} ms')
-    assert np.median(delays) < MAX_DELAY_MS
     page.page.close()
 
 

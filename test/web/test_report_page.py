@@ -289,5 +289,5 @@ def test_a_report_of_very_many_poses_is_thinned_with_a_note(vehicle_replays, roa
     assert path.stat().st_size < MAX_MB * 1e6
     text = path.read_text(encoding='utf-8')
     data = json.loads(text.split('id="data">')[1].split('</script>')[0])
-    assert any('poses per track' in note['text'] for note in data['notes'])
+    assert any('per track' in note['text'] for note in data['notes'])
     assert len(data['scene']['tracks']) == n

@@ -16,12 +16,20 @@ namespace mag_tracking {
 
 enum Reason {
     // DONE: the batch is finished. The other codes: the sample has been rejected.
-    DONE, UNKNOWN_SENSOR, NO_FIELD, NO_COVARIANCE, DUPLICATE, OUT_OF_ORDER, LATE,
+    DONE,
+    UNKNOWN_SENSOR,
+    NO_FIELD,
+    NO_COVARIANCE,
+    DUPLICATE,
+    OUT_OF_ORDER,
+    LATE,
     // Time has restarted; must be handled before the same sample is processed again.
     JUMPED_BACK,
     // CLOCK_STEP: the clock may have stepped, and the sample was not added. TOO_MANY: the sensor
     // has more pending samples than allowed. COMPLETE: the next frame is complete.
-    CLOCK_STEP, TOO_MANY, COMPLETE
+    CLOCK_STEP,
+    TOO_MANY,
+    COMPLETE
 };
 
 // Later than any timestamp.
@@ -160,7 +168,8 @@ class Alignment {
         const bool is_young = newest_ - first_ < settings_.wait;
         // At the start of the input, a frame that ends at a negative time does not wait if any
         // sensor has not delivered a sample yet.
-        if (due_ < 0 && is_young && std::find(latest_.begin(), latest_.end(), NEVER) != latest_.end())
+        if (due_ < 0 && is_young
+            && std::find(latest_.begin(), latest_.end(), NEVER) != latest_.end())
             return false;
         return is_one_behind() && (!settings_.is_burst || is_one_missing(is_young));
     }
@@ -193,7 +202,8 @@ class Alignment {
             Queue& queue = queues_[i];
             int64_t& n = out.n_samples[i];
             double n_axis[3] = {0.0, 0.0, 0.0};
-            if (queue.size() && queue.oldest().stamp < end) first = std::min(first, queue.oldest().stamp);
+            if (queue.size() && queue.oldest().stamp < end)
+                first = std::min(first, queue.oldest().stamp);
             while (queue.size() && queue.oldest().stamp < end && !(settings_.is_burst && n)) {
                 const Sample& sample = queue.oldest();
                 ++n;
@@ -210,7 +220,8 @@ class Alignment {
         end_ = settings_.is_burst ? newest + 1 : end;
         // Rounds of sensors with different rates overlap; the offsets preserve the sample times.
         const double mean = double(since_all + n_all * (end - first)) / double(n_all);
-        stamp_ = std::max(first + int64_t(std::nearbyint(mean)), stamp_ == NEVER ? NEVER : stamp_ + 1);
+        stamp_ = std::max(first + int64_t(std::nearbyint(mean)),
+                          stamp_ == NEVER ? NEVER : stamp_ + 1);
         for (std::size_t i = 0; i < queues_.size(); ++i) {
             const int64_t n = out.n_samples[i];
             out.time_offset[i] = double(since[i] + n * (end - stamp_))
@@ -266,8 +277,8 @@ class Alignment {
                 if (queues_[i].oldest().stamp >= due_) return true;
             } else if (latest_[i] == NEVER) {
                 if (is_young) return true;
-            // All samples of the sensor are in earlier frames. At the start of a round, the latest
-            // samples of the other sensors are one round old.
+                // All samples of the sensor are in earlier frames. At the start of a round, the latest
+                // samples of the other sensors are one round old.
             } else if (last_taken_ == NEVER || latest_[i] >= last_taken_ - settings_.wait) {
                 return true;
             }

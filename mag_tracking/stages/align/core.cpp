@@ -55,9 +55,10 @@ PYBIND11_MODULE(core, m) {
     py::class_<Alignment>(m, "Alignment")
         .def(py::init([](Size n_sensors, int64_t period, int64_t wait, int64_t limit,
                          int64_t jump_back, int64_t most, bool is_burst) {
-            if (n_sensors < 0) throw py::value_error("n_sensors: negative");
-            return Alignment(n_sensors, {period, wait, limit, jump_back, most, is_burst});
-        }), py::arg("n_sensors"), py::arg("period"), py::arg("wait"), py::arg("limit"),
+        if (n_sensors < 0) throw py::value_error("n_sensors: negative");
+        return Alignment(n_sensors, {period, wait, limit, jump_back, most, is_burst});
+    }),
+             py::arg("n_sensors"), py::arg("period"), py::arg("wait"), py::arg("limit"),
              py::arg("jump_back"), py::arg("most"), py::arg("is_burst"))
         .def_readwrite("next", &Alignment::next)
         .def_readonly("row", &Alignment::row)

@@ -16,6 +16,7 @@ from mag_tracking.stages.align import core
 from mag_tracking.stages.align.clock_step import ClockStepFilter, HeldSample
 from mag_tracking.stages.align.frame_period import frame_period
 from mag_tracking.stages.align.settings import AlignSettings
+from mag_tracking.stages.stage import MAX_BACKWARD_JUMP_S
 from mag_tracking.units import NS
 
 UNLIMITED_NS = np.iinfo(np.int64).max
@@ -59,7 +60,7 @@ class Align:
         longest_jump = int(round(settings.max_clock_jump_s * NS)) or UNLIMITED_NS
         self._alignment = core.Alignment(
             self._n, self._period, self._wait, longest_jump,
-            int(round(settings.max_backward_jump_s * NS)),
+            int(round(MAX_BACKWARD_JUMP_S * NS)),
             settings.max_buffered, settings.burst)
         self._clock_steps = ClockStepFilter(self._n, longest_jump,
                                             min(settings.max_buffered, MAX_HELD))

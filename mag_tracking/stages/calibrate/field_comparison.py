@@ -9,7 +9,7 @@ from mag_tracking.calibration.agreement import FieldInconsistency, consensus, di
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted, updated
 from mag_tracking.network import SensorNetwork
 from mag_tracking.stages.health.diagnosis import Cause, Finding
-from mag_tracking.stages.survey.settings import SurveySettings
+from mag_tracking.stages.survey.settings import COMPASS_BIAS_STD, SurveySettings
 
 MIN_CHANGE = 1e-7
 """[T] Change of a background after which it is compared again; the smallest fault that distorts
@@ -30,7 +30,7 @@ def compared_with_earth(network: SensorNetwork, survey: SurveySettings,
     if earth_field is None:
         earth_field = consensus(levels, network.R_ws)
     return disagreements(network.names, levels, network.R_ws, std, earth_field,
-                         survey.compass_bias_std, survey.offset_std)
+                         COMPASS_BIAS_STD, survey.offset_std)
 
 
 def earth_field_findings(inconsistencies: Iterable[FieldInconsistency]) -> list[Finding]:

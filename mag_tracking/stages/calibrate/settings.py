@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mag_tracking.settings import param
+from mag_tracking.settings import USER, param
 
 
 @dataclass(frozen=True)
@@ -12,36 +12,17 @@ class CalibrateSettings:
     learn_s: float = param(
         3.0, 'Duration of the quiet interval from which a background is learnt, unless the '
         'network file contains one. If there is no quiet interval within twice this time, the most '
-        'frequent level becomes a provisional background.', 's', (0.1, 3600.0))
-    look_ahead_s: float = param(
-        300.0, 'Offline only: duration, from the start of the recording, that is searched for the '
-        'most frequent level of a sensor that is not quiet at the start. 0 disables the search.',
-        's', (0.0, 86400.0))
-    memory_s: float = param(
-        20.0, 'Duration of the quiet interval to which level, drift and noise are fitted.',
-        's', (1.0, 36000.0))
-    guard_s: float = param(
-        1.5, 'Delay before a quiet reading is included in the background, so that the slow '
-        'approach of a target is excluded.', 's', (0.0, 600.0))
-    block_s: float = param(
-        0.25, 'Duration of a block. The quietness of a sensor is evaluated block by block.',
-        's', (0.01, 60.0))
-    freeze_std: float = param(
-        2.0, 'The background is frozen if the mean of a block deviates from it by more than this '
-        'number of standard deviations of the noise.', '', (0.5, 1000.0))
+        'frequent level becomes a provisional background.', 's', (0.1, 3600.0), level=USER)
     relearn_s: float = param(
         120.0, 'Time after which a steady new level becomes the background (a parked car). If no '
         'target was observed approaching, the time is reduced to four times the duration for '
         'which the background was observed, but not below 10 s. If a parked vehicle was observed '
         'leaving, the time is 2 s for sensors of at least 20 Hz. 0 disables relearning.',
-        's', (0.0, 86400.0))
+        's', (0.0, 86400.0), level=USER)
     max_field: float = param(
         1e-3, 'Maximum absolute value of a field component. Larger readings are rejected, because '
         'gauss or microtesla published as tesla is the most common fault. Near magnets, fields of '
-        'millitesla are legitimate.', 'T', (1e-6, 10.0))
-    max_forward_jump_s: float = param(
-        60.0, 'Maximum forward jump of a timestamp. A larger jump is treated as corrupt unless the '
-        'next timestamp confirms it.', 's', (1e-3, 1e9))
+        'millitesla are legitimate.', 'T', (1e-6, 10.0), level=USER)
     spike_std: float = param(
         30.0, 'Threshold for spikes, in standard deviations of the noise. Up to three consecutive '
         'readings that differ from their neighbours by more than this are rejected. A possible '
@@ -60,11 +41,8 @@ class CalibrateSettings:
         0.0, 'Approximate rate to which faster sensors are low-pass filtered and decimated: an '
         'integer fraction of the rate of the sensor, with 60 dB of alias rejection and a delay of '
         'four output intervals. 0 disables decimation; frames average the samples in any case.',
-        'Hz', (0.0, 10000.0))
+        'Hz', (0.0, 10000.0), level=USER)
     max_resume_gap_s: float = param(
         60.0, 'Maximum gap in the timestamps of a sensor, caused by a restart of a node, after '
         'which the learnt background is restored. 0 disables restoration.',
         's', (0.0, 86400.0))
-    max_backward_jump_s: float = param(
-        1.0, 'Maximum backward jump of a timestamp. A larger jump is treated as a restart (a '
-        'looped recording), and the learnt background is discarded.', 's', (0.0, 3600.0))

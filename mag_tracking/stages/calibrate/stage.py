@@ -44,8 +44,23 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.health.clocks import ClockSpan, corrected
 from mag_tracking.stages.health.diagnosis import Cause
 from mag_tracking.stages.health.timestamps import TimestampMonitor
+from mag_tracking.stages.stage import MAX_BACKWARD_JUMP_S
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NEVER, NS
+
+MEMORY_S = 20.0
+"""[s] Duration of the quiet interval to which level, drift and noise are fitted."""
+GUARD_S = 1.5
+"""[s] Delay before a quiet reading is included in the background, so that the slow approach of a
+target is excluded."""
+BLOCK_S = 0.25
+"""[s] Duration of a block. The quietness of a sensor is evaluated block by block."""
+FREEZE_STD = 2.0
+"""The background is frozen if the mean of a block deviates from it by more than this number of
+standard deviations of the noise."""
+MAX_FORWARD_JUMP_S = 60.0
+"""[s] Maximum forward jump of a timestamp. A larger jump is treated as corrupt unless the next
+timestamp confirms it."""
 
 MAX_SYNCHRONOUS = 16
 """Maximum number of sensors whose blocks may end at the same time. In larger networks, the blocks
@@ -89,7 +104,7 @@ class Calibrate:
         self._batches = np.zeros(1, core.BATCH)
         self.driver_faults = DriverFaults(network.names, self._sensors)
         self._limits = np.array([(
-            settings.max_field, settings.max_forward_jump_s * NS, settings.max_backward_jump_s * NS,
+            settings.max_field, MAX_FORWARD_JUMP_S * NS, MAX_BACKWARD_JUMP_S * NS,
             settings.reject_stuck, settings.spike_std, settings.decimate_to_hz > 0.0,
             settings.trust_covariances)], core.LIMITS)
         self._causes = {**REJECTIONS, core.TOO_LARGE: (
@@ -150,7 +165,7 @@ class Calibrate:
         """Create the background estimator of sensor `i` from the settings and the network file."""
         s, network = self._settings, self._network
         return self._background_type(
-            s.learn_s, s.memory_s, s.guard_s, s.block_s, s.freeze_std, s.relearn_s,
+            s.learn_s, MEMORY_S, GUARD_S, BLOCK_S, FREEZE_STD, s.relearn_s,
             network.background[i], network.noise_std[i],
             phase=i / len(network) if len(network) > MAX_SYNCHRONOUS else None,
             sensors=self._sensors[i:i + 1],

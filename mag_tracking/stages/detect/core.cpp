@@ -11,7 +11,8 @@ namespace {
 void learn(Array field, double memory, Array n, Array square) {
     const Size n_sensors = length_of(field, "field", 2);
     const double* y = input_of(field, "field", {n_sensors, 3});
-    double *count = data_of(n, "n", {n_sensors, 3}), *mean = data_of(square, "square", {n_sensors, 3});
+    double *count = data_of(n, "n", {n_sensors, 3}),
+           *mean = data_of(square, "square", {n_sensors, 3});
     for (Size i = 0; i < 3 * n_sensors; ++i) {
         if (std::isnan(y[i])) continue;
         count[i] = std::min(count[i] + 1.0, memory);
@@ -23,8 +24,8 @@ Array scaled(Array covariance, Array n, Array square, double least, double facto
              double allowance) {
     const Size n_sensors = length_of(covariance, "covariance", 3);
     const double* C = input_of(covariance, "covariance", {n_sensors, 3, 3});
-    const double *count = input_of(n, "n", {n_sensors, 3});
-    const double *mean = input_of(square, "square", {n_sensors, 3});
+    const double* count = input_of(n, "n", {n_sensors, 3});
+    const double* mean = input_of(square, "square", {n_sensors, 3});
     Array out({n_sensors, Size(3), Size(3)});
     double* scaled = out.mutable_data();
     for (Size j = 0; j < n_sensors; ++j, C += 9, scaled += 9, count += 3, mean += 3) {

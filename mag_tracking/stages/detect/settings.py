@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mag_tracking.settings import param
+from mag_tracking.settings import USER, param
 
 
 @dataclass(frozen=True)
@@ -11,13 +11,10 @@ class DetectSettings:
 
     false_alarm_probability: float = param(
         1e-3, 'Probability that a single frame of noise exceeds the threshold. The actual '
-        'probability is lower if background_std is not 0.', '', (1e-12, 0.5))
+        'probability is lower if background_std is not 0.', '', (1e-12, 0.5), level=USER)
     onset_frames: int = param(
         3, 'Number of consecutive frames above the threshold that start a detection.', '',
         (1, 1000))
-    release_probability: float = param(
-        1e-2, 'Probability that noise exceeds the release threshold. A frame below that threshold '
-        'is quiet.', '', (1e-12, 0.5))
     hold_s: float = param(
         1.0, 'Duration for which all frames have to be quiet before a detection ends.',
         's', (0.0, 3600.0))

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.errors import SettingsError
 from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.network import SensorNetwork
@@ -18,14 +17,16 @@ from mag_tracking.stages.detect.resting_axes import RestingAxes
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.units import NS
 
+RELEASE_PROBABILITY = 1e-2
+"""Probability that noise exceeds the release threshold, unless that of the detection is larger. A
+frame below that threshold is quiet."""
+
 RECOVERY_S = 5.0
 """[s] Approximate time in which the calibration learns the background again after a target."""
 
 
 class Detect:
     """Decides for each frame whether a target is present, and reports onset and release.
-
-    Raises SettingsError if the release probability is below the false alarm probability.
 
     Attributes
     ----------
@@ -37,11 +38,6 @@ class Detect:
     """
 
     def __init__(self, network: SensorNetwork, settings: DetectSettings) -> None:
-        if settings.release_probability < settings.false_alarm_probability:
-            raise SettingsError(
-                f'detect.release_probability: {settings.release_probability:g} is below '
-                f'false_alarm_probability ({settings.false_alarm_probability:g}); the release '
-                'threshold must not exceed the detection threshold')
         self.counts: Counter[str] = Counter()
         self._names = network.names
         self._settings = settings
@@ -143,7 +139,7 @@ class Detect:
             self.max_consecutive_above = max(self.max_consecutive_above, self._n_above)
         else:
             self._n_above = 0
-        if statistic > self.threshold(s.release_probability, n):
+        if statistic > self.threshold(max(RELEASE_PROBABILITY, s.false_alarm_probability), n):
             self._last_active_ns = stamp_ns
         if not self._present and self._n_above >= s.onset_frames:
             self._present, self._last_active_ns = True, stamp_ns

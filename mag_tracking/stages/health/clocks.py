@@ -141,5 +141,5 @@ def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
         elif differs:
             yield Finding(True, name, f'its timestamps differ by {ahead_s:+.4g} s from '
                           'the timestamps of other sensors', 'synchronise its clock (chrony, PTP); '
-                          'knocks correct only offsets below survey.max_clock_offset_s',
+                          'knocks correct only offsets below half a second',
                           Cause.CLOCK_DIFFERS)

@@ -5,15 +5,15 @@
 namespace mag_tracking {
 namespace {
 
-Size add_readings(Integers rows, Integers stamps, Array fields, std::int64_t received_ns, Size first,
-                  Integers count, Integers stamp, Integers received, Array field) {
+Size add_readings(Integers rows, Integers stamps, Array fields, std::int64_t received_ns,
+                  Size first, Integers count, Integers stamp, Integers received, Array field) {
     const Size n = length_of(rows, "rows", 1), n_sensors = length_of(stamp, "stamp", 2);
     const Size capacity = stamp.shape(1);
     const std::int64_t *row = input_of(rows, "rows", {n}), *time = input_of(stamps, "stamps", {n});
     const double* value = input_of(fields, "fields", {n, 3});
-    std::int64_t *counts = data_of(count, "count", {n_sensors});
-    std::int64_t *times = data_of(stamp, "stamp", {n_sensors, capacity});
-    std::int64_t *came = data_of(received, "received", {n_sensors, capacity});
+    std::int64_t* counts = data_of(count, "count", {n_sensors});
+    std::int64_t* times = data_of(stamp, "stamp", {n_sensors, capacity});
+    std::int64_t* came = data_of(received, "received", {n_sensors, capacity});
     double* values = data_of(field, "field", {n_sensors, capacity, 3});
     if (first < 0) throw py::index_error("first: negative");
     for (Size i = first; i < n; ++i) {

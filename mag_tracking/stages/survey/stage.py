@@ -27,12 +27,22 @@ from mag_tracking.calibration.orientation import (
 from mag_tracking.geometry import yaw_between
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import AccelerationSample
-from mag_tracking.stages.survey.settings import SurveySettings
+from mag_tracking.stages.survey.settings import COMPASS_BIAS_STD, SurveySettings
 from mag_tracking.units import NS
 
 MAX_GAP_S = 3600.0
 """[s] Maximum gap between accelerations. After a longer gap or a backward jump, earlier readings
 belong to another recording and are discarded."""
+
+ACCELEROMETER_BIAS = 0.05
+"""[m/s²] Bias of an accelerometer, per axis; it tilts the estimated vertical by 0.3 degrees."""
+
+MAX_CLOCK_OFFSET_S = 0.5
+"""[s] Maximum offset between two clocks. The knocks must be further apart, at irregular
+intervals."""
+
+MAX_ACCELERATIONS = 60_000
+"""Maximum number of stored readings per accelerometer, which bounds the memory."""
 
 MIN_NOMINAL_STD = 1e-3
 """[rad] Minimum standard deviation of an orientation in the network file."""
@@ -93,7 +103,7 @@ class Survey:
         # The result of an earlier survey is not additional evidence.
         self._network, self._settings = network.with_nominal_orientations(), settings
         self._accelerations: dict[str, deque[tuple[int, FloatArray]]] = {
-            name: deque(maxlen=settings.max_accelerations) for name in network.names}
+            name: deque(maxlen=MAX_ACCELERATIONS) for name in network.names}
 
     def feed(self, sample: AccelerationSample) -> list[NetworkSurvey]:
         """Add an acceleration, or reject and count it if it is invalid; return an empty list."""
@@ -163,7 +173,7 @@ class Survey:
             return None
         try:
             return up_direction(np.array([a for _, a in self._accelerations[name]]),
-                                self._settings.accelerometer_bias)
+                                ACCELEROMETER_BIAS)
         except ValueError as error:
             warnings.append(f'{error}; the orientation in the network file is retained')
             return None
@@ -185,7 +195,7 @@ class Survey:
         except ValueError as error:
             warnings[network.names[0]].append(str(error))
             return []
-        return disagreements(network.names, field, R, std, earth, self._settings.compass_bias_std,
+        return disagreements(network.names, field, R, std, earth, COMPASS_BIAS_STD,
                              self._settings.offset_std)
 
     def _compass(self, ups: Mapping[int, UpDirection], field: FloatArray, nominal_std: FloatArray,
@@ -196,7 +206,7 @@ class Survey:
         Return the std of the compass biases [T], and the orientation and its source by sensor
         index.
         """
-        network, bias_std = self._network, self._settings.compass_bias_std
+        network, bias_std = self._network, COMPASS_BIAS_STD
         usable = {j: up for j, up in ups.items() if not np.isnan(field[j]).all()}
         if network.earth_field is None or not usable:
             return bias_std, {}
@@ -211,7 +221,7 @@ class Survey:
                                                        network.R_ws[j])
                 except ValueError as error:
                     failures[j] = str(error)
-            bias_std = pooled_bias_std(list(estimates.values()), self._settings.compass_bias_std)
+            bias_std = pooled_bias_std(list(estimates.values()), COMPASS_BIAS_STD)
         for j in failures.keys() - estimates.keys():
             warnings[network.names[j]].append(failures[j])
         out = {}
@@ -245,7 +255,7 @@ class Survey:
 
         The name of the reference is empty if no two sensors measured the same knock.
         """
-        max_offset = self._settings.max_clock_offset_s
+        max_offset = MAX_CLOCK_OFFSET_S
         first_lags: dict[str, Lag] = {}
         for reference, (t, s) in signals.items():
             lags = {name: knock_lag(t, s, *signals[name], max_offset)

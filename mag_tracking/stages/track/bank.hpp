@@ -56,9 +56,9 @@ INLINE void advance_all(const Target& target, const Sensors& sensors, const Size
             } else if (iterations > 1) {
                 std::memcpy(prior.data(), P.data(), n.square() * sizeof(double));
             }
-            out.log_likelihood[p] = filter.update(
-                frame, x_lin.data(), bank.lengths(p), x.data(), P.data(),
-                scratch.gains(0, n), out.nis + p * n.n_sensors);
+            out.log_likelihood[p] =
+                filter.update(frame, x_lin.data(), bank.lengths(p), x.data(), P.data(),
+                              scratch.gains(0, n), out.nis + p * n.n_sensors);
         }
         std::copy(x.data(), x.data() + n_x, out.x + p * n_x);
         from_wide(P.data(), n, out.P + p * square);
@@ -67,8 +67,8 @@ INLINE void advance_all(const Target& target, const Sensors& sensors, const Size
 
 // Largest distance between smoothed positions and a path `at`, both (n, n_x), in units of the
 // standard deviations `deviation` (n). NaN propagates: such a path has not converged.
-INLINE double farthest(const double* smoothed, const double* at, const double* deviation,
-                       int n, int n_x) {
+INLINE double farthest(const double* smoothed, const double* at, const double* deviation, int n,
+                       int n_x) {
     double farthest = 0.0;
     for (int k = 0; k < n; ++k) {
         double square = 0.0;
@@ -97,9 +97,9 @@ INLINE void run_along_all(const Target& target, const Sensors& sensors, const Si
         for (int pass = 0; pass < along.passes; ++pass) {
             std::copy(bank.x + p * n_x, bank.x + (p + 1) * n_x, x.data());
             to_wide(bank.P + p * square, n, P.data());
-            along.log_likelihood[p] = filter.run(
-                frames, along.first_is_updated, along.max_nis, along.iterations,
-                bank.lengths(p), at, x.data(), P.data(), path);
+            along.log_likelihood[p] =
+                filter.run(frames, along.first_is_updated, along.max_nis, along.iterations,
+                           bank.lengths(p), at, x.data(), P.data(), path);
             if (!filter.smooth(frames, path, smoothed.data(), std.data()))
                 along.log_likelihood[p] = -std::numeric_limits<double>::infinity();
             along.max_shift[p] = farthest(smoothed.data(), at, std.data(), frames.n, n_x);
@@ -119,43 +119,43 @@ INLINE void run_along_all(const Target& target, const Sensors& sensors, const Si
 // Function multiversioning does not work with templates, so each target type has its functions.
 [[maybe_unused]]
 FOR_PROCESSORS static void advance(const RowVehicle& target, const Sensors& sensors, const Sizes& n,
-                            const Frame& frame, bool moves, int iterations, const Bank& bank,
-                            const Advanced& out) {
+                                   const Frame& frame, bool moves, int iterations, const Bank& bank,
+                                   const Advanced& out) {
     advance_all(target, sensors, n, frame, moves, iterations, bank, out);
 }
 
 [[maybe_unused]]
 FOR_PROCESSORS static void advance(const Vehicles& target, const Sensors& sensors, const Sizes& n,
-                            const Frame& frame, bool moves, int iterations, const Bank& bank,
-                            const Advanced& out) {
+                                   const Frame& frame, bool moves, int iterations, const Bank& bank,
+                                   const Advanced& out) {
     advance_all(target, sensors, n, frame, moves, iterations, bank, out);
 }
 
 [[maybe_unused]]
 FOR_PROCESSORS static void advance(const Magnet& target, const Sensors& sensors, const Sizes& n,
-                            const Frame& frame, bool moves, int iterations, const Bank& bank,
-                            const Advanced& out) {
+                                   const Frame& frame, bool moves, int iterations, const Bank& bank,
+                                   const Advanced& out) {
     advance_all(target, sensors, n, frame, moves, iterations, bank, out);
 }
 
 [[maybe_unused]]
-FOR_PROCESSORS static void run_along(const RowVehicle& target, const Sensors& sensors, const Sizes& n,
-                              const Frames& frames, const Bank& bank, const Along& along,
-                              const Advanced& out) {
+FOR_PROCESSORS static void run_along(const RowVehicle& target, const Sensors& sensors,
+                                     const Sizes& n, const Frames& frames, const Bank& bank,
+                                     const Along& along, const Advanced& out) {
     run_along_all(target, sensors, n, frames, bank, along, out);
 }
 
 [[maybe_unused]]
 FOR_PROCESSORS static void run_along(const Vehicles& target, const Sensors& sensors, const Sizes& n,
-                              const Frames& frames, const Bank& bank, const Along& along,
-                              const Advanced& out) {
+                                     const Frames& frames, const Bank& bank, const Along& along,
+                                     const Advanced& out) {
     run_along_all(target, sensors, n, frames, bank, along, out);
 }
 
 [[maybe_unused]]
 FOR_PROCESSORS static void run_along(const Magnet& target, const Sensors& sensors, const Sizes& n,
-                              const Frames& frames, const Bank& bank, const Along& along,
-                              const Advanced& out) {
+                                     const Frames& frames, const Bank& bank, const Along& along,
+                                     const Advanced& out) {
     run_along_all(target, sensors, n, frames, bank, along, out);
 }
 

@@ -13,6 +13,7 @@ from mag_tracking.physics.sources import Magnet, SourceModel
 from mag_tracking.physics.vehicles import MAX_TURN_RATE, RowVehicle
 from mag_tracking.records import FieldFrame, plain
 from mag_tracking.stages.track import core
+from mag_tracking.stages.track.initiation_magnet import NEAR_FIELD_LENGTH
 from mag_tracking.stages.track.observation import TIME_RESOLUTION_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.unobserved_length import MAX_CAR_ROW
@@ -76,11 +77,11 @@ class BankFilter:
         """Apply new values of the live settings."""
         self._settings = settings
         is_vehicle = settings.target == 'vehicle'
-        self._near_field_lengths: FloatArray = np.atleast_1d(
-            settings.vehicle.near_field_lengths if is_vehicle
-            else settings.magnet.near_field_length).astype(float)
+        self._near_field_lengths: FloatArray = np.array(
+            [kind.near_field_length for kind in settings.vehicle.kinds] if is_vehicle
+            else [NEAR_FIELD_LENGTH])
         self._is_long_kind: BoolArray = np.array(
-            settings.vehicle.lengths if is_vehicle else [0.0]) > MAX_CAR_ROW
+            [kind.length for kind in settings.vehicle.kinds] if is_vehicle else [0.0]) > MAX_CAR_ROW
 
     def move(self, bank: FilterBank, dt: float) -> None:
         """Predict a bank in place by `dt` seconds, without an update; negative values move it

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.sources import SourceModel
+from mag_tracking.stages.track.initiation_magnet import MAX_STARTS
 from mag_tracking.stages.track.initiation_vehicle import moment_directions
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.settings import TrackSettings
 
 MAX_BYTES = 4 << 30
 """Memory above which settings are rejected [bytes]. The limit applies to the covariances of all
-starting hypotheses, and separately to the grid of a magnet. The peak memory is 1.5 times as
-large."""
+starting hypotheses. The peak memory is 1.5 times as large."""
 START_BYTES = 250_000_000
 """Memory for the covariances with which a track starts [bytes]. If the covariances with all sensors
 need more, the track starts with fewer sensors. The remaining sensors are added after the frames
@@ -85,18 +85,10 @@ def max_hypotheses(observation: Observation, n_sensors: int) -> int:
 
 def check_magnet_bank(settings: TrackSettings, network: SensorNetwork,
                       model: SourceModel) -> None:
-    """Check the memory for a magnet; raises SettingsError if the grid or the starting hypotheses
-    exceed `MAX_BYTES`."""
-    magnet, n = settings.magnet, _n_sensors(settings, network)
-    # Each grid point stores the derivative (3, 3) of every sensor's field with respect to the
-    # moment.
-    size = magnet.grid_points * n * 9 * _FLOAT_BYTES
-    if size > MAX_BYTES:
-        raise SettingsError(f'track.magnet.grid_points: {magnet.grid_points} points x {n} sensors '
-                            f'need {_in_gigabytes(size)} of memory; the limit is '
-                            f'{_in_gigabytes(MAX_BYTES)}. Reduce track.magnet.grid_points or '
-                            'track.max_sensors')
-    _check_bank('track.magnet', {'starts': magnet.starts}, settings, n, model)
+    """Check the memory for a magnet; raises SettingsError if the starting hypotheses exceed
+    `MAX_BYTES`."""
+    _check_bank('track.magnet', {'optima': MAX_STARTS}, settings, _n_sensors(settings, network),
+                model)
 
 
 def _check_bank(group: str, factors: Mapping[str, int], settings: TrackSettings, n: int,

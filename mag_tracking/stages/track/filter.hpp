@@ -38,8 +38,12 @@ struct Frames {
 
     INLINE Frame at(int k, const Sizes& n) const {
         const int own = n.n_x - n.n_t;
-        return {field + k * n.n_sensors * 3, covariance + k * n.n_sensors * 9,
-                offset + k * n.n_sensors, dt[k], decay + k * own, variance + k * own};
+        return {field + k * n.n_sensors * 3,
+                covariance + k * n.n_sensors * 9,
+                offset + k * n.n_sensors,
+                dt[k],
+                decay + k * own,
+                variance + k * own};
     }
 };
 
@@ -106,10 +110,10 @@ class Filter {
         }
         double log_likelihood = 0.0;
         for (int j = 0; j < n_.n_sensors; ++j)
-            nis[j] = update_by_sensor(
-                x, P, x_lin, frame.field + 3 * j, frame.covariance + 9 * j, h_.data() + 3 * j,
-                gains.H + j * 3 * n_.n_seen(), inflation_[j], n_, j, gains.G + j * 3 * n_.wide,
-                gains.z + 3 * j, gains.W + 6 * j, log_likelihood);
+            nis[j] = update_by_sensor(x, P, x_lin, frame.field + 3 * j, frame.covariance + 9 * j,
+                                      h_.data() + 3 * j, gains.H + j * 3 * n_.n_seen(),
+                                      inflation_[j], n_, j, gains.G + j * 3 * n_.wide,
+                                      gains.z + 3 * j, gains.W + 6 * j, log_likelihood);
         complete(P, n_);
         return is_lost ? -std::numeric_limits<double>::infinity() : log_likelihood;
     }
@@ -221,7 +225,7 @@ class Filter {
     }
 
     INLINE bool is_implausible(const double* y, const std::vector<double>& nis,
-                           double max_nis) const {
+                               double max_nis) const {
         double total = 0.0;
         int axes = 0;
         for (int j = 0; j < n_.n_sensors; ++j) {

@@ -13,19 +13,21 @@ from mag_tracking.physics.sources import Magnet
 from mag_tracking.records import FieldFrame
 from mag_tracking.settings import param
 
+START_MARGIN = 0.15
+"""[m] Margin around the bounding box of the sensors within which the magnet may first appear."""
+GRID_POINTS = 4000
+"""Number of points of the coarse grid over the region in which the magnet may first appear."""
+MAX_STARTS = 24
+"""Number of best grid points that are refined."""
+NEAR_FIELD_LENGTH = 5e-4
+"""[m] Near-field length of a magnet (lambda in [ICASSP11]_ eq. (9)). Near the magnet, the
+model error is the first neglected multipole term."""
+
 
 @dataclass(frozen=True)
 class MagnetSettings:
     """Motion of the magnet, and the region in which it may appear."""
 
-    start_margin: float = param(
-        0.15, 'Margin around the bounding box of the sensors within which the magnet may first '
-        'appear.', 'm', (1e-3, 100.0))
-    grid_points: int = param(
-        4000, 'Number of points of the coarse grid over the region in which the magnet may first '
-        'appear.', '', (8, 1_000_000))
-    starts: int = param(24, 'Number of grid points that are refined; the best points are used.',
-                        '', (1, 1000))
     speed_std: float = param(0.05, 'Standard deviation of the initial velocity, per axis.', 'm/s',
                              (1e-9, 100.0))
     spin_std: float = param(0.5, 'Standard deviation of the initial angular velocity, per axis.',
@@ -34,9 +36,6 @@ class MagnetSettings:
         0.02, 'Root spectral density of the acceleration.', 'm/s^1.5', (0.0, 1000.0))
     angular_acceleration: float = param(
         0.2, 'Root spectral density of the angular acceleration.', 'rad/s^1.5', (0.0, 1000.0))
-    near_field_length: float = param(
-        5e-4, 'Near-field length of the magnet (lambda in ICASSP11 eq. (9)). Near the magnet, the '
-        'model error is the first neglected multipole term.', 'm', (0.0, 1000.0), live=True)
     axis: tuple[float, ...] = param(
         (0.0, 0.0, 1.0), 'Direction of the moment in the frame of the magnet.',
         '', (-1.0, 1.0), length=3)
@@ -55,7 +54,7 @@ def is_lost_after(settings: MagnetSettings, network: SensorNetwork, dt: float) -
     """
     std = settings.acceleration * np.sqrt(dt**3 / 3.0)
     extent = np.ptp(network.positions, axis=0).max()
-    return bool(std > 2.0 * settings.start_margin + extent)
+    return bool(std > 2.0 * START_MARGIN + extent)
 
 
 def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldFrame,
@@ -80,7 +79,7 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
     std = np.sqrt(np.einsum('jii->ji', frame.covariance) + background_std**2
                   + (relative_std * magnitude[:, None]) ** 2)
     y = (frame.field / std)[is_present]
-    grid = _start_grid(settings, network)
+    grid = _start_grid(network)
     # The Jacobian with respect to the moment does not depend on the moment.
     dB_dm = dipole_jacobians(network.positions[None] - grid[:, None], np.zeros(3))[1]
     A = np.einsum('jik,gjkl->gjil', network.R_sw, dB_dm) / std[:, :, None]
@@ -88,7 +87,7 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
     is_usable = np.isfinite(A).all(axis=(1, 2))
     moments, residual, _ = project_out_linear(A[is_usable], y)
     cost = np.einsum('gy,gy->g', residual, residual)
-    best = np.argsort(cost, kind='stable')[:settings.starts]
+    best = np.argsort(cost, kind='stable')[:MAX_STARTS]
     start = np.hstack([grid[is_usable][best], moments[best]])
     state, P, cost = _distinct_optima(settings, network, start, y, std, is_present)
     if not len(cost):
@@ -99,18 +98,18 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
     return bank
 
 
-def _start_grid(settings: MagnetSettings, network: SensorNetwork) -> FloatArray:
+def _start_grid(network: SensorNetwork) -> FloatArray:
     """Grid (n, 3) [m] over the bounding box of the sensors with its margin.
 
     A side that is shorter than half the spacing of the grid has one point, in its middle. The other
     sides then share the number of points.
     """
     low, high = network.positions.min(axis=0), network.positions.max(axis=0)
-    extent, step, is_long = high - low + 2.0 * settings.start_margin, 0.0, np.full(3, True)
+    extent, step, is_long = high - low + 2.0 * START_MARGIN, 0.0, np.full(3, True)
     while (extent[is_long] <= step / 2).any() or not step:
         is_long &= extent > step / 2
-        step = float((np.prod(extent[is_long]) / settings.grid_points) ** (1.0 / is_long.sum()))
-    axes = [np.arange(a - settings.start_margin + step / 2, b + settings.start_margin, step)
+        step = float((np.prod(extent[is_long]) / GRID_POINTS) ** (1.0 / is_long.sum()))
+    axes = [np.arange(a - START_MARGIN + step / 2, b + START_MARGIN, step)
             if long else np.array([(a + b) / 2])
             for a, b, long in zip(low, high, is_long, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)

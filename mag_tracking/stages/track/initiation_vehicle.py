@@ -14,10 +14,25 @@ from mag_tracking.physics.dipole import MU0, dipole_jacobians
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.quantities import quantity
 from mag_tracking.records import FieldFrame
-from mag_tracking.settings import param
+from mag_tracking.settings import USER, param
 
 REFERENCE_FIELD = 5e-5
 """Field for which `VehicleSettings.induced_share` is defined [T]."""
+
+LATERAL_STD = 1.5
+"""[m] Standard deviation of the lateral distance from a starting line."""
+ALONG_STD = 3.0
+"""[m] Standard deviation of the starting distance along the line."""
+MAX_START_DISTANCE = 30.0
+"""[m] Maximum starting distance from the outermost sensor."""
+SPEED_STD = 0.3
+"""Standard deviation of each initial speed, relative to the speed."""
+CROSS_SPEED_STD = 0.1
+"""Standard deviation of the velocity across the heading, relative to the initial speed."""
+CLIMB_STD = 0.1
+"""[m/s] Standard deviation of the vertical velocity."""
+TURN_SHARE = 0.5
+"""Fraction of vehicles that turn near the sensors."""
 
 START_TURN_RATIO = 0.5
 """Initial standard deviation of the turn rate, relative to the standard deviation of a turning
@@ -25,64 +40,57 @@ vehicle. The ratio is below 1, because vehicles arrive along straight lines."""
 
 
 @dataclass(frozen=True)
+class VehicleKind:
+    """Length, magnetism and height of a kind of vehicle; the defaults are those of a car."""
+
+    name: str
+    length: float = param(
+        3.0, 'Initial length of the row of dipoles (TSP14 eq. (10)), which is somewhat shorter '
+        'than the vehicle. 0 selects a point target. If all kinds are points, the filter is '
+        'several times faster. For kinds above 4 m, the covariance of the published position '
+        'allows for the part of the vehicle beyond the row.', 'm', (0.0, 1000.0), level=USER)
+    length_std: float = param(
+        1.0, 'Standard deviation of the length; 0 for points.', 'm', (0.0, 1000.0), level=USER)
+    moment: float = param(
+        400.0, 'Initial magnitude of the moment. TSP14 gives 300 to 600 for cars and about 1800 '
+        'for trucks, which the default moment_std covers.', 'A m^2', (1e-6, 1e6), level=USER)
+    moment_std: float = param(
+        150.0, 'Standard deviation of the total hard iron moment, per axis.', 'A m^2',
+        (1e-6, 1e6), level=USER)
+    difference_std: float = param(
+        45.0, 'Standard deviation of the dipole moments of a row about their mean, per axis; 0 for '
+        'points. The iron of a vehicle is not distributed evenly.', 'A m^2', (0.0, 1e6),
+        level=USER)
+    height: float = param(
+        0.5, 'Height of the magnetic centre above the plane z = 0 of the sensors.', 'm',
+        (-100.0, 100.0), level=USER)
+    height_std: float = param(
+        0.2, 'Standard deviation of the height.', 'm', (1e-6, 100.0), level=USER)
+    near_field_length: float = param(
+        0.3, 'Near-field length (lambda in ICASSP11 eq. (9)): distance of the iron from the '
+        'modelled dipoles. Near a vehicle, the model error is the first neglected multipole term.',
+        'm', (0.0, 1000.0), level=USER)
+
+
+@dataclass(frozen=True)
 class VehicleSettings:
     """Motion, magnetism and arrival directions of vehicles."""
 
     arrival_names: tuple[str, ...] = param(
-        ('left', 'right', 'rear'), 'Names of the arrival directions.')
+        ('left', 'right', 'rear'), 'Names of the arrival directions.', level=USER)
     arrival_headings_deg: tuple[float, ...] = param(
         (0.0, 180.0, 90.0), 'Heading on arrival, one per arrival name, measured anticlockwise from '
         'x. The arrival lines pass through the centre of the network.',
-        'deg', (-360.0, 360.0))
+        'deg', (-360.0, 360.0), level=USER)
     lateral_offsets: tuple[float, ...] = param(
         (-4.0, 0.0, 4.0), 'Lateral offsets of the starting lines from each arrival line. Positive '
-        'offsets are to the left of the heading.', 'm', (-1000.0, 1000.0))
-    lateral_std: float = param(1.5, 'Standard deviation of the lateral distance from a starting '
-                               'line.', 'm', (1e-3, 1000.0))
-    along_std: float = param(3.0, 'Standard deviation of the starting distance along the line.',
-                             'm', (1e-3, 1000.0))
-    max_start_distance: float = param(
-        30.0, 'Maximum starting distance from the outermost sensor.', 'm', (0.1, 10000.0))
-    speeds: tuple[float, ...] = param((5.0, 10.0, 20.0), 'Initial speeds.', 'm/s', (0.01, 200.0))
-    speed_std: float = param(0.3, 'Standard deviation of each initial speed, as a fraction of the '
-                             'speed.', '', (1e-3, 10.0))
-    cross_speed_std: float = param(
-        0.1, 'Standard deviation of the velocity across the heading, relative to the initial '
-        'speed.', '', (1e-3, 10.0))
-    climb_std: float = param(0.1, 'Standard deviation of the vertical velocity.', 'm/s',
-                             (1e-9, 100.0))
+        'offsets are to the left of the heading.', 'm', (-1000.0, 1000.0), level=USER)
+    speeds: tuple[float, ...] = param((5.0, 10.0, 20.0), 'Initial speeds.', 'm/s', (0.01, 200.0),
+                                      level=USER)
     dipoles: int = param(
         5, 'Number of dipoles in the row that models a vehicle with a length. Three are '
         'sufficient for cars; a truck that passes close by is then tracked less accurately.', '',
         (2, 20))
-    kinds: tuple[str, ...] = param(
-        ('small', 'car', 'truck'), 'Names of the kinds of vehicle; the evidence selects one per '
-        'track. Each setting from lengths to near_field_lengths has one value per kind.')
-    lengths: tuple[float, ...] = param(
-        (0.0, 3.0, 9.0), 'Initial length of the row of dipoles (TSP14 eq. (10)), which is somewhat '
-        'shorter than the vehicle. 0 selects a point target. If all kinds are points, the filter '
-        'is several times faster. For kinds above 4 m, the covariance of the published position '
-        'allows for the part of the vehicle beyond the row.', 'm', (0.0, 1000.0))
-    length_stds: tuple[float, ...] = param(
-        (0.0, 1.0, 3.0), 'Standard deviation of the length; 0 for points.', 'm', (0.0, 1000.0))
-    moments: tuple[float, ...] = param(
-        (120.0, 400.0, 1600.0), 'Initial magnitude of the moment. TSP14 gives 300 to 600 for cars '
-        'and about 1800 for trucks, which the default moment_stds cover.', 'A m^2', (1e-6, 1e6))
-    moment_stds: tuple[float, ...] = param(
-        (45.0, 150.0, 600.0), 'Standard deviation of the total hard iron moment, per axis.',
-        'A m^2', (1e-6, 1e6))
-    difference_stds: tuple[float, ...] = param(
-        (0.0, 45.0, 240.0), 'Standard deviation of the dipole moments of a row about their '
-        'mean, per axis. The iron of a vehicle is not distributed evenly.', 'A m^2', (0.0, 1e6))
-    heights: tuple[float, ...] = param(
-        (0.5, 0.5, 1.0), 'Height of the magnetic centre above the plane z = 0 of the sensors.',
-        'm', (-100.0, 100.0))
-    height_stds: tuple[float, ...] = param(
-        (0.2, 0.2, 0.4), 'Standard deviation of the height.', 'm', (1e-6, 100.0))
-    near_field_lengths: tuple[float, ...] = param(
-        (0.8, 0.3, 0.3), 'Near-field length (lambda in ICASSP11 eq. (9)): distance of the iron '
-        'from the modelled dipoles. Near a vehicle, the model error is the first neglected '
-        'multipole term.', 'm', (0.0, 1000.0))
     induced_share: float = param(
         0.4, 'Fraction of the initial moment that a field of 50 uT would induce: soft iron D = '
         'share x moment x mu0 / 50 uT along each axis of the vehicle, m = Rz (m0 + D Rz^T B0/mu0). '
@@ -102,8 +110,6 @@ class VehicleSettings:
         'hypothesis has a turning counterpart. 0 disables turning hypotheses, which halves the '
         'number of hypotheses.', 'm/s^2', (0.0, 100.0))
     turn_time: float = param(1.5, 'Correlation time of the turn rate.', 's', (0.01, 1000.0))
-    turn_share: float = param(
-        0.5, 'Fraction of vehicles that turn near the sensors.', '', (1e-6, 0.999999))
     climb_acceleration: float = param(
         0.1, 'Root spectral density of the vertical acceleration.', 'm/s^1.5', (0.0, 1000.0))
     moment_drift: float = param(
@@ -112,34 +118,30 @@ class VehicleSettings:
     difference_drift: float = param(
         0.0125, 'Random walk of the dipole moments of a row about their mean, relative to the '
         'magnitude of the hard iron moment.', '1/s^0.5', (0.0, 1e3))
-
-
-PER_KIND = ('lengths', 'length_stds', 'moments', 'moment_stds', 'difference_stds', 'heights',
-            'height_stds', 'near_field_lengths')
-"""Settings with one value per kind of vehicle."""
+    kinds: tuple[VehicleKind, ...] = param(
+        (VehicleKind('small', 0.0, 0.0, 120.0, 45.0, 0.0, 0.5, 0.2, 0.8), VehicleKind('car'),
+         VehicleKind('truck', 9.0, 3.0, 1600.0, 600.0, 240.0, 1.0, 0.4, 0.3)),
+        'Names of the kinds of vehicle; the evidence selects one per track. A new kind has the '
+        'values of a car where none are given.', level=USER)
 
 
 def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehicle:
     """Source model of a vehicle; without an earth field, soft iron has no effect.
 
-    Raises SettingsError if lists that belong together differ in length, if a kind is listed twice,
-    or if a kind without length has a std of the length or of the moment differences.
+    Raises SettingsError if the arrivals have more or fewer headings than names, or if a kind
+    without length has a std of the length or of the moment differences.
     """
-    for names, item, lists in (('arrival_names', 'arrival name', ('arrival_headings_deg',)),
-                               ('kinds', 'kind', PER_KIND)):
-        n = len(getattr(settings, names))
-        for name in lists:
-            if len(getattr(settings, name)) != n:
-                raise SettingsError(f'track.vehicle.{name}: expected {quantity(n, "value")} '
-                                    f'(one per {item}), got {len(getattr(settings, name))}')
-    if len(set(settings.kinds)) < len(settings.kinds):
-        raise SettingsError(f'track.vehicle.kinds: a name is duplicated in {settings.kinds}')
-    for name in ('length_stds', 'difference_stds'):
-        for kind, length, spread in zip(settings.kinds, settings.lengths, getattr(settings, name),
-                                        strict=True):
-            if spread and not length:
-                raise SettingsError(f'track.vehicle.{name}: {spread:g} for {kind}, which is a '
-                                    'point (its length is 0); use 0')
+    n = len(settings.arrival_names)
+    if len(settings.arrival_headings_deg) != n:
+        raise SettingsError(
+            f'track.vehicle.arrival_headings_deg: expected {quantity(n, "value")} (one per arrival '
+            f'name), got {len(settings.arrival_headings_deg)}')
+    for kind in settings.kinds:
+        for name in ('length_std', 'difference_std'):
+            if getattr(kind, name) and not kind.length:
+                raise SettingsError(f'track.vehicle.kinds.{kind.name}.{name}: '
+                                    f'{getattr(kind, name):g} for a point (its length is 0); '
+                                    'use 0')
     horizontal, vertical = settings.acceleration**2, settings.climb_acceleration**2
     return RowVehicle(_earth_field(network), np.array([horizontal, horizontal, vertical]),
                       settings.moment_drift, settings.difference_drift,
@@ -148,12 +150,12 @@ def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehic
 
 def _n_dipoles(settings: VehicleSettings) -> int:
     """Number of dipoles: the setting if any kind has a length, else 1."""
-    return settings.dipoles if any(settings.lengths) else 1
+    return settings.dipoles if any(kind.length for kind in settings.kinds) else 1
 
 
 def _soft_iron_per_share(settings: VehicleSettings, kind: int) -> float:
     """Soft iron [m³] of a kind of vehicle for an induced share of one."""
-    return settings.moments[kind] * MU0 / REFERENCE_FIELD
+    return settings.kinds[kind].moment * MU0 / REFERENCE_FIELD
 
 
 def soft_iron(settings: VehicleSettings, kind: int) -> float:
@@ -193,24 +195,24 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
     labels: list[int] = []
     kinds: list[int] = []
     measured = _MeasuredEnergy(network, frame)
-    for kind in range(len(settings.kinds)):
-        moments = settings.moments[kind] * moment_directions()
+    for kind, of_kind in enumerate(settings.kinds):
+        moments = of_kind.moment * moment_directions()
         for label, heading in enumerate(np.deg2rad(settings.arrival_headings_deg)):
             R = rotation_about_z(heading)
             hard_iron = (moments - soft_iron(settings, kind) * _earth_field(network) / MU0) @ R
             velocities = np.array(settings.speeds)[:, None] * R[:, 0]
             starts = _matching_positions(settings, network, measured, R, moments,
-                                         settings.heights[kind])
+                                         of_kind.height)
             states.append(_initial_states(settings, kind, starts, velocities, hard_iron))
             by_speed = np.array([
-                starting_covariance(settings, kind, R, v, settings.moment_stds[kind])
+                starting_covariance(settings, kind, R, v, of_kind.moment_std)
                 for v in settings.speeds])
             covariances.append(np.tile(by_speed.repeat(len(moments), 0), (len(starts), 1, 1)))
             labels += [label] * len(states[-1])
             kinds += [kind] * len(states[-1])
     bank = FilterBank.from_targets(np.vstack(states), np.vstack(covariances), np.array(labels),
                                    len(network), background_std, own_covariance, np.array(kinds))
-    return _add_turning_hypotheses(bank, vehicle_model(settings, network), settings.turn_share)
+    return _add_turning_hypotheses(bank, vehicle_model(settings, network), TURN_SHARE)
 
 
 def _add_turning_hypotheses(bank: FilterBank, model: RowVehicle, fraction: float) -> FilterBank:
@@ -250,7 +252,7 @@ def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
     outermost sensor.
     """
     along = (network.positions - network.centre) @ R[:, 0]
-    distance = np.linspace(settings.max_start_distance, 0.0, 160) - along.min()
+    distance = np.linspace(MAX_START_DISTANCE, 0.0, 160) - along.min()
     line = np.array([network.centre[0], network.centre[1], height])
     offsets = np.array(settings.lateral_offsets)
     points = line + offsets[:, None, None] * R[:, 1] - distance[:, None] * R[:, 0]
@@ -275,8 +277,8 @@ def _initial_states(settings: VehicleSettings, kind: int, positions: FloatArray,
     x = np.empty((len(positions), len(velocities), len(hard_iron), 8 + 3 * d + min(d, 2) + n_turn))
     x[..., :3], x[..., 3:6] = positions[:, None], velocities[:, None]
     x[..., 6:6 + 3 * d] = np.tile(hard_iron / d, d)
-    x[..., 6 + 3 * d:] = [*[soft_iron(settings, kind)] * 3, *[settings.lengths[kind]] * (d > 1),
-                          *[0.0] * n_turn]
+    x[..., 6 + 3 * d:] = [*[soft_iron(settings, kind)] * 3,
+                          *[settings.kinds[kind].length] * (d > 1), *[0.0] * n_turn]
     return x.reshape(-1, x.shape[-1])
 
 
@@ -292,16 +294,15 @@ def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, spe
     soft_iron_std = settings.induced_share_std * _soft_iron_per_share(settings, kind)
     n_t = soft_index + 2 + min(d, 2) + int(settings.turn_acceleration > 0.0)
     P = np.zeros((n_t, n_t))
-    P[:3, :3] = R @ np.diag([settings.along_std**2, settings.lateral_std**2,
-                             settings.height_stds[kind]**2]) @ R.T
-    P[3:6, 3:6] = R @ np.diag([(settings.speed_std * speed) ** 2,
-                               (settings.cross_speed_std * speed) ** 2,
-                               settings.climb_std**2]) @ R.T
+    P[:3, :3] = R @ np.diag([ALONG_STD**2, LATERAL_STD**2,
+                             settings.kinds[kind].height_std**2]) @ R.T
+    P[3:6, 3:6] = R @ np.diag([(SPEED_STD * speed) ** 2, (CROSS_SPEED_STD * speed) ** 2,
+                               CLIMB_STD**2]) @ R.T
     mean = np.full((d, d), 1.0 / d)
     among_dipoles = (moment_std**2 / d * mean
-                     + settings.difference_stds[kind]**2 * (np.eye(d) - mean))
+                     + settings.kinds[kind].difference_std**2 * (np.eye(d) - mean))
     P[6:soft_index, 6:soft_index] = np.kron(among_dipoles, np.eye(3))
     P[soft_index:soft_index + 3, soft_index:soft_index + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
     if d > 1:
-        P[soft_index + 3, soft_index + 3] = settings.length_stds[kind]**2
+        P[soft_index + 3, soft_index + 3] = settings.kinds[kind].length_std**2
     return P

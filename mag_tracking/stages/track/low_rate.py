@@ -5,6 +5,7 @@ import numpy as np
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.initiation_vehicle import LATERAL_STD
 from mag_tracking.stages.track.plausibility import MAX_RELATIVE_MOVE
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NEVER, NS
@@ -34,19 +35,19 @@ def required_rate(network: SensorNetwork, settings: TrackSettings) -> float:
     `MAX_RELATIVE_MOVE` times its distance from the nearest sensor. The field of a pass at distance
     d and speed v has little content above the frequency v / (2 d), because its spectrum decreases
     like exp(-2 pi f d / v). The distance is that of the path between the outermost lanes that keeps
-    furthest from all sensors, and includes `lateral_std`: a lower rate is too low in every lane.
+    furthest from all sensors, and includes `LATERAL_STD`: a lower rate is too low in every lane.
     """
     if settings.target != 'vehicle':
         return 0.0
     vehicle = settings.vehicle
     offsets = np.linspace(min(vehicle.lateral_offsets), max(vehicle.lateral_offsets), N_PATHS)
     relative = network.positions - network.positions.mean(axis=0)
-    z = network.positions[:, 2] - min(vehicle.heights)
+    z = network.positions[:, 2] - min(kind.height for kind in vehicle.kinds)
     distances = []
     for heading in np.deg2rad(vehicle.arrival_headings_deg):
         lateral = np.cos(heading) * relative[:, 1] - np.sin(heading) * relative[:, 0]
         nearest = np.hypot(lateral - offsets[:, None], z).min(axis=1)
-        distances.append(np.hypot(nearest.max(), vehicle.lateral_std))
+        distances.append(np.hypot(nearest.max(), LATERAL_STD))
     return typical_speed(settings) / (MAX_RELATIVE_MOVE * float(np.median(distances)))
 
 

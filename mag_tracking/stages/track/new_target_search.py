@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.initiation_vehicle import moment_directions
+from mag_tracking.stages.track.initiation_vehicle import TURN_SHARE, moment_directions
 from mag_tracking.stages.track.joint import JointExplanation, are_sensed_by_two
 from mag_tracking.stages.track.new_target_evidence import IMPROBABLE
 from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, field_energy
@@ -256,15 +256,14 @@ class NewTargetSearch:
 
     def _add_turning_starts(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
         """Return the starts and copies of them, in each of which one new vehicle turns."""
-        fraction = self._vehicles.settings.turn_share
         out = []
         for start in starts:
             turning = [P for P in (self._vehicles.turning(start.x, start.P, i)
                                    for i in start.new_indices) if P is not None]
-            out.append(replace(start, log_w=start.log_w + float(np.log(1.0 - fraction))
+            out.append(replace(start, log_w=start.log_w + float(np.log(1.0 - TURN_SHARE))
                                if turning else start.log_w))
-            out += [replace(start, P=P, log_w=start.log_w + float(np.log(fraction / len(turning))))
-                    for P in turning]
+            out += [replace(start, P=P, log_w=start.log_w + float(
+                np.log(TURN_SHARE / len(turning)))) for P in turning]
         return out
 
     def _run_starts(self, starts: Sequence[WindowStart]
@@ -302,7 +301,7 @@ class NewTargetSearch:
             speed = np.hypot(*x[i * n + 3:i * n + 5])
             moment = np.linalg.norm(self._vehicles.hard_moments(x[i * n:]).sum(axis=0))
             if not self._search.prior.min_speed <= speed <= MAX_RATIO * max(settings.speeds) \
-                    or moment > MAX_RATIO * max(settings.moments):
+                    or moment > MAX_RATIO * max(kind.moment for kind in settings.kinds):
                 return False
         return True
 

@@ -7,7 +7,7 @@ from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
+from mag_tracking.stages.track.initiation_vehicle import LATERAL_STD, VehicleSettings
 from mag_tracking.stages.track.observation import Observation
 
 P_MOUNTING = 0.05
@@ -57,10 +57,10 @@ class Plausibility:
         reasons = set()
         if _needs_rotated_sensors(observation, x, mounting_std):
             reasons.add(doubts.SENSORS_ROTATED)
-        height_error = abs(float(x[2]) - settings.heights[kind])
-        if height_error > -ndtri(P_HEIGHT / 2.0) * settings.height_stds[kind]:
+        height_error = abs(float(x[2]) - settings.kinds[kind].height)
+        if height_error > -ndtri(P_HEIGHT / 2.0) * settings.kinds[kind].height_std:
             reasons.add(doubts.HEIGHT)
-        if x[2] < 0.0 < settings.heights[kind]:
+        if x[2] < 0.0 < settings.kinds[kind].height:
             reasons.add(doubts.BELOW_SENSORS)
         if self._was_off_road[bank.origin[best]] or _is_off_road(
                 x[None], settings, observation.positions, LANE_STDS_LATER)[0]:
@@ -101,7 +101,7 @@ def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray
     lateral = (x[:, 3] * offsets[:, 1] - x[:, 4] * offsets[:, 0]) / speed
     outermost = max(map(abs, settings.lateral_offsets))
     half_width = np.ptp(lateral, axis=0) / 2.0
-    edge = np.maximum(outermost + n_stds * settings.lateral_std,
+    edge = np.maximum(outermost + n_stds * LATERAL_STD,
                       half_width + np.minimum(outermost, half_width - outermost))
     on_one_side = (lateral > 0.0).all(axis=0) | (lateral < 0.0).all(axis=0)
     is_off_road: BoolArray = on_one_side & (np.abs(lateral.mean(axis=0)) > edge) & _is_moving(x)
@@ -119,7 +119,7 @@ def lane_note(settings: VehicleSettings, network: SensorNetwork) -> str | None:
     is_one_sided = np.ptp(network.positions[:, :2] @ across, axis=0) < MAX_ONE_SIDED_WIDTH
     if len(network) < 2 or network.is_compact or 2 * is_one_sided.sum() <= len(headings):
         return None
-    edge = max(map(abs, settings.lateral_offsets)) + LANE_STDS * settings.lateral_std
+    edge = max(map(abs, settings.lateral_offsets)) + LANE_STDS * LATERAL_STD
     offsets = ', '.join(f'{offset:g}' for offset in settings.lateral_offsets)
     return (f'the sensors stand in a line along the road: vehicles up to {edge:.1f} m beside the '
             'line are expected. If a lane is farther away, add its distance to '

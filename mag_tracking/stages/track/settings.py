@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.settings import param
+from mag_tracking.settings import USER, param
 from mag_tracking.stages.track.initiation_magnet import MagnetSettings
 from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
 
@@ -17,16 +17,16 @@ MIXTURE, HOLD, BEST = 'mixture', 'hold', 'best'
 class TrackSettings:
     """Settings of the tracker."""
 
-    target: str = param('vehicle', 'Kind of target: vehicle or magnet.')
+    target: str = param('vehicle', 'Kind of target: vehicle or magnet.', level=USER)
     ambiguous_poses: str = param(
         MIXTURE, 'Pose of an ambiguous track on the topics without an ambiguity flag (pose, '
         'odometry, detections_3d): the best pose with the covariance of all hypotheses (mixture), '
         'no pose (hold), or the best pose with its own covariance (best).', choices=(
-            MIXTURE, HOLD, BEST))
+            MIXTURE, HOLD, BEST), level=USER)
     single_sensor_prior: bool = param(
         False, 'Track even if the network has only one sensor, or only one measures at the start. '
         'The scale is not observable from one sensor: moment and range follow from the configured '
-        'moments, heights and offsets alone. Such tracks are always ambiguous.')
+        'moments, heights and offsets alone. Such tracks are always ambiguous.', level=USER)
     field_error: float = param(
         0.04, 'Error of the predicted field relative to its magnitude, due to the gains and axes '
         'of the sensors and the shape of the target.',
@@ -46,7 +46,7 @@ class TrackSettings:
         'network file, for sensors without orientation_std_deg. The angles are estimated with each '
         'track (to first order: at 15 degrees the field is 3 % too large). 0 disables the '
         'estimation for all sensors, which is several times faster with dozens of sensors.', 'deg',
-        (0.0, 15.0))
+        (0.0, 15.0), level=USER)
     min_bayes_factor: float = param(
         20.0, 'Minimum Bayes factor of a target against a disturbance. A disturbance varies '
         'smoothly, either independently at each sensor (temperature drift, a knock) or across the '
@@ -62,30 +62,18 @@ class TrackSettings:
         'sensors. After a change of sensors, the track is not smoothed at its end. For the initial '
         'hypotheses of a vehicle, the memory limit (250 MB) may allow only about ten sensors. The '
         'remaining sensors are then added at the detection or as the vehicle moves. If they are '
-        'added at the detection, smoothing begins there.', '', (2, 1000))
+        'added at the detection, smoothing begins there.', '', (2, 1000), level=USER)
     max_joint_targets: int = param(
         4, 'Maximum number of vehicles with overlapping fields that are tracked jointly. '
         'Each additional vehicle adds computing time. 1 disables joint tracking.', '', (1, 4))
-    prune_ratio: float = param(
-        1e-12, 'Weight, relative to the heaviest hypothesis, below which a hypothesis is dropped '
-        '(T10 Alg. 3).', '', (1e-300, 0.5), live=True)
     max_hypotheses: int = param(
         1200, 'Maximum number of hypotheses. The heaviest are retained.', '', (1, 100000),
         live=True)
-    max_initial_hypotheses: int = param(
-        1200, 'Maximum number of hypotheses in the frames before the detection, if larger than '
-        'max_hypotheses. These frames contain little information about the origin of a target, so '
-        'the correct hypothesis is often lost if few are kept.', '', (1, 100000), live=True)
     relinearise_window_s: float = param(
         2.0, 'Duration of the window over which the leading hypotheses of a running track are '
         'relinearised along their smoothed paths. It covers one to two times this duration, and at '
         'most 64 frames. 0 disables relinearisation, which reduces the computing time by a fifth.',
         's', (0.0, 60.0))
-    relinearise_interval_s: float = param(
-        0.15, 'Interval between relinearisations. Their cost grows with the number of sensors; at '
-        '100 frames per second, 0.5 is recommended.', 's', (0.0, 60.0))
-    relinearise_max_hypotheses: int = param(
-        20, 'Maximum number of hypotheses that are relinearised.', '', (1, 100000))
     cross_check: bool = param(
         True, 'Fit a path of steady acceleration and turn rate to the whole pass once a vehicle '
         'has passed, and about four times after that. The fit reveals clock offsets, clipped '
@@ -115,7 +103,7 @@ class TrackSettings:
         0.0, 'Lag of the fixed-lag smoothing. Each pose of a running track is published again '
         'after this time, with the information of the frames since. Every frame then '
         'takes about 50 µs longer for each frame of the lag. 0 disables fixed-lag smoothing.',
-        's', (0.0, 10.0))
+        's', (0.0, 10.0), level=USER)
     vehicle: VehicleSettings = field(default_factory=VehicleSettings)
     magnet: MagnetSettings = field(default_factory=MagnetSettings)
 

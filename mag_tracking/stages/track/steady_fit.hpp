@@ -81,8 +81,7 @@ FOR_PROCESSORS static void fit_steady(SteadyModel& model, const double* y, Rows&
                                       double* cost, double* covariance) {
     SeparableFit<SteadyModel> fit(model, y, nuisance, limits);
     const long k = model.n_theta();
-    for (long p = 0; p < n; ++p)
-        cost[p] = fit.refine(theta + p * k, covariance + p * k * k);
+    for (long p = 0; p < n; ++p) cost[p] = fit.refine(theta + p * k, covariance + p * k * k);
 }
 
 }  // namespace mag_tracking

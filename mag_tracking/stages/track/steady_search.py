@@ -20,7 +20,14 @@ from mag_tracking.inference.matrices import ignoring_overflow, pseudo_inverse
 from mag_tracking.inference.separable_fit import distinct
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.steady_pass import N_STRAIGHT, PATH, SteadyPass
-from mag_tracking.stages.track.initiation_vehicle import VehicleSettings
+from mag_tracking.stages.track.initiation_vehicle import (
+    CLIMB_STD,
+    CROSS_SPEED_STD,
+    LATERAL_STD,
+    MAX_START_DISTANCE,
+    SPEED_STD,
+    VehicleSettings,
+)
 from mag_tracking.stages.track.pass_samples import PassSamples
 from mag_tracking.stages.track.reach import DETECTABLE_ENERGY
 from mag_tracking.stages.track.window_start import in_order_of
@@ -79,18 +86,20 @@ class PathPrior:
             m, s = np.array(means, dtype=float), np.array(stds, dtype=float)
             return float(m.mean()), max(float(np.sqrt(m.var() + np.square(s).mean())), MIN_STD)
 
-        height, height_std = spread(vehicle.heights, vehicle.height_stds)
+        kinds = vehicle.kinds
+        height, height_std = spread([k.height for k in kinds], [k.height_std for k in kinds])
         speeds = np.array(vehicle.speeds)
-        speed, speed_std = spread(speeds, vehicle.speed_std * speeds)
-        length, length_std = spread(vehicle.lengths, vehicle.length_stds)
-        lateral_std = spread(vehicle.lateral_offsets, [vehicle.lateral_std])[1]
-        total = np.sqrt(np.square(vehicle.moments).mean() / 3.0)
-        difference = max(float(np.sqrt(np.square(vehicle.difference_stds).mean())), MIN_STD)
+        speed, speed_std = spread(speeds, SPEED_STD * speeds)
+        length, length_std = spread([k.length for k in kinds], [k.length_std for k in kinds])
+        lateral_std = spread(vehicle.lateral_offsets, [LATERAL_STD])[1]
+        total = np.sqrt(np.square([k.moment for k in kinds]).mean() / 3.0)
+        difference = max(float(np.sqrt(np.square(
+            [k.difference_std for k in kinds]).mean())), MIN_STD)
         # The first combination is the mean of the row times the root of the number of dipoles.
         return cls(np.deg2rad(vehicle.arrival_headings_deg), network.centre[:2],
                    np.array([0.0, 0.0, height, speed, 0.0, 0.0, length]),
-                   np.array([np.inf, lateral_std, height_std, speed_std, vehicle.cross_speed_std,
-                             vehicle.climb_std, length_std]),
+                   np.array([np.inf, lateral_std, height_std, speed_std, CROSS_SPEED_STD,
+                             CLIMB_STD, length_std]),
                    np.repeat([total / np.sqrt(N_DIPOLES)] + [difference] * (N_DIPOLES - 1), 3),
                    MIN_SPEED_RATIO * min(vehicle.speeds))
 
@@ -125,11 +134,11 @@ class PathPrior:
             along = np.array([np.cos(heading), np.sin(heading)])
             sensors = (network.positions[:, :2] - self.centre) @ along
             half_length = float(np.abs(sensors).max())
-            x = np.arange(-vehicle.max_start_distance - half_length, GRID_MARGIN + half_length,
+            x = np.arange(-MAX_START_DISTANCE - half_length, GRID_MARGIN + half_length,
                           GRID_STEP)
             # No sensor senses a vehicle in a wide gap between the sensors.
             distance = np.abs(x[:, None] - sensors).min(axis=1)
-            x = x[distance <= vehicle.max_start_distance + GRID_MARGIN]
+            x = x[distance <= MAX_START_DISTANCE + GRID_MARGIN]
             x, y, v = (a.ravel() for a in np.meshgrid(x, offsets, speeds, indexing='ij'))
             grid = np.tile(self.mean, (len(x), 1))
             grid[:, :2] = self.centre + x[:, None] * along \

@@ -60,8 +60,9 @@ def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
         row = vehicle_model(vehicle, network)
         check_vehicle_bank(settings, network, row)
         return Target(row, VehicleOrientation(), vehicle.arrival_names,
-                      vehicle.kinds,
-                      partial(UnobservedLength, vehicle.lengths, vehicle.length_stds),
+                      [kind.name for kind in vehicle.kinds],
+                      partial(UnobservedLength, [kind.length for kind in vehicle.kinds],
+                              [kind.length_std for kind in vehicle.kinds]),
                       False, _start_vehicle)
     if settings.target == 'magnet':
         magnet = settings.magnet

@@ -28,6 +28,18 @@ from mag_tracking.stages.track.smoothing import (
 from mag_tracking.stages.track.target import Target
 from mag_tracking.units import NS
 
+PRUNE_RATIO = 1e-12
+"""Weight, relative to the heaviest hypothesis, below which a hypothesis is dropped ([T10]_
+Alg. 3)."""
+MAX_INITIAL_HYPOTHESES = 1200
+"""Maximum number of hypotheses in the frames before the detection, if larger than `max_hypotheses`.
+With fewer, the correct hypothesis is often lost, because these frames contain little information
+about the origin of a target."""
+RELINEARISE_INTERVAL_S = 0.15
+"""[s] Interval between relinearisations, whose cost grows with the number of sensors."""
+MAX_RELINEARISED = 20
+"""Maximum number of hypotheses that are relinearised."""
+
 
 @dataclass(frozen=True)
 class FrameUpdate:
@@ -67,8 +79,7 @@ class TrackBank:
         self.later_sensors: SensorSubset | None = later_sensors
         self._rejection = SensorRejection(sensors.network.names)
         self._relinearisation = Relinearisation(
-            settings.relinearise_interval_s, settings.relinearise_window_s,
-            settings.relinearise_max_hypotheses)
+            RELINEARISE_INTERVAL_S, settings.relinearise_window_s, MAX_RELINEARISED)
         self._whole_track = WholeTrack(settings.max_smoothing_s)
         self._fixed_lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
 
@@ -143,8 +154,8 @@ class TrackBank:
         self._relinearisation.add(bank, frame_update.predicted, frame_update.log_likelihood,
                                   frame_update.evidence, frame_update.frame, frame_update.dt)
         self._counts['hypotheses dropped'] += bank.prune(
-            -np.log(s.prune_ratio),
-            s.max_hypotheses if publish else max(s.max_hypotheses, s.max_initial_hypotheses))
+            -np.log(PRUNE_RATIO),
+            s.max_hypotheses if publish else max(s.max_hypotheses, MAX_INITIAL_HYPOTHESES))
         self._counts.update(self._relinearisation.relinearise_leading(self.filter, bank))
         self._whole_track.add(bank, frame_update.frame, frame_update.dt, publish)
 

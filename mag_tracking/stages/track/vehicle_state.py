@@ -56,12 +56,12 @@ class VehicleState:
         s = self.settings
         R = rotation_about_z(float(np.deg2rad(s.arrival_headings_deg[label])))
         total = moments.sum(axis=0)
-        mean = s.moments[kind] * total / max(float(np.linalg.norm(total)), MIN_MOMENT)
+        mean = s.kinds[kind].moment * total / max(float(np.linalg.norm(total)), MIN_MOMENT)
         x = self.along(theta, mean[None], np.array([t]), kind)[0]
-        x[2], x[5] = s.heights[kind], 0.0
+        x[2], x[5] = s.kinds[kind].height, 0.0
         if self._n_dipoles > 1:
-            x[9 + 3 * self._n_dipoles] = s.lengths[kind]
-        return x, starting_covariance(s, kind, R, float(theta[3]), s.moment_stds[kind])
+            x[9 + 3 * self._n_dipoles] = s.kinds[kind].length
+        return x, starting_covariance(s, kind, R, float(theta[3]), s.kinds[kind].moment_std)
 
     def along(self, theta: FloatArray, moments: FloatArray, times: FloatArray, kind: int
               ) -> FloatArray:
@@ -75,14 +75,14 @@ class VehicleState:
         velocity = np.array([theta[3] * np.cos(heading), theta[3] * np.sin(heading), theta[5]])
         x[:, :3], x[:, 3:6] = theta[:3] + times[:, None] * velocity, velocity
         ordered = moments[::-1] if length < 0.0 else moments
-        is_point = s.length_stds[kind] == 0.0
+        is_point = s.kinds[kind].length_std == 0.0
         dipole_moments = np.tile(moments.sum(axis=0) / d, (d, 1)) if is_point \
             else _resampled(ordered, d)
         induced = soft_D * self._model.field_strength
         x[:, 6:6 + 3 * d] = (dipole_moments @ R - induced @ R / d).ravel()
         x[:, 6 + 3 * d:9 + 3 * d] = soft_D
         if d > 1:
-            x[:, 9 + 3 * d] = s.lengths[kind] if is_point else abs(length)
+            x[:, 9 + 3 * d] = s.kinds[kind].length if is_point else abs(length)
         return x
 
     def hard_moments(self, x: FloatArray) -> FloatArray:

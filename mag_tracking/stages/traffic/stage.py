@@ -24,11 +24,10 @@ from mag_tracking.network.counting_line import (
     Pose,
     counting_lines,
 )
-from mag_tracking.quantities import quantity
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.report.traffic_intervals import TrafficIntervals
 from mag_tracking.stages.traffic.field_direction import FieldDirection
-from mag_tracking.stages.traffic.settings import PER_CLASS, PER_LINE, TrafficSettings
+from mag_tracking.stages.traffic.settings import TrafficSettings, VehicleClass
 from mag_tracking.units import NS
 
 AMBIGUOUS, CONTRADICTED, EXTRAPOLATED = 'ambiguous', 'direction_contradicted', 'extrapolated'
@@ -96,20 +95,23 @@ class Traffic:
 
     A vehicle is counted when its track has ended, from its smoothed poses if available. Passages
     are returned in chronological order, unless a track lasts longer than `MAX_WAIT_S`. Without
-    `counts_vehicles`, as for other targets, nothing is counted. Raises SettingsError if lists in
-    the settings differ in length, or if names are invalid.
+    `counts_vehicles`, as for other targets, nothing is counted. Raises SettingsError if a class has
+    the name of vehicles that match no class.
     """
 
     def __init__(self, network: SensorNetwork, settings: TrafficSettings,
                  counts_vehicles: bool = True) -> None:
-        _check_lists(settings)
         self.counts: Counter[str] = Counter()
-        self._settings = settings
-        self._lines = counting_lines(settings.line_names, settings.line_headings_deg,
-                                     settings.line_offsets, settings.line_half_widths,
-                                     network.centre) if counts_vehicles else []
+        self._classes, names = settings.classes, [line.name for line in settings.lines]
+        if any(c.name == UNKNOWN for c in settings.classes):
+            raise SettingsError(f'traffic.classes.names: {UNKNOWN!r} is the name of vehicles that '
+                                'match no class')
+        self._lines = counting_lines(
+            names, [line.heading_deg for line in settings.lines],
+            [line.offset for line in settings.lines], [line.half_width for line in settings.lines],
+            network.centre) if counts_vehicles else []
         self._direction = FieldDirection(network)
-        self._intervals = TrafficIntervals(settings.line_names, settings.interval_s, self.counts)
+        self._intervals = TrafficIntervals(names, settings.interval_s, self.counts)
         self._open: dict[int, _TrackHistory] = {}
         self._ended: list[_TrackHistory] = []
         self._pending: list[_PendingCrossing] = []
@@ -233,7 +235,7 @@ class Traffic:
             (EXTRAPOLATED, crossing.is_extrapolated)) if applies)
         velocity_estimate = pose.velocity[:2], pose.covariance[3:5, 3:5]
         speed, speed_std = speed_of(*velocity_estimate)
-        posterior = _class_of(pose, self._settings)
+        posterior = _class_of(pose, self._classes)
         passage = VehiclePassage(
             crossing.stamp_ns, self.counts['passages'], line.name, pending.track_id,
             crossing.forward, pending.direction_error, crossing.position,
@@ -255,37 +257,21 @@ def _are_same_vehicle(one: _PendingCrossing, other: _PendingCrossing) -> bool:
             and not one.track.overlaps(other.track.begin_ns, other.track.last_ns))
 
 
-def _check_lists(settings: TrafficSettings) -> None:
-    """Raise SettingsError if lists differ in length or names are invalid."""
-    for names, item, lists in (('line_names', 'line', PER_LINE),
-                               ('class_names', 'class', PER_CLASS)):
-        values = getattr(settings, names)
-        for name in lists:
-            if len(getattr(settings, name)) != len(values):
-                raise SettingsError(f'traffic.{name}: expected {quantity(len(values), "value")} '
-                                    f'(one per {item}), got {len(getattr(settings, name))}')
-        if len(set(values)) < len(values):
-            raise SettingsError(f'traffic.{names}: duplicate names in {values}')
-        if '' in values or UNKNOWN in values:
-            raise SettingsError(f'traffic.{names}: {"" if "" in values else UNKNOWN!r} is not a '
-                                'valid name')
-
-
 def _is_running(record: Track | SmoothedPose | Disturbance) -> bool:
     """Whether a record is a pose of a running track."""
     return isinstance(record, Track) and not record.ended
 
 
-def _class_of(pose: Pose, settings: TrafficSettings) -> ClassPosterior:
+def _class_of(pose: Pose, classes: Sequence[VehicleClass]) -> ClassPosterior:
     """Classify a vehicle by the magnitude of its moment, and by its length if available."""
-    magnitude = float(np.linalg.norm(pose.moment))
+    magnitude, shares = float(np.linalg.norm(pose.moment)), [c.share for c in classes]
     if not magnitude > 0.0:
-        prior = np.array(settings.class_shares)
+        prior = np.array(shares)
         return ClassPosterior(UNKNOWN, prior / prior.sum())
     along = pose.moment / magnitude
     features = [Feature(magnitude, float(np.sqrt(along @ pose.moment_covariance @ along)),
-                        settings.class_moments, settings.class_moment_spreads)]
+                        [c.moment for c in classes], [c.moment_spread for c in classes])]
     if pose.length > 0.0:
-        features.append(Feature(pose.length, pose.length_std, settings.class_lengths,
-                                settings.class_length_spreads))
-    return class_posterior(settings.class_names, settings.class_shares, features)
+        features.append(Feature(pose.length, pose.length_std, [c.length for c in classes],
+                                [c.length_spread for c in classes]))
+    return class_posterior([c.name for c in classes], shares, features)

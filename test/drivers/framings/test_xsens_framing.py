@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from mag_tracking.drivers.framings.xsens import XsensFraming, XsensSettings
 from mag_tracking.drivers.reading import Reading
+from support.counters import assert_counts
 from support.xsens_messages import (
     FRAME,
     LAYOUT,
@@ -54,10 +55,7 @@ def test_other_messages_are_counted_by_kind_and_errors_by_code():
             + message(0x42, b'\x04') + message(0x42, b'') + message(0xC1, bytes(32)))
     parsed = FRAMING.parse(sent)
     assert parsed.readings == () and parsed.consumed == len(sent)
-    assert parsed.rejected == {
-        'other messages: 0x3E': 1, 'error messages with code 0x04': 2,
-        'error messages with code 0x1E': 1, 'error messages without a code': 1,
-        'other messages: 0xC1': 1}
+    assert_counts(parsed.rejected, {'0x3E': 1, '0x04': 2, '0x1E': 1, 'without': 1, '0xC1': 1})
 
 
 @pytest.mark.parametrize('mid', [0x00, 0x30, 0x34, 0x3C, 0x40])

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections import Counter
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -9,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mag_tracking.settings import replace
+from mag_tracking.stages.align import stage as align_stage
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.stage import rejected
+from support.counters import assert_counts, count_of
 from support.disordered_samples import C, disorder
 from support.networks import line_network
 from support.samples import MagSample, one
@@ -99,7 +102,7 @@ def test_a_sensor_that_stops_becomes_a_nan_row_and_delays_frames_only_once():
     late = [d for d, f in zip(delays, frames, strict=True) if f.stamp_ns > 2e9]
     assert max(late) < 0.2 and max(delays) < 0.8
     assert np.isnan(frames[-1].field[1]).all() and frames[-1].n_samples.tolist()[1] == 0
-    assert align.counts['frames with a sensor missing'] > 20
+    assert count_of(align.counts, 'missing') > 20
 
 
 def test_a_sensor_without_any_sample_delays_frames_only_once():
@@ -113,8 +116,7 @@ def test_late_duplicate_and_out_of_order_samples_are_counted():
     for ms in (490, 485):
         align.feed(one(sample(ms, 0)))
     align.feed(one(MagSample(0, 'mag_7', np.zeros(3), C)))
-    assert rejected(align.counts) == {'duplicate timestamp': 1, 'out of order': 1,
-                                      'unknown sensor mag_7': 1}
+    assert_counts(rejected(align.counts), {'duplicate': 1, 'order': 1, 'mag_7': 1})
     slow = stage(2, max_wait_s=0.2)
     feed(slow, [s for s in stream(2, 2000) if s.sensor == 'mag_1'], flush=False)
     slow.feed(one(sample(100, 1)))
@@ -127,14 +129,14 @@ def test_a_missing_covariance_is_taken_from_the_network_or_rejected():
     align = Align(dataclasses.replace(network, noise_std=stds), AlignSettings())
     frames = feed(align, [MagSample(0, f'mag_{j}', np.ones(3)) for j in (1, 2)] + [sample(1, 0)])
     np.testing.assert_array_equal(frames[0].covariance, [C, np.diag(stds[1] ** 2)])
-    assert rejected(align.counts) == {'unknown covariance, and no noise_std in the network': 1}
+    assert_counts(rejected(align.counts), {'noise_std': 1})
 
 
 def test_a_looped_recording_restarts_the_alignment_and_loses_no_samples():
     align = stage()
     first = feed(align, stream(2, 2400), flush=False)
     second = feed(align, stream(2, 2400))
-    assert align.counts['time jumped back'] == 1
+    assert count_of(align.counts, 'jumped') == 1
     assert sum(f.n_samples.sum() for f in first + second) == 960
     assert not rejected(align.counts)
 
@@ -144,7 +146,7 @@ def test_the_number_of_held_samples_is_bounded():
     for k in range(1000):
         align.feed(one(sample(10.0 * k, 0)))
     assert align.n_held == 50
-    assert rejected(align.counts) == {'too many pending samples': 950}
+    assert_counts(rejected(align.counts), {'pending': 950})
 
 
 def test_burst_mode_completes_a_round_with_the_sample_of_its_last_sensor():
@@ -208,7 +210,7 @@ class PlainAlign:
     def __init__(self, n, s):
         self.n, self.burst, self.max_held, self.counts = n, s.burst, s.max_buffered, Counter()
         self.period, self.max_wait, self.max_jump = (
-            round(1e9 * v) for v in (s.period_s, s.max_wait_s, s.max_backward_jump_s))
+            round(1e9 * v) for v in (s.period_s, s.max_wait_s, align_stage.MAX_BACKWARD_JUMP_S))
         self.begin()
 
     def begin(self):
@@ -297,8 +299,12 @@ def test_frames_and_counts_match_the_reference_at_every_sample(seed):
     chosen = replace(AlignSettings(), {
         'burst': bool(rng.integers(2)), 'period_s': float(rng.choice([1e-4, 0.01, 0.03, 0.2])),
         'max_wait_s': float(rng.choice([0.001, 0.02, 0.1, 0.5, 60.0])),
-        'max_backward_jump_s': float(rng.choice([0.0, 0.05, 1.0])), 'max_clock_jump_s': 0.0,
-        'max_buffered': int(rng.choice([2, 5, 20, 10000]))})
+        'max_clock_jump_s': 0.0, 'max_buffered': int(rng.choice([2, 5, 20, 10000]))})
+    with mock.patch.object(align_stage, 'MAX_BACKWARD_JUMP_S', float(rng.choice([0.0, 0.05, 1.0]))):
+        compare_with_reference(n, rng, chosen)
+
+
+def compare_with_reference(n, rng, chosen):
     align, reference = Align(line_network(n), chosen), PlainAlign(n, chosen)
     frames, rows = [], []
     for s in disorder(rng, n):

@@ -1,6 +1,5 @@
 """Alignment during forward clock steps: each sample is used, rejected with a cause, or held."""
 
-from collections import Counter
 
 import numpy as np
 from hypothesis import given, settings
@@ -11,6 +10,7 @@ from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import MAX_HELD, Align
 from mag_tracking.stages.stage import rejected
 from support.clock_steps import sample, stream, wild, with_clock_step
+from support.counters import assert_counts, count_of
 from support.networks import line_network
 from support.samples import one
 
@@ -37,7 +37,6 @@ def test_every_sample_is_used_rejected_or_held(seed):
     n = int(rng.integers(1, 6))
     stage = align(n, max_clock_jump_s=float(rng.choice([0.05, 0.5, 3.0])),
                   burst=bool(rng.integers(2)), max_wait_s=float(rng.choice([0.1, 0.5])),
-                  max_backward_jump_s=float(rng.choice([0.1, 1])),
                   max_buffered=int(rng.choice([2, 10_000])))
     n_used, n_fed = 0, 0
     for j, t in wild(rng, n, 500):
@@ -60,7 +59,7 @@ def test_held_samples_are_aligned_before_a_restart_and_may_cause_restarts():
     frames += frames_of(stage, [(0, 100), *stream(3, 110, 1000)])
     frames += stage.flush()
     assert rejected(stage.counts) == {}
-    assert stage.counts['time jumped back'] == 3
+    assert count_of(stage.counts, 'jumped') == 3
     assert sum(int(f.n_samples.sum()) for f in frames) == 1500 + 3 + 1 + 267
 
 
@@ -71,7 +70,7 @@ def test_a_clock_step_leaves_the_frames_of_other_sensors_unchanged():
     frames = frames_of(stage, with_clock_step(arrivals, {2}, 2000, 4000, by=1000)) + stage.flush()
     without_steps = [a for a in arrivals if a[0] != 2 or not 2000 <= a[1] < 4000]
     expected = frames_of(other, without_steps) + other.flush()
-    assert rejected(stage.counts) == {'ahead of all other sensors: mag_3': 200}
+    assert_counts(rejected(stage.counts), {'mag_3': 200})
     assert [(f.stamp_ns, f.n_samples.tolist()) for f in frames] == [
         (f.stamp_ns, f.n_samples.tolist()) for f in expected]
 
@@ -89,13 +88,13 @@ def test_clock_steps_are_detected_after_a_jump_back_in_time():
     stage = align(3)
     frames_of(stage, stream(3, 100_000, 102_000))
     frames_of(stage, with_clock_step(stream(3, 0, 4000), {1}, 2000, 3000, by=1000))
-    assert rejected(stage.counts) == {'ahead of all other sensors: mag_2': 100}
+    assert_counts(rejected(stage.counts), {'mag_2': 100})
 
 
 def test_a_sensor_that_falls_silent_while_ahead_is_named_in_the_count():
     stage = align(3)
     frames_of(stage, stream(3, 0, 1000) + [(1, 5000)] + stream(3, 1000, 3000, skip=(1,)))
-    assert rejected(stage.counts) == {'ahead of all other sensors: mag_2': 1}
+    assert_counts(rejected(stage.counts), {'mag_2': 1})
 
 
 def test_the_number_of_held_samples_with_equal_timestamps_is_bounded():
@@ -104,14 +103,13 @@ def test_the_number_of_held_samples_with_equal_timestamps_is_bounded():
         frames_of(stage, stream(3, 0, 1000))
         frames_of(stage, [(1, 9000)] * 100)
         assert stage.n_held_ahead == expected
-        assert rejected(stage.counts)['ahead of all other sensors: mag_2'] == 100 - expected
+        assert count_of(rejected(stage.counts), 'mag_2') == 100 - expected
 
 
 def test_rejections_by_clock_steps_are_counted_for_each_sensor():
     stage = align(6)
     frames_of(stage, with_clock_step(stream(6, 0, 4000), {0, 5}, 1000, 2000, by=5000))
-    assert Counter(rejected(stage.counts)) == {
-        'ahead of all other sensors: mag_1': 100, 'ahead of all other sensors: mag_6': 100}
+    assert_counts(rejected(stage.counts), {'mag_1': 100, 'mag_6': 100})
 
 
 def test_jumps_are_measured_from_the_newest_timestamp_of_all_sensors():

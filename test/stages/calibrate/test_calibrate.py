@@ -10,6 +10,7 @@ from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import OVERRULED, Calibrate
 from mag_tracking.stages.stage import rejected
 from support.calibration_runs import EARTH, SIGMA, feed, running, sample, stage
+from support.counters import assert_counts, count_of
 from support.fed_background import FedBackground
 from support.networks import line_network
 from support.samples import MagSample, fed
@@ -30,7 +31,7 @@ def test_a_background_is_not_ready_before_it_is_learnt():
     b = running()
     feed(b, np.arange(0, 2.0, 0.01))
     assert not b.ready
-    with pytest.raises(ValueError, match='not been learnt'):
+    with pytest.raises(ValueError, match='learnt'):
         b.level(2.0)
 
 
@@ -111,8 +112,8 @@ def test_a_configured_background_without_noise_learns_the_noise():
 @pytest.mark.parametrize('field, cause', [
     ([np.nan] * 3, 'all NaN'),
     ([np.inf, 0, 0], 'infinite'),
-    ([0.02, 0.15, -0.49], 'gauss or microtesla'),
-    ([2.0, 15.0, -49.0], 'gauss or microtesla'),
+    ([0.02, 0.15, -0.49], 'gauss'),
+    ([2.0, 15.0, -49.0], 'gauss'),
 ])
 def test_invalid_fields_are_counted_and_rejected(field, cause):
     s = stage()
@@ -128,7 +129,7 @@ def test_fields_of_millitesla_pass_with_a_larger_max_field():
 def test_a_reading_of_an_unknown_sensor_is_counted_and_rejected():
     s = stage()
     assert fed(s, sample(1.0, sensor='mag_9')) == []
-    assert rejected(s.counts) == {'unknown sensor mag_9': 1}
+    assert_counts(rejected(s.counts), {'mag_9': 1})
 
 
 def test_a_missing_axis_stays_missing():
@@ -141,14 +142,14 @@ def test_duplicate_and_out_of_order_timestamps_are_counted_and_rejected():
     s = stage()
     for t in (1.0, 1.0, 0.5, 1.1):
         fed(s, sample(t))
-    assert rejected(s.counts) == {'duplicate timestamp': 1, 'out of order': 1}
+    assert_counts(rejected(s.counts), {'duplicate': 1, 'order': 1})
 
 
 def test_a_jump_back_in_time_is_accepted_and_counted():
     s = stage()
     fed(s, sample(100.0))
     assert len(fed(s, sample(1.0))) == 1
-    assert s.counts['time jumped back'] == 1
+    assert count_of(s.counts, 'jumped') == 1
 
 
 def test_implausible_message_covariances_are_overruled_unless_trusted():
@@ -173,7 +174,7 @@ def test_implausible_message_covariances_are_overruled_unless_trusted():
         np.testing.assert_array_equal(fed(s, sample(1.0 + k, covariance=C))[0].covariance, C)
     for C in (*implausible[:4], *implausible[6:]):
         assert fed(s, sample(9.0, covariance=C)) == []
-    assert rejected(s.counts) == {'covariance is not positive definite': 24}
+    assert_counts(rejected(s.counts), {'definite': 24})
 
 
 def test_forget_refuses_an_unknown_sensor():
@@ -230,7 +231,7 @@ def test_a_reading_without_an_axis_that_the_correction_needs_is_rejected():
     field = [EARTH[0], EARTH[1], np.nan]
     s = corrected(correction=SOFT_IRON + 0.01)
     assert fed(s, sample(1.0, field, 'mag_2')) == []
-    assert rejected(s.counts) == {'an axis that the correction needs is missing': 1}
+    assert_counts(rejected(s.counts), {'axis': 1})
     # An offset needs no other axis.
     (out,) = fed(corrected(offset=HARD_IRON), sample(1.0, field, 'mag_2'))
     np.testing.assert_allclose(out.field[:2], -HARD_IRON[:2], atol=1e-18)
@@ -271,7 +272,7 @@ def test_a_new_calibration_keeps_a_background_that_a_target_has_frozen():
     np.testing.assert_allclose(np.mean([s.field for s in out], axis=0), car, atol=1e-8)
     # The timestamps use the new clock offset, and are accepted as chronological.
     assert out[0].stamp_ns == 1000 * 10**7 - 250_000_000
-    assert stage.counts['rejected: out of order'] == 0
+    assert count_of(stage.counts, 'rejected: out') == 0
 
 
 def test_a_new_hard_iron_offset_restarts_learning():

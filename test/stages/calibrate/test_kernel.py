@@ -10,6 +10,7 @@ from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate import stage as calibrate
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import OVERRULED, Calibrate
+from support.counters import count_of
 from support.faulty_streams import FAULTS, stream
 from support.networks import line_network
 from support.plain_calibration import PlainCalibration
@@ -125,7 +126,7 @@ def test_a_new_calibration_and_relearning_do_not_depend_on_batches():
         found.append((samples_of(*out), stage.counts))
     assert_equal(found[0][0], found[1][0])
     assert found[0][1] == found[1][1]
-    assert found[0][1]['held back while learning'] > 2 * 300
+    assert count_of(found[0][1], 'held back') > 2 * 300
 
 
 def test_later_readings_do_not_modify_earlier_outputs():
@@ -171,7 +172,7 @@ def test_an_axis_that_appears_later_is_held_back_while_learning():
     fields[:600, 1] = np.nan
     stage = checked_stage(network, [MagSample(10**18 + k * 10**7, 'mag_1', f)
                                     for k, f in enumerate(fields)])
-    assert stage.counts['axes held back while learning'] > 20
+    assert count_of(stage.counts, 'axes held') > 20
 
 
 def test_arrays_of_other_types_and_layouts_are_accepted():
@@ -226,7 +227,7 @@ def test_corrupt_timestamps_do_not_confirm_each_other():
     times_s = [1, 2, 1000, 3, 1001, 4, 1000.5, 5]
     for k, t in enumerate(times_s):
         stage.feed(one(MagSample(int(t * 1e9), 'mag_1', np.full(3, 1e-8 * (k + 1)))))
-    assert stage.counts['rejected: timestamp too far ahead'] == 3
+    assert count_of(stage.counts, 'ahead') == 3
     assert stage.counts['calibrated'] == 5
 
 
@@ -240,7 +241,7 @@ def test_a_clock_step_is_confirmed_once_even_with_a_stored_background():
         if k == 1:
             stage.resume({'mag_1': stored})
         stage.feed(one(MagSample(int((t + 1.0) * 1e9), 'mag_1', np.full(3, 1e-8 * (k + 1)))))
-    assert stage.counts['rejected: timestamp too far ahead'] == 1
+    assert count_of(stage.counts, 'ahead') == 1
 
 
 def test_flush_clears_the_history_of_spike_screening():

@@ -13,8 +13,8 @@ from mag_tracking.inference.driving_direction import rotation_of_pass
 from mag_tracking.messages.schema import pass_event_dict
 from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.event_tables import EVENT_COLUMNS
 from mag_tracking.records import Readings
+from mag_tracking.results.columns import EVENTS, names_of
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.events.single_sensor_pass import closest_point
 from mag_tracking.stages.events.stage import Events
@@ -22,6 +22,7 @@ from mag_tracking.stages.track.manager import NO_SCALE_FRAMES
 from mag_tracking.units import NS
 from support import spoiler
 from support.bundled import LINEARISED_ONCE, NETWORK_FILE, VEHICLES, vehicle_path
+from support.counters import count_of
 from support.marks import studied
 from support.spoilt_runs import recorded
 
@@ -174,8 +175,7 @@ def test_a_single_sensor_tracks_only_with_a_prior_and_its_poses_are_ambiguous():
     readings = spoiler.only_sensor('mag_1')(recorded('straight_car_right').readings)
     result = mt.track(readings, single)
     assert not len(result.poses)
-    assert result.counts['track'][
-        'detections not tracked (scale not observable with one sensor)'] > 0
+    assert count_of(result.report.counts['track'], 'detections not') > 0
     result = mt.track(readings, single, settings={'track.single_sensor_prior': True})
     assert len(result.poses) and result.poses['ambiguous'].all()
     assert result.smoothed['ambiguous'].all()
@@ -185,7 +185,7 @@ def test_a_network_with_a_single_active_sensor_tracks_only_with_a_prior():
     readings = spoiler.only_sensor('mag_2')(recorded('straight_car_right').readings)
     result = mt.track(readings, NETWORK)
     assert len(result.detections) and not len(result.poses)
-    assert result.counts['track'][NO_SCALE_FRAMES] > 10
+    assert result.report.counts['track'][NO_SCALE_FRAMES] > 10
     result = mt.track(readings, NETWORK, settings={'track.single_sensor_prior': True})
     assert len(result.poses) and result.poses['ambiguous'].all()
 
@@ -197,7 +197,7 @@ def test_a_track_that_begins_when_a_sensor_returns_is_ambiguous():
     begin_ns = mt.track(readings, NETWORK, settings=LINEARISED_ONCE).poses['stamp_ns'][0]
     assert begin_ns < readings.stamp_ns[silent].max(), 'no track begins during the dropout'
     result = mt.track(readings.part(~silent), NETWORK, settings=LINEARISED_ONCE)
-    assert result.counts['track'][NO_SCALE_FRAMES] > 0
+    assert result.report.counts['track'][NO_SCALE_FRAMES] > 0
     assert len(result.poses) and result.poses['ambiguous'].all()
     assert result.poses['stamp_ns'][0] > readings.stamp_ns[silent].max() - 0.1 * NS
 
@@ -276,19 +276,20 @@ def test_the_event_of_a_target_that_stays_has_not_ended():
     assert len(events) == 2 and not any(e.ended for e in events)
 
 
-def test_the_events_command_prints_counts_and_writes_tables(tmp_path, capsys):
-    assert main(['events', str(vehicle_path('straight_car_right')), '--network', str(NETWORK_FILE),
-                 '--out', str(tmp_path / 'out')]) == 0
+def test_replay_prints_counts_and_writes_tables(tmp_path, capsys):
+    command = ['replay', str(vehicle_path('straight_car_right')), '--network', str(NETWORK_FILE),
+               '--tables', 'events', '--out']
+    assert main([*command, str(tmp_path / 'out')]) == 0
     out = capsys.readouterr().out
-    assert 'mag_1: 1 event, mag_2: 1 event' in out and 'left to right (98%)' in out
+    assert 'mag_1: 1 event, mag_2: 1 event' in out and 'right (98%)' in out
     assert ' m/s' not in out and 'unique' not in out
     with open(tmp_path / 'out' / 'events.csv', newline='') as stream:
         rows = list(csv.DictReader(stream))
-    assert tuple(rows[0]) == EVENT_COLUMNS and {r['sensor'] for r in rows} == {'mag_1', 'mag_2'}
+    assert tuple(rows[0]) == names_of(EVENTS) and {r['sensor'] for r in rows} == {'mag_1', 'mag_2'}
     with open(tmp_path / 'out' / 'signatures.csv', newline='') as stream:
         assert len(list(csv.DictReader(stream))) == 66
-    assert main(['events', str(vehicle_path('straight_car_right')), '--network', str(NETWORK_FILE),
-                 '--out', str(vehicle_path('straight_car_right').parent)]) == 1
+    assert {p.name for p in (tmp_path / 'out').iterdir()} == {'events.csv', 'signatures.csv'}
+    assert main([*command, str(vehicle_path('straight_car_right').parent)]) == 1
 
 
 def test_events_from_python_match_the_command():

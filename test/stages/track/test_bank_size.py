@@ -15,9 +15,7 @@ from support.networks import line_network
 
 @pytest.mark.parametrize('target, changes, product', [
     ('vehicle', {'track.vehicle.speeds': [1.0 + 1e-3 * k for k in range(100_000)]},
-     '75600000 starting hypotheses, kinds (3) x arrival_names (3) x lateral_offsets (3) x speeds '
-     '(100000) x moment directions (14) x straight or turning (2), with 44 states each for 2 '
-     'sensors (track.max_sensors) need 1.17e+03 GB of memory; the limit is 4.29 GB'),
+     'speeds (100000)'),
     ('vehicle', {**POINT, 'track.vehicle.lateral_offsets': [1e-3 * k for k in range(10_000)]},
      'lateral_offsets (10000)'),
     ('vehicle', {'track.vehicle.arrival_names': [str(k) for k in range(3000)],
@@ -29,20 +27,14 @@ def test_too_many_hypotheses_are_rejected_with_their_number(target, changes, pro
     assert str(error.value).startswith(f'track.{target}: ') and product in str(error.value)
 
 
-@pytest.mark.parametrize('changes, message', [
-    ({'grid_points': 1_000_000},
-     'track.magnet.grid_points: 1000000 points x 90 sensors need 6.48 GB of memory; '
-     'the limit is 4.29 GB'),
-    ({'starts': 1000},
-     'track.magnet: 1000 starting hypotheses, starts (1000), with 822 states each for 90 sensors')])
-def test_too_many_hypotheses_of_a_magnet_are_rejected(changes, message):
-    changes = {f'track.magnet.{name}': value for name, value in changes.items()}
-    settings = settings_for('magnet', {'track.mounting_std_deg': 5.0, 'track.max_sensors': 90,
-                                       'track.model_error_time_s': 0.3, **changes})
+def test_too_many_hypotheses_of_a_magnet_are_rejected():
+    settings = settings_for('magnet', {'track.mounting_std_deg': 5.0, 'track.max_sensors': 600,
+                                       'track.model_error_time_s': 0.3})
     Pipeline(line_network(9), settings)
     with pytest.raises(SettingsError) as error:
-        Pipeline(line_network(90), settings)
-    assert message in str(error.value)
+        Pipeline(line_network(600), settings)
+    assert 'track.magnet: 24 starting hypotheses, optima (24), with 5412 states each for 600 ' \
+        'sensors (track.max_sensors) need 5.62 GB of memory' in str(error.value)
 
 
 def bytes_at_start(n, settings):
@@ -104,6 +96,5 @@ def test_the_number_of_retained_hypotheses_is_limited_by_memory(n):
 def test_more_sensors_than_fit_into_memory_are_rejected():
     changes = {'track.max_sensors': 1000}
     Pipeline(line_network(90), settings_for('vehicle', changes))
-    with pytest.raises(SettingsError, match=r'track.max_sensors: 100 hypotheses with the '
-                       r'states of 400 sensors need 10.5 GB of memory; the limit is 4.29 GB'):
+    with pytest.raises(SettingsError, match='track.max_sensors: 100 .*400 sensors .*10.5 GB'):
         Pipeline(line_network(400), settings_for('vehicle', changes))

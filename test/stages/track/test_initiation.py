@@ -11,7 +11,14 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_magnet import start_magnet
-from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
+from mag_tracking.stages.track.initiation_vehicle import (
+    CROSS_SPEED_STD,
+    MAX_START_DISTANCE,
+    SPEED_STD,
+    TURN_SHARE,
+    start_vehicle,
+    vehicle_model,
+)
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
@@ -70,17 +77,18 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
                        np.full(2, 8), np.zeros(2))
     bank = start_vehicle(vehicle, road_network, frame, 2e-8, None)
     model = vehicle_model(vehicle, road_network)
+    moments, lengths = np.array([(k.moment, k.length) for k in vehicle.kinds])[bank.kind].T
     length, turn = (model.state_names.index(name) for name in 'Lw')
     m = model.dipoles(bank.x[:, :turn + 1]).m.sum(axis=1)
-    np.testing.assert_allclose(np.linalg.norm(m, axis=1), np.take(vehicle.moments, bank.kind),
+    np.testing.assert_allclose(np.linalg.norm(m, axis=1), moments,
                                rtol=1e-9)
-    np.testing.assert_array_equal(bank.x[:, length], np.take(vehicle.lengths, bank.kind))
+    np.testing.assert_array_equal(bank.x[:, length], lengths)
     # In 50 uT, the soft iron of each axis contributes the induced share of this moment.
     soft = [model.state_names.index(f'D{axis}') for axis in 'xyz']
-    share = bank.x[:, soft] * 5e-5 / MU0 / np.take(vehicle.moments, bank.kind)[:, None]
+    share = bank.x[:, soft] * 5e-5 / MU0 / moments[:, None]
     np.testing.assert_allclose(share, vehicle.induced_share, rtol=1e-12)
     share_covariance = (bank.P[:, soft][:, :, soft] * (5e-5 / MU0)**2
-                        / np.square(np.take(vehicle.moments, bank.kind))[:, None, None])
+                        / np.square(moments)[:, None, None])
     np.testing.assert_allclose(share_covariance / vehicle.induced_share_std**2 - 1.0,
                                np.tile(np.eye(3), (len(bank), 1, 1)), atol=1e-9)
     assert len(bank) == 3 * 3 * 14 * 3 * 3 * 2
@@ -91,7 +99,7 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
     speed = np.hypot(*bank.x[:, 3:5].T)[turns]
     np.testing.assert_allclose(bank.P[turns, turn, turn],
                                (0.5 * vehicle.turn_acceleration / speed)**2)
-    assert np.exp(bank.log_w[turns]).sum() == pytest.approx(vehicle.turn_share)
+    assert np.exp(bank.log_w[turns]).sum() == pytest.approx(TURN_SHARE)
     assert len(set(bank.origin)) == len(bank)
     # The length and the differences between dipoles of a point have no variance.
     points = bank.P[bank.kind == 0]
@@ -107,7 +115,7 @@ def test_every_vehicle_starts_with_the_moment_of_the_settings(road_network):
         # The standard deviations of the velocity match the settings, relative to the speed.
         ahead = np.array([np.cos(heading), np.sin(heading)])
         across = np.array([-ahead[1], ahead[0]])
-        for direction, share in ((ahead, vehicle.speed_std), (across, vehicle.cross_speed_std)):
+        for direction, share in ((ahead, SPEED_STD), (across, CROSS_SPEED_STD)):
             std = np.sqrt(direction @ bank.P[rows, 3:5, 3:5] @ direction)
             np.testing.assert_allclose(std, share * speed, rtol=1e-9)
 
@@ -148,9 +156,9 @@ def test_a_vehicle_starts_where_its_field_first_has_the_frame_energy(missing):
     assert reached.mean() > 0.5
     # A vehicle that never reaches the energy starts at the outermost sensor.
     np.testing.assert_allclose(before[~reached], 0.0, atol=1e-9)
-    starts_inside = reached & (before < vehicle.max_start_distance - 1e-9)
+    starts_inside = reached & (before < MAX_START_DISTANCE - 1e-9)
     assert starts_inside.mean() > 0.5
-    assert (energy(vehicle.max_start_distance / 159.0)[starts_inside] < required).all()
+    assert (energy(MAX_START_DISTANCE / 159.0)[starts_inside] < required).all()
 
 
 def test_the_start_covariance_includes_the_model_error():
@@ -190,6 +198,22 @@ def test_a_magnet_track_estimates_mounting_angles():
     assert tracks[-1].mounting.shape == (9, 3)
     assert (tracks[0].mounting_std <= np.deg2rad(2.0)).all()
     assert (tracks[0].mounting_std > np.deg2rad(0.1)).all()
+
+
+@pytest.mark.parametrize('name, is_spin', [
+    ('speed_std', False), ('acceleration', False), ('spin_std', True),
+    ('angular_acceleration', True)])
+def test_a_magnet_that_may_move_faster_has_a_less_certain_pose(name, is_spin):
+    network, frames, _ = magnet_frames(2)
+    variances = []
+    for value in (1e-4, 10.0):
+        settings = settings_for('bench', {f'track.magnet.{name}': value}).track
+        stage = TrackManager(network, settings)
+        track = [t for f in frames for t in stage.feed(f)][-1]
+        # The largest variance of the orientation is that of the unobservable roll.
+        variances.append(np.linalg.eigvalsh(track.orientation_covariance)[:2].sum() if is_spin
+                         else np.trace(track.covariance))
+    assert variances[1] > 1.01 * variances[0]
 
 
 def test_drifting_backgrounds_are_not_a_target(road_network):

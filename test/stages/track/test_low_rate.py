@@ -8,6 +8,7 @@ import pytest
 import mag_tracking as mt
 from mag_tracking.pipeline import settings_for
 from mag_tracking.stages.track import doubts
+from mag_tracking.stages.track.initiation_vehicle import LATERAL_STD
 from mag_tracking.stages.track.low_rate import low_rate_fault, required_rate
 from mag_tracking.stages.track.manager import TOO_SLOW
 from support.bundled import NETWORK_FILE
@@ -44,7 +45,7 @@ def test_a_vehicle_at_the_required_rate_moves_less_than_its_distance(n):
     """Half of the rate resolves frequencies at which the field of the pass is below 5 %."""
     network = line_network(n)
     rate = required_rate(network, SETTINGS)
-    distance = np.hypot(4.5, SETTINGS.vehicle.lateral_std)
+    distance = np.hypot(4.5, LATERAL_STD)
     assert np.exp(-np.pi * rate * distance / 10.0) < 0.05
 
 
@@ -64,14 +65,14 @@ def test_a_low_rate_is_described_with_both_numbers():
 @pytest.mark.parametrize('every', [50, 100, 400])
 def test_no_track_is_claimed_at_a_low_rate(every):
     result = tracked(thinned(every))
-    assert not result.tracks and not result.counts['track'].get('tracks', 0)
+    assert not result.tracks and not result.report.counts['track'].get('tracks', 0)
 
 
 @pytest.mark.parametrize('every', [10, 20, 30])
 def test_tracks_above_the_required_rate_are_right_or_ambiguous(every):
     assert 100.0 / every > required_rate(NETWORK, SETTINGS)
     result = tracked(thinned(every))
-    assert len(result.tracks) == 1 and not result.counts['track'].get(TOO_SLOW, 0)
+    assert len(result.tracks) == 1 and not result.report.counts['track'].get(TOO_SLOW, 0)
     errors = replace(result, truth=recorded(RECORDING).truth).errors()
     assert errors['anees'] < 3.0 or result.poses['ambiguous'].all()
 
@@ -86,7 +87,7 @@ def test_a_slow_sensor_beside_a_fast_one_is_not_enough():
         np.median(readings.field[readings.sensor == j][:200], axis=0) for j in range(2)))
     result = mt.track(readings.part(keep), network)
     assert result.detections['onset'].any() and not result.tracks
-    assert result.counts['track'][TOO_SLOW]
+    assert result.report.counts['track'][TOO_SLOW]
 
 
 def test_a_track_at_a_rate_that_falls_is_ambiguous():

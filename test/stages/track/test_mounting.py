@@ -79,7 +79,7 @@ def rotated_pass():
                            np.random.default_rng(6))
     R = rotation_from_quaternion(quaternion_from_rotation_vector(ANGLES))
     pipeline = Pipeline(network, settings_for('vehicle', {
-        **POINT, 'track.field_error': 0.02, 'track.vehicle.near_field_lengths': [0.0]}))
+        **POINT, 'track.field_error': 0.02, 'track.vehicle.kinds.car.near_field_length': 0.0}))
     tracks, frames = [], {}
     for s in samples:
         rotated = R[network.names.index(s.sensor)] @ s.field
@@ -142,7 +142,7 @@ def passes(n):
                 network, point_body([300.0, -150.0, 80.0], 5.0, 0.5),
                 Path(np.array([-70.0, side]), 0.0, 10.0), seed=seed,
                 changes={**POINT, 'track.mounting_std_deg': mounting, 'track.field_error': 0.02,
-                         'track.vehicle.near_field_lengths': [0.0]},
+                         'track.vehicle.kinds.car.near_field_length': 0.0},
                 flaws=SensorErrorModel(bias_std=1e-6, tilt_std=np.deg2rad(5.0)))
             live = [t for t in tracks if not t.ended]
             for t, q in zip(live, truth, strict=True):

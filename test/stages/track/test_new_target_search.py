@@ -24,6 +24,7 @@ from mag_tracking.stages.track.window_start import in_order_of, inserted, overla
 from mag_tracking.units import NS
 from support import busy_worlds
 from support.busy_worlds import NETWORKS, passing, world
+from support.counters import count_of
 
 PERIOD = round(0.08 * NS)
 
@@ -192,7 +193,7 @@ def meeting():
 def test_two_vehicles_that_meet_keep_their_tracks(meeting):
     scene, records, pipeline = meeting
     tracks = [r for r in records if isinstance(r, Track)]
-    assert {t.id for t in tracks} == {1, 2} and pipeline.track.counts['tracks of new targets'] == 1
+    assert {t.id for t in tracks} == {1, 2} and count_of(pipeline.track.counts, 'of new') == 1
     score = busy_worlds.score([t for t in tracks if not t.ended],
                               [(scene.t, p) for p in scene.positions])
     assert score.is_found.all() and score.rms.max() <= 1.0, str(score)
@@ -227,7 +228,7 @@ def test_slow_sensors_at_staggered_times_find_a_new_target():
                           covariance=None if readings.covariance is None
                           else readings.covariance[order]))
     pipeline.flush()
-    assert pipeline.track.counts['tracks of new targets'] == 1
+    assert count_of(pipeline.track.counts, 'of new') == 1
 
 
 def test_joint_tracks_do_not_depend_on_batches(meeting):

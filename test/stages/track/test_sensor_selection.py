@@ -9,7 +9,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.simulation.scenario import Path, point_body
-from mag_tracking.stages.track import bank_size, manager
+from mag_tracking.stages.track import bank_size, manager, track_bank
 from mag_tracking.stages.track.approach import Approach
 from mag_tracking.stages.track.doubts import DOUBTFUL_BACKGROUND
 from mag_tracking.stages.track.sensor_selection import (
@@ -19,6 +19,7 @@ from mag_tracking.stages.track.sensor_selection import (
 )
 from mag_tracking.stages.track.smoothing import NOT_SMOOTHED
 from support.bundled import POINT
+from support.counters import count_of
 from support.networks import line_network
 from support.samples import one, simulate
 
@@ -104,7 +105,7 @@ def test_a_target_is_tracked_along_forty_sensors():
     print(f'rms {np.sqrt((e**2).sum(axis=1).mean()):.2f} m, mean NEES {np.mean(nees):.2f} of 2')
     assert np.sqrt((e**2).sum(axis=1).mean()) < 0.5
     assert np.mean(nees) < 4.0
-    assert pipeline.counts()['track']['tracks handed over to other sensors'] >= 10
+    assert count_of(pipeline.counts()['track'], 'handed over') >= 10
     frames = {r.stamp_ns: r for r in records if isinstance(r, FieldFrame)}
     for t in inside:
         assert t.predicted.shape == (40, 3) and t.mounting.shape == (40, 3)
@@ -134,7 +135,7 @@ def test_further_sensors_join_after_the_frames_before_the_detection(monkeypatch,
         assert max(np.count_nonzero(~np.isnan(t.nis_by_sensor)) for t in live) == min(limit, 12)
         smoothed = [r for r in records if isinstance(r, SmoothedPose) and r.complete]
         if limit == 16:
-            assert pipeline.track.counts['tracks handed over to other sensors'] == 0
+            assert count_of(pipeline.track.counts, 'handed over') == 0
             assert [p.stamp_ns for p in smoothed] == [t.stamp_ns for t in live]
             errors = [np.linalg.norm(p.position[:2] - truth(p.stamp_ns / 1e9)) for p in smoothed
                       if 0.0 < truth(p.stamp_ns / 1e9)[0] < 45.0]
@@ -191,7 +192,7 @@ def test_no_hypothesis_is_dropped_without_frames_before_the_detection(monkeypatc
         monkeypatch.setattr(bank_size, name, value)
     first = next(k for k, f in enumerate(frames[1]) if f.target_present)
     tracker, _ = track_frames(frames, {}, start=slice(first, first + 1))
-    assert len(tracker.bank) == settings_for('vehicle').track.max_initial_hypotheses
+    assert len(tracker.bank) == track_bank.MAX_INITIAL_HYPOTHESES
     _, tracks = track_frames(frames, POINT, start=slice(first, None))
     used = [np.count_nonzero(~np.isnan(t.nis_by_sensor)) for t in tracks]
     assert used[0] <= 4 < max(used)
@@ -216,7 +217,7 @@ def test_the_first_pose_is_flagged_for_a_sensor_that_joins_with_it(monkeypatch, 
         monkeypatch.setattr(manager, 'sensors_at_start', lambda *_, n=n: n)
         tracker, tracks = track_frames(frames, POINT, {far: ((0, 2**62),)})
         assert DOUBTFUL_BACKGROUND in tracks[0].doubts
-        assert tracker.counts['tracks with doubtful readings: doubtful_background'] == 1
+        assert count_of(tracker.counts, 'doubtful_background') == 1
 
 
 def test_a_network_of_at_most_max_sensors_is_used_completely():

@@ -3,60 +3,21 @@
 import csv
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from os import PathLike
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from mag_tracking.analysis.correlated_motion import CorrelatedMotion
+from mag_tracking.analysis.fitted_pass import FittedPass
 from mag_tracking.analysis.pass_result import Bearing, PassFit
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import OutputError
 from mag_tracking.files import new_text_file, output_folder
 from mag_tracking.report.json_text import without_nan
+from mag_tracking.results.columns import FITS, names_of
 
-FIT_COLUMNS = (
-    'recording', 'pass', 'vehicle', 'n_vehicles', 'n_dipoles', 'chosen', 'reason', 'stamp_ns',
-    'n_values', 'n_unknowns', 'normalised_cost', 'explained', 'residual_elsewhere',
-    'velocity_change',
-    'trusted', 'ambiguous',
-    'x', 'y', 'z', 'vx', 'vy', 'vz', 'sd_x', 'sd_y', 'sd_z', 'sd_vx', 'sd_vy', 'sd_vz',
-    'speed', 'sd_speed', 'heading_deg', 'sd_heading_deg', 'length', 'sd_length',
-    'mx', 'my', 'mz', 'sd_mx', 'sd_my', 'sd_mz', 'cpa_time', 'sd_cpa_time',
-    'cpa_range', 'sd_cpa_range', 'rate', 'sd_rate',
-    'delay_speed', 'sd_delay_speed', 'delay_heading_deg', 'sd_delay_heading_deg', 'no_delay')
-"""Columns of `fits.csv`. Standard deviations are from `PassFit.robust_covariance`, those of
-positions from `PassFit.position_covariance`. The closest point of approach (CPA) refers to the
-centre of the sensors; its time is in seconds after `stamp_ns`. `rate` is the speed divided by the
-CPA range, which a single sensor can observe; the corresponding directions are in `fits.json`. For a
-fit that is not trusted as a whole, only the trusted quantities (speed, heading, time of the CPA)
-are written, and only if the fit is reported for its pass. Jointly fitted vehicles share their
-unknowns and costs. The speed and heading from the delays between sensors are model-free and equal
-for all fits of a pass."""
-
-
-class _FittedPass(Protocol):
-    """Interface of `apps.pass_fitter.FittedPass`."""
-
-    @property
-    def recording(self) -> str: ...
-    @property
-    def number(self) -> int: ...
-    @property
-    def vehicle(self) -> int: ...
-    @property
-    def n_vehicles(self) -> int: ...
-    @property
-    def fits(self) -> Sequence[PassFit]: ...
-    @property
-    def notes(self) -> Sequence[str]: ...
-    @property
-    def reported(self) -> PassFit | None: ...
-    @property
-    def correlated(self) -> CorrelatedMotion: ...
-    @property
-    def chosen(self) -> PassFit | None: ...
+_NAMES = names_of(FITS)
 
 
 def fit_row(fit: PassFit, is_reported: bool = True) -> dict[str, Any]:
@@ -64,7 +25,7 @@ def fit_row(fit: PassFit, is_reported: bool = True) -> dict[str, Any]:
 
     A fit that is neither trusted nor reported for its pass lacks its trusted quantities too.
     """
-    row: dict[str, Any] = dict.fromkeys(FIT_COLUMNS[FIT_COLUMNS.index('stamp_ns'):], math.nan)
+    row: dict[str, Any] = dict.fromkeys(_NAMES[_NAMES.index('stamp_ns'):], math.nan)
     row |= {'ambiguous': '', 'trusted': '', 'n_dipoles': fit.n_dipoles, 'reason': fit.reason,
             'stamp_ns': fit.data.stamp_ns, 'n_values': fit.data.n_values,
             'n_unknowns': fit.n_unknowns}
@@ -78,39 +39,36 @@ def fit_row(fit: PassFit, is_reported: bool = True) -> dict[str, Any]:
         row |= {'cpa_time': b.cpa_time, 'sd_cpa_time': b.cpa_time_std, 'rate': b.rate,
                 'sd_rate': b.rate_std}
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
-    if fit.reason:
-        return row | (_trusted_quantities(fit, centre) if is_reported else {})
-    row['ambiguous'] = int(fit.ambiguous)
-    sd = np.sqrt(np.concatenate([np.diagonal(fit.position_covariance),
-                                 np.diagonal(fit.robust_covariance)[3:6]]))
-    moment, P = fit.moment
-    heading = [math.degrees(v) for v in fit.heading]
-    groups: tuple[tuple[str, Iterable[float]], ...] = (
-        ('x y z', fit.position), ('vx vy vz', fit.velocity),
-        ('sd_x sd_y sd_z sd_vx sd_vy sd_vz', sd), ('speed sd_speed', fit.speed),
-        ('heading_deg sd_heading_deg', heading), ('length sd_length', fit.length),
-        ('mx my mz', moment), ('sd_mx sd_my sd_mz', np.sqrt(np.diagonal(P))),
-        ('cpa_time sd_cpa_time cpa_range sd_cpa_range', fit.closest_approach(centre)))
+    trusted = fit.trusted if fit.reason and is_reported else ()
+    groups: list[tuple[str, Iterable[float]]] = []
+    if not fit.reason or 'speed' in trusted:
+        groups.append(('speed sd_speed', fit.speed))
+    if not fit.reason or 'direction' in trusted:
+        groups.append(('heading_deg sd_heading_deg', np.degrees(fit.heading)))
+    if not fit.reason or 'time' in trusted:
+        groups.append(('cpa_time sd_cpa_time', fit.closest_approach(centre)[:2]))
+    if not fit.reason:
+        row['ambiguous'] = int(fit.ambiguous)
+        moment, P = fit.moment
+        groups += [
+            ('x y z', fit.position), ('sd_x sd_y sd_z', _std(fit.position_covariance)),
+            ('vx vy vz', fit.velocity),
+            ('sd_vx sd_vy sd_vz', _std(fit.robust_covariance[3:6, 3:6])),
+            ('length sd_length', fit.length), ('mx my mz', moment), ('sd_mx sd_my sd_mz', _std(P)),
+            ('cpa_range sd_cpa_range', fit.closest_approach(centre)[2:])]
     for names, values in groups:
         row |= dict(zip(names.split(), map(float, values), strict=True))
     return row
 
 
-def _trusted_quantities(fit: PassFit, centre: FloatArray) -> dict[str, float]:
-    """Trusted quantities of a fit, by column; the time of the CPA refers to `centre`, (3,) m."""
-    quantities: dict[str, Iterable[float]] = {}
-    if 'speed' in fit.trusted:
-        quantities['speed sd_speed'] = fit.speed
-    if 'direction' in fit.trusted:
-        quantities['heading_deg sd_heading_deg'] = np.degrees(fit.heading)
-    if 'time' in fit.trusted:
-        quantities['cpa_time sd_cpa_time'] = fit.closest_approach(centre)[:2]
-    return {name: float(value) for names, values in quantities.items()
-            for name, value in zip(names.split(), values, strict=True)}
+def _std(P: FloatArray) -> FloatArray:
+    """Standard deviations of a covariance."""
+    std: FloatArray = np.sqrt(np.diagonal(P))
+    return std
 
 
-def pass_rows(fitted_pass: _FittedPass) -> list[dict[str, Any]]:
-    """Rows of a fitted pass with `FIT_COLUMNS`, one per fit."""
+def pass_rows(fitted_pass: FittedPass) -> list[dict[str, Any]]:
+    """Rows of a fitted pass with the columns `FITS`, one per fit."""
     chosen, reported, c = fitted_pass.chosen, fitted_pass.reported, fitted_pass.correlated
     delay = {'delay_speed': c.speed, 'sd_delay_speed': c.speed_std,
              'delay_heading_deg': math.degrees(c.heading),
@@ -137,7 +95,7 @@ class FitFolder:
         except OSError as error:
             raise OutputError(f'cannot write to {self.folder}: {error.strerror}') from error
         self._writer = csv.writer(self._stream)
-        self._writer.writerow(FIT_COLUMNS)
+        self._writer.writerow(_NAMES)
 
     def __enter__(self) -> 'FitFolder':
         return self
@@ -149,13 +107,12 @@ class FitFolder:
                       allow_nan=False)
             stream.write('\n')
 
-    def add(self, fitted_pass: _FittedPass) -> None:
+    def add(self, fitted_pass: FittedPass) -> None:
         """Write the rows of a fitted pass."""
         for fit, row in zip(fitted_pass.fits, pass_rows(fitted_pass), strict=True):
             self.rows.append(row | {'notes': list(fitted_pass.notes),
                                     'bearing': _bearing(fit.bearing)})
-            self._writer.writerow([repr(v) if isinstance(v, float) else v
-                                   for v in (row[c] for c in FIT_COLUMNS)])
+            self._writer.writerow([row[name] for name in _NAMES])
         self._stream.flush()
 
 

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from mag_tracking.cli import main
-from mag_tracking.report.rerun_file import RERUN_FILE, write_rerun
+from mag_tracking.results.rerun_file import RERUN_FILE, write_rerun
 from support.bundled import NETWORK_FILE, vehicle_path
 
 NAME = 'straight_small_left'
 
 
 def test_a_missing_rerun_sdk_is_reported_before_the_replay(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr('mag_tracking.report.rerun_file.find_spec', lambda _: None)
+    monkeypatch.setattr('mag_tracking.results.rerun_file.find_spec', lambda _: None)
     assert main(['replay', str(vehicle_path(NAME)), '--network', str(NETWORK_FILE), '--rerun',
                  '--out', str(tmp_path / 'out')]) == 1
-    assert 'pip install rerun-sdk' in capsys.readouterr().err
+    assert 'rerun-sdk' in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()
 
 

@@ -9,20 +9,14 @@ import numpy as np
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import SIGNATURE_SPAN, PassEvent
 from mag_tracking.files import new_text_file, output_folder
+from mag_tracking.results.columns import EVENTS, SIGNATURES, names_of, row_of
 from mag_tracking.units import NS
-
-EVENT_COLUMNS = ('sensor', 'number', 'ended', 'onset_ns', 'release_ns', 'peak_ns', 'peak_x_nt',
-                 'peak_y_nt', 'peak_z_nt', 'energy_nt2_s', 'axes', 'closest_ns', 'sd_closest_s',
-                 'time_scale_s', 'left_to_right')
-SIGNATURE_COLUMNS = ('sensor', 'number', 'time_s', 'x_nt', 'y_nt', 'z_nt')
 
 
 def event_row(event: PassEvent) -> list[object]:
-    """Values of `EVENT_COLUMNS` for an event."""
-    return [event.sensor, event.number, event.ended, event.onset_ns, event.release_ns,
-            event.peak_ns, *(_number(1e9 * v) for v in event.peak), _number(1e18 * event.energy),
-            event.axes, event.closest_ns, _number(event.closest_std), _number(event.time_scale),
-            round(event.left_to_right, 4)]
+    """Cells of an event by column; numbers with a unit have six significant digits."""
+    row = row_of(EVENTS, event)
+    return [_number(row[c.name]) if c.kind == 'f' and c.unit else row[c.name] for c in EVENTS]
 
 
 def _number(value: float) -> str:
@@ -36,11 +30,11 @@ def write_events(folder: str | PathLike[str], events: Iterable[PassEvent]) -> No
     try:
         with new_text_file(folder / 'events.csv', newline='') as stream:
             writer = csv.writer(stream)
-            writer.writerow(EVENT_COLUMNS)
+            writer.writerow(names_of(EVENTS))
             writer.writerows(map(event_row, events))
         with new_text_file(folder / 'signatures.csv', newline='') as stream:
             writer = csv.writer(stream)
-            writer.writerow(SIGNATURE_COLUMNS)
+            writer.writerow(names_of(SIGNATURES))
             for event in events:
                 offsets_s = event.time_scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN,
                                                            len(event.signature))

@@ -1,23 +1,56 @@
 """Explanation of a recording without detections: largest excursions and likely cause."""
 
 from collections.abc import Mapping, Sequence
+from typing import Protocol
 
 import numpy as np
 
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Settings
 from mag_tracking.quantities import quantity
+from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
 
 MAX_NOISE_RATIO = 3.0
 """Ratio to the scatter of readings above which a configured standard deviation is too large."""
 
 
-def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
+class StageSettings(Protocol):
+    """Settings of the stages up to the detection."""
+
+    @property
+    def calibrate(self) -> CalibrateSettings:
+        """Settings of the calibration."""
+
+    @property
+    def detect(self) -> DetectSettings:
+        """Settings of the detection."""
+
+
+def no_detection_reason(network: SensorNetwork, settings: StageSettings, calibrate: Calibrate,
                         detect: Detect, missing_topics: Sequence[str],
                         rejected: Mapping[str, int]) -> str | None:
-    """Explain in a sentence why nothing was detected in a whole recording; None if a target was."""
+    """Explain why nothing was detected.
+
+    Parameters
+    ----------
+    network : SensorNetwork
+    settings : StageSettings
+    calibrate : Calibrate
+        Calibration stage after the whole recording.
+    detect : Detect
+        Detection stage after the whole recording.
+    missing_topics : sequence of str
+        Topics of the network that were not recorded.
+    rejected : {cause: number}
+        Rejected readings.
+
+    Returns
+    -------
+    str or None
+        One sentence; None if a target was detected.
+    """
     if detect.counts['onsets']:
         return None
     n_accepted = sum(calibrate.counts_of(name)['accepted'] for name in network.names)
@@ -42,7 +75,7 @@ def no_detection_reason(network: SensorNetwork, settings: Settings, calibrate: C
             f'({by_sensor}); {_likely_cause(network, settings, calibrate, detect)}')
 
 
-def _likely_cause(network: SensorNetwork, settings: Settings, calibrate: Calibrate,
+def _likely_cause(network: SensorNetwork, settings: StageSettings, calibrate: Calibrate,
                   detect: Detect) -> str:
     """Describe the probable cause of the missing detection."""
     unready_sensors = calibrate.unready()

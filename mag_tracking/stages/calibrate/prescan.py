@@ -1,7 +1,7 @@
 """First pass over a recording, to find backgrounds if a target is present at the start."""
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from itertools import chain
 
 from mag_tracking.arrays import FloatArray
@@ -10,14 +10,15 @@ from mag_tracking.calibration.quiet_level import BlockRecorder
 from mag_tracking.calibration.reading_faults import ReadingFaults
 from mag_tracking.calibration.sensor_state import N_WINDOW
 from mag_tracking.network import SensorNetwork
-from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
-from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.units import NS
+
+LOOK_AHEAD_S = 300.0
+"""[s] Duration, from the start of the recording, that is searched for the most frequent level of a
+sensor that is not quiet at the start."""
 
 LEARNING_TOLERANCE_S = 1.0
 """Excess over the nominal learning time above which a target is considered present [s]."""
@@ -67,13 +68,11 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
             settings: CalibrateSettings) -> Prescan:
     """Find the backgrounds of sensors if a target is present at the start of the raw readings.
 
-    The batches are consumed up to `look_ahead_s`. If the network file contains all backgrounds,
-    there are only faults; if `look_ahead_s` is 0, the result is empty.
+    The batches are consumed up to `LOOK_AHEAD_S`. If the network file contains all backgrounds,
+    there are only faults.
     """
     without_background = [name for name, level in zip(network.names, network.background,
                                                       strict=True) if level is None]
-    if not settings.look_ahead_s:
-        return Prescan({}, {}, {})
     batches = iter(batches)
     beginning, faults = _beginning(batches, network, settings)
     if not without_background:
@@ -87,7 +86,7 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
         recorder.feed(readings)
         _learn(learner, readings, first_ns, learnt)
         start_ns = min(first_ns.values(), default=0)
-        if len(readings) and int(readings.stamp_ns[-1]) - start_ns > settings.look_ahead_s * NS:
+        if len(readings) and int(readings.stamp_ns[-1]) - start_ns > LOOK_AHEAD_S * NS:
             break
     levels, steps, is_quiet = {}, {}, True
     for name, background in recorder.backgrounds().items():
@@ -161,19 +160,3 @@ def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: MostFrequent
         return False
     # Without relearning, a level remains the background even if another level lasts.
     return not settings.relearn_s or recorder.is_known_level(learnt[1], level)
-
-
-def prescan_of(recording: Recording, network: SensorNetwork, settings: CalibrateSettings,
-               stopped: Callable[[], bool] | None = None) -> Prescan:
-    """Find the backgrounds of sensors if a target is present at the start of a recording."""
-    # A separate Recording is used, because losses are counted whenever a recording is read.
-    reader = SampleReader(Recording(recording.path), network)
-
-    def batches() -> Iterator[Readings]:
-        try:
-            yield from until_stopped(reader.readings, None, stopped)
-        except ReadingStopped:
-            return
-
-    found = prescan(batches(), network, settings)
-    return replace(found, clocks=reader.clocks)

@@ -25,8 +25,8 @@ from typing import Any
 
 from mag_tracking.errors import OutputError
 from mag_tracking.files import output_folder, replace_text
-from mag_tracking.recording.archive_tables import TABLES
-from mag_tracking.recording.parquet_table import (
+from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.parquet_table import (
     VERSION,
     TableWriter,
     check_row,

@@ -8,9 +8,10 @@ import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from mag_tracking.errors import MissingDependencyError, OutputError
+from mag_tracking.results.columns import Column
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -24,25 +25,6 @@ MAX_BUFFERED_ROWS = 5000
 
 _MAGIC = b'PAR1'
 """First and last bytes of a file."""
-
-
-class Column(NamedTuple):
-    """Description of a column of a table."""
-
-    name: str
-    """Name of the column."""
-    kind: str
-    """Type: 't' for UTC time, 'i' for integer, 'f' for float, 's' for string, 'b' for boolean, and
-    'C' for a (6, 6) matrix in row-major order, which is NaN if it is unknown."""
-    unit: str
-    """Unit; empty for a dimensionless column."""
-    meaning: str
-    """Description."""
-
-
-def columns_of(kind: str, unit: str, /, **meanings: str) -> tuple[Column, ...]:
-    """Create columns of the same type and unit from their descriptions by name."""
-    return tuple(Column(name, kind, unit, meaning) for name, meaning in meanings.items())
 
 
 def check_row(row: Mapping[str, Any], columns: Iterable[Column]) -> None:
@@ -118,7 +100,7 @@ class TableWriter:
             raise OutputError(f'cannot write {self._path}: {error.strerror or error}') from error
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Add a row; missing columns are null, and NaN in a matrix."""
+        """Add a row; missing columns and NaN are null, except in a matrix, which is NaN."""
         self._rows.append({**self._unknown, **row})
         if len(self._rows) >= MAX_BUFFERED_ROWS:
             self._flush()
@@ -133,10 +115,7 @@ class TableWriter:
         """Write the buffered rows."""
         rows, self._rows = self._rows, []
         if rows:
-            # Parquet stores only UTF-8 text, but a path may contain other bytes.
-            rows = [{name: value.encode(errors='backslashreplace').decode()
-                     if isinstance(value, str) else value for name, value in row.items()}
-                    for row in rows]
+            rows = [{name: _stored(value) for name, value in row.items()} for row in rows]
             with self._convert_errors():
                 self._writer.write_table(
                     import_pyarrow().Table.from_pylist(rows, self._schema))
@@ -154,3 +133,10 @@ class TableWriter:
                     self._draft.replace(self._path)
         finally:
             self._draft.unlink(missing_ok=True)
+
+
+def _stored(value: Any) -> Any:
+    """Value that Parquet stores: UTF-8, although a path may have other bytes, and null for NaN."""
+    if isinstance(value, str):
+        return value.encode(errors='backslashreplace').decode()
+    return None if isinstance(value, float) and math.isnan(value) else value

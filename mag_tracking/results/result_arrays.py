@@ -1,39 +1,32 @@
 """Poses, smoothed poses and detections as structured arrays, one element per record."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from mag_tracking.arrays import StructArray
 from mag_tracking.records import Detection, SmoothedPose, Track
 
-_Fields: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
-"""Maps field names to (type, shape of one element)."""
-
 _TEXT_WIDTH = 16
 """Minimum width of a string field in characters. Longer names widen the field."""
 
-_STATE_FIELDS: _Fields = {
-    'stamp_ns': ('i8', ()), 'track_id': ('i8', ()),
-    'position': ('f8', (3,)), 'velocity': ('f8', (3,)), 'covariance': ('f8', (6, 6)),
-    'orientation': ('f8', (4,)), 'orientation_covariance': ('f8', (3, 3)),
-    'position_orientation_covariance': ('f8', (3, 3)),
-    'moment': ('f8', (3,)), 'moment_covariance': ('f8', (3, 3)),
-    'kind': ('U', ()), 'length': ('f8', ()), 'length_std': ('f8', ()), 'ambiguous': ('?', ())}
+_STATE_FIELDS = {
+    'stamp_ns': 'i8', 'track_id': 'i8', 'position': '3f8', 'velocity': '3f8',
+    'covariance': '(6,6)f8', 'orientation': '4f8', 'orientation_covariance': '(3,3)f8',
+    'position_orientation_covariance': '(3,3)f8', 'moment': '3f8', 'moment_covariance': '(3,3)f8',
+    'kind': 'U', 'length': 'f8', 'length_std': 'f8', 'ambiguous': '?'}
 """Fields that `Track` and `SmoothedPose` have in common. These classes document the units."""
 
-_POSE_FIELDS: _Fields = {
-    **_STATE_FIELDS, 'doubts': ('U', ()), 'arrival': ('U', ()), 'weight': ('f8', ()),
-    'kind_weight': ('f8', ()), 'existence': ('f8', ()), 'nis': ('f8', ()),
-    'degrees_of_freedom': ('i8', ()), 'unobservable': ('?', (6,))}
+_POSE_FIELDS = {
+    **_STATE_FIELDS, 'doubts': 'U', 'arrival': 'U', 'weight': 'f8', 'kind_weight': 'f8',
+    'existence': 'f8', 'nis': 'f8', 'degrees_of_freedom': 'i8', 'unobservable': '6?'}
 
-_SMOOTHED_FIELDS: _Fields = {**_STATE_FIELDS, 'complete': ('?', ())}
+_SMOOTHED_FIELDS = {**_STATE_FIELDS, 'complete': '?'}
 
-_DETECTION_FIELDS: _Fields = {
-    'stamp_ns': ('i8', ()), 'id': ('i8', ()), 'onset': ('?', ()), 'statistic': ('f8', ()),
-    'degrees_of_freedom': ('i8', ()), 'threshold': ('f8', ()),
-    'false_alarm_probability': ('f8', ()), 'strongest_sensor': ('U', ())}
+_DETECTION_FIELDS = {
+    'stamp_ns': 'i8', 'id': 'i8', 'onset': '?', 'statistic': 'f8', 'degrees_of_freedom': 'i8',
+    'threshold': 'f8', 'false_alarm_probability': 'f8', 'strongest_sensor': 'U'}
 
 
 def pose_array(tracks: Sequence[Track]) -> StructArray:
@@ -54,14 +47,15 @@ def detection_array(detections: Sequence[Detection]) -> StructArray:
     return _array(detections, _DETECTION_FIELDS)
 
 
-def _array(records: Sequence[Track | SmoothedPose | Detection], fields: _Fields) -> StructArray:
+def _array(records: Sequence[Track | SmoothedPose | Detection], fields: Mapping[str, str]
+           ) -> StructArray:
     """Convert records to a structured array (n,) of the attributes that `fields` names."""
     columns = {name: [_value(r, name) for r in records] for name in fields}
-    dtype = [(name, f'U{max(_TEXT_WIDTH, *map(len, columns[name]), 1)}' if kind == 'U' else kind,
-              shape) for name, (kind, shape) in fields.items()]
+    dtype = [(name, f'U{max(_TEXT_WIDTH, *map(len, columns[name]), 1)}' if kind == 'U' else kind)
+             for name, kind in fields.items()]
     out = np.zeros(len(records), dtype=dtype)
-    for name, (_, shape) in fields.items():
-        out[name] = np.array(columns[name], dtype=out[name].dtype).reshape(len(records), *shape)
+    for name, values in columns.items():
+        out[name] = np.array(values, dtype=out[name].dtype).reshape(out[name].shape)
     return out
 
 

@@ -1,10 +1,11 @@
-"""Commands `mag-tracking topics`, `echo`, `param` and `lifecycle`."""
+"""Commands `mag-tracking ros topics`, `echo`, `param`, `lifecycle` and `watch`."""
 
 import argparse
 import os
 import signal
 import sys
 
+from mag_tracking.cli.live_page import WATCH_HELP, add_page, watch
 from mag_tracking.cli.options import Commands, add_command
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
@@ -18,23 +19,26 @@ namespace set with --ros-args -r __ns:=/NAMESPACE.
 
 def add(commands: Commands) -> None:
     """Register the commands."""
-    add_command(commands, 'topics', _topics, _GRAPH_HELP)
-    p = add_command(commands, 'echo', _echo, _GRAPH_HELP)
+    add_command(commands, 'ros topics', _topics, _GRAPH_HELP)
+    p = add_command(commands, 'ros echo', _echo, _GRAPH_HELP)
     p.add_argument('topic', metavar='TOPIC', help='name of the topic')
     p.add_argument('--count', type=int, metavar='N', help='exit after N messages')
-    p = add_command(commands, 'param', _param, _GRAPH_HELP)
+    p = add_command(commands, 'ros param', _param, _GRAPH_HELP)
     p.add_argument('node', metavar='NODE', help='name of the node')
     p.add_argument('name', nargs='?', metavar='NAME',
                    help='name of the parameter (default: all parameters)')
     p.add_argument('value', nargs='?', metavar='VALUE', help='new value of the parameter (YAML)')
-    p = add_command(commands, 'lifecycle', _lifecycle, _GRAPH_HELP)
+    p = add_command(commands, 'ros lifecycle', _lifecycle, _GRAPH_HELP)
     p.add_argument('node', metavar='NODE', help='name of the node')
     p.add_argument('transition', nargs='?', metavar='TRANSITION', help='transition to trigger: '
                    'configure, activate, deactivate, cleanup or shutdown')
+    p = add_command(commands, 'ros watch', watch, WATCH_HELP)
+    add_page(p)
+    p.add_argument('--until-eof', action='store_true', help=argparse.SUPPRESS)
 
 
 def _topics(args: argparse.Namespace) -> int:
-    """Run `mag-tracking topics`."""
+    """Run `mag-tracking ros topics`."""
     from mag_tracking.nodes.graph_tools import observer, topics
 
     with observer(args.ros_arguments) as graph:
@@ -45,7 +49,7 @@ def _topics(args: argparse.Namespace) -> int:
 
 
 def _echo(args: argparse.Namespace) -> int:
-    """Run `mag-tracking echo`."""
+    """Run `mag-tracking ros echo`."""
     from mag_tracking.nodes.graph_tools import as_text, observer, receive_messages
 
     if args.count is not None and args.count < 1:
@@ -70,7 +74,7 @@ def _echo(args: argparse.Namespace) -> int:
 
 
 def _param(args: argparse.Namespace) -> int:
-    """Run `mag-tracking param`."""
+    """Run `mag-tracking ros param`."""
     from mag_tracking.nodes.graph_tools import observer, parameter_lines, set_parameter
 
     with observer(args.ros_arguments) as graph:
@@ -82,7 +86,7 @@ def _param(args: argparse.Namespace) -> int:
 
 
 def _lifecycle(args: argparse.Namespace) -> int:
-    """Run `mag-tracking lifecycle`."""
+    """Run `mag-tracking ros lifecycle`."""
     from mag_tracking.nodes.graph_tools import (
         change_lifecycle_state,
         lifecycle_state,

@@ -11,7 +11,7 @@ from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording import core
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.result_folder import ResultFolder, figure_name
+from mag_tracking.results.result_folder import ResultFolder, figure_name
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 from support.networks import line_network
 

@@ -1,0 +1,132 @@
+"""Table `passages` of `mag-tracking replay`: vehicles that cross a line, and traffic counts."""
+
+import argparse
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mag_tracking.apps.fleet import Fleet, earth_field_strength, pass_of
+from mag_tracking.apps.traffic import CountedVehicle, TrafficResult, TrafficSink
+from mag_tracking.cli.options import check_writable
+from mag_tracking.cli.vehicle_rows import time_of
+from mag_tracking.errors import SettingsError
+from mag_tracking.inference.identification import Identification
+from mag_tracking.inference.log_normal_classes import UNKNOWN
+from mag_tracking.network import SensorNetwork
+from mag_tracking.pipeline import Pipeline
+from mag_tracking.quantities import quantity
+from mag_tracking.results.columns import DIRECTIONS, traffic_tables
+from mag_tracking.results.fleet_file import FleetPass, read_fleet, write_fleet
+from mag_tracking.results.traffic_tables import passage_row, summary_rows, write_traffic
+from mag_tracking.run import RunReport
+
+
+class Passages:
+    """Passages of all recordings; the table is written after each recording."""
+
+    upto = 'traffic'
+    """Last stage of the pipeline that the table needs."""
+
+    def __init__(self, args: argparse.Namespace, network: SensorNetwork,
+                 stopped: Callable[[], bool], stack: ExitStack) -> None:
+        self._args, self._network, self._stopped = args, network, stopped
+        self._fleet = _fleet(args, network)
+        self._tables: dict[str, list[dict[str, Any]]] = {'passages': [], 'intervals': []}
+        self._enrolled: list[FleetPass] = []
+
+    def sink(self, name: str, pipeline: Pipeline) -> TrafficSink:
+        """Return the sink of a recording."""
+        self._sink = TrafficSink(pipeline)
+        return self._sink
+
+    def finish(self, name: str, report: RunReport, out: Path | None) -> None:
+        """Print and write the passages of a recording; enrol the vehicle after the last one."""
+        result, fleet = self._sink.result(report), self._fleet
+        if self._args.enrol is not None and not self._stopped():
+            self._enrolled.append(pass_of(name, [v.passage for v in result.vehicles]))
+        identifications = [None if fleet is None else fleet.identify(v.passage)
+                           for v in result.vehicles]
+        _print(name, result, identifications)
+        self._tables['passages'] += [
+            passage_row(name, v.passage, result.class_names, v.delays, _vehicle(identification))
+            for v, identification in zip(result.vehicles, identifications, strict=True)]
+        self._tables['intervals'] += [row for s in result.summaries
+                                      for row in summary_rows(name, s)]
+        if self._args.out is not None:
+            # Written after each recording, so that an interruption loses nothing.
+            write_traffic(self._args.out, self._tables,
+                          traffic_tables(result.class_names, fleet is not None))
+        if self._enrolled and len(self._enrolled) == len(self._args.recordings):
+            _enrol(self._args, self._network, self._enrolled)
+
+
+def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
+    """Check --fleet and --enrol; return the fleet, or None with --enrol or without --fleet."""
+    if args.enrol is not None:
+        if args.fleet is None:
+            raise SettingsError('--enrol requires a fleet file: add --fleet FILE')
+        if args.enrol.strip() in ('', UNKNOWN):
+            raise SettingsError(f'--enrol: {args.enrol!r} is not a valid name of a vehicle')
+        earth_field_strength(network)
+        check_writable(args.fleet)
+        return None
+    return None if args.fleet is None else Fleet(read_fleet(args.fleet), network)
+
+
+def _enrol(args: argparse.Namespace, network: SensorNetwork, passes: list[FleetPass]) -> None:
+    """Add passes of the vehicle named by --enrol to the fleet file."""
+    fleet = read_fleet(args.fleet) if args.fleet.exists() else {}
+    fleet[args.enrol] = [*fleet.get(args.enrol, []), *passes]
+    # Fleet raises an error before a vehicle that cannot be enrolled is written.
+    vehicle = next(v for v in Fleet(fleet, network).vehicles if v.name == args.enrol)
+    write_fleet(args.fleet, fleet)
+    at = 'any heading' if vehicle.iron is not None else \
+        f'a heading of {np.degrees(vehicle.heading):.0f} degrees only'
+    print(f'{args.fleet}: {args.enrol} is recognised at {at} (passes: {len(fleet[args.enrol])})')
+
+
+def _vehicle(identification: Identification | None) -> dict[str, Any]:
+    """Return the table columns of the identified vehicle; an empty dict without a fleet file."""
+    return {} if identification is None else {
+        'vehicle': identification.name,
+        'p_vehicle': identification.probabilities.get(identification.name, np.nan)}
+
+
+def _print(name: str, result: TrafficResult,
+           identifications: Sequence[Identification | None]) -> None:
+    """Print one line per vehicle, the counts, and warnings."""
+    for vehicle, identification in zip(result.vehicles, identifications, strict=True):
+        identity = '' if identification is None else f', vehicle {identification.name}'
+        print(f'{line_of(vehicle)}{identity}')
+    counts = Counter((v.passage.line, DIRECTIONS[v.passage.forward], v.passage.vehicle_class)
+                     for v in result.vehicles)
+    print(f'{name}: {quantity(len(result.vehicles), "vehicle")}')
+    for (line, direction, vehicle_class), n in sorted(counts.items()):
+        print(f'  {line}, {direction}, {vehicle_class}: {n}')
+    n_ambiguous = sum(v.passage.ambiguous for v in result.vehicles)
+    warnings = {**({'ambiguous passages': n_ambiguous} if n_ambiguous else {}),
+                **{cause: n for cause, n in result.report.counts['traffic'].items()
+                  if n and cause != 'passages'}}
+    for cause, n in warnings.items():
+        print(f'  warning: {cause}: {n}')
+    if result.report.no_track_reason:
+        print(f'  {result.report.no_track_reason}')
+
+
+def line_of(vehicle: CountedVehicle) -> str:
+    """Describe a passage in one line."""
+    p = vehicle.passage
+    error = '' if np.isnan(p.direction_error) else f' (error probability {p.direction_error:.3f})'
+    vehicle_class = f'{p.vehicle_class} ({p.class_probabilities.max():.0%})'
+    length = f', {p.length:.1f} m' if p.length else ''
+    headway = '' if np.isnan(p.headway) else f', headway {p.headway:.1f} s'
+    delay = '' if vehicle.delay.reason else f', {vehicle.delay.speed:.1f} m/s from the delay'
+    contradiction = ', speeds contradict each other' if vehicle.speeds_contradict else ''
+    doubts = f', doubts: {", ".join(p.doubts)}' if p.doubts else ''
+    return (f'{p.number} {time_of(p.stamp_ns)} {p.line}: '
+            f'{DIRECTIONS[p.forward]}{error}, {p.speed:.1f} ± {p.speed_std:.1f} m/s{delay}, '
+            f'{vehicle_class}{length}{headway}{contradiction}{doubts}')

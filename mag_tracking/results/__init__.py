@@ -1,0 +1,1 @@
+"""Formats of results: tables, archives, fits, trajectories and recordings of tracks."""

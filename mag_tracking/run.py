@@ -1,0 +1,309 @@
+"""One way to play readings through the stages: a source, a pipeline, sinks and one report."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+from mag_tracking.errors import OutputError
+from mag_tracking.network import SensorNetwork
+from mag_tracking.pipeline import Pipeline
+from mag_tracking.record_receiver import Step
+from mag_tracking.recording.interruptible import Progress, ReadingStopped, until_stopped
+from mag_tracking.recording.reader import Recording
+from mag_tracking.recording.sample_reader import SampleReader
+from mag_tracking.records import Readings
+from mag_tracking.stages.calibrate.prescan import Prescan, prescan
+from mag_tracking.stages.health.clocks import ClockSpan
+from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding, ranked
+from mag_tracking.stages.health.input_findings import sensor_findings, source_findings
+from mag_tracking.stages.health.no_detection import no_detection_reason
+from mag_tracking.stages.stage import rejected
+from mag_tracking.stages.track.manager import NO_SCALE, NO_SCALE_FRAMES
+
+ARRAY_BATCH = 4096
+"""Number of readings per batch when arrays are processed, to bound the memory for outputs."""
+
+
+class Source(Protocol):
+    """Readings in the order of their receipt, with an account of what could not be read."""
+
+    name: str
+    """Name for messages."""
+    stem: str
+    """Name for tables and files."""
+
+    @property
+    def rejected(self) -> Mapping[str, int]:
+        """Messages without a usable reading so far: {cause: number}."""
+
+    @property
+    def lost(self) -> Mapping[str, int]:
+        """Unreadable parts so far: {damage: number}."""
+
+    @property
+    def clocks(self) -> Mapping[str, ClockSpan]:
+        """Timestamps and times of receipt so far: {sensor: ClockSpan}; empty if unknown."""
+
+    def missing_topics(self) -> Sequence[str]:
+        """List the topics of the network without messages.
+
+        Returns
+        -------
+        sequence of str
+        """
+
+    def beginning(self) -> 'Source':
+        """Return the source at its beginning, for a first pass that counts nothing.
+
+        Returns
+        -------
+        Source
+        """
+
+    def batches(self, progress: Progress | None = None) -> Iterator[tuple[Readings, int | None]]:
+        """Iterate over the readings.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Called with the number of bytes read since the last call.
+
+        Yields
+        ------
+        readings : Readings
+        received_ns : int, ns, or None
+            Time of receipt; None if the batch contains several messages.
+        """
+
+
+class RecordingSource:
+    """Readings of a recording; with `by_message`, each message is a batch."""
+
+    def __init__(self, recording: Recording, network: SensorNetwork, truth: str | None = None,
+                 by_message: bool = False) -> None:
+        self.recording, self.name = recording, recording.path.name
+        self.stem = recording.path.resolve().stem
+        self._network, self._by_message = network, by_message
+        self.reader = SampleReader(recording, network, truth)
+
+    @property
+    def rejected(self) -> Mapping[str, int]:
+        """Messages without a usable reading so far: {cause: number}."""
+        return self.reader.rejected
+
+    @property
+    def lost(self) -> Mapping[str, int]:
+        """Unreadable parts so far: {damage: number}."""
+        return self.recording.losses
+
+    @property
+    def clocks(self) -> Mapping[str, ClockSpan]:
+        """Timestamps and log times so far: {sensor: ClockSpan}."""
+        return self.reader.clocks
+
+    def missing_topics(self) -> Sequence[str]:
+        """List the topics of the network that are not in the recording."""
+        return self.reader.missing_topics()
+
+    def beginning(self) -> 'RecordingSource':
+        """Open the recording again, because losses are counted whenever a recording is read."""
+        return RecordingSource(Recording(self.recording.path), self._network)
+
+    def batches(self, progress: Progress | None = None) -> Iterator[tuple[Readings, int | None]]:
+        """Iterate over batches of messages, or over single messages with their log times."""
+        if self._by_message:
+            yield from self.reader.readings_as_received(progress)
+        else:
+            for readings in self.reader.readings(progress):
+                yield readings, None
+
+
+@dataclass
+class ArraySource:
+    """Readings in memory, and the account of the recording from which they were read."""
+
+    readings: Readings
+    name: str = 'readings'
+    stem: str = 'readings'
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    lost: Mapping[str, int] = field(default_factory=dict)
+    clocks: Mapping[str, ClockSpan] = field(default_factory=dict)
+    topics: Sequence[str] = ()
+    """Topics of the network that were not recorded."""
+
+    def missing_topics(self) -> Sequence[str]:
+        """List the topics of the network that were not recorded."""
+        return self.topics
+
+    def beginning(self) -> 'ArraySource':
+        """Return this source, which counts nothing."""
+        return self
+
+    def batches(self, progress: Progress | None = None) -> Iterator[tuple[Readings, int | None]]:
+        """Iterate over batches of at most `ARRAY_BATCH` readings."""
+        for i in range(0, len(self.readings), ARRAY_BATCH):
+            yield self.readings.part(slice(i, i + ARRAY_BATCH)), None
+
+
+class Sink(Protocol):
+    """Receiver of the results of a run."""
+
+    def add(self, step: Step, /) -> None:
+        """Add the results of a batch.
+
+        Parameters
+        ----------
+        step : Step
+
+        Raises
+        ------
+        OutputError
+            If the results cannot be written. The other sinks still receive the rest.
+        """
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """What was lost, rejected or missing in a run, and why."""
+
+    counts: dict[str, dict[str, int]]
+    """{stage: {event: number}}."""
+    rejected: dict[str, int]
+    """Readings that were not used: {cause: number}."""
+    lost: dict[str, int]
+    """Unreadable parts of the source: {damage: number}."""
+    missing_topics: tuple[str, ...]
+    """Topics of the network without messages."""
+    sensors_without_background: tuple[str, ...]
+    """Sensors that were not used because their background was not learnt. To use them, record a
+    quiet interval, or set `background` and `noise_std` in the network file."""
+    no_detection_reason: str | None
+    """Explanation of why nothing was detected; None if a target was detected or not searched."""
+    no_track_reason: str | None
+    """Explanation of why a detected target was not tracked; None if unknown."""
+    diagnoses: tuple[Diagnosis, ...]
+    """Faults of the source, the sensors and the stages, the most important first."""
+    prescan: Prescan
+    """Result of the first pass over the source."""
+    interrupted: bool = False
+    """Whether the caller stopped the run; the results then cover only a part of the source."""
+    failures: tuple[OutputError, ...] = ()
+    """Errors of sinks, which did not receive the rest."""
+
+    def warnings(self) -> list[str]:
+        """One line per diagnosis, rejection, loss and failure.
+
+        Returns
+        -------
+        list of str
+        """
+        not_used = {**self.rejected, **self.lost}
+        return [*map(str, self.diagnoses), *(f'not used: {n} {cause}' for cause, n in
+                                             not_used.items()),
+                *(f'not written completely: {error}' for error in self.failures)]
+
+
+def run(source: Source, pipeline: Pipeline, sinks: Sequence[Sink],
+        progress: Progress | None = None,
+        stopped: Callable[[], bool] | None = None) -> RunReport:
+    """Play a source through a pipeline into sinks.
+
+    The source is read twice: first up to `calibrate.look_ahead_s`, to find the backgrounds of
+    sensors near a target that is present at the start.
+
+    Parameters
+    ----------
+    source : Source
+    pipeline : Pipeline
+        Pipeline that has processed nothing.
+    sinks : sequence of Sink
+        If one fails with an OutputError, the others receive the rest.
+    progress : callable, optional
+        Called with the number of bytes read since the last call.
+    stopped : callable, optional
+        Called after every batch and every progress report. When it returns true, reading ends; the
+        sinks still receive what the stages have buffered.
+
+    Returns
+    -------
+    RunReport
+
+    Raises
+    ------
+    RecordingError
+        If the source cannot be read.
+    OutputError
+        If all sinks have failed.
+    """
+    first_pass = prescan_of(source, pipeline, stopped)
+    first_pass.apply(pipeline.calibrate)
+    remaining, failures, interrupted = list(sinks), [], False
+
+    def add(step: Step) -> None:
+        for sink in list(remaining):
+            try:
+                sink.add(step)
+            except OutputError as error:
+                remaining.remove(sink)
+                failures.append(error)
+        if sinks and not remaining:
+            raise failures[0]
+
+    try:
+        for readings, received_ns in until_stopped(source.batches, progress, stopped):
+            add(Step(readings, received_ns, pipeline.feed(readings)))
+    except ReadingStopped:
+        interrupted = True
+    add(Step(Readings.joined([]), None, pipeline.drain()))
+    add(Step(Readings.joined([]), None, pipeline.close(), is_last=True))
+    return replace(report_of(source, pipeline, first_pass), interrupted=interrupted,
+                   failures=tuple(failures))
+
+
+def prescan_of(source: Source, pipeline: Pipeline,
+               stopped: Callable[[], bool] | None = None) -> Prescan:
+    """Find the backgrounds of sensors if a target is present at the start of a source."""
+    source = source.beginning()
+
+    def batches() -> Iterator[Readings]:
+        try:
+            for readings, _ in until_stopped(source.batches, None, stopped):
+                yield readings
+        except ReadingStopped:
+            return
+
+    found = prescan(batches(), pipeline.network, pipeline.settings.calibrate)
+    return replace(found, clocks=dict(source.clocks))
+
+
+def report_of(source: Source, pipeline: Pipeline, first_pass: Prescan) -> RunReport:
+    """Report on a source that the pipeline has processed."""
+    counts, missing = pipeline.counts(), tuple(source.missing_topics())
+    not_used = dict(Counter(source.rejected) + Counter(pipeline.rejections()))
+    reason = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
+                                 pipeline.detect, missing, not_used) if 'detect' in counts else None
+    found = [*source_findings(source.name, source.lost, source.rejected),
+             *sensor_findings(pipeline.network, pipeline.calibrate, pipeline.settings.track,
+                              missing, source.clocks)]
+    for stage, counts_of_stage in counts.items():
+        if stage != 'calibrate' and (causes := rejected(counts_of_stage)):
+            found.append(Finding(False, stage, ', '.join(
+                f'{cause}: {n}' for cause, n in causes.items()), 'run mag-tracking doctor',
+                Cause.REJECTED))
+    if reason:
+        found.append(Finding(False, 'detect', 'nothing was detected with the settings for a '
+                             f'{pipeline.settings.track.target}: {reason}',
+                             'run mag-tracking doctor', Cause.NO_DETECTION))
+    return RunReport(counts, not_used, dict(source.lost), missing,
+                     tuple(pipeline.calibrate.unready()), reason,
+                     no_track_reason(counts.get('track', {})), tuple(ranked(found)), first_pass)
+
+
+def no_track_reason(counts: Mapping[str, int]) -> str | None:
+    """Explain, from the counts of the tracker, why a single sensor tracked nothing, else None."""
+    if counts.get(NO_SCALE, 0) or counts.get(NO_SCALE_FRAMES, 0) and not counts.get('tracks', 0):
+        return ('no track: the scale is not observable with a single sensor. Use `mag-tracking '
+                'replay --tables events` to describe the passes without scale, or set '
+                'track.single_sensor_prior: true if the vehicles match the settings')
+    return None
