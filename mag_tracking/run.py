@@ -205,12 +205,12 @@ class RunReport:
 
 
 def run(source: Source, pipeline: Pipeline, sinks: Sequence[Sink],
-        progress: Progress | None = None,
-        stopped: Callable[[], bool] | None = None) -> RunReport:
+        progress: Progress | None = None, stopped: Callable[[], bool] | None = None,
+        look_ahead: bool = True) -> RunReport:
     """Play a source through a pipeline into sinks.
 
-    The source is read twice: first up to `calibrate.look_ahead_s`, to find the backgrounds of
-    sensors near a target that is present at the start.
+    With `look_ahead`, the source is read twice: first up to `LOOK_AHEAD_S`, to find the backgrounds
+    of sensors near a target that is present at the start.
 
     Parameters
     ----------
@@ -224,6 +224,7 @@ def run(source: Source, pipeline: Pipeline, sinks: Sequence[Sink],
     stopped : callable, optional
         Called after every batch and every progress report. When it returns true, reading ends; the
         sinks still receive what the stages have buffered.
+    look_ahead : bool
 
     Returns
     -------
@@ -236,7 +237,7 @@ def run(source: Source, pipeline: Pipeline, sinks: Sequence[Sink],
     OutputError
         If all sinks have failed.
     """
-    first_pass = prescan_of(source, pipeline, stopped)
+    first_pass = prescan_of(source, pipeline, stopped) if look_ahead else Prescan({}, {}, {})
     first_pass.apply(pipeline.calibrate)
     remaining, failures, interrupted = list(sinks), [], False
 
