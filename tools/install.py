@@ -64,15 +64,19 @@ def cache_folder():
     try:
         cache.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = cache.stat()
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         say(f'without a cache of compiled files: {error}')
         return None
     if status.st_uid != os.getuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         say(f'without a cache of compiled files: others may write to {cache}')
         return None
     for old in cache.glob('*/*'):
-        if time.time() - old.stat().st_mtime > KEPT_DAYS * 86400:
-            old.unlink(missing_ok=True)
+        newest = max(path.stat().st_mtime for path in (old, *old.glob('*')))
+        if time.time() - newest > KEPT_DAYS * 86400:
+            if old.is_dir():
+                shutil.rmtree(old, ignore_errors=True)
+            else:
+                old.unlink(missing_ok=True)
     return cache
 
 
