@@ -52,7 +52,8 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
 
     The recording must start without a target near the sensors. `passes` refines the nominal
     orientations with passing targets, which reads the recording twice; it is omitted if
-    `track.mounting_std_deg` is zero or a sensor contradicts the Earth's field.
+    `track.mounting_std_deg` is zero or a sensor contradicts the Earth's field. Raises
+    RecordingError if the recording has no samples of the network.
     """
     levels, survey, stage, interrupted = _survey_recording(
         recording, network, settings, date, progress, stopped)
