@@ -61,7 +61,7 @@ def test_a_full_disk_is_named_and_leaves_the_other_tables(tmp_path, monkeypatch,
     monkeypatch.setattr(ResultFolder, method, full_disk)
     assert main(['replay', str(PATH), *OPTIONS, '--tables', 'poses,passages,events', '--out',
                  str(tmp_path), '--no-figures']) == 1
-    assert str(tmp_path) in capsys.readouterr().out
+    assert str(tmp_path) in capsys.readouterr().err
     assert len((tmp_path / 'passages.csv').read_text().splitlines()) == 2
     assert len((tmp_path / 'events.csv').read_text().splitlines()) == 3
     if method == 'add_track':
@@ -72,7 +72,7 @@ def test_a_table_whose_sink_failed_is_not_written(tmp_path, monkeypatch, capsys)
     monkeypatch.setattr(TrafficSink, 'add_passage', full_disk)
     assert main(['replay', str(PATH), *OPTIONS, '--tables', 'passages,events', '--out',
                  str(tmp_path)]) == 1
-    assert 'incomplete' in capsys.readouterr().out
+    assert 'No space' in capsys.readouterr().err
     assert not (tmp_path / 'passages.csv').exists() and (tmp_path / 'events.csv').exists()
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import signal
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
@@ -250,7 +251,7 @@ def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Setti
             report = run(source, pipeline, sinks_of(pipeline), bar.update, stopped)
         print_diagnoses(report.diagnoses)
     for failure in report.failures:
-        print(f'  warning: incomplete results: {failure.error}')
+        _print_incomplete(failure.error)
     is_complete = not report.failures
     for table, sink in zip(tables, sinks, strict=True):
         if report.has_failed(sink):
@@ -258,9 +259,14 @@ def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Setti
         try:
             table.finish(source.stem, report, out)
         except (OutputError, OSError) as error:
-            print(f'  warning: incomplete results: {output_error(error, table)}')
+            _print_incomplete(output_error(error, table))
             is_complete = False
     return is_complete
+
+
+def _print_incomplete(error: OutputError) -> None:
+    """Print why results are incomplete."""
+    print(f'mag-tracking: incomplete results: {error}', file=sys.stderr)
 
 
 def _write(result: Run, network: SensorNetwork, out: Path, stopped: Callable[[], bool],
