@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from mag_tracking.errors import OutputError
 from mag_tracking.network import SensorNetwork
@@ -158,9 +158,16 @@ class Sink(Protocol):
 
         Raises
         ------
-        OutputError
+        OutputError, OSError
             If the results cannot be written. The other sinks still receive the rest.
         """
+
+
+class Failure(NamedTuple):
+    """Sink that could not write its results, and did not receive the rest."""
+
+    sink: Sink
+    error: OutputError
 
 
 @dataclass(frozen=True)
@@ -188,29 +195,43 @@ class RunReport:
     """Result of the first pass over the source."""
     interrupted: bool = False
     """Whether the caller stopped the run; the results then cover only a part of the source."""
-    failures: tuple[OutputError, ...] = ()
-    """Errors of sinks, which did not receive the rest."""
+    failures: tuple[Failure, ...] = ()
+    """Sinks that could not write their results."""
 
     def warnings(self) -> list[str]:
-        """One line per diagnosis, rejection, loss and failure.
+        """One line per diagnosis, missing track, rejection, loss and failure.
 
         Returns
         -------
         list of str
         """
-        not_used = {**self.rejected, **self.lost}
-        return [*map(str, self.diagnoses), *(f'not used: {n} {cause}' for cause, n in
-                                             not_used.items()),
-                *(f'not written completely: {error}' for error in self.failures)]
+        not_used = [*self.rejected.items(), *self.lost.items()]
+        return [*map(str, self.diagnoses),
+                *([self.no_track_reason] if self.no_track_reason else []),
+                *(f'not used: {n} {cause}' for cause, n in not_used),
+                *(f'incomplete results: {failure.error}' for failure in self.failures)]
+
+    def has_failed(self, sink: Sink) -> bool:
+        """Whether a sink could not write its results.
+
+        Parameters
+        ----------
+        sink : Sink
+
+        Returns
+        -------
+        bool
+        """
+        return any(failure.sink is sink for failure in self.failures)
 
 
 def run(source: Source, pipeline: Pipeline, sinks: Sequence[Sink],
-        progress: Progress | None = None,
-        stopped: Callable[[], bool] | None = None) -> RunReport:
+        progress: Progress | None = None, stopped: Callable[[], bool] | None = None,
+        look_ahead: bool = True) -> RunReport:
     """Play a source through a pipeline into sinks.
 
-    The source is read twice: first up to `calibrate.look_ahead_s`, to find the backgrounds of
-    sensors near a target that is present at the start.
+    With `look_ahead`, the source is read twice: first up to `LOOK_AHEAD_S`, to find the backgrounds
+    of sensors near a target that is present at the start.
 
     Parameters
     ----------
@@ -218,12 +239,13 @@ def run(source: Source, pipeline: Pipeline, sinks: Sequence[Sink],
     pipeline : Pipeline
         Pipeline that has processed nothing.
     sinks : sequence of Sink
-        If one fails with an OutputError, the others receive the rest.
+        If one cannot write its results, the others receive the rest.
     progress : callable, optional
         Called with the number of bytes read since the last call.
     stopped : callable, optional
         Called after every batch and every progress report. When it returns true, reading ends; the
         sinks still receive what the stages have buffered.
+    look_ahead : bool
 
     Returns
     -------
@@ -236,19 +258,20 @@ def run(source: Source, pipeline: Pipeline, sinks: Sequence[Sink],
     OutputError
         If all sinks have failed.
     """
-    first_pass = prescan_of(source, pipeline, stopped)
+    first_pass = prescan_of(source, pipeline, stopped) if look_ahead else Prescan({}, {}, {})
     first_pass.apply(pipeline.calibrate)
-    remaining, failures, interrupted = list(sinks), [], False
+    remaining, interrupted = list(sinks), False
+    failures: list[Failure] = []
 
     def add(step: Step) -> None:
         for sink in list(remaining):
             try:
                 sink.add(step)
-            except OutputError as error:
+            except (OutputError, OSError) as error:
                 remaining.remove(sink)
-                failures.append(error)
+                failures.append(Failure(sink, output_error(error, sink)))
         if sinks and not remaining:
-            raise failures[0]
+            raise failures[0].error
 
     try:
         for readings, received_ns in until_stopped(source.batches, progress, stopped):
@@ -257,8 +280,15 @@ def run(source: Source, pipeline: Pipeline, sinks: Sequence[Sink],
         interrupted = True
     add(Step(Readings.joined([]), None, pipeline.drain()))
     add(Step(Readings.joined([]), None, pipeline.close(), is_last=True))
-    return replace(report_of(source, pipeline, first_pass), interrupted=interrupted,
-                   failures=tuple(failures))
+    return replace(report_of(source, pipeline, first_pass, interrupted), failures=tuple(failures))
+
+
+def output_error(error: OutputError | OSError, sink: object) -> OutputError:
+    """Error of a sink; a full disk names no file, so the folder of the sink is named."""
+    if isinstance(error, OutputError):
+        return error
+    place = error.filename or getattr(sink, 'folder', '')
+    return OutputError(f'cannot write{f" to {place}" if place else ""}: {error.strerror or error}')
 
 
 def prescan_of(source: Source, pipeline: Pipeline,
@@ -277,12 +307,14 @@ def prescan_of(source: Source, pipeline: Pipeline,
     return replace(found, clocks=dict(source.clocks))
 
 
-def report_of(source: Source, pipeline: Pipeline, first_pass: Prescan) -> RunReport:
+def report_of(source: Source, pipeline: Pipeline, first_pass: Prescan,
+              interrupted: bool) -> RunReport:
     """Report on a source that the pipeline has processed."""
     counts, missing = pipeline.counts(), tuple(source.missing_topics())
     not_used = dict(Counter(source.rejected) + Counter(pipeline.rejections()))
-    reason = no_detection_reason(pipeline.network, pipeline.settings, pipeline.calibrate,
-                                 pipeline.detect, missing, not_used) if 'detect' in counts else None
+    # Of an interrupted run, the rest may contain what is missing.
+    reason = None if interrupted or 'detect' not in counts else no_detection_reason(
+        pipeline.network, pipeline.settings, pipeline.calibrate, pipeline.detect, missing, not_used)
     found = [*source_findings(source.name, source.lost, source.rejected),
              *sensor_findings(pipeline.network, pipeline.calibrate, pipeline.settings.track,
                               missing, source.clocks)]
@@ -297,7 +329,8 @@ def report_of(source: Source, pipeline: Pipeline, first_pass: Prescan) -> RunRep
                              'run mag-tracking doctor', Cause.NO_DETECTION))
     return RunReport(counts, not_used, dict(source.lost), missing,
                      tuple(pipeline.calibrate.unready()), reason,
-                     no_track_reason(counts.get('track', {})), tuple(ranked(found)), first_pass)
+                     no_track_reason(counts.get('track', {})), tuple(ranked(found)), first_pass,
+                     interrupted)
 
 
 def no_track_reason(counts: Mapping[str, int]) -> str | None:

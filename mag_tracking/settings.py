@@ -334,7 +334,7 @@ def closest_name(name: str, candidates: Iterable[str]) -> str:
     str
         Empty if no candidate is similar.
     """
-    return next(iter(difflib.get_close_matches(name, list(candidates), n=1)), '')
+    return next(iter(difflib.get_close_matches(name, list(candidates), n=1, cutoff=0.75)), '')
 
 
 def _rebuild(settings: _Settings, checked: Mapping[str, Value], prefix: str) -> _Settings:

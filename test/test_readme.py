@@ -63,8 +63,8 @@ def test_the_shell_commands_succeed(line, tmp_path, monkeypatch, capsys):
 def test_the_python_example_runs(tmp_path):
     """The code is run in the project folder, with a temporary path for the picture."""
     assert len(PYTHON_EXAMPLE.split('\n\n')[1].strip().splitlines()) + 1 <= 5
-    code = PYTHON_EXAMPLE.replace("'map.png'", repr(str(tmp_path / 'map.png')))
+    code = PYTHON_EXAMPLE.replace("'pass.png'", repr(str(tmp_path / 'pass.png')))
     process = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True,
                              text=True, check=False)
     assert process.returncode == 0, process.stderr
-    assert (tmp_path / 'map.png').stat().st_size > 10_000
+    assert (tmp_path / 'pass.png').stat().st_size > 10_000

@@ -34,8 +34,7 @@ def run(*command, **variables):
     """Run a command; if it fails, end with its status."""
     process = subprocess.run([str(c) for c in command], cwd=ROOT, env=os.environ | variables)
     if process.returncode:
-        sys.exit(f'Setting up failed with status {process.returncode}. If uv cannot reach the '
-                 'package index here, try: make INSTALLER=pip')
+        sys.exit(f'Setting up failed with status {process.returncode}.')
 
 
 def find_uv():
@@ -65,41 +64,76 @@ def cache_folder():
     try:
         cache.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = cache.stat()
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         say(f'without a cache of compiled files: {error}')
         return None
     if status.st_uid != os.getuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         say(f'without a cache of compiled files: others may write to {cache}')
         return None
     for old in cache.glob('*/*'):
-        if time.time() - old.stat().st_mtime > KEPT_DAYS * 86400:
-            old.unlink(missing_ok=True)
+        newest = max(path.stat().st_mtime for path in (old, *old.glob('*')))
+        if time.time() - newest > KEPT_DAYS * 86400:
+            if old.is_dir():
+                shutil.rmtree(old, ignore_errors=True)
+            else:
+                old.unlink(missing_ok=True)
     return cache
 
 
+def settings_of_pip():
+    """Variables with which uv uses the index, folders and certificates of pip."""
+    lines = subprocess.run([sys.executable, '-m', 'pip', 'config', 'list'], capture_output=True,
+                           text=True).stdout.splitlines()
+    found = {}
+    for line in lines:
+        # Variables of the environment (":env:.") are listed first, and take precedence.
+        name, _, value = line.partition('=')
+        found.setdefault(name.rpartition('.')[2], value.strip('\'"'))
+    names = {'index-url': 'UV_DEFAULT_INDEX', 'extra-index-url': 'UV_INDEX',
+             'find-links': 'UV_FIND_LINKS', 'trusted-host': 'UV_INSECURE_HOST',
+             'no-index': 'UV_NO_INDEX', 'cert': 'SSL_CERT_FILE'}
+    # pip separates several values by spaces, uv by commas where it does not accept spaces.
+    return {uv: found[pip].replace(' ', ',') if pip == 'find-links' else found[pip]
+            for pip, uv in names.items() if pip in found and uv not in os.environ}
+
+
 class Installer:
-    """uv, or pip."""
+    """uv, or pip if uv cannot run or fails, for example behind a proxy that only pip knows."""
 
     def __init__(self):
         self.uv = find_uv()
+        self.settings = settings_of_pip() if self.uv else {}
         if not self.uv:
-            run(sys.executable, '-m', 'pip', '--quiet', 'install', '-c', PINS, '--upgrade', 'pip')
+            self.use_pip()
 
-    def install(self, *arguments, **variables):
+    def use_pip(self):
+        self.uv = None
+        run(sys.executable, '-m', 'pip', '--quiet', 'install', '-c', PINS, '--upgrade', 'pip')
+
+    def succeeds(self, *arguments, **variables):
+        """Whether uv can be used and a command of it succeeds; from then on, pip is used if not."""
+        if not self.uv:
+            return False
+        if not subprocess.run([self.uv, *map(str, arguments)], cwd=ROOT,
+                              env=os.environ | self.settings | variables).returncode:
+            return True
+        say('uv failed; pip installs instead, which takes longer')
+        self.use_pip()
+        return False
+
+    def install(self, *arguments, again=(), **variables):
+        """Install what `arguments` name, and the packages `again` even if they are installed."""
         pins = '-c', PINS, '--build-constraint', PINS
-        if self.uv:
-            run(self.uv, 'pip', 'install', '--python', sys.executable, *pins, *arguments,
-                **variables)
-        else:
-            run(sys.executable, '-m', 'pip', '--disable-pip-version-check', '--no-input',
-                'install', *pins, *arguments, **variables)
+        if self.succeeds('pip', 'install', '--python', sys.executable, *pins, *arguments,
+                         *(f'--reinstall-package={name}' for name in again), **variables):
+            return
+        run(sys.executable, '-m', 'pip', '--disable-pip-version-check', '--no-input', 'install',
+            *pins, *arguments, *(['--force-reinstall', '--no-deps'] if again else []), **variables)
 
     def build_wheel(self, project, folder):
         """Build the wheel of a project in a folder."""
-        if self.uv:
-            run(self.uv, 'build', '--quiet', '--wheel', '--python', sys.executable,
-                '--build-constraint', PINS, '--out-dir', folder, project)
-        else:
+        if not self.succeeds('build', '--quiet', '--wheel', '--python', sys.executable,
+                             '--build-constraint', PINS, '--out-dir', folder, project):
             run(sys.executable, '-m', 'pip', '--quiet', '--disable-pip-version-check', 'wheel',
                 '--no-deps', '--build-constraint', PINS, '--wheel-dir', folder, project)
 
@@ -145,8 +179,7 @@ def install_run(installer):
     wheel = messages_wheel(installer, cache)
     say('mag_tracking and what it needs to run (compiled in part, about a minute the first time)')
     variables = {'MAG_TRACKING_CACHE': str(cache / 'cores')} if cache else {}
-    installer.install('--reinstall-package' if installer.uv else '--force-reinstall',
-                      *(['mag-tracking-msgs', wheel] if installer.uv else ['--no-deps', wheel]))
+    installer.install(wheel, again=['mag-tracking-msgs'])
     # setuptools warns about every editable package outside src/.
     installer.install('-e', '.[ros]', PYTHONWARNINGS='ignore', **variables)
 

@@ -1,6 +1,6 @@
 """Calibration of a network from a recording, for the command `mag-tracking calibrate network`."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,10 +11,12 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings
 from mag_tracking.quantities import quantity
+from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import AccelerationSample, Track
+from mag_tracking.run import RecordingSource, run
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.survey.stage import NetworkSurvey, Survey, with_measured_noise
@@ -50,7 +52,8 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
 
     The recording must start without a target near the sensors. `passes` refines the nominal
     orientations with passing targets, which reads the recording twice; it is omitted if
-    `track.mounting_std_deg` is zero or a sensor contradicts the Earth's field.
+    `track.mounting_std_deg` is zero or a sensor contradicts the Earth's field. Raises
+    RecordingError if the recording has no samples of the network.
     """
     levels, survey, stage, interrupted = _survey_recording(
         recording, network, settings, date, progress, stopped)
@@ -61,9 +64,12 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
     # A faulty sensor would bias the orientations of the other sensors.
     if passes and not interrupted and settings.track.mounting_std_deg \
             and not survey.disagreements:
-        tracks, interrupted = _track_passes(recording, calibrated_network, settings, progress,
-                                            stopped)
-        if tracks:
+        passed = _PassTracks()
+        # The backgrounds are those of the survey.
+        interrupted = run(RecordingSource(recording, network), Pipeline(
+            calibrated_network, settings, 'track'), [passed], progress, stopped,
+            look_ahead=False).interrupted
+        if tracks := passed.tracks():
             prior = np.array([
                 np.full(3, np.deg2rad(settings.track.mounting_std_deg)) if s is None else s
                 for s in calibrated_network.orientation_std])
@@ -104,30 +110,20 @@ def _survey_recording(recording: Recording, network: SensorNetwork, settings: Se
     return levels, survey.solve(levels, date), stage, interrupted
 
 
-def _track_passes(recording: Recording, network: SensorNetwork, settings: Settings,
-                  progress: Callable[[int], object] | None, stopped: Callable[[], bool] | None,
-                  ) -> tuple[list[Track], bool]:
-    """Track the targets; return (last unambiguous pose of each track, interrupted).
+class _PassTracks(RecordReceiver):
+    """Counts the unambiguous poses of each track, and keeps the last one."""
 
-    Tracks with fewer than `MIN_POSES` unambiguous poses are excluded.
-    """
-    reader, pipeline = SampleReader(recording, network), Pipeline(network, settings)
-    poses: dict[int, tuple[int, Track]] = {}
-    interrupted = False
+    def __init__(self) -> None:
+        self._poses: dict[int, tuple[int, Track]] = {}
 
-    def add(records: Iterable[object]) -> None:
-        for record in records:
-            if isinstance(record, Track) and not record.ended and not record.ambiguous:
-                n = poses[record.id][0] + 1 if record.id in poses else 1
-                poses[record.id] = n, record
+    def add_track(self, track: Track) -> None:
+        """Count a pose."""
+        if not track.ended and not track.ambiguous:
+            self._poses[track.id] = self._poses.get(track.id, (0, track))[0] + 1, track
 
-    try:
-        for readings in until_stopped(reader.readings, progress, stopped):
-            add(pipeline.feed(readings))
-    except ReadingStopped:
-        interrupted = True
-    add(pipeline.flush())
-    return [track for n, track in poses.values() if n >= MIN_POSES], interrupted
+    def tracks(self) -> list[Track]:
+        """Last unambiguous pose of each track with at least `MIN_POSES` of them."""
+        return [track for n, track in self._poses.values() if n >= MIN_POSES]
 
 
 def _with_pass_records(network: SensorNetwork, surveyed: SensorNetwork, date: str,

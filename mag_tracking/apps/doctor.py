@@ -160,7 +160,7 @@ def examine(source: RecordingSource, network: SensorNetwork, settings: Settings,
     """Diagnose a network from a recording that is read by message.
 
     The second result are the findings about the recording, which `Doctor.findings` does not
-    include.
+    include. Raises RecordingError if the recording cannot be read.
     """
     doctor = Doctor(Pipeline(network, settings, 'calibrate'))
     run(source, doctor.pipeline, [doctor], progress, stopped)

@@ -98,14 +98,20 @@ def recorded_readings(recording: Recording, reader: SampleReader,
 def source_of(source: UserSource, network: SensorNetwork, time_unit: str | None = None) -> Source:
     """Source for `run`: a recording, which need not fit into memory, or readings."""
     if is_table(source):
-        source = readings_of_table(source, time_unit)
+        source = readings_of_table(source, time_unit, network.names)
     elif isinstance(source, Mapping):
         source = readings_of_arrays(source, time_unit)
     elif time_unit is not None:
         raise ReadingsError('time_unit: only for the times of a DataFrame or of arrays')
     if isinstance(source, Readings):
         check_order(source)
-        source = RecordedReadings(source, {}, {}, {}, ())
+        present = {source.names[j] for j in np.unique(source.sensor)}
+        source = RecordedReadings(source, {}, {}, {}, tuple(
+            topic for name, topic in zip(network.names, network.absolute_topics, strict=True)
+            if name not in present))
+    if not isinstance(source, RecordedReadings | str | PathLike):
+        raise ReadingsError('source: expected a path, Readings, a DataFrame or {sensor: (times, '
+                            f'fields)}}, got {type(source).__name__}')
     if isinstance(source, RecordedReadings):
         return ArraySource(checked_readings(source.readings, network), rejected=source.rejected,
                            lost=source.lost, topics=source.missing_topics)

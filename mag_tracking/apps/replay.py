@@ -1,7 +1,7 @@
 """Offline replay of a recording through all stages, with tables, a summary and figures."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Protocol
@@ -33,7 +33,15 @@ from mag_tracking.report.metrics import (
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.results.result_folder import ResultFolder, figure_name
 from mag_tracking.results.tum_file import write_tum
-from mag_tracking.run import RecordingSource, RunReport, Sink, Source, run
+from mag_tracking.run import (
+    Failure,
+    RecordingSource,
+    RunReport,
+    Sink,
+    Source,
+    output_error,
+    run,
+)
 from mag_tracking.stages.align.frame_period import frame_period_warning
 from mag_tracking.stages.track.plausibility import lane_note
 from mag_tracking.stages.track.settings import acceleration_density
@@ -98,14 +106,22 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
         if truth is not None and is_table else None
     source = RecordingSource(recording, network, truth if table is None else None)
     pipeline, history = Pipeline(network, settings), TrackHistory()
-    with ResultFolder(out, network) as results:
-        if results.replaces_earlier and report is not None:
-            report(f'replacing the results of an earlier run in {out}')
-        run_report = run(source, pipeline, [results, history, *more_sinks(pipeline)],
-                         progress, stopped)
-        truth_arrays = source.reader.truth_arrays() if table is None else table
-        summary = summarise(source, pipeline, history, truth_arrays, run_report)
-        results.write_summary(summary)
+    results, summary = ResultFolder(out, network), None
+    if results.replaces_earlier and report is not None:
+        report(f'replacing the results of an earlier run in {out}')
+    try:
+        with results:
+            run_report = run(source, pipeline, [results, history, *more_sinks(pipeline)],
+                             progress, stopped)
+            truth_arrays = source.reader.truth_arrays() if table is None else table
+            summary = summarise(source, pipeline, history, truth_arrays, run_report)
+            results.write_summary(summary)
+    except OSError as error:
+        # The files are written and closed even on a full disk; other sinks have their results.
+        if summary is None:
+            raise
+        run_report = replace(run_report, failures=(
+            *run_report.failures, Failure(results, output_error(error, results))))
     return Run(summary, run_report, history.logs, history.smoothed, truth_arrays)
 
 
@@ -179,7 +195,7 @@ def summarise(source: Source, pipeline: Pipeline, history: TrackHistory,
             'unflagged_poses': unflagged_poses(history.logs.values(), truth.values())
             if truth and pipeline.settings.track.target == 'vehicle' else None,
             'interrupted': report.interrupted,
-            'not_written': [str(error) for error in report.failures]}
+            'not_written': [str(failure.error) for failure in report.failures]}
 
 
 def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline,

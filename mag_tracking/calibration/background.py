@@ -123,7 +123,8 @@ class RunningBackground:
                         else (0.0, self._known_background, np.zeros(3), 0.0), self._known_noise)
 
     def resume(self, background: FloatArray, covariance: FloatArray) -> None:
-        """Resume with a recently stored background (3,) T and noise (3, 3) T² of a reading.
+        """Resume with a recently stored background (3,) T and noise (3, 3) T² of a reading; NaN
+        marks an unreported axis.
 
         The level remains constant until the new quiet interval is as long as `learn`.
         """

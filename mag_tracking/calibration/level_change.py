@@ -72,7 +72,8 @@ def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: F
     """Evaluate a change to a steady level from chronological blocks that begin at the old level.
 
     The last `n_steady` blocks are at the later level. `before` (k, 3) in T is the earlier level at
-    the times of the blocks; `noise_std` (3,) in T is that of one reading. `origin` in s is the zero
+    the times of the blocks; `noise_std` (3,) in T is that of one reading. NaN marks an
+    unreported axis. `origin` in s is the zero
     of the block times in the time common to all sensors.
     """
     after = np.average(blocks.mean[-n_steady:], axis=0)

@@ -61,8 +61,8 @@ def isolated_readings(values: FloatArray, min_height: float = 0.0) -> IntArray:
 def saturated_readings(fields: FloatArray, max_run: float = MAX_RUN) -> BoolArray:
     """Find readings at the limit of the range of an axis among chronological raw readings (n, 3).
 
-    `max_run` is the most readings, about half a second, for which a single excursion stays at the
-    limit. See `with_margin` for the adjacent readings.
+    NaN marks a missing axis. `max_run` is the most readings, about half a second, for which a
+    single excursion stays at the limit. See `with_margin` for the adjacent readings.
     """
     fields = np.asarray(fields, dtype=float)
     is_saturated = np.zeros(fields.shape, dtype=bool)

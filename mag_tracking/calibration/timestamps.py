@@ -176,6 +176,7 @@ def _groups(is_joined: BoolArray, stamps: IntArray) -> tuple[int, float, float]:
 
 
 def latest_interval_s(stamps: IntArray) -> float:
-    """Median of the latest intervals, robust to a few lost readings; 0 if there are too few."""
+    """Median [s] of the latest intervals of `stamps` (n,) [ns], robust to a few lost readings; 0 if
+    there are too few."""
     intervals = np.diff(stamps[-N_INTERVALS - 1:])
     return max(float(np.median(intervals)) / NS, 0.0) if len(intervals) == N_INTERVALS else 0.0

@@ -66,9 +66,10 @@ RENAMED = {
     'traffic': 'replay --tables passages', 'events': 'replay --tables events',
     'view': 'replay --live', 'watch': 'ros watch', 'topics': 'ros topics', 'echo': 'ros echo',
     'param': 'ros param', 'lifecycle': 'ros lifecycle', 'tumble': 'calibrate tumble',
-    'board-geometry': 'calibrate board', 'geometry': 'calibrate board',
+    'calibrate': 'calibrate network', 'board-geometry': 'calibrate board',
+    'geometry': 'calibrate board',
 }
-"""Present forms of former commands."""
+"""Present forms of former commands, and of a command that has subcommands now."""
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -134,6 +135,8 @@ def _exit(parser: argparse.ArgumentParser, parent: str, word: str,
     if not parent and word in RENAMED:
         parser.exit(2, f'{parser.prog}: {word} is now: {parser.prog} {RENAMED[word]}\n')
     similar = get_close_matches(word, names, 1)
+    if parent.strip() in RENAMED and not similar:
+        parser.exit(2, f'{parser.prog}: {parent}is now: {parser.prog} {RENAMED[parent.strip()]}\n')
     parser.exit(2, f'{parser.prog}: unknown command {parent}{word}; '
                 + (f'did you mean {parent}{similar[0]}?' if similar else
                    f'expected {", ".join(names)}') + '\n')

@@ -2,6 +2,7 @@
 
 import argparse
 import signal
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
@@ -42,7 +43,7 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.report.page import WARNING
 from mag_tracking.report.track_log import TrackLog
 from mag_tracking.results.rerun_file import RERUN_FILE, check_rerun, write_rerun
-from mag_tracking.run import RecordingSource, Sink, run
+from mag_tracking.run import RecordingSource, Sink, output_error, run
 from mag_tracking.stages.track.doubts import MEANINGS
 
 _REPLAY_HELP = '''
@@ -62,7 +63,7 @@ tables, selected by --tables NAME,NAME,... (default: poses), computed in one run
               report.html         interactive report: map, time slider, curves, tables
               *_track_N.png       figures: map, weights, measured and predicted field
   passages  the vehicles that cross a line (default: perpendicular to the x axis, through the centre
-            of the network; the settings traffic.line_* define other lines), counted when their
+            of the network; the setting traffic.lines defines other lines), counted when their
             tracks have ended; ambiguous passages are marked:
               passages.csv        one row per vehicle: time, direction, speed, class, ...
               intervals.csv       counts and mean speeds per interval, direction and class
@@ -160,11 +161,11 @@ def _replay(args: argparse.Namespace) -> int:
     """Run `mag-tracking replay`."""
     network = recorded_network(args)
     settings = settings_of(args, network)
-    names = distinct_names(args.recordings)
     _check(args, settings)
     if args.live:
         return show_recording(args.recordings[0], network, settings, args.rate, args.host,
                               args.port)
+    names = distinct_names(args.recordings)
     sources = [RecordingSource(Recording(path), network) for path in args.recordings]
     folders = [args.out / name if args.out and len(names) > 1 else args.out for name in names]
     _check_folders(args, sources, folders)
@@ -174,23 +175,26 @@ def _replay(args: argparse.Namespace) -> int:
 
         tables = [TABLES[name](args, network, stopped, stack)
                   for name in args.tables if name != POSES]
+        is_complete = True
         for source, out in zip(sources, folders, strict=True):
-            _replay_one(source, network, settings, out, tables, stopped, args)
+            is_complete &= _replay_one(source, network, settings, out, tables, stopped, args)
             if signals:
                 break
         if args.out is not None:
-            print(f'{"interrupted; partial results" if signals else "results"} in {args.out}')
+            print(f'{"interrupted; partial results" if signals else "results"} in {args.out}'
+                  + ('' if is_complete else ' are incomplete'))
         elif signals:
             print('interrupted: the results cover only the part read so far')
-    return 130 if signals else 0
+    return 130 if signals else 0 if is_complete else 1
 
 
 def _check(args: argparse.Namespace, settings: Settings) -> None:
     """Check the combination of the options; raises SettingsError if it is invalid."""
     if args.live:
-        if len(args.recordings) > 1 or args.out is not None or args.tables != [POSES]:
+        if len(args.recordings) > 1 or args.tables != [POSES] or args.tum or args.rerun or any(
+                v is not None for v in (args.out, args.truth, args.fleet, args.enrol)):
             raise SettingsError('--live shows one recording and writes no files: omit the other '
-                                'recordings, --out and --tables')
+                                'recordings and the options of tables and files')
         return
     if args.out is None and {POSES, 'fits'} & {*args.tables}:
         raise SettingsError('add --out DIR for the results, or --live for a live page')
@@ -198,6 +202,10 @@ def _check(args: argparse.Namespace, settings: Settings) -> None:
         check_vehicles(settings)
     if 'passages' not in args.tables and (args.fleet, args.enrol) != (None, None):
         raise SettingsError('--fleet and --enrol require --tables passages')
+    if POSES not in args.tables and (args.truth is not None or args.tum or args.rerun):
+        raise SettingsError('--truth, --tum and --rerun require --tables poses')
+    if args.rate != 1.0:
+        raise SettingsError('--rate requires --live')
     if args.rerun:
         check_rerun()
 
@@ -217,10 +225,16 @@ def _check_folders(args: argparse.Namespace, sources: Iterable[RecordingSource],
 
 def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Settings,
                 out: Path | None, tables: Sequence[Table], stopped: Callable[[], bool],
-                args: argparse.Namespace) -> None:
-    """Compute the tables of one recording; an interrupted run leaves partial results."""
+                args: argparse.Namespace) -> bool:
+    """Compute the tables of one recording; an interrupted run leaves partial results.
+
+    The result is whether everything could be written.
+    """
+    sinks: list[Sink] = []
+
     def sinks_of(pipeline: Pipeline) -> list[Sink]:
-        return [table.sink(source.stem, pipeline) for table in tables]
+        sinks.extend(table.sink(source.stem, pipeline) for table in tables)
+        return sinks
 
     if POSES in args.tables and out is not None:
         with progress_bar(source) as bar:
@@ -228,15 +242,31 @@ def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Setti
                             tqdm.write, args.truth, sinks_of)
         report = result.report
         _print_summary(source.name, result, network, args.verbose)
-        _write(result, network, out, stopped, args)
+        if not report.failures:
+            _write(result, network, out, stopped, args)
     else:
         pipeline = Pipeline(network, settings,
                             max((table.upto for table in tables), key=STAGES.index))
         with progress_bar(source) as bar:
             report = run(source, pipeline, sinks_of(pipeline), bar.update, stopped)
         print_diagnoses(report.diagnoses)
-    for table in tables:
-        table.finish(source.stem, report, out)
+    for failure in report.failures:
+        _print_incomplete(failure.error)
+    is_complete = not report.failures
+    for table, sink in zip(tables, sinks, strict=True):
+        if report.has_failed(sink):
+            continue
+        try:
+            table.finish(source.stem, report, out)
+        except (OutputError, OSError) as error:
+            _print_incomplete(output_error(error, table))
+            is_complete = False
+    return is_complete
+
+
+def _print_incomplete(error: OutputError) -> None:
+    """Print why results are incomplete."""
+    print(f'mag-tracking: incomplete results: {error}', file=sys.stderr)
 
 
 def _write(result: Run, network: SensorNetwork, out: Path, stopped: Callable[[], bool],

@@ -43,9 +43,9 @@ def _field_and_jacobians(r: ArrayLike,
 def multipole_field(r: ArrayLike, moments: ArrayLike) -> FloatArray:
     """Flux density (..., 3) [T] of a multipole expansion, summed over its orders; NaN at r = 0.
 
-    `r` [m] points from the source to the sensor; `moments` (..., 3 | 8 | 15) are as in the module
-    docstring. T10 eq. (3.39)-(3.41); in T10 eq. (4.17), r points from the sensor to the source, so
-    moments of even order have the opposite sign.
+    `r` [m] points from the source to the sensor, in the world frame; `moments` (..., 3 | 8 | 15)
+    are as in the module docstring. T10 eq. (3.39)-(3.41); in T10 eq. (4.17), r points from the
+    sensor to the source, so moments of even order have the opposite sign.
     """
     return _field_and_jacobians(r, moments)[0]
 

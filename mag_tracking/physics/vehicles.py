@@ -118,8 +118,8 @@ class RowVehicle:
         return predicted, F_turn, Q
 
     def turn_variance(self, speed: FloatArray) -> FloatArray:
-        """Stationary variance [rad²/s²] of the turn rate at a horizontal speed, at most
-        `MAX_TURN_RATE`²."""
+        """Stationary variance [rad²/s²] of the turn rate at a horizontal speed; at most
+        `MAX_TURN_RATE` squared."""
         min_speed = self.turn_acceleration / MAX_TURN_RATE
         variance: FloatArray = np.square(self.turn_acceleration / np.maximum(speed, min_speed))
         return variance

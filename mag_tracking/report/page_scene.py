@@ -172,7 +172,7 @@ def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
 
 
 def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
-    """JSON object of the smoothed or the true path (n, 3) [m] of a track."""
+    """JSON object of the smoothed or the true path (n, 3) [m, world frame] of a track."""
     return {'id': track_id, **{name: packed(points[:, a]) for a, name in enumerate('xyz')}}
 
 

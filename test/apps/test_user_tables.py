@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 
 import mag_tracking as mt
+from mag_tracking.apps.readings import source_of
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path
 
 NETWORK = mt.read_network(NETWORK_FILE)
@@ -12,6 +13,9 @@ READINGS = mt.read_recording(vehicle_path('straight_car_right'), NETWORK).readin
 NAMES = np.array(READINGS.sensor_names())
 LONG = pd.DataFrame({'sensor': NAMES, 'time': READINGS.stamp_ns,
                      **dict(zip('xyz', READINGS.field.T, strict=True))})
+
+
+FIELD = np.zeros((3, 3))
 
 
 def arrays():
@@ -69,6 +73,28 @@ def test_all_functions_accept_a_table():
     assert len(mt.fit(table, NETWORK, QUICK, orders=(1,)).passes) == 1
 
 
+WIDE = wide(lambda name, axis: f'{name}_{axis}')
+
+
+def test_absent_sensors_and_unmeasured_axes_are_reported():
+    alone = mt.track(LONG[LONG['sensor'] == 'mag_1'], NETWORK)
+    assert alone.report.missing_topics == ('/mag_2/imu/mag',)
+    assert any('mag_2' in line for line in alone.report.warnings())
+    assert any('scale' in line for line in alone.report.warnings())
+    planar = mt.track(LONG.assign(z=np.nan), NETWORK, settings=QUICK)
+    assert len(planar.tracks) == 1
+
+
+def test_names_of_sensors_may_end_like_an_axis():
+    network = mt.SensorNetwork(('bx', 'gate_z'), NETWORK.positions, NETWORK.R_ws,
+                               ('bx/mag', 'gate_z/mag'))
+    for separator in ('', '_', '.'):
+        table = WIDE.rename(columns=lambda c, separator=separator: c.replace(
+            'mag_1_', f'bx{separator}').replace('mag_2_', f'gate_z{separator}'))
+        source = source_of(table, network)
+        assert not source.missing_topics() and set(source.readings.names) == {'bx', 'gate_z'}
+
+
 MIXED = LONG.assign(time=[pd.Timestamp(t, tz='UTC' if k % 2 else 'Asia/Tokyo')
                           for k, t in enumerate(LONG['time'])])
 
@@ -81,13 +107,33 @@ MIXED = LONG.assign(time=[pd.Timestamp(t, tz='UTC' if k % 2 else 'Asia/Tokyo')
     (pd.concat([LONG, LONG]).sort_values('time'), 'mag_1: its reading 1 '),
     (LONG.assign(time=LONG['time'] / 1e9).assign(time=np.nan), 'time'),
     (wide(lambda name, axis: f'{name}_{axis}').assign(temperature=20.0), "'temperature'"),
-    (LONG.assign(sensor='mag_9'), 'mag_9')])
+    (LONG.assign(sensor='mag_9'), 'mag_9'), (LONG.drop(columns='z'), 'column for z'),
+    (WIDE.drop(columns='mag_1_z'), 'mag_1: .*z'), (WIDE.assign(mag_1_X=0.0), 'mag_1_X'),
+    (WIDE.assign(humidity=40.0), "'humidity'"), (LONG[['time']], 'no columns'),
+    (pd.concat([LONG, LONG['sensor']], axis=1), "'sensor'"), (LONG.assign(t=1), 'time, t'),
+    (LONG.assign(time=np.full(len(LONG), '2600-01-01', dtype='datetime64[s]')),
+     'time: ')])
 def test_tables_with_faults_are_refused(table, term):
     with pytest.raises(mt.ReadingsError, match=term):
         mt.track(table, NETWORK)
 
 
+@pytest.mark.parametrize('unit, factor', [('s', 10**3), ('ms', 10**6)])
+@pytest.mark.parametrize('number', [int, float])
+def test_times_in_a_smaller_unit_than_stated_are_refused(unit, factor, number):
+    times = (LONG['time'] // (1_000_000_000 // factor)).astype(number)
+    with pytest.raises(mt.ReadingsError, match='time_unit'):
+        mt.track(LONG.assign(time=times), NETWORK, time_unit=unit)
+
+
+@pytest.mark.parametrize('source', [None, [1, 2], np.zeros((3, 3)), LONG['x']])
+def test_other_types_of_sources_are_refused(source):
+    with pytest.raises(mt.ReadingsError, match=type(source).__name__):
+        mt.track(source, NETWORK)
+
+
 @pytest.mark.parametrize('faulty, term', [
+    ({'mag_1': (1, 2)}, 'mag_1'), ({'mag_1': 5}, 'mag_1'), ({1: (np.arange(3), FIELD)}, '1: '),
     ({}, 'no sensors'), ({'mag_1': (np.arange(3), np.zeros((3, 2)))}, r'mag_1: .*\(3, 3\)'),
     ({'mag_1': (np.arange(3), np.zeros((2, 3)))}, 'mag_1'),
     ({'mag_1': (np.arange(3),)}, 'mag_1'),

@@ -12,11 +12,11 @@ from mag_tracking.errors import NetworkError, OutputError
 from mag_tracking.messages.schema import odometry_dict, pose_covariance
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.recording import result_folder
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Detection, FieldFrame, Track
+from mag_tracking.results import result_folder
 from mag_tracking.simulation.scenario import Path, point_body
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align

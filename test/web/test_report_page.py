@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -208,8 +209,9 @@ def test_the_table_selects_each_track(chromium, vehicle_replays, road_network, t
     """The second track is a later copy of the first track at another position."""
     run, _ = vehicle_replays[RECORDING]
     later = second_track(run.logs[1])
-    two_tracks = type(run)({**run.summary, 'tracks': [*run.summary['tracks'], {
-        **run.summary['tracks'][0], 'id': 2}]}, {1: run.logs[1], 2: later}, run.smoothed, run.truth)
+    summary = {**run.summary, 'tracks': [*run.summary['tracks'],
+                                         {**run.summary['tracks'][0], 'id': 2}]}
+    two_tracks = replace(run, summary=summary, logs={1: run.logs[1], 2: later})
     page = Opened(chromium, write_report(two_tracks, road_network, tmp_path).as_uri())
     page.wait('magTracking.drawn > 0')
     shown = page.value('''[...new Set(document.getElementById('overview').data
@@ -283,8 +285,8 @@ def test_a_report_of_very_many_poses_is_thinned_with_a_note(vehicle_replays, roa
         log.id = k
         logs[k] = log
     entry = run.summary['tracks'][0]
-    many = type(run)({**run.summary, 'tracks': [{**entry, 'id': k} for k in logs]}, logs,
-                     {}, run.truth)
+    many = replace(run, summary={**run.summary, 'tracks': [{**entry, 'id': k} for k in logs]},
+                   logs=logs, smoothed={})
     path = write_report(many, road_network, tmp_path)
     assert path.stat().st_size < MAX_MB * 1e6
     text = path.read_text(encoding='utf-8')

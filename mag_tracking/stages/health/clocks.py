@@ -53,7 +53,7 @@ class ClockSpan(NamedTuple):
 
     @classmethod
     def of(cls, stamps: IntArray, received: IntArray) -> 'ClockSpan':
-        """Span of consecutive readings with times of receipt."""
+        """Span of consecutive readings with timestamps and times of receipt, both (n,) [ns]."""
         return cls(int(stamps[0]), int(stamps[-1]), int(received[0]), int(received[-1]))
 
     @property

@@ -172,8 +172,8 @@ def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_n
     """Fit straight and bent paths to the frames of a pass; None if the frames do not determine a
     path.
 
-    The search starts at positions and velocities `starts` (n, 6) at the time of the strongest
-    field, `stamp_ns`.
+    The search starts at positions and velocities `starts` (n, 6) [m, m/s] at the time of the
+    strongest field, `stamp_ns`.
     """
     data = PassSamples.of(network, frames, stamp_ns)
     n_clocks = data.n_clocks
