@@ -105,6 +105,7 @@ def source_of(source: UserSource, network: SensorNetwork, time_unit: str | None 
         raise ReadingsError('time_unit: only for the times of a DataFrame or of arrays')
     if isinstance(source, Readings):
         check_order(source)
+        source = checked_readings(source, network)
         present = {source.names[j] for j in np.unique(source.sensor)}
         source = RecordedReadings(source, {}, {}, {}, tuple(
             topic for name, topic in zip(network.names, network.absolute_topics, strict=True)

@@ -67,8 +67,8 @@ def _check_range(values: NDArray[Any], unit: str, name: str) -> None:
     limit = LATEST_NS // UNITS_NS[unit]
     if values.size and not -limit <= values.min() <= values.max() <= limit:
         raise ReadingsError(f'{name}: {values.min()} .. {values.max()} {unit} is outside '
-                            f'{-limit} .. {limit}; check the unit of the times (time_unit); '
-                            'they are counted since 1970')
+                            f'{-limit} .. {limit} {unit} since 1970; check the unit of the '
+                            'times (time_unit)')
 
 
 def readings_of_arrays(arrays: Mapping[str, tuple[ArrayLike, ArrayLike]],
