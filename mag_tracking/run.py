@@ -172,7 +172,7 @@ class Failure(NamedTuple):
 
 @dataclass(frozen=True)
 class RunReport:
-    """What was lost, rejected or missing in a run, and why."""
+    """Losses, rejections and missing topics of a run, with their causes."""
 
     counts: dict[str, dict[str, int]]
     """{stage: {event: number}}."""

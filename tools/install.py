@@ -23,7 +23,7 @@ MESSAGES = ROOT / 'msg_defs'
 PINS = ROOT / 'constraints.txt'
 BIN = Path(sys.prefix) / 'bin'
 KEPT_DAYS = 60
-"""What was not used for so long is removed from the cache."""
+"""Days without use after which a file is removed from the cache."""
 
 
 def say(text):
@@ -177,7 +177,7 @@ def install_run(installer):
     """What running needs, with the nodes, and mag_tracking itself, editable."""
     cache = cache_folder()
     wheel = messages_wheel(installer, cache)
-    say('mag_tracking and what it needs to run (compiled in part, about a minute the first time)')
+    say('mag_tracking and what it needs to run (compiled in part, minutes the first time)')
     variables = {'MAG_TRACKING_CACHE': str(cache / 'cores')} if cache else {}
     installer.install(wheel, again=['mag-tracking-msgs'])
     # setuptools warns about every editable package outside src/.

@@ -34,7 +34,7 @@ class EventsResult(DisplayedResult):
     events: tuple[PassEvent, ...]
     """Events in the order in which they ended."""
     report: RunReport
-    """What was lost, rejected or missing, and why."""
+    """Losses, rejections and missing topics, with their causes."""
 
     def counts(self) -> dict[str, int]:
         """Count the events of each sensor.

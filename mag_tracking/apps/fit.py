@@ -32,7 +32,7 @@ class FitResult(DisplayedResult):
     passes: tuple[FittedPass, ...]
     """One entry per pass and vehicle."""
     report: RunReport
-    """What was lost, rejected or missing, and why."""
+    """Losses, rejections and missing topics, with their causes."""
 
     def __repr__(self) -> str:
         notes = self.report.warnings()

@@ -105,18 +105,17 @@ def source_of(source: UserSource, network: SensorNetwork, time_unit: str | None 
         raise ReadingsError('time_unit: only for the times of a DataFrame or of arrays')
     if isinstance(source, Readings):
         check_order(source)
-        source = checked_readings(source, network)
-        present = {source.names[j] for j in np.unique(source.sensor)}
-        source = RecordedReadings(source, {}, {}, {}, tuple(
-            topic for name, topic in zip(network.names, network.absolute_topics, strict=True)
-            if name not in present))
-    if not isinstance(source, RecordedReadings | str | PathLike):
-        raise ReadingsError('source: expected a path, Readings, a DataFrame or {sensor: (times, '
-                            f'fields)}}, got {type(source).__name__}')
+        readings = checked_readings(source, network)
+        present = {readings.names[j] for j in np.unique(readings.sensor)}
+        return ArraySource(readings, topics=[topic for name, topic in zip(
+            network.names, network.absolute_topics, strict=True) if name not in present])
     if isinstance(source, RecordedReadings):
         return ArraySource(checked_readings(source.readings, network), rejected=source.rejected,
                            lost=source.lost, topics=source.missing_topics)
-    return RecordingSource(Recording(source), network)
+    if isinstance(source, str | PathLike):
+        return RecordingSource(Recording(source), network)
+    raise ReadingsError('source: expected a path, Readings, a DataFrame or {sensor: (times, '
+                        f'fields)}}, got {type(source).__name__}')
 
 
 def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: ArrayLike,

@@ -69,7 +69,7 @@ class Run:
     summary: dict[str, Any]
     """Content of `summary.json`."""
     report: RunReport
-    """What was lost, rejected or missing, and why."""
+    """Losses, rejections and missing topics, with their causes."""
     logs: dict[int, TrackLog] = field(default_factory=dict)
     """{track id: history of the track}."""
     smoothed: dict[int, SmoothedLog] = field(default_factory=dict)

@@ -52,7 +52,7 @@ class TrackingResult(DisplayedResult):
     """{target: (timestamps (n,) ns, positions (n, 3) m, quaternions (n, 4) xyzw)}; empty without
     ground truth."""
     report: RunReport
-    """What was lost, rejected or missing, and why."""
+    """Losses, rejections and missing topics, with their causes."""
     disturbances: tuple[Disturbance, ...]
     """Field changes that are explained better by a disturbance than by a target."""
 

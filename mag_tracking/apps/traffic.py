@@ -71,8 +71,8 @@ class TrafficResult(DisplayedResult):
     summaries: tuple[TrafficSummary, ...]
     """One summary per line and interval."""
     report: RunReport
-    """What was lost, rejected or missing, and why; `report.counts['traffic']` counts passages,
-    tracks that crossed no line, and other events."""
+    """Losses, rejections and missing topics, with their causes; `report.counts['traffic']` counts
+    passages, tracks that crossed no line, and other events."""
 
     def to_dataframe(self) -> 'pd.DataFrame':
         """Convert the counted vehicles to a table.

@@ -46,7 +46,7 @@ class BagFile:
     ----------
     types : message type by topic
     message_counts : number of messages by topic
-    start_ns, end_ns : log times of the first and last message; None if there is none
+    start_ns, end_ns : log times of the first and last message; None without messages
     losses : number of unreadable parts by description, updated in place
     """
 

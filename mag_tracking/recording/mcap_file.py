@@ -61,7 +61,7 @@ class McapFile:
     ----------
     types : message type by topic
     message_counts : number of messages by topic; empty if unknown
-    start_ns, end_ns : log times of the first and last message; None if there is none
+    start_ns, end_ns : log times of the first and last message; None without messages
     losses : number of unreadable parts by description, updated in place
     """
 

@@ -2,7 +2,7 @@
 
 
 def count_of(counts, term):
-    """Value of the only counter whose name contains `term`; 0 if there is none."""
+    """Value of the only counter whose name contains `term`; 0 without such a counter."""
     found = {name: n for name, n in counts.items() if term in name}
     assert len(found) <= 1, found
     return sum(found.values())

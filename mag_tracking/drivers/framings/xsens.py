@@ -185,7 +185,7 @@ class XsensFraming:
     def _search_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
                        more: bool) -> _ParseStep | None:
         """Search `outer` for another data message; return a step that rejects `outer` or waits for
-        more bytes, or None if there is none."""
+        more bytes, or None without a message."""
         rejection = _REJECT_STEP._replace(causes=('messages that contain the start of another',))
         index = 0
         while True:

@@ -164,7 +164,7 @@ class UdpSocket(Polled[socket.socket]):
         return f'cannot be opened: {error.strerror}'
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """Return up to `MAX_DATAGRAMS_PER_READ` available datagrams; wait only if there is none."""
+        """Return up to `MAX_DATAGRAMS_PER_READ` available datagrams; wait for the first one."""
         with self._lock:
             if self._handle is None:
                 raise DeviceError(f'UDP {self._socket_name()}: not open')
