@@ -5,6 +5,7 @@ constraints.txt. What was compiled is kept in the user's cache and used again wh
 the Python and the compiler are the same.
 """
 
+import fcntl
 import hashlib
 import os
 import shutil
@@ -200,6 +201,9 @@ EXTRAS = {
 
 def main(stages):
     begin = time.monotonic()
+    # `make -j` starts several stages at once; each waits for the one before. (uv locks .lock.)
+    lock = open(Path(sys.prefix) / '.installing', 'w')
+    fcntl.flock(lock, fcntl.LOCK_EX)
     installer = Installer()
     for stage in stages:
         if stage == 'run':
