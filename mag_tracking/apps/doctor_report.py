@@ -6,31 +6,33 @@ from pathlib import Path
 import numpy as np
 
 from mag_tracking.apps.doctor import Doctor
-from mag_tracking.files import replace_text
 from mag_tracking.quantities import quantity
-from mag_tracking.report.page import ERROR, NOTE, Chart, Note, Page, Table, report_html
-from mag_tracking.report.page_charts import axes, escape_markup
-from mag_tracking.report.palette import AXIS_COLOURS
+from mag_tracking.report.page import (
+    ERROR,
+    NOTE,
+    Chart,
+    Note,
+    Page,
+    Table,
+    axes_layout,
+    escape_markup,
+    write_page,
+)
+from mag_tracking.report.style import AXIS_COLOURS
 from mag_tracking.stages.health.diagnosis import Diagnosis
 from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S
 
 
 def write_report(doctor: Doctor, diagnoses: Sequence[Diagnosis], subject: str,
                  path: Path) -> None:
-    """Write the report of the diagnoses of `subject`, a recording or network."""
-    replace_text(path, report_html(doctor_page(doctor, diagnoses, subject)))
-
-
-def doctor_page(doctor: Doctor, diagnoses: Sequence[Diagnosis], subject: str) -> Page:
-    """Create the page of `subject`, a recording or network, with diagnoses, noise and sample
-    rates."""
+    """Write the report of `subject`, a recording or network: diagnoses, noise, sample rates."""
     notes = [Note(ERROR if d.serious else NOTE, str(d))
              for d in diagnoses] or [Note(NOTE, 'no faults found')]
     n_serious = sum(d.serious for d in diagnoses)
     numbers = (f'{quantity(n_serious, "serious finding")}, '
                f'{quantity(len(diagnoses) - n_serious, "note")}')
-    return Page(f'Health of {subject}', numbers, notes, None, [_noise(doctor), _rates(doctor)],
-                [_table(doctor)])
+    write_page(Page(f'Health of {subject}', numbers, notes, None,
+                    [_noise(doctor), _rates(doctor)], [_table(doctor)]), path)
 
 
 def _noise(doctor: Doctor) -> Chart:
@@ -42,7 +44,7 @@ def _noise(doctor: Doctor) -> Chart:
         traces.append({'type': 'bar', 'x': names, 'name': letter, 'marker': {
             'color': colour, 'pattern': {'shape': ('', '/', 'x')[axis]}},
             'y': [v if np.isfinite(v) else None for v in values]})
-    return Chart('Noise per axis', traces, axes('', 'standard deviation [nT]'))
+    return Chart('Noise per axis', traces, axes_layout('', 'standard deviation [nT]'))
 
 
 def _rates(doctor: Doctor) -> Chart:
@@ -51,7 +53,7 @@ def _rates(doctor: Doctor) -> Chart:
     return Chart('Sample rate', [{
         'type': 'bar', 'x': [escape_markup(name) for name in doctor.sensors],
         'y': [v if np.isfinite(v) else None for v in rates], 'showlegend': False}],
-        axes('', 'rate [Hz]'))
+        axes_layout('', 'rate [Hz]'))
 
 
 def _table(doctor: Doctor) -> Table:

@@ -1,21 +1,40 @@
-"""Report of fitted passes: map with time slider, fields, model orders."""
+"""Figures and report of fitted passes: fields, model orders, map with time slider."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from mag_tracking.analysis.fitted_pass import FittedPass
 from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, PassFit
-from mag_tracking.files import replace_text
+from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.quantities import quantity
-from mag_tracking.report.fit_figures import target_alone
-from mag_tracking.report.page import NOTE, REPORT, WARNING, Chart, Note, Page, Table, report_html
-from mag_tracking.report.page_charts import axes, curve
+from mag_tracking.report.page import (
+    NOTE,
+    WARNING,
+    Chart,
+    Note,
+    Page,
+    Table,
+    axes_layout,
+    curve,
+    write_page,
+)
 from mag_tracking.report.page_scene import field_entry, fitted_entry, scene_of
 from mag_tracking.report.road import Road, road_of
+from mag_tracking.report.style import (
+    AXIS_COLOURS,
+    SCALE_1D,
+    SERIES_COLOURS,
+    field_unit,
+    legend_beside,
+    literal,
+    plain_log_ticks,
+)
+from mag_tracking.results.result_folder import REPORT
 from mag_tracking.units import NS
 
 RECORDING_GAP_S = 5.0
@@ -24,12 +43,91 @@ N_POSES = 120
 """Number of poses shown per pass."""
 
 
+def pass_figure(fit: PassFit, title: str, max_sensors: int = 6) -> Figure:
+    """Plot the measured and the fitted field, with bands that should contain 90 % of the readings.
+
+    The bands account for the noise and for the uncertainty of the fitted parameters
+    (`PassFit.robust_covariance`). A normalised cost above 1 scales the noise variance, to account
+    for model errors. Only the `max_sensors` sensors with the strongest fields are plotted. As
+    [TSP14]_ Fig. 6.
+    """
+    data = fit.data
+    background = fit.predicted - target_alone(fit)
+    strength = {j: np.nanmax(np.abs(data.field - background)[data.sensor == j])
+                for j in data.sensors}
+    strongest = sorted(sorted(strength, key=lambda j: -strength[j])[:max_sensors])
+    f, unit = field_unit(max(strength.values()))
+    factor = max(1.0, fit.normalised_cost)
+    figure = Figure(figsize=(10.0, 1.0 + 2.6 * len(strongest)), layout='constrained')
+    for axes, j in zip(figure.subplots(len(strongest), 1, squeeze=False, sharex=True).flat,
+                       strongest, strict=True):
+        rows = data.sensor == j
+        t = data.t[rows]
+        # At rest, a coarse sensor has an enlarged covariance, so that all its readings count as one
+        # reading. The minimum excludes these covariances.
+        noise = np.nanmin(np.einsum('nii->ni', data.covariance[rows]), axis=0, initial=np.inf)
+        for a, colour in enumerate(AXIS_COLOURS):
+            if np.isnan(data.field[rows, a]).all():
+                continue
+            middle = f * (fit.predicted - background)[rows, a]
+            half = f * SCALE_1D * np.sqrt(fit.predicted_std[rows, a]**2 + factor * noise[a])
+            axes.fill_between(t, middle - half, middle + half, color=colour, alpha=0.25, lw=0)
+            axes.plot(t, f * (data.field - background)[rows, a], '.', ms=2.5, color=colour,
+                      label=f'{"xyz"[a]}')
+            axes.plot(t, middle, '-', lw=0.9, color='k')
+        axes.set_title(literal(data.network.names[j]), fontsize=9)
+        axes.set_ylabel(f'field [{unit}]')
+        axes.grid(alpha=0.3)
+        legend_beside(axes)
+    axes.set_xlabel('time relative to the strongest field [s]')
+    figure.suptitle(f'{literal(title)}: measured (dots), fitted (lines), 90 % bands', fontsize=11)
+    return figure
+
+
+def target_alone(fit: PassFit) -> FloatArray:
+    """Fitted field (n, 3) [T] of the target, without the fitted background of each sensor."""
+    out = fit.predicted.copy()
+    for name, value in zip(fit.names, fit.x, strict=True):
+        if name.startswith('B '):
+            sensor, axis = name[2:].rsplit(' ', 1)
+            out[fit.data.sensor == fit.data.network.index(sensor), 'xyz'.index(axis)] -= value
+    return out
+
+
+def order_figure(passes: Sequence[FittedPass]) -> Figure:
+    """Plot the normalised cost against the number of dipoles, one line per pass, as [TSP14]_ Fig.
+    7.
+
+    A filled symbol marks the chosen number of dipoles.
+    """
+    figure = Figure(figsize=(7.5, 5.0), layout='constrained')
+    axes = figure.add_subplot()
+    for k, one in enumerate(passes):
+        fits = [f for f in one.fits if len(f.x)]
+        if not fits:
+            continue
+        colour = SERIES_COLOURS[k % len(SERIES_COLOURS)]
+        axes.semilogy([f.n_dipoles for f in fits], [f.normalised_cost for f in fits], 'o-',
+                      mfc='w', color=colour, label=literal(f'{one.recording}, {one.label}'))
+        if one.chosen is not None:
+            axes.semilogy([one.chosen.n_dipoles], [one.chosen.normalised_cost], 'o', ms=8,
+                          color=colour)
+    axes.axhline(1.0, color='k', lw=0.8, ls='--')
+    axes.set_xticks(sorted({f.n_dipoles for one in passes for f in one.fits}))
+    axes.set_xlabel('number of dipoles')
+    axes.set_ylabel('normalised cost (1 if the residuals match the noise)')
+    axes.grid(alpha=0.3, which='both')
+    legend_beside(axes)
+    plain_log_ticks(axes)
+    figure.suptitle('Fit of a row of dipoles to each pass (filled: chosen order)',
+                    fontsize=11)
+    return figure
+
+
 def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
-                 out: Path) -> Path:
+                 out: Path) -> None:
     """Write the report of fitted passes, with `RecordingFit.warnings`, to `report.html`."""
-    path = out / REPORT
-    replace_text(path, report_html(fit_page(passes, network, warnings)))
-    return path
+    write_page(fit_page(passes, network, warnings), out / REPORT)
 
 
 def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
@@ -123,7 +221,8 @@ def _order_chart(passes: Sequence[FittedPass]) -> Chart:
         fits = [f for f in fitted.fits if len(f.x)]
         traces.append(curve([f.n_dipoles for f in fits], [f.normalised_cost for f in fits],
                             f'{fitted.recording}, {fitted.label}', k, 'lines+markers'))
-    layout = axes('number of dipoles', 'normalised cost (1 = consistent with noise)', log_y=True)
+    layout = axes_layout('number of dipoles', 'normalised cost (1 = consistent with noise)',
+                         log_y=True)
     layout['xaxis']['dtick'] = 1
     return Chart('Quality of the fits by number of dipoles', traces, layout)
 

@@ -1,9 +1,6 @@
-"""Figures of a run; each function returns one figure.
+"""Figures of tracks, with 90 % regions, and of values over time; each function returns one."""
 
-All figures show uncertainty as 90 % regions.
-"""
-
-from typing import Protocol
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,32 +8,23 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from mag_tracking.arrays import FloatArray
-from mag_tracking.report.literal_text import literal
-from mag_tracking.report.palette import AXIS_COLOURS, SERIES_COLOURS, VERMILLION
-from mag_tracking.report.scales import field_unit, scale_of
-from mag_tracking.report.style import legend_beside
-from mag_tracking.report.track_log import TrackLog
+from mag_tracking.analysis.track_log import TrackLog
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.network import SensorNetwork
+from mag_tracking.report.style import (
+    AXIS_COLOURS,
+    SERIES_COLOURS,
+    VERMILLION,
+    field_unit,
+    legend_beside,
+    literal,
+    scale_of,
+)
 
 SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
 """Radius of a 90 % ellipse in the plane, in standard deviations."""
-SCALE_1D = 1.645
-"""Half width of a 90 % interval, in standard deviations."""
-
 MIN_WEIGHT = 0.01
 """Minimum weight of a plotted hypothesis. Less probable hypotheses are omitted for clarity."""
-
-
-class _Network(Protocol):
-    """Attributes of a `SensorNetwork` that the figures use."""
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-
-    @property
-    def positions(self) -> FloatArray: ...
-
-    def __len__(self) -> int: ...
 
 
 def ellipse_points(position: FloatArray, covariance: FloatArray, n: int = 48) -> FloatArray:
@@ -63,7 +51,7 @@ def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray
     return np.insert(points, switches, np.nan, axis=0)
 
 
-def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None,
+def map_figure(log: TrackLog, network: SensorNetwork, truth: FloatArray | None = None,
                smoothed: ArrayLike | None = None) -> Figure:
     """Plot a track with 90 % ellipses, its hypotheses by arrival direction, sensors and truth.
 
@@ -148,7 +136,7 @@ def weights_figure(log: TrackLog) -> Figure:
     return figure
 
 
-def field_figure(log: TrackLog, network: _Network, max_sensors: int = 8) -> Figure:
+def field_figure(log: TrackLog, network: SensorNetwork, max_sensors: int = 8) -> Figure:
     """Plot the measured field and the field of the best hypothesis, per sensor and axis.
 
     In a network of more than `max_sensors`, only the sensors with the strongest fields are plotted,
@@ -182,4 +170,24 @@ def field_figure(log: TrackLog, network: _Network, max_sensors: int = 8) -> Figu
     selection = '' if len(sensors) == len(network) \
         else f' (the strongest {len(sensors)} of {len(network)})'
     figure.suptitle(f'Track {log.id}: measured and predicted field, sensor frame{selection}')
+    return figure
+
+
+def time_figure(stamp_ns: IntArray, values: FloatArray, std: FloatArray | None,
+                groups: Sequence[str], label: str) -> Figure:
+    """Draw values (n,), with standard deviations if known, over time, a colour per group."""
+    figure = Figure(figsize=(8.0, 3.5), layout='constrained')
+    axis = figure.add_subplot()
+    times = np.asarray(stamp_ns, dtype='datetime64[ns]')
+    for k, group in enumerate(dict.fromkeys(groups)):
+        rows = np.array([g == group for g in groups])
+        axis.errorbar(times[rows], values[rows], None if std is None else std[rows], fmt='o',
+                      color=SERIES_COLOURS[k % len(SERIES_COLOURS)], label=literal(group))
+    axis.set_xlabel('time (UTC)')
+    axis.set_ylabel(label)
+    axis.grid(True, alpha=0.3)
+    if len(groups):
+        legend_beside(axis)
+    else:
+        axis.text(0.5, 0.5, 'nothing was found', transform=axis.transAxes, ha='center')
     return figure

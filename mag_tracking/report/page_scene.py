@@ -1,16 +1,18 @@
 """Map with a time slider as JSON: sensors, tracks, hypotheses and fields."""
 
+import base64
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
+from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.report.packed import Packed, packed
+from mag_tracking.network import SensorNetwork
 from mag_tracking.report.road import Road
-from mag_tracking.report.scales import scale_of
-from mag_tracking.report.track_log import TrackLog
+from mag_tracking.report.style import scale_of
 from mag_tracking.units import NS
 
 MAX_SENSORS = 8
@@ -26,30 +28,23 @@ MAX_MARGIN_RATIO = 6.0
 SINGLE_SENSOR_MARGIN_M = 10.0
 """Maximum margin of the map around a network without extent, such as a single sensor [m]."""
 
-
 NO_ROAD = Road()
 
-
-class Sensors(Protocol):
-    """Attributes of a `SensorNetwork` that a page uses."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Sensor names."""
-
-    @property
-    def positions(self) -> FloatArray:
-        """Sensor positions, (n, 3) m, world frame."""
-
-    @property
-    def frame(self) -> str:
-        """Name of the world frame."""
-
-    def __len__(self) -> int: ...
+Packed = dict[str, str]
+"""Maps the type of the numbers of an array to little-endian base64, which `scene.js` decodes."""
 
 
-def scene_of(network: Sensors, begin_ns: int, end_ns: int, tracks: Sequence[Mapping[str, Any]],
-             road: Road = NO_ROAD) -> dict[str, Any]:
+def packed(values: ArrayLike, kind: str = 'f8') -> Packed:
+    """Encode an array (n,) as JSON object in a third of the space of decimal numbers.
+
+    `kind` is 'f8', 'u1', or 'f4', which is sufficient for values that are only plotted.
+    """
+    raw = np.ascontiguousarray(values, dtype=f'<{kind}').tobytes()
+    return {kind: base64.b64encode(raw).decode('ascii')}
+
+
+def scene_of(network: SensorNetwork, begin_ns: int, end_ns: int,
+             tracks: Sequence[Mapping[str, Any]], road: Road = NO_ROAD) -> dict[str, Any]:
     """JSON object of the map with a time slider, of tracks from `track_entry`.
 
     The page shows seconds since `begin_ns`.

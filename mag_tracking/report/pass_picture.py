@@ -1,18 +1,16 @@
 """Picture of a pass: road, sensors, vehicle to scale, published track and smoothed path."""
 
-from typing import Protocol
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.network import SensorNetwork
 from mag_tracking.report.figures import ellipse_points
-from mag_tracking.report.literal_text import literal
-from mag_tracking.report.palette import BLUE, VERMILLION
 from mag_tracking.report.road import road_of
-from mag_tracking.report.track_log import TrackLog
+from mag_tracking.report.style import BLUE, VERMILLION, literal
 from mag_tracking.units import NS
 
 N_VEHICLES = 5
@@ -30,17 +28,7 @@ WIDTHS_M = ((1.0, 0.8), (5.0, 1.8), (np.inf, 2.5))
 GRASS, ASPHALT, LINE, DARK = '#eef1ea', '#d3d4d6', '#ffffff', '#333333'
 
 
-class _Network(Protocol):
-    """Attributes of a `SensorNetwork` that the picture uses."""
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-
-    @property
-    def positions(self) -> FloatArray: ...
-
-
-def pass_figure(log: TrackLog, network: _Network, smoothed: ArrayLike | None = None,
+def pass_figure(log: TrackLog, network: SensorNetwork, smoothed: ArrayLike | None = None,
                 max_std: float = float('inf')) -> Figure:
     """Draw the pass of a vehicle as a picture with a scale bar.
 
@@ -155,7 +143,7 @@ def _draw_vehicles(axes: Axes, log: TrackLog, shown: IntArray, sensors: FloatArr
                       ha='center', va='center', fontsize=11, color=DARK, zorder=8)
 
 
-def _draw_sensors(axes: Axes, network: _Network) -> None:
+def _draw_sensors(axes: Axes, network: SensorNetwork) -> None:
     """Draw the sensors with their names."""
     axes.plot(*network.positions[:, :2].T, '^', ms=13, mfc=DARK, mec=LINE, mew=1.5, zorder=7,
               ls='none', label='magnetometers')

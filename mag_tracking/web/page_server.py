@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from mag_tracking.errors import DeviceError
-from mag_tracking.report.json_text import json_text
+from mag_tracking.files import json_text
 from mag_tracking.report.page import live_html
 
 LOOPBACK = '127.0.0.1'

@@ -6,9 +6,9 @@ from typing import TypeAlias, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mag_tracking.analysis.track_log import SmoothedLog, TrackLog
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.geometry import rotation_from_quaternion
-from mag_tracking.report.track_log import SmoothedLog, TrackLog
 
 Truth: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
 """Timestamps (n,) [ns], positions (n, 3) [m] and quaternions (n, 4) xyzw of a target; quaternions
