@@ -2,7 +2,8 @@
 
 import base64
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,7 +31,22 @@ SINGLE_SENSOR_MARGIN_M = 10.0
 
 NO_ROAD = Road()
 
-Packed = dict[str, str]
+@dataclass(frozen=True, eq=False)
+class SensorLayout:
+    """Names and positions of the sensors, as published by the tracker."""
+
+    frame: str
+    """Name of the world frame."""
+    names: tuple[str, ...]
+    positions: FloatArray
+    """(n, 3) [m], world frame."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+Sensors: TypeAlias = SensorNetwork | SensorLayout
+Packed: TypeAlias = dict[str, str]
 """Maps the type of the numbers of an array to little-endian base64, which `scene.js` decodes."""
 
 
@@ -43,7 +59,7 @@ def packed(values: ArrayLike, kind: str = 'f8') -> Packed:
     return {kind: base64.b64encode(raw).decode('ascii')}
 
 
-def scene_of(network: SensorNetwork, begin_ns: int, end_ns: int,
+def scene_of(network: Sensors, begin_ns: int, end_ns: int,
              tracks: Sequence[Mapping[str, Any]], road: Road = NO_ROAD) -> dict[str, Any]:
     """JSON object of the map with a time slider, of tracks from `track_entry`.
 

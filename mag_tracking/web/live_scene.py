@@ -11,10 +11,10 @@ import numpy as np
 from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.arrays import FloatArray
 from mag_tracking.files import json_text
-from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.report.page import Note, Table
 from mag_tracking.report.page_scene import (
+    Sensors,
     facts_of,
     packed,
     path_entry,
@@ -106,7 +106,7 @@ class LiveScene:
     Title and subtitle are sent with the next complete scene.
     """
 
-    def __init__(self, title: str, network: SensorNetwork) -> None:
+    def __init__(self, title: str, network: Sensors) -> None:
         self.title, self.subtitle = title, ''
         self._network = network
         self._lock = threading.Lock()
@@ -116,7 +116,7 @@ class LiveScene:
         self._n_tracks = 0
         self._clear()
 
-    def use_network(self, network: SensorNetwork) -> None:
+    def use_network(self, network: Sensors) -> None:
         """Start a new scene with another network."""
         with self._lock:
             self._network = network
