@@ -125,9 +125,8 @@ def write_page(spectator, out):
         entry = track_entry(log, begin_ns, strongest_sensors(log))
         entry['facts'] = facts_of(log.summary())
         if log.id in spectator.smoothed:
-            entry['smoothed'] = path_entry(log.id, spectator.smoothed[log.id])
-        entry['truth'] = path_entry(log.id, interpolate_truth(spectator.truth_arrays(),
-                                                              log.stamp_ns))
+            entry['smoothed'] = path_entry(spectator.smoothed[log.id])
+        entry['truth'] = path_entry(interpolate_truth(spectator.truth_arrays(), log.stamp_ns))
         tracks.append(entry)
     scene = scene_of(spectator.network, begin_ns, max(log.stamp_ns[-1] for log in logs), tracks)
     path = out / 'report.html'

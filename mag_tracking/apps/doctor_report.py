@@ -1,6 +1,7 @@
 """Report of `mag-tracking doctor`: faults of the sensors and advice."""
 
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,6 @@ from mag_tracking.report.page import (
     Page,
     Table,
     axes_layout,
-    escape_markup,
     write_page,
 )
 from mag_tracking.report.style import AXIS_COLOURS
@@ -31,29 +31,21 @@ def write_report(doctor: Doctor, diagnoses: Sequence[Diagnosis], subject: str,
     n_serious = sum(d.serious for d in diagnoses)
     numbers = (f'{quantity(n_serious, "serious finding")}, '
                f'{quantity(len(diagnoses) - n_serious, "note")}')
-    write_page(Page(f'Health of {subject}', numbers, notes, None,
-                    [_noise(doctor), _rates(doctor)], [_table(doctor)]), path)
+    write_page(Page(f'Health of {subject}', numbers, notes, None, _charts(doctor),
+                    [_table(doctor)]), path)
 
 
-def _noise(doctor: Doctor) -> Chart:
-    """Chart of the noise of each axis."""
-    names = [escape_markup(name) for name in doctor.sensors]
-    traces = []
-    for axis, (letter, colour) in enumerate(zip('xyz', AXIS_COLOURS, strict=True)):
-        values = [1e9 * float(h.noise_std[axis]) for h in doctor.sensors.values()]
-        traces.append({'type': 'bar', 'x': names, 'name': letter, 'marker': {
-            'color': colour, 'pattern': {'shape': ('', '/', 'x')[axis]}},
-            'y': [v if np.isfinite(v) else None for v in values]})
-    return Chart('Noise per axis', traces, axes_layout('', 'standard deviation [nT]'))
-
-
-def _rates(doctor: Doctor) -> Chart:
-    """Chart of the sample rates."""
+def _charts(doctor: Doctor) -> list[Chart]:
+    """Charts of the noise of each axis and of the sample rates."""
+    names = [escape(name, quote=False) for name in doctor.sensors]
+    noise = [{'type': 'bar', 'x': names, 'name': letter, 'marker': {
+        'color': colour, 'pattern': {'shape': ('', '/', 'x')[axis]}},
+        'y': [1e9 * float(h.noise_std[axis]) for h in doctor.sensors.values()]}
+        for axis, (letter, colour) in enumerate(zip('xyz', AXIS_COLOURS, strict=True))]
     rates = [float(h.rate) if h.counts['readings'] else 0.0 for h in doctor.sensors.values()]
-    return Chart('Sample rate', [{
-        'type': 'bar', 'x': [escape_markup(name) for name in doctor.sensors],
-        'y': [v if np.isfinite(v) else None for v in rates], 'showlegend': False}],
-        axes_layout('', 'rate [Hz]'))
+    return [Chart('Noise per axis', noise, axes_layout('', 'standard deviation [nT]')),
+            Chart('Sample rate', [{'type': 'bar', 'x': names, 'y': rates, 'showlegend': False}],
+                  axes_layout('', 'rate [Hz]'))]
 
 
 def _table(doctor: Doctor) -> Table:

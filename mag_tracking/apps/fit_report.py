@@ -23,8 +23,8 @@ from mag_tracking.report.page import (
     curve,
     write_page,
 )
-from mag_tracking.report.page_scene import field_entry, fitted_entry, scene_of
-from mag_tracking.report.road import Road, road_of
+from mag_tracking.report.page_scene import field_entry, pose_entry, scene_of
+from mag_tracking.report.road import road_of
 from mag_tracking.report.style import (
     AXIS_COLOURS,
     SCALE_1D,
@@ -37,25 +37,27 @@ from mag_tracking.report.style import (
 from mag_tracking.results.result_folder import REPORT
 from mag_tracking.units import NS
 
+MAX_SENSORS = 6
+"""Maximum number of sensors in the figure of a pass."""
 RECORDING_GAP_S = 5.0
 """Gap between two recordings on the time axis of the page [s]."""
 N_POSES = 120
 """Number of poses shown per pass."""
 
 
-def pass_figure(fit: PassFit, title: str, max_sensors: int = 6) -> Figure:
+def pass_figure(fit: PassFit, title: str) -> Figure:
     """Plot the measured and the fitted field, with bands that should contain 90 % of the readings.
 
     The bands account for the noise and for the uncertainty of the fitted parameters
     (`PassFit.robust_covariance`). A normalised cost above 1 scales the noise variance, to account
-    for model errors. Only the `max_sensors` sensors with the strongest fields are plotted. As
-    [TSP14]_ Fig. 6.
+    for model errors. Only the `MAX_SENSORS` with the strongest fields are plotted. As [TSP14]_ Fig.
+    6.
     """
     data = fit.data
-    background = fit.predicted - target_alone(fit)
+    background = fit.predicted - _target_field(fit)
     strength = {j: np.nanmax(np.abs(data.field - background)[data.sensor == j])
                 for j in data.sensors}
-    strongest = sorted(sorted(strength, key=lambda j: -strength[j])[:max_sensors])
+    strongest = sorted(sorted(strength, key=lambda j: -strength[j])[:MAX_SENSORS])
     f, unit = field_unit(max(strength.values()))
     factor = max(1.0, fit.normalised_cost)
     figure = Figure(figsize=(10.0, 1.0 + 2.6 * len(strongest)), layout='constrained')
@@ -84,7 +86,7 @@ def pass_figure(fit: PassFit, title: str, max_sensors: int = 6) -> Figure:
     return figure
 
 
-def target_alone(fit: PassFit) -> FloatArray:
+def _target_field(fit: PassFit) -> FloatArray:
     """Fitted field (n, 3) [T] of the target, without the fitted background of each sensor."""
     out = fit.predicted.copy()
     for name, value in zip(fit.names, fit.x, strict=True):
@@ -113,14 +115,13 @@ def order_figure(passes: Sequence[FittedPass]) -> Figure:
             axes.semilogy([one.chosen.n_dipoles], [one.chosen.normalised_cost], 'o', ms=8,
                           color=colour)
     axes.axhline(1.0, color='k', lw=0.8, ls='--')
-    axes.set_xticks(sorted({f.n_dipoles for one in passes for f in one.fits}))
-    axes.set_xlabel('number of dipoles')
-    axes.set_ylabel('normalised cost (1 if the residuals match the noise)')
+    axes.set(xticks=sorted({f.n_dipoles for one in passes for f in one.fits}),
+             xlabel='number of dipoles',
+             ylabel='normalised cost (1 if the residuals match the noise)')
     axes.grid(alpha=0.3, which='both')
     legend_beside(axes)
     plain_log_ticks(axes)
-    figure.suptitle('Fit of a row of dipoles to each pass (filled: chosen order)',
-                    fontsize=11)
+    figure.suptitle('Fit of a row of dipoles to each pass (filled: chosen order)', fontsize=11)
     return figure
 
 
@@ -133,7 +134,13 @@ def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings:
 def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
              warnings: Sequence[str]) -> Page:
     """Create the page of fitted passes; those without an estimate are not on the map."""
-    notes = [Note(WARNING, text) for text in (*warnings, *_poor_fits(passes))]
+    chosen = [fitted.chosen for fitted in passes if fitted.chosen is not None]
+    n_poor = sum(fit.normalised_cost > MAX_NORMALISED_COST for fit in chosen)
+    notes = [Note(WARNING, text) for text in warnings]
+    if n_poor:
+        notes.append(Note(WARNING, 'poor fits (normalised cost above '
+                          f'{MAX_NORMALISED_COST:g}): {n_poor} of {len(chosen)}; errors in speed '
+                          'and position may exceed several standard deviations'))
     if not passes:
         notes.append(Note(NOTE, 'no passes: nothing was detected'))
     if any(fitted.n_vehicles > 1 for fitted in passes):
@@ -144,27 +151,20 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
         notes.append(Note(NOTE, 'the time axis shows the recordings one after another'))
     tracks = [_pass_entry(k + 1, fitted, fitted.chosen, peak_times[k])
               for k, fitted in enumerate(passes) if fitted.chosen is not None]
-    end_times = [peak_times[k] + float(fitted.fits[0].data.t.max())
-                 for k, fitted in enumerate(passes)]
-    scene = scene_of(network, 0, int(max(end_times) * NS), tracks, _road(passes, network)) \
-        if tracks else None
-    n_estimates = len(tracks)
+    scene = None
+    if tracks:
+        end = max(peak + float(fitted.fits[0].data.t.max())
+                  for peak, fitted in zip(peak_times, passes, strict=True))
+        # The road is along the unambiguous fits.
+        road = road_of(network.positions[:, :2], [
+            fit.x[:2] + np.outer(_times(fit), fit.x[3:5]) for fit in chosen if not fit.ambiguous])
+        scene = scene_of(network, 0, int(end * NS), tracks, road)
     n_passes = len({(fitted.recording, fitted.number) for fitted in passes})
     vehicles_text = f', {quantity(len(passes), "vehicle")}' if len(passes) > n_passes else ''
     return Page(f'{quantity(n_passes, "pass", "passes")}{vehicles_text}, '
-                f'{n_estimates} with an estimate',
+                f'{len(tracks)} with an estimate',
                 'each fitted as a row of dipoles at constant velocity', notes, scene,
                 [_order_chart(passes)] if passes else [], [_table(passes)])
-
-
-def _poor_fits(passes: Sequence[FittedPass]) -> list[str]:
-    """Return one warning if chosen fits have a high normalised cost, otherwise an empty list."""
-    costs = [fitted.chosen.normalised_cost for fitted in passes if fitted.chosen is not None]
-    n_poor = sum(cost > MAX_NORMALISED_COST for cost in costs)
-    if not n_poor:
-        return []
-    return [f'poor fits (normalised cost above {MAX_NORMALISED_COST:g}): {n_poor} of {len(costs)}; '
-            'errors in speed and position may exceed several standard deviations']
 
 
 def _peaks_ns(passes: Sequence[FittedPass]) -> list[int]:
@@ -182,36 +182,35 @@ def _peaks_ns(passes: Sequence[FittedPass]) -> list[int]:
     return peaks
 
 
+def _times(fit: PassFit) -> FloatArray:
+    """Times (n,) [s] of the poses that are shown."""
+    return np.linspace(fit.data.t.min(), fit.data.t.max(), N_POSES)
+
+
 def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, peak_time: float) -> dict[str, Any]:
     """Create the scene entry of a chosen fit; the field is strongest at `peak_time` [s]."""
-    data = fit.data
-    t = np.linspace(data.t.min(), data.t.max(), N_POSES)
+    data, t = fit.data, _times(fit)
     F = np.tile(np.eye(6), (N_POSES, 1, 1))
     F[:, :3, 3:] = t[:, None, None] * np.eye(3)
     state = F @ fit.x[:6]
     C = F @ fit.robust_covariance[:6, :6] @ F.transpose(0, 2, 1)
     C[:, :3, :3] += fit.position_covariance - fit.robust_covariance[:3, :3]
-    target_field = target_alone(fit)
+    missing = np.full((N_POSES, 3), np.nan)
+    entry = pose_entry(number, peak_time + t, state, C, np.full(N_POSES, fit.ambiguous),
+                       np.full(N_POSES, float(fit.length[0])), missing, missing[:, 0],
+                       np.zeros(N_POSES))
+    target_field = _target_field(fit)
     other_field = fit.predicted - target_field
-    fields = [field_entry(int(j), (data.field - other_field)[data.sensor == j],
-                          target_field[data.sensor == j], peak_time + data.t[data.sensor == j])
-              for j in data.sensors]
-    entry = fitted_entry(number, peak_time + t, state, C, fit.ambiguous, float(fit.length[0]),
-                         fields)
+    entry['fields'] = [
+        field_entry(int(j), (data.field - other_field)[data.sensor == j],
+                    target_field[data.sensor == j], peak_time + data.t[data.sensor == j])
+        for j in data.sensors]
     entry['facts'] = {
         'label': f'{fitted.recording}, {fitted.label}', 'kind': quantity(fit.n_dipoles, 'dipole'),
         'speed': float(fit.speed[0]), 'moment': float(np.linalg.norm(fit.moment[0])),
         'verdict': ('ambiguous' if fit.ambiguous else 'unique')
         + f', cost {fit.normalised_cost:.2f}'}
     return entry
-
-
-def _road(passes: Sequence[FittedPass], network: SensorNetwork) -> Road:
-    """Road along the unambiguous fits."""
-    fits = [fitted.chosen for fitted in passes if fitted.chosen is not None]
-    return road_of(network.positions[:, :2], [
-        fit.x[:2] + np.outer(np.linspace(fit.data.t.min(), fit.data.t.max(), N_POSES), fit.x[3:5])
-        for fit in fits if not fit.ambiguous])
 
 
 def _order_chart(passes: Sequence[FittedPass]) -> Chart:
@@ -232,15 +231,12 @@ def _table(passes: Sequence[FittedPass]) -> Table:
     rows: list[list[str | float | None]] = []
     for fitted in passes:
         for fit in fitted.fits:
-            row: list[str | float | None] = [fitted.recording, fitted.label.removeprefix('pass '),
-                                             fit.n_dipoles]
-            has_estimate = bool(len(fit.x)) and not fit.reason
-            row += [float(fit.normalised_cost) if len(fit.x) else None]
-            row += [*map(float, fit.position), float(fit.speed[0]),
-                    float(np.degrees(fit.heading[0])), float(fit.length[0]),
-                    float(np.linalg.norm(fit.moment[0]))] if has_estimate else [None] * 7
-            row += ['chosen' if fit is fitted.chosen else fit.reason]
-            rows.append(row)
+            estimate = [*fit.position, fit.speed[0], np.degrees(fit.heading[0]), fit.length[0],
+                        np.linalg.norm(fit.moment[0])] if len(fit.x) and not fit.reason else []
+            rows.append([fitted.recording, fitted.label.removeprefix('pass '), fit.n_dipoles,
+                         float(fit.normalised_cost) if len(fit.x) else None,
+                         *(map(float, estimate) if estimate else [None] * 7),
+                         'chosen' if fit is fitted.chosen else fit.reason])
     return Table('All fits', ['recording', 'pass', 'dipoles', 'cost', 'x [m]', 'y [m]', 'z [m]',
                               'speed [m/s]', 'heading [deg]', 'length [m]', 'moment [A m²]', ''],
                  rows)

@@ -35,6 +35,7 @@ from mag_tracking.results.result_folder import REPORT
 
 MIN_MISSED = 1e-6
 """Probabilities of a missed pass below this value are not drawn."""
+ROUND_NUMBERS = [10.0**k * m for k in range(-7, 8) for m in (1, 2, 5)]
 LOW_QUANTILE = 0.02
 """Quantile of a bound at the lower end of its colour scale; the upper end is symmetric."""
 
@@ -46,8 +47,9 @@ def position_figure(plan: Plan) -> Figure:
     z = f * np.clip(plan.position_std, None, np.ptp(plan.x))
     mesh = axes.pcolormesh(f * plan.x, f * plan.y, z, norm=LogNorm(), cmap='viridis',
                            shading='nearest', rasterized=True)
-    lines = axes.contour(f * plan.x, f * plan.y, z, levels=_levels(z, 1.0), colors='w',
-                         linewidths=0.8)
+    low, high = np.nanmin(z), np.nanmax(z)
+    levels = [v for v in ROUND_NUMBERS if low < v < high] or [np.sqrt(low * high)]
+    lines = axes.contour(f * plan.x, f * plan.y, z, levels=levels, colors='w', linewidths=0.8)
     axes.clabel(lines, fmt=f'%g {unit}', fontsize=8)
     figure.colorbar(mesh, ax=axes, label=f'horizontal standard deviation [{unit}]')
     return figure
@@ -72,16 +74,12 @@ def sensor_figure(plan: Plan) -> Figure:
 
     The map is white where no sensor is allowed.
     """
-    gain = 1.0 - plan.std_with_added_sensor / plan.std_without_added_sensor
-    possible = np.isfinite(gain).any()
     figure, axes, f, unit = _draw_map(
         plan, 'Improvement by one additional sensor\n(median bound near the sensors without it: '
         f'{length_text(plan.std_without_added_sensor)})')
-    ny, nx = gain.shape
-    x, y = np.linspace(plan.x[0], plan.x[-1], nx), np.linspace(plan.y[0], plan.y[-1], ny)
-    mesh = axes.pcolormesh(f * x, f * y, 100.0 * gain, cmap='cividis', shading='nearest',
-                           rasterized=True)
-    if not possible:
+    x, y, gain = _gain(plan, f)
+    mesh = axes.pcolormesh(x, y, gain, cmap='cividis', shading='nearest', rasterized=True)
+    if not np.isfinite(gain).any():
         return figure
     best = plan.best_position
     axes.plot(f * best[0], f * best[1], 'r*', ms=15, mec='w', clip_on=False, zorder=6,
@@ -97,27 +95,25 @@ def lane_figure(plan: Plan) -> Figure:
     figure = Figure(figsize=(10.0, 9.0), layout='constrained')
     top, middle, bottom = figure.subplots(3, 1)
     f, unit = scale_of(np.ptp(plan.x))
-    for k, (name, lane) in enumerate(distinct_lanes(plan.lanes)):
+    for k, (name, lane) in enumerate(_distinct_lanes(plan.lanes)):
         colour = SERIES_COLOURS[k % len(SERIES_COLOURS)]
         top.semilogy(f * lane.along, f * lane.filter_std, '-', color=colour,
                      label=f'{name}: filter')
         top.semilogy(f * lane.along, f * lane.pass_std[:, 0], '--', color=colour,
                      label=f'{name}: whole pass')
         middle.plot(f * lane.along, lane.detection, color=colour, label=name)
-    top.set_ylabel(f'position bound [{unit}]')
-    top.set_ylim(top=min(top.get_ylim()[1], f * np.ptp(plan.x)))
+    top.set(ylabel=f'position bound [{unit}]',
+            ylim=(None, min(top.get_ylim()[1], f * np.ptp(plan.x))))
     legend_beside(top)
     plain_log_ticks(top)
     top.set_title('Along the lanes, in the direction of travel (0 is nearest to the centre)')
-    middle.set_ylabel('P(detection by one frame)')
-    middle.set_xlabel(f'distance along the lane [{unit}]')
+    middle.set(ylabel='P(detection by one frame)', xlabel=f'distance along the lane [{unit}]')
     legend_beside(middle)
     drawn_rows = plan.miss_curve[plan.miss_curve[:, 1] >= MIN_MISSED]
     bottom.semilogy(f * drawn_rows[:, 0], drawn_rows[:, 1], '.-', color='k')
-    bottom.set_xlim(f * plan.miss_curve[0, 0], 1.02 * f * plan.miss_curve[-1, 0])
-    bottom.set_ylim(0.5 * MIN_MISSED, 2.0)
-    bottom.set_xlabel(f'lateral distance of a pass from the centre of the sensors [{unit}]')
-    bottom.set_ylabel('P(missed pass)')
+    bottom.set(xlim=(f * plan.miss_curve[0, 0], 1.02 * f * plan.miss_curve[-1, 0]),
+               ylim=(0.5 * MIN_MISSED, 2.0), ylabel='P(missed pass)',
+               xlabel=f'lateral distance of a pass from the centre of the sensors [{unit}]')
     for axes in (top, middle, bottom):
         axes.grid(alpha=0.3)
     return figure
@@ -128,31 +124,30 @@ def _draw_map(plan: Plan, title: str) -> tuple[Figure, Axes, float, str]:
     f, unit = scale_of(np.ptp(plan.x))
     figure = Figure(figsize=(8.0, 6.8), layout='constrained')
     axes = figure.add_subplot()
-    axes.set_aspect('equal')
-    axes.set_xlabel(f'x [{unit}]')
-    axes.set_ylabel(f'y [{unit}]')
+    axes.set(aspect='equal', xlabel=f'x [{unit}]', ylabel=f'y [{unit}]',
+             xlim=(f * plan.x[0], f * plan.x[-1]), ylim=(f * plan.y[0], f * plan.y[-1]))
     axes.set_title(title, fontsize=11)
-    for lane in plan.lanes:
-        low, high = (plan.x[0], plan.y[0]), (plan.x[-1], plan.y[-1])
-        inside = f * lane.points[((lane.points >= low) & (lane.points <= high)).all(axis=1)]
+    for inside in _lane_points(plan, f):
         axes.plot(*inside.T, '--', color='0.25', lw=0.8)
         if len(inside) > 3:
             axes.annotate('', inside[-1], inside[-4],
                           arrowprops={'arrowstyle': '-|>', 'color': '0.25'})
     axes.plot(*(f * plan.network.positions[:, :2]).T, 'k^', ms=8, mec='w', zorder=5)
-    axes.set_xlim(f * plan.x[0], f * plan.x[-1])
-    axes.set_ylim(f * plan.y[0], f * plan.y[-1])
     return figure, axes, f, unit
 
 
-def _levels(values: FloatArray, factor: float) -> FloatArray:
-    """Contour levels within the range of `factor` times `values`: 1, 2 or 5 times powers of ten, or
-    the geometric mean of the range if it contains none of these."""
-    powers_of_ten = 10.0 ** np.arange(-6, 7)
-    levels = np.sort(np.concatenate([powers_of_ten, 2.0 * powers_of_ten, 5.0 * powers_of_ten]))
-    low, high = factor * np.nanmin(values), factor * np.nanmax(values)
-    inside = levels[(levels > low) & (levels < high)]
-    return inside if len(inside) else np.array([np.sqrt(low * high)])
+def _lane_points(plan: Plan, f: float) -> list[FloatArray]:
+    """Points (n, 2) of each lane on the map, scaled by `f`."""
+    low, high = (plan.x[0], plan.y[0]), (plan.x[-1], plan.y[-1])
+    return [f * lane.points[((lane.points >= low) & (lane.points <= high)).all(axis=1)]
+            for lane in plan.lanes]
+
+
+def _gain(plan: Plan, f: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Coordinates scaled by `f`, and reduction [%] of the bound by a sensor at each point."""
+    gain = 100.0 * (1.0 - plan.std_with_added_sensor / plan.std_without_added_sensor)
+    return (f * np.linspace(plan.x[0], plan.x[-1], gain.shape[1]),
+            f * np.linspace(plan.y[0], plan.y[-1], gain.shape[0]), gain)
 
 
 def length_text(metres: float) -> str:
@@ -160,7 +155,7 @@ def length_text(metres: float) -> str:
     return f'{metres:.3g} m' if metres >= 0.01 else f'{1e3 * metres:.2g} mm'
 
 
-def distinct_lanes(lanes: Sequence[Lane]) -> list[tuple[str, Lane]]:
+def _distinct_lanes(lanes: Sequence[Lane]) -> list[tuple[str, Lane]]:
     """Group lanes with identical curves, which would overlap in a plot.
 
     Return the combined names of each group, and its first lane.
@@ -181,14 +176,13 @@ def distinct_lanes(lanes: Sequence[Lane]) -> list[tuple[str, Lane]]:
 def write_report(plan: Plan, lines: list[str], out: Path) -> None:
     """Write the report of a plan, with its `summary_lines`, to `report.html`."""
     network = plan.network
-    page = Page(f'Plan for {quantity(len(network), "sensor")}',
-                f'target with {plan.target.moment:g} A m^2 at {plan.target.speed:g} m/s',
-                [Note(NOTE, line.strip()) for line in lines], None,
-                [*_maps(plan), *_lanes(plan)],
-                [Table('Sensors', ['sensor', 'x [m]', 'y [m]', 'z [m]'],
-                       [[name, *map(float, position)] for name, position in zip(
-                           network.names, network.positions, strict=True)])])
-    write_page(page, out / REPORT)
+    write_page(Page(
+        f'Plan for {quantity(len(network), "sensor")}',
+        f'target with {plan.target.moment:g} A m^2 at {plan.target.speed:g} m/s',
+        [Note(NOTE, line.strip()) for line in lines], None, [*_maps(plan), *_lanes(plan)],
+        [Table('Sensors', ['sensor', 'x [m]', 'y [m]', 'z [m]'],
+               [[name, *map(float, position)] for name, position in zip(
+                   network.names, network.positions, strict=True)])]), out / REPORT)
 
 
 def summary_lines(p: Plan) -> list[str]:
@@ -246,16 +240,14 @@ def _maps(plan: Plan) -> list[Chart]:
     position['colorbar'] |= _log_ticks(low, high)
     position |= {'text': [[f'{10.0**v:.3g} {unit}' for v in row] for row in bound],
                  'hoverinfo': 'x+y+text'}
-    gain = 100.0 * (1.0 - plan.std_with_added_sensor / plan.std_without_added_sensor)
-    ny, nx = gain.shape
+    gain_x, gain_y, gain = _gain(plan, f)
     charts = [Chart('Position bound from a whole pass', [position, *_site_traces(plan, f)], layout),
               Chart('Probability that one frame detects the target', [
                   heat_map(x, y, plan.detection, 'Cividis', 'probability', 0.0, 1.0),
                   *_site_traces(plan, f)], layout)]
     if np.isfinite(gain).any():
         charts.append(Chart('Gain of an additional sensor', [
-            heat_map(np.linspace(x[0], x[-1], nx), np.linspace(y[0], y[-1], ny), gain, 'Cividis',
-                     'reduction [%]'), *_site_traces(plan, f),
+            heat_map(gain_x, gain_y, gain, 'Cividis', 'reduction [%]'), *_site_traces(plan, f),
             {'type': 'scatter', 'mode': 'markers', 'x': [f * plan.best_position[0]],
              'y': [f * plan.best_position[1]], 'name': 'best position', 'hoverinfo': 'name+x+y',
              'marker': {'symbol': 'star', 'size': 15, 'color': '#D55E00',
@@ -265,20 +257,17 @@ def _maps(plan: Plan) -> list[Chart]:
 
 def _log_ticks(low: float, high: float) -> dict[str, Any]:
     """Create the ticks of a colour bar that label logarithmic values with linear numbers."""
-    steps = [10.0**k * m for k in range(-7, 8) for m in (1, 2, 5)]
-    ticks = [v for v in steps if low <= np.log10(v) <= high] or [10.0 ** (0.5 * (low + high))]
+    ticks = [v for v in ROUND_NUMBERS if low <= np.log10(v) <= high] or [
+        10.0 ** (0.5 * (low + high))]
     return {'tickvals': np.log10(ticks).tolist(), 'ticktext': [f'{v:.3g}' for v in ticks]}
 
 
 def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:
     """Traces of the lanes and sensors on a map whose coordinates are scaled by `f`."""
-    low, high = (plan.x[0], plan.y[0]), (plan.x[-1], plan.y[-1])
-    traces = []
-    for lane in plan.lanes:
-        points_inside = f * lane.points[((lane.points >= low) & (lane.points <= high)).all(axis=1)]
-        traces.append({'type': 'scatter', 'mode': 'lines', 'x': points_inside[:, 0].tolist(),
-                       'y': points_inside[:, 1].tolist(), 'hoverinfo': 'skip', 'showlegend': False,
-                       'line': {'color': '#ffffff', 'dash': 'dash', 'width': 1.5}})
+    traces = [{'type': 'scatter', 'mode': 'lines', 'x': points[:, 0].tolist(),
+               'y': points[:, 1].tolist(), 'hoverinfo': 'skip', 'showlegend': False,
+               'line': {'color': '#ffffff', 'dash': 'dash', 'width': 1.5}}
+              for points in _lane_points(plan, f)]
     return [*traces, sensor_trace(f * plan.network.positions, plan.network.names)]
 
 
@@ -286,7 +275,7 @@ def _lanes(plan: Plan) -> list[Chart]:
     """Charts of position bound and detection probability along the lanes, and of missed passes."""
     f, unit = scale_of(np.ptp(plan.x))
     bounds, detection = [], []
-    for k, (name, lane) in enumerate(distinct_lanes(plan.lanes)):
+    for k, (name, lane) in enumerate(_distinct_lanes(plan.lanes)):
         along: FloatArray = f * lane.along
         bounds += [curve(along, f * lane.filter_std, f'{name}: filter so far', 2 * k),
                    curve(along, f * lane.pass_std[:, 0], f'{name}: whole pass', 2 * k + 1)]
@@ -300,4 +289,4 @@ def _lanes(plan: Plan) -> list[Chart]:
             Chart('Missed passes', [curve(f * missed_passes[:, 0], missed_passes[:, 1], '', 0,
                                           'lines+markers')],
                   axes_layout(f'lateral distance from the centre of the sensors [{unit}]',
-                       'probability of a miss', log_y=True))]
+                              'probability of a miss', log_y=True))]

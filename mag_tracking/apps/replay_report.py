@@ -24,7 +24,7 @@ from mag_tracking.report.page_scene import (
     thin_poses,
     track_entry,
 )
-from mag_tracking.report.road import Road, road_of
+from mag_tracking.report.road import road_of
 from mag_tracking.results.result_folder import REPORT
 from mag_tracking.run import no_track_reason
 from mag_tracking.stages.track.evidence import LOST
@@ -32,6 +32,21 @@ from mag_tracking.stages.track.manager import UNCERTAIN_ORIENTATIONS
 from mag_tracking.stages.track.running_track import BELOW_SENSORS
 from mag_tracking.stages.track.smoothing import NOT_SMOOTHED
 from mag_tracking.units import NS
+
+COUNTED = (
+    (f'tracks ended: {LOST}', 'track lost its target', 'tracks lost their target',
+     ': check the orientations in the network file; other possible causes are simultaneous '
+     'targets, or a kind of target that the settings do not include'),
+    (BELOW_SENSORS, 'vehicle appears', 'vehicles appear', ' to pass below the sensors: two sensors '
+     'are exchanged, or the sensors are mounted upside down; check topics, positions and '
+     'orientations in the network file'),
+    *((f'tracks ended: {reason}', 'track', 'tracks', f' ended: {reason}; {bounds.ADVICE}')
+      for reason in bounds.REASONS),
+    (UNCERTAIN_ORIENTATIONS, 'sensor has', 'sensors have', ' an orientation uncertainty of more '
+     'than 15 degrees in the network file: calibrate the network'),
+    (NOT_SMOOTHED, 'track was', 'tracks were', ' not smoothed: too long (track.max_smoothing_s), '
+     'too many frames for the number of sensors, or a change of the sensors'))
+"""Warnings about counts of the tracker: (cause, singular, plural, rest of the text)."""
 
 
 def write_report(run: Run, network: SensorNetwork, out: Path) -> Path:
@@ -73,20 +88,16 @@ def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
         entry['facts'] = facts_of(facts)
         if log.id in run.smoothed:
             path = np.array(run.smoothed[log.id].position)
-            entry['smoothed'] = path_entry(log.id, path[::-(-len(path) // max_poses)])
+            entry['smoothed'] = path_entry(path[::-(-len(path) // max_poses)])
         if 'truth' in facts:
-            entry['truth'] = path_entry(log.id, interpolate_truth(
+            entry['truth'] = path_entry(interpolate_truth(
                 run.truth[facts['truth']['name']], [log.stamp_ns[k] for k in rows]))
         tracks.append(entry)
-    return scene_of(network, begin_ns, max(log.stamp_ns[-1] for log in logs), tracks,
-                    _road(run, network, logs))
-
-
-def _road(run: Run, network: SensorNetwork, logs: Sequence[TrackLog]) -> Road:
-    """Road along the smoothed paths of the vehicles whose tracks ended unambiguously."""
-    paths = [np.array(run.smoothed[log.id].position)[:, :2] for log in logs
-             if log.kind[-1] and not log.ambiguous[-1] and log.id in run.smoothed]
-    return road_of(network.positions[:, :2], paths)
+    # The road is along the vehicles whose tracks ended unambiguously.
+    road = road_of(network.positions[:, :2], [
+        np.array(run.smoothed[log.id].position)[:, :2] for log in logs
+        if log.kind[-1] and not log.ambiguous[-1] and log.id in run.smoothed])
+    return scene_of(network, begin_ns, max(log.stamp_ns[-1] for log in logs), tracks, road)
 
 
 def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) -> Table:
@@ -138,32 +149,12 @@ def _limit_notes(summary: Mapping[str, Any]) -> Iterator[Note]:
                    'delays between the sensors')
     if summary['lanes'] and summary['target'] == 'vehicle' and counts.get('tracks', 0):
         yield Note(NOTE, summary['lanes'])
-    if summary['frames_too_long']:
-        yield Note(WARNING, summary['frames_too_long'])
-    if summary['clocks_apart']:
-        yield Note(WARNING, summary['clocks_apart'])
-    n_lost = counts.get(f'tracks ended: {LOST}', 0)
-    if n_lost:
-        yield Note(WARNING, quantity(n_lost, 'track lost its target', 'tracks lost their target')
-                   + ': check the orientations in the network file; other possible causes are '
-                   'simultaneous targets, or a kind of target that the settings do not include')
-    if n := counts.get(BELOW_SENSORS, 0):
-        yield Note(WARNING, f'{quantity(n, "vehicle appears", "vehicles appear")} to pass below '
-                   'the sensors: two sensors are exchanged, or the sensors are mounted upside '
-                   'down; check topics, positions and orientations in the network file')
-    for reason in bounds.REASONS:
-        if n := counts.get(f'tracks ended: {reason}', 0):
-            yield Note(WARNING, f'{quantity(n, "track")} ended: {reason}; {bounds.ADVICE}')
-    n_uncertain = counts.get(UNCERTAIN_ORIENTATIONS, 0)
-    if n_uncertain:
-        yield Note(WARNING, quantity(n_uncertain, 'sensor has', 'sensors have')
-                   + ' an orientation uncertainty of more than 15 degrees in the network file: '
-                   'calibrate the network')
-    n_unsmoothed = counts.get(NOT_SMOOTHED, 0)
-    if n_unsmoothed:
-        yield Note(WARNING, quantity(n_unsmoothed, 'track was', 'tracks were')
-                   + ' not smoothed: too long (track.max_smoothing_s), too many frames for the '
-                   'number of sensors, or a change of the sensors')
+    for warning in (summary['frames_too_long'], summary['clocks_apart']):
+        if warning:
+            yield Note(WARNING, warning)
+    for cause, one, several, text in COUNTED:
+        if n := counts.get(cause, 0):
+            yield Note(WARNING, quantity(n, one, several) + text)
 
 
 def _truth_notes(summary: Mapping[str, Any]) -> Iterator[Note]:

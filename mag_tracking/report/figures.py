@@ -11,6 +11,7 @@ from scipy.special import chdtri
 from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
+from mag_tracking.report.page_scene import strongest_sensors
 from mag_tracking.report.style import (
     AXIS_COLOURS,
     SERIES_COLOURS,
@@ -83,14 +84,12 @@ def map_figure(log: TrackLog, network: SensorNetwork, truth: FloatArray | None =
     axes.plot(f * network.positions[:, 0], f * network.positions[:, 1], 'k^', ms=8,
               label='magnetometers')
     middle, half = 0.5 * (low + high), 0.5 * span + 0.12 * span
-    axes.set_xlim(f * (middle[0] - half), f * (middle[0] + half))
-    axes.set_ylim(f * (middle[1] - half), f * (middle[1] + half))
-    axes.set_aspect('equal')
-    axes.set_xlabel(f'x [{unit}]')
-    axes.set_ylabel(f'y [{unit}]')
+    axes.set(xlim=(f * (middle[0] - half), f * (middle[0] + half)),
+             ylim=(f * (middle[1] - half), f * (middle[1] + half)), aspect='equal',
+             xlabel=f'x [{unit}]', ylabel=f'y [{unit}]',
+             title=f'Track {log.id} with 90 % ellipses')
     axes.grid(alpha=0.3)
     legend_beside(axes)
-    axes.set_title(f'Track {log.id} with 90 % ellipses')
     return figure
 
 
@@ -122,35 +121,28 @@ def weights_figure(log: TrackLog) -> Figure:
         w = np.array([row[name][0] if name in row else 0.0 for row in log.arrivals])
         top.plot(t, w, color=colour, label=literal(name) or 'all hypotheses')
         bottom.semilogy(t, np.where(w > 0.0, w, np.nan), color=colour)
-    top.set_ylim(-0.03, 1.03)
-    top.set_ylabel('weight')
     legend_beside(top)
     subject = 'each arrival direction (a line ends when its direction is pruned)' \
         if any(_colours(log)) else 'the hypotheses, which have no arrival directions'
-    top.set_title(f'Track {log.id}: weight of {subject}')
-    bottom.set_ylim(1e-13, 3.0)
-    bottom.set_ylabel('weight (log)')
-    bottom.set_xlabel('time since the first pose [s]')
+    top.set(ylim=(-0.03, 1.03), ylabel='weight', title=f'Track {log.id}: weight of {subject}')
+    bottom.set(ylim=(1e-13, 3.0), ylabel='weight (log)', xlabel='time since the first pose [s]')
     for axes in (top, bottom):
         axes.grid(alpha=0.3)
     return figure
 
 
-def field_figure(log: TrackLog, network: SensorNetwork, max_sensors: int = 8) -> Figure:
+def field_figure(log: TrackLog, network: SensorNetwork) -> Figure:
     """Plot the measured field and the field of the best hypothesis, per sensor and axis.
 
-    In a network of more than `max_sensors`, only the sensors with the strongest fields are plotted,
-    and the title states how many.
+    In a large network, only the `strongest_sensors` are plotted, and the title states how many.
     """
     measured, predicted = np.array(log.measured), np.array(log.predicted)
-    strength = np.nan_to_num(np.nanmax(np.abs(np.where(np.isnan(measured), 0.0, measured)),
-                                       axis=(0, 2)))
-    sensors = np.sort(np.argsort(-strength, kind='stable')[:max_sensors])
+    sensors = strongest_sensors(log)
     n_columns = 2 if len(sensors) > 1 else 1
     n_rows = -(-len(sensors) // n_columns)
     figure = Figure(figsize=(9.5, 1.2 + 2.4 * n_rows), layout='constrained')
     grid = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True)
-    f, unit = field_unit(strength.max())
+    f, unit = field_unit(np.nan_to_num(np.abs(measured)).max())
     t = log.seconds()
     for axes in grid.flat[len(sensors):]:
         axes.set_visible(False)
@@ -183,8 +175,7 @@ def time_figure(stamp_ns: IntArray, values: FloatArray, std: FloatArray | None,
         rows = np.array([g == group for g in groups])
         axis.errorbar(times[rows], values[rows], None if std is None else std[rows], fmt='o',
                       color=SERIES_COLOURS[k % len(SERIES_COLOURS)], label=literal(group))
-    axis.set_xlabel('time (UTC)')
-    axis.set_ylabel(label)
+    axis.set(xlabel='time (UTC)', ylabel=label)
     axis.grid(True, alpha=0.3)
     if len(groups):
         legend_beside(axis)

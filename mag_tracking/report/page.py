@@ -4,6 +4,7 @@ The template and the scripts are in the folder `page`. The folder `plotly` conta
 plotly.js-cartesian-dist-min of npm, a third of the size of the bundle with all chart types.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
@@ -87,29 +88,16 @@ def _html(title: str, data: Mapping[str, Any]) -> str:
 
     In the data, `<` is escaped so that no string can close the script element.
     """
-    report = resources.files('mag_tracking.report')
-    folder, plotly = report / 'page', report / 'plotly' / 'plotly-cartesian.min.js'
-    script = '\n'.join(_read(folder / f'{name}.js') for name in SCRIPTS)
-    parts = (('@TITLE@', escape(title)), ('@STYLE@', _read(folder / 'page.css')),
-             ('@PLOTLY@', _read(plotly)), ('@SCRIPT@', script),
-             ('@DATA@', json_text(data).replace('<', '\\u003c')))
-    out, remaining = [], _read(folder / 'page.html')
-    ordered_parts = sorted(parts, key=lambda part: remaining.index(part[0]))
-    for placeholder, text in ordered_parts:
-        before, remaining = remaining.split(placeholder, 1)
-        out += [before, text]
-    return ''.join([*out, remaining])
+    def read(name: str) -> str:
+        return (resources.files('mag_tracking.report') / name).read_text(encoding='utf-8')
 
-
-def _read(path: Any) -> str:
-    """Read a text file of the package."""
-    text: str = path.read_text(encoding='utf-8')
-    return text
-
-
-def escape_markup(text: str) -> str:
-    """Escape the markup characters of Plotly."""
-    return text.replace('&', '&amp;').replace('<', '&lt;').replace('>', '&gt;')
+    parts = {'TITLE': escape(title), 'STYLE': read('page/page.css'),
+             'PLOTLY': read('plotly/plotly-cartesian.min.js'),
+             'SCRIPT': '\n'.join(read(f'page/{name}.js') for name in SCRIPTS),
+             'DATA': json_text(data).replace('<', '\\u003c')}
+    texts = re.split('@([A-Z]+)@', read('page/page.html'))
+    texts[1::2] = [parts[name] for name in texts[1::2]]
+    return ''.join(texts)
 
 
 def numbers(values: ArrayLike) -> list[Any]:
@@ -127,7 +115,7 @@ def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') ->
     """
     colour = SERIES_COLOURS[k % len(SERIES_COLOURS)]
     return {'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y),
-            'name': escape_markup(name), 'showlegend': bool(name),
+            'name': escape(name, quote=False), 'showlegend': bool(name),
             'line': {'color': colour, 'dash': DASHES[k % len(DASHES)], 'width': 2},
             'marker': {'color': colour, 'size': 6}}
 
@@ -148,7 +136,7 @@ def heat_map(x: FloatArray, y: FloatArray, z: FloatArray, scale: str, title: str
 def sensor_trace(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
     """Plotly trace of the sensors on a map; `points` are in the unit of the map."""
     return {'type': 'scatter', 'mode': 'markers', 'x': numbers(points[:, 0]),
-            'y': numbers(points[:, 1]), 'text': [escape_markup(name) for name in names],
+            'y': numbers(points[:, 1]), 'text': [escape(name, quote=False) for name in names],
             'hoverinfo': 'text', 'name': 'magnetometers', 'showlegend': False,
             'marker': {'symbol': 'triangle-up', 'size': 11, 'color': '#ffffff',
                        'line': {'color': '#000000', 'width': 1.5}}}

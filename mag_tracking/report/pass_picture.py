@@ -43,13 +43,21 @@ def pass_figure(log: TrackLog, network: SensorNetwork, smoothed: ArrayLike | Non
     points = np.vstack([network.positions[:, :2], *(_shapes(log, k)[0] for k in drawn[shown])])
     low, high = points.min(axis=0) - MARGIN_M, points.max(axis=0) + MARGIN_M
     figure, axes = _empty_map(low, high)
-    _draw_road(axes, network.positions[:, :2], path)
+    road = road_of(network.positions[:, :2], [path])
+    for area in road.areas:
+        axes.fill(*area.T, color=ASPHALT, lw=0, zorder=1)
+    for marking in road.markings:
+        axes.plot(*marking.T, color=LINE, lw=2.5, dashes=(7.0, 7.0), zorder=2)
     _draw_regions(axes, log, drawn)
     axes.plot(*path.T, color=VERMILLION, lw=2.5, zorder=4, label='smoothed path',
               solid_capstyle='round')
     _draw_vehicles(axes, log, drawn[shown], network.positions[:, :2])
     axes.plot(*positions[drawn].T, 'o', color=DARK, ms=2.5, zorder=6, label='published poses')
-    _draw_sensors(axes, network)
+    axes.plot(*network.positions[:, :2].T, '^', ms=13, mfc=DARK, mec=LINE, mew=1.5, zorder=7,
+              ls='none', label='magnetometers')
+    for name, position in zip(network.names, network.positions, strict=True):
+        axes.annotate(literal(name), position[:2], xytext=(12, 0), textcoords='offset points',
+                      va='center', fontsize=12, color=DARK, zorder=8)
     _draw_scale(axes, low, high)
     figure.legend(loc='lower center', ncol=4, fontsize=11, frameon=False)
     return figure
@@ -118,15 +126,6 @@ def _shapes(log: TrackLog, k: int) -> list[FloatArray]:
             for shape in (body, *windows)]
 
 
-def _draw_road(axes: Axes, sensors: FloatArray, path: FloatArray) -> None:
-    """Draw the road along a path, with its lanes."""
-    road = road_of(sensors, [path])
-    for area in road.areas:
-        axes.fill(*area.T, color=ASPHALT, lw=0, zorder=1)
-    for marking in road.markings:
-        axes.plot(*marking.T, color=LINE, lw=2.5, dashes=(7.0, 7.0), zorder=2)
-
-
 def _draw_vehicles(axes: Axes, log: TrackLog, shown: IntArray, sensors: FloatArray) -> None:
     """Draw the vehicle at the given poses, with the time since the first of them."""
     for rank, k in enumerate(shown):
@@ -141,15 +140,6 @@ def _draw_vehicles(axes: Axes, log: TrackLog, shown: IntArray, sensors: FloatArr
         place = max(sides, key=lambda side: np.hypot(*(sensors - side).T).min())
         axes.annotate(f'{(log.stamp_ns[k] - log.stamp_ns[shown[0]]) / NS:.1f} s', place,
                       ha='center', va='center', fontsize=11, color=DARK, zorder=8)
-
-
-def _draw_sensors(axes: Axes, network: SensorNetwork) -> None:
-    """Draw the sensors with their names."""
-    axes.plot(*network.positions[:, :2].T, '^', ms=13, mfc=DARK, mec=LINE, mew=1.5, zorder=7,
-              ls='none', label='magnetometers')
-    for name, position in zip(network.names, network.positions, strict=True):
-        axes.annotate(literal(name), position[:2], xytext=(12, 0), textcoords='offset points',
-                      va='center', fontsize=12, color=DARK, zorder=8)
 
 
 def _draw_scale(axes: Axes, low: FloatArray, high: FloatArray) -> None:

@@ -171,7 +171,7 @@ class LiveScene:
         with self._lock:
             live = self._latest_by_id.get(track_id)
             if live is not None:
-                live.smoothed = {**path_entry(track_id, points), 'key': live.key}
+                live.smoothed = {**path_entry(points), 'key': live.key}
                 live.is_smoothed_new = True
 
     def set_health(self, notes: Iterable[Note], tables: Iterable[Table]) -> None:
