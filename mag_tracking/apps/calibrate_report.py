@@ -16,19 +16,7 @@ from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit
 from mag_tracking.geometry import yaw_between
 from mag_tracking.network import SensorNetwork
 from mag_tracking.quantities import quantity
-from mag_tracking.report.page import (
-    ERROR,
-    NOTE,
-    WARNING,
-    Chart,
-    Note,
-    Page,
-    Table,
-    axes_layout,
-    curve,
-    write_page,
-)
-from mag_tracking.report.style import SCALE_1D, SERIES_COLOURS, literal
+from mag_tracking.report import page, style
 
 MAX_KNOCKS = 8
 """Maximum number of sensors in the charts of knocks."""
@@ -45,17 +33,16 @@ Curve: TypeAlias = tuple[str, FloatArray, FloatArray]
 def write_report(calibration: Calibration, nominal: SensorNetwork, name: str, path: Path) -> None:
     """Write the report of a calibration of the network `nominal` from the recording `name`."""
     survey = calibration.survey
-    severity = ERROR if survey.disagreements else WARNING
-    notes = [Note(severity, text) for text in survey.warnings()]
-    notes += [Note(WARNING, f'{sensor}: no background was learnt')
+    severity = page.ERROR if survey.disagreements else page.WARNING
+    notes = [page.Note(severity, text) for text in survey.warnings()]
+    notes += [page.Note(page.WARNING, f'{sensor}: no background was learnt')
               for sensor in calibration.without_background]
-    notes += [Note(WARNING, f'{cause}: {n}') for cause, n in calibration.rejected.items()]
+    notes += [page.Note(page.WARNING, f'{cause}: {n}') for cause, n in calibration.rejected.items()]
     if calibration.evidence is not None:
         passes = quantity(calibration.evidence.n_tracks, 'pass', 'passes')
-        notes.append(Note(NOTE, f'{passes} used'))
-    write_page(Page(
-        f'Calibration from {name}', quantity(len(nominal), 'sensor'), notes, None,
-        [*_charts(calibration, nominal)], [_table(calibration)]), path)
+        notes.append(page.Note(page.NOTE, f'{passes} used'))
+    page.Page(f'Calibration from {name}', quantity(len(nominal), 'sensor'), notes, None,
+              [*_charts(calibration, nominal)], [_table(calibration)]).write(path)
 
 
 def _knocks(calibration: Calibration) -> list[tuple[str, list[Curve]]]:
@@ -86,29 +73,29 @@ def _rotations(calibration: Calibration, nominal: SensorNetwork,
         steps.append(('compass and passes', calibration.network))
     return [(label, [float(np.degrees(yaw_between(*R)))
                      for R in zip(nominal.R_ws, network.R_ws, strict=True)],
-             [0.0 if s is None else SCALE_1D * float(np.degrees(s[2]))
+             [0.0 if s is None else style.SCALE_1D * float(np.degrees(s[2]))
               for s in network.orientation_std]) for label, network in steps]
 
 
-def _charts(calibration: Calibration, nominal: SensorNetwork) -> Iterator[Chart]:
+def _charts(calibration: Calibration, nominal: SensorNetwork) -> Iterator[page.Chart]:
     """Charts of the first knock and of the rotations about the vertical."""
     for title, curves in _knocks(calibration):
         if curves:
-            yield Chart(f'First knock, {title}',
-                        [curve(t, a, name, k, 'lines+markers')
-                         for k, (name, t, a) in enumerate(curves)],
-                        axes_layout('time [s]', 'acceleration relative to rest [m/s²]'))
+            yield page.Chart(
+                f'First knock, {title}', [page.curve(t, a, name, k, 'lines+markers')
+                                          for k, (name, t, a) in enumerate(curves)],
+                page.axes('time [s]', 'acceleration relative to rest [m/s²]'))
     names = [escape(name, quote=False) for name in nominal.names]
-    yield Chart('Rotation about the vertical relative to the network file, 90% intervals', [
+    yield page.Chart('Rotation about the vertical relative to the network file, 90% intervals', [
         {'type': 'scatter', 'mode': 'markers', 'x': yaw, 'y': names, 'name': label,
          'showlegend': True,
-         'error_x': {'type': 'data', 'array': half_width, 'color': SERIES_COLOURS[k]},
-         'marker': {'color': SERIES_COLOURS[k], 'size': 8, 'symbol': ('circle', 'square')[k]}}
+         'error_x': {'type': 'data', 'array': half_width, 'color': style.SERIES_COLOURS[k]},
+         'marker': {'color': style.SERIES_COLOURS[k], 'size': 8, 'symbol': ('circle', 'square')[k]}}
         for k, (label, yaw, half_width) in enumerate(_rotations(calibration, nominal))],
-        axes_layout('[degrees]', ''))
+        page.axes('[degrees]', ''))
 
 
-def _table(calibration: Calibration) -> Table:
+def _table(calibration: Calibration) -> page.Table:
     """Table of the orientation, clock offset and noise of each sensor."""
     network, rows = calibration.network, list[list[str | float | None]]()
     for j, name in enumerate(network.names):
@@ -123,8 +110,8 @@ def _table(calibration: Calibration) -> Table:
             1e3 * record.clock_offset_std if record is not None and has_clock else None,
             None if noise is None else 1e9 * float(np.nanmean(noise)),
             'nominal orientation' if record is None else record.by])
-    return Table('Sensors', ['sensor', 'tilt [deg]', 'heading [deg]', 'std [deg]',
-                             'clock [ms]', 'std [ms]', 'noise [nT]', 'source'], rows)
+    return page.Table('Sensors', ['sensor', 'tilt [deg]', 'heading [deg]', 'std [deg]',
+                                  'clock [ms]', 'std [ms]', 'noise [nT]', 'source'], rows)
 
 
 def calibration_figure(calibration: Calibration, nominal: SensorNetwork) -> Figure:
@@ -136,7 +123,7 @@ def calibration_figure(calibration: Calibration, nominal: SensorNetwork) -> Figu
     *left, right = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
     for axes, (title, curves) in zip(left, _knocks(calibration), strict=True):
         for k, (name, t, acceleration) in enumerate(curves):
-            axes.plot(t, acceleration, '.-', ms=4, lw=0.8, color=f'C{k}', label=literal(name))
+            axes.plot(t, acceleration, '.-', ms=4, lw=0.8, color=f'C{k}', label=style.literal(name))
         axes.set_title(f'knock, {title}', fontsize=10)
         axes.set_xlabel('time [s]')
     left[0].set_ylabel('acceleration relative to rest [m/s²]')
@@ -146,7 +133,7 @@ def calibration_figure(calibration: Calibration, nominal: SensorNetwork) -> Figu
         right.errorbar(yaw, np.arange(len(yaw)) + (0.12, -0.12)[k], xerr=half_width, fmt='o', ms=4,
                        capsize=3, color=('tab:orange', 'tab:blue')[k], label=label)
     right.axvline(0.0, color='k', lw=0.8, ls=':', label='network file')
-    right.set_yticks(range(len(nominal)), [literal(name) for name in nominal.names])
+    right.set_yticks(range(len(nominal)), [style.literal(name) for name in nominal.names])
     right.invert_yaxis()
     right.set_title('rotation about the vertical (90 %)', fontsize=10)
     right.set_xlabel('rotation [degrees]')
@@ -170,7 +157,7 @@ def tumble_figure(fits: Mapping[str, EllipsoidFit], readings: Mapping[str, Float
             magnitude = np.linalg.norm(values, axis=1)
             left.plot(magnitude / magnitude.mean(), '.', ms=2, color=colour, rasterized=True,
                       label=f'{label}: std {100 * magnitude.std() / magnitude.mean():.2f} %')
-        left.set_title(literal(name), fontsize=9)
+        left.set_title(style.literal(name), fontsize=9)
         left.set(xlabel='reading', ylabel='field magnitude\nrelative to its mean')
         left.legend(fontsize=8, loc='upper right')
         u = B / np.linalg.norm(B, axis=1, keepdims=True)
@@ -199,14 +186,14 @@ def geometry_figure(survey: GeometrySurvey) -> Figure:
             (shift, 'displacement [mm]', 1e3 * displacement, 1e3 * g.position_std),
             (rotation, 'rotation [deg]', np.rad2deg(survey.rotation_angle),
              np.rad2deg(g.rotation_std))):
-        axes.bar(indices, SCALE_1D * np.sqrt(np.square(std).mean(axis=1)), color='0.85', width=0.8,
-                 label='uncertainty (90 %, per axis)')
+        axes.bar(indices, style.SCALE_1D * np.sqrt(np.square(std).mean(axis=1)), color='0.85',
+                 width=0.8, label='uncertainty (90 %, per axis)')
         axes.plot(indices, magnitude, 'o', ms=4, color='tab:blue', label='correction')
         _set_title(axes, title)
         axes.legend(fontsize=7, ncols=2, loc='lower right', bbox_to_anchor=(1.0, 1.0),
                     frameon=False)
         axes.grid(alpha=0.3)
-    gain.errorbar(indices, g.gain, yerr=SCALE_1D * g.gain_std, fmt='o', ms=4, capsize=2,
+    gain.errorbar(indices, g.gain, yerr=style.SCALE_1D * g.gain_std, fmt='o', ms=4, capsize=2,
                   color='tab:blue')
     _mark_one(gain, 'gain (90 %)')
     residual.bar(indices, np.nan_to_num(g.sensor_residual), width=0.8,
@@ -215,8 +202,8 @@ def geometry_figure(survey: GeometrySurvey) -> Figure:
               'residual in standard deviations (RMS; 1 for correct noise and field error)')
     residual.grid(alpha=0.3)
     step = -(-len(names) // MAX_NAMES)
-    residual.set_xticks(indices[::step], [literal(name) for name in names[::step]], rotation=90,
-                        fontsize=7)
+    residual.set_xticks(indices[::step], [style.literal(name) for name in names[::step]],
+                        rotation=90, fontsize=7)
     residual.set_xlim(-0.7, len(names) - 0.3)
     return figure
 
@@ -260,7 +247,7 @@ def _plot_displacements(figure: SubFigure, axes: Axes, survey: GeometrySurvey,
                   color=SUSPECT_COLOUR, label='suspect sensor')
     if len(positions) <= MAX_NAMES:
         for name, position in zip(survey.network.names, positions, strict=True):
-            axes.annotate(literal(name), position[[a, b]], xytext=(3, -8),
+            axes.annotate(style.literal(name), position[[a, b]], xytext=(3, -8),
                           textcoords='offset points', fontsize=6, color='0.35')
     # A few distant poses must not extend the axes.
     low, high = positions.min(axis=0) - 0.15 * extent, positions.max(axis=0) + 0.15 * extent

@@ -12,28 +12,9 @@ from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, PassFit
 from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.quantities import quantity
-from mag_tracking.report.page import (
-    NOTE,
-    WARNING,
-    Chart,
-    Note,
-    Page,
-    Table,
-    axes_layout,
-    curve,
-    write_page,
-)
+from mag_tracking.report import page, style
 from mag_tracking.report.page_scene import field_entry, pose_entry, scene_of
 from mag_tracking.report.road import road_of
-from mag_tracking.report.style import (
-    AXIS_COLOURS,
-    SCALE_1D,
-    SERIES_COLOURS,
-    field_unit,
-    legend_beside,
-    literal,
-    plain_log_ticks,
-)
 from mag_tracking.results.result_folder import REPORT
 from mag_tracking.units import NS
 
@@ -58,7 +39,7 @@ def pass_figure(fit: PassFit, title: str) -> Figure:
     strength = {j: np.nanmax(np.abs(data.field - background)[data.sensor == j])
                 for j in data.sensors}
     strongest = sorted(sorted(strength, key=lambda j: -strength[j])[:MAX_SENSORS])
-    f, unit = field_unit(max(strength.values()))
+    f, unit = style.field_unit(max(strength.values()))
     factor = max(1.0, fit.normalised_cost)
     figure = Figure(figsize=(10.0, 1.0 + 2.6 * len(strongest)), layout='constrained')
     for axes, j in zip(figure.subplots(len(strongest), 1, squeeze=False, sharex=True).flat,
@@ -68,21 +49,22 @@ def pass_figure(fit: PassFit, title: str) -> Figure:
         # At rest, a coarse sensor has an enlarged covariance, so that all its readings count as one
         # reading. The minimum excludes these covariances.
         noise = np.nanmin(np.einsum('nii->ni', data.covariance[rows]), axis=0, initial=np.inf)
-        for a, colour in enumerate(AXIS_COLOURS):
+        for a, colour in enumerate(style.AXIS_COLOURS):
             if np.isnan(data.field[rows, a]).all():
                 continue
             middle = f * (fit.predicted - background)[rows, a]
-            half = f * SCALE_1D * np.sqrt(fit.predicted_std[rows, a]**2 + factor * noise[a])
+            half = f * style.SCALE_1D * np.sqrt(fit.predicted_std[rows, a]**2 + factor * noise[a])
             axes.fill_between(t, middle - half, middle + half, color=colour, alpha=0.25, lw=0)
             axes.plot(t, f * (data.field - background)[rows, a], '.', ms=2.5, color=colour,
                       label=f'{"xyz"[a]}')
             axes.plot(t, middle, '-', lw=0.9, color='k')
-        axes.set_title(literal(data.network.names[j]), fontsize=9)
+        axes.set_title(style.literal(data.network.names[j]), fontsize=9)
         axes.set_ylabel(f'field [{unit}]')
         axes.grid(alpha=0.3)
-        legend_beside(axes)
+        style.legend_beside(axes)
     axes.set_xlabel('time relative to the strongest field [s]')
-    figure.suptitle(f'{literal(title)}: measured (dots), fitted (lines), 90 % bands', fontsize=11)
+    figure.suptitle(f'{style.literal(title)}: measured (dots), fitted (lines), 90 % bands',
+                    fontsize=11)
     return figure
 
 
@@ -108,9 +90,9 @@ def order_figure(passes: Sequence[FittedPass]) -> Figure:
         fits = [f for f in one.fits if len(f.x)]
         if not fits:
             continue
-        colour = SERIES_COLOURS[k % len(SERIES_COLOURS)]
+        colour = style.series_colour(k)
         axes.semilogy([f.n_dipoles for f in fits], [f.normalised_cost for f in fits], 'o-',
-                      mfc='w', color=colour, label=literal(f'{one.recording}, {one.label}'))
+                      mfc='w', color=colour, label=style.literal(f'{one.recording}, {one.label}'))
         if one.chosen is not None:
             axes.semilogy([one.chosen.n_dipoles], [one.chosen.normalised_cost], 'o', ms=8,
                           color=colour)
@@ -119,8 +101,8 @@ def order_figure(passes: Sequence[FittedPass]) -> Figure:
              xlabel='number of dipoles',
              ylabel='normalised cost (1 if the residuals match the noise)')
     axes.grid(alpha=0.3, which='both')
-    legend_beside(axes)
-    plain_log_ticks(axes)
+    style.legend_beside(axes)
+    style.plain_log_ticks(axes)
     figure.suptitle('Fit of a row of dipoles to each pass (filled: chosen order)', fontsize=11)
     return figure
 
@@ -128,27 +110,28 @@ def order_figure(passes: Sequence[FittedPass]) -> Figure:
 def write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
                  out: Path) -> None:
     """Write the report of fitted passes, with `RecordingFit.warnings`, to `report.html`."""
-    write_page(fit_page(passes, network, warnings), out / REPORT)
+    fit_page(passes, network, warnings).write(out / REPORT)
 
 
 def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
-             warnings: Sequence[str]) -> Page:
+             warnings: Sequence[str]) -> page.Page:
     """Create the page of fitted passes; those without an estimate are not on the map."""
     chosen = [fitted.chosen for fitted in passes if fitted.chosen is not None]
     n_poor = sum(fit.normalised_cost > MAX_NORMALISED_COST for fit in chosen)
-    notes = [Note(WARNING, text) for text in warnings]
+    texts = [*warnings]
     if n_poor:
-        notes.append(Note(WARNING, 'poor fits (normalised cost above '
-                          f'{MAX_NORMALISED_COST:g}): {n_poor} of {len(chosen)}; errors in speed '
-                          'and position may exceed several standard deviations'))
+        texts.append(f'poor fits (normalised cost above {MAX_NORMALISED_COST:g}): {n_poor} of '
+                     f'{len(chosen)}; errors in speed and position may exceed several standard '
+                     'deviations')
+    notes = [page.Note(page.WARNING, text) for text in texts]
     if not passes:
-        notes.append(Note(NOTE, 'no passes: nothing was detected'))
+        notes.append(page.Note(page.NOTE, 'no passes: nothing was detected'))
     if any(fitted.n_vehicles > 1 for fitted in passes):
-        notes.append(Note(NOTE, 'for vehicles that were fitted together, the fitted field of the '
-                          'other vehicles is subtracted from the measured field'))
+        notes.append(page.Note(page.NOTE, 'for vehicles that were fitted together, the fitted '
+                               'field of the other vehicles is subtracted from the measured field'))
     peak_times = [ns / NS for ns in _peaks_ns(passes)]
     if len({fitted.recording for fitted in passes}) > 1:
-        notes.append(Note(NOTE, 'the time axis shows the recordings one after another'))
+        notes.append(page.Note(page.NOTE, 'the time axis shows the recordings one after another'))
     tracks = [_pass_entry(k + 1, fitted, fitted.chosen, peak_times[k])
               for k, fitted in enumerate(passes) if fitted.chosen is not None]
     scene = None
@@ -161,7 +144,7 @@ def fit_page(passes: Sequence[FittedPass], network: SensorNetwork,
         scene = scene_of(network, 0, int(end * NS), tracks, road)
     n_passes = len({(fitted.recording, fitted.number) for fitted in passes})
     vehicles_text = f', {quantity(len(passes), "vehicle")}' if len(passes) > n_passes else ''
-    return Page(f'{quantity(n_passes, "pass", "passes")}{vehicles_text}, '
+    return page.Page(f'{quantity(n_passes, "pass", "passes")}{vehicles_text}, '
                 f'{len(tracks)} with an estimate',
                 'each fitted as a row of dipoles at constant velocity', notes, scene,
                 [_order_chart(passes)] if passes else [], [_table(passes)])
@@ -213,20 +196,20 @@ def _pass_entry(number: int, fitted: FittedPass, fit: PassFit, peak_time: float)
     return entry
 
 
-def _order_chart(passes: Sequence[FittedPass]) -> Chart:
+def _order_chart(passes: Sequence[FittedPass]) -> page.Chart:
     """Chart of the normalised cost against the number of dipoles."""
     traces = []
     for k, fitted in enumerate(passes):
         fits = [f for f in fitted.fits if len(f.x)]
-        traces.append(curve([f.n_dipoles for f in fits], [f.normalised_cost for f in fits],
+        traces.append(page.curve([f.n_dipoles for f in fits], [f.normalised_cost for f in fits],
                             f'{fitted.recording}, {fitted.label}', k, 'lines+markers'))
-    layout = axes_layout('number of dipoles', 'normalised cost (1 = consistent with noise)',
+    layout = page.axes('number of dipoles', 'normalised cost (1 = consistent with noise)',
                          log_y=True)
     layout['xaxis']['dtick'] = 1
-    return Chart('Quality of the fits by number of dipoles', traces, layout)
+    return page.Chart('Quality of the fits by number of dipoles', traces, layout)
 
 
-def _table(passes: Sequence[FittedPass]) -> Table:
+def _table(passes: Sequence[FittedPass]) -> page.Table:
     """Table with one row per fitted vehicle and number of dipoles."""
     rows: list[list[str | float | None]] = []
     for fitted in passes:
@@ -237,6 +220,6 @@ def _table(passes: Sequence[FittedPass]) -> Table:
                          float(fit.normalised_cost) if len(fit.x) else None,
                          *(map(float, estimate) if estimate else [None] * 7),
                          'chosen' if fit is fitted.chosen else fit.reason])
-    return Table('All fits', ['recording', 'pass', 'dipoles', 'cost', 'x [m]', 'y [m]', 'z [m]',
-                              'speed [m/s]', 'heading [deg]', 'length [m]', 'moment [A m²]', ''],
-                 rows)
+    return page.Table(
+        'All fits', ['recording', 'pass', 'dipoles', 'cost', 'x [m]', 'y [m]', 'z [m]',
+                     'speed [m/s]', 'heading [deg]', 'length [m]', 'moment [A m²]', ''], rows)

@@ -12,25 +12,7 @@ from matplotlib.figure import Figure
 from mag_tracking.apps.plan import GOOD_PD, Lane, Plan
 from mag_tracking.arrays import FloatArray
 from mag_tracking.quantities import quantity
-from mag_tracking.report.page import (
-    NOTE,
-    Chart,
-    Note,
-    Page,
-    Table,
-    axes_layout,
-    curve,
-    heat_map,
-    sensor_trace,
-    write_page,
-)
-from mag_tracking.report.style import (
-    SERIES_COLOURS,
-    legend_beside,
-    literal,
-    plain_log_ticks,
-    scale_of,
-)
+from mag_tracking.report import page, style
 from mag_tracking.results.result_folder import REPORT
 
 MIN_MISSED = 1e-6
@@ -94,9 +76,9 @@ def lane_figure(plan: Plan) -> Figure:
     """Plot bounds and detection probability along the lanes, and P(missed pass) by distance."""
     figure = Figure(figsize=(10.0, 9.0), layout='constrained')
     top, middle, bottom = figure.subplots(3, 1)
-    f, unit = scale_of(np.ptp(plan.x))
+    f, unit = style.scale_of(np.ptp(plan.x))
     for k, (name, lane) in enumerate(_distinct_lanes(plan.lanes)):
-        colour = SERIES_COLOURS[k % len(SERIES_COLOURS)]
+        colour = style.series_colour(k)
         top.semilogy(f * lane.along, f * lane.filter_std, '-', color=colour,
                      label=f'{name}: filter')
         top.semilogy(f * lane.along, f * lane.pass_std[:, 0], '--', color=colour,
@@ -104,11 +86,11 @@ def lane_figure(plan: Plan) -> Figure:
         middle.plot(f * lane.along, lane.detection, color=colour, label=name)
     top.set(ylabel=f'position bound [{unit}]',
             ylim=(None, min(top.get_ylim()[1], f * np.ptp(plan.x))))
-    legend_beside(top)
-    plain_log_ticks(top)
+    style.legend_beside(top)
+    style.plain_log_ticks(top)
     top.set_title('Along the lanes, in the direction of travel (0 is nearest to the centre)')
     middle.set(ylabel='P(detection by one frame)', xlabel=f'distance along the lane [{unit}]')
-    legend_beside(middle)
+    style.legend_beside(middle)
     drawn_rows = plan.miss_curve[plan.miss_curve[:, 1] >= MIN_MISSED]
     bottom.semilogy(f * drawn_rows[:, 0], drawn_rows[:, 1], '.-', color='k')
     bottom.set(xlim=(f * plan.miss_curve[0, 0], 1.02 * f * plan.miss_curve[-1, 0]),
@@ -121,7 +103,7 @@ def lane_figure(plan: Plan) -> Figure:
 
 def _draw_map(plan: Plan, title: str) -> tuple[Figure, Axes, float, str]:
     """Draw a map with the sensors and the lanes; return figure, axes, length factor and unit."""
-    f, unit = scale_of(np.ptp(plan.x))
+    f, unit = style.scale_of(np.ptp(plan.x))
     figure = Figure(figsize=(8.0, 6.8), layout='constrained')
     axes = figure.add_subplot()
     axes.set(aspect='equal', xlabel=f'x [{unit}]', ylabel=f'y [{unit}]',
@@ -166,23 +148,23 @@ def _distinct_lanes(lanes: Sequence[Lane]) -> list[tuple[str, Lane]]:
             if all(np.array_equal(a.shape, b.shape) and np.allclose(a, b, rtol=1e-3) for a, b in (
                     (lane.along, other.along), (lane.filter_std, other.filter_std),
                     (lane.pass_std, other.pass_std), (lane.detection, other.detection))):
-                names.append(literal(lane.name))
+                names.append(style.literal(lane.name))
                 break
         else:
-            out.append(([literal(lane.name)], lane))
+            out.append(([style.literal(lane.name)], lane))
     return [(' and '.join(names), lane) for names, lane in out]
 
 
 def write_report(plan: Plan, lines: list[str], out: Path) -> None:
     """Write the report of a plan, with its `summary_lines`, to `report.html`."""
     network = plan.network
-    write_page(Page(
+    page.Page(
         f'Plan for {quantity(len(network), "sensor")}',
         f'target with {plan.target.moment:g} A m^2 at {plan.target.speed:g} m/s',
-        [Note(NOTE, line.strip()) for line in lines], None, [*_maps(plan), *_lanes(plan)],
-        [Table('Sensors', ['sensor', 'x [m]', 'y [m]', 'z [m]'],
-               [[name, *map(float, position)] for name, position in zip(
-                   network.names, network.positions, strict=True)])]), out / REPORT)
+        [page.Note(page.NOTE, line.strip()) for line in lines], None, [*_maps(plan), *_lanes(plan)],
+        [page.Table('Sensors', ['sensor', 'x [m]', 'y [m]', 'z [m]'],
+                    [[name, *map(float, position)] for name, position in zip(
+                        network.names, network.positions, strict=True)])]).write(out / REPORT)
 
 
 def summary_lines(p: Plan) -> list[str]:
@@ -228,29 +210,29 @@ def summary_lines(p: Plan) -> list[str]:
     return lines
 
 
-def _maps(plan: Plan) -> list[Chart]:
+def _maps(plan: Plan) -> list[page.Chart]:
     """Maps of position bound, detection probability and gain of an additional sensor."""
-    f, unit = scale_of(np.ptp(plan.x))
-    layout = axes_layout(f'x [{unit}]', f'y [{unit}]', is_map=True)
+    f, unit = style.scale_of(np.ptp(plan.x))
+    layout = page.axes(f'x [{unit}]', f'y [{unit}]', is_map=True)
     x, y = f * plan.x, f * plan.y
     bound = np.log10(f * np.clip(plan.position_std, None, np.ptp(plan.x)))
     low, high = np.nanquantile(bound, [LOW_QUANTILE, 1.0 - LOW_QUANTILE])
-    position = heat_map(x, y, bound, 'Viridis', f'standard deviation [{unit}]', float(low),
+    position = page.heat_map(x, y, bound, 'Viridis', f'standard deviation [{unit}]', float(low),
                         float(high))
     position['colorbar'] |= _log_ticks(low, high)
     position |= {'text': [[f'{10.0**v:.3g} {unit}' for v in row] for row in bound],
                  'hoverinfo': 'x+y+text'}
     gain_x, gain_y, gain = _gain(plan, f)
-    charts = [Chart('Position bound from a whole pass', [position, *_site_traces(plan, f)], layout),
-              Chart('Probability that one frame detects the target', [
-                  heat_map(x, y, plan.detection, 'Cividis', 'probability', 0.0, 1.0),
-                  *_site_traces(plan, f)], layout)]
+    site = _site_traces(plan, f)
+    charts = [page.Chart('Position bound from a whole pass', [position, *site], layout),
+              page.Chart('Probability that one frame detects the target', [page.heat_map(
+                  x, y, plan.detection, 'Cividis', 'probability', 0.0, 1.0), *site], layout)]
     if np.isfinite(gain).any():
-        charts.append(Chart('Gain of an additional sensor', [
-            heat_map(gain_x, gain_y, gain, 'Cividis', 'reduction [%]'), *_site_traces(plan, f),
+        charts.append(page.Chart('Gain of an additional sensor', [
+            page.heat_map(gain_x, gain_y, gain, 'Cividis', 'reduction [%]'), *site,
             {'type': 'scatter', 'mode': 'markers', 'x': [f * plan.best_position[0]],
              'y': [f * plan.best_position[1]], 'name': 'best position', 'hoverinfo': 'name+x+y',
-             'marker': {'symbol': 'star', 'size': 15, 'color': '#D55E00',
+             'marker': {'symbol': 'star', 'size': 15, 'color': style.VERMILLION,
                         'line': {'color': '#ffffff', 'width': 1}}}], layout))
     return charts
 
@@ -268,25 +250,26 @@ def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:
                'y': points[:, 1].tolist(), 'hoverinfo': 'skip', 'showlegend': False,
                'line': {'color': '#ffffff', 'dash': 'dash', 'width': 1.5}}
               for points in _lane_points(plan, f)]
-    return [*traces, sensor_trace(f * plan.network.positions, plan.network.names)]
+    return [*traces, page.sensor_trace(f * plan.network.positions, plan.network.names)]
 
 
-def _lanes(plan: Plan) -> list[Chart]:
+def _lanes(plan: Plan) -> list[page.Chart]:
     """Charts of position bound and detection probability along the lanes, and of missed passes."""
-    f, unit = scale_of(np.ptp(plan.x))
+    f, unit = style.scale_of(np.ptp(plan.x))
     bounds, detection = [], []
     for k, (name, lane) in enumerate(_distinct_lanes(plan.lanes)):
         along: FloatArray = f * lane.along
-        bounds += [curve(along, f * lane.filter_std, f'{name}: filter so far', 2 * k),
-                   curve(along, f * lane.pass_std[:, 0], f'{name}: whole pass', 2 * k + 1)]
-        detection.append(curve(along, lane.detection, name, k))
+        bounds += [page.curve(along, f * lane.filter_std, f'{name}: filter so far', 2 * k),
+                   page.curve(along, f * lane.pass_std[:, 0], f'{name}: whole pass', 2 * k + 1)]
+        detection.append(page.curve(along, lane.detection, name, k))
     missed_passes = plan.miss_curve[plan.miss_curve[:, 1] >= MIN_MISSED]
     label = f'distance along the lane from the point nearest to the centre [{unit}]'
-    return [Chart('Position bound along the lanes', bounds,
-                  axes_layout(label, f'standard deviation [{unit}]', log_y=True)),
-            Chart('Detection along the lanes', detection,
-                  axes_layout(label, 'probability per frame')),
-            Chart('Missed passes', [curve(f * missed_passes[:, 0], missed_passes[:, 1], '', 0,
-                                          'lines+markers')],
-                  axes_layout(f'lateral distance from the centre of the sensors [{unit}]',
-                              'probability of a miss', log_y=True))]
+    misses = page.curve(f * missed_passes[:, 0], missed_passes[:, 1], '', 0, 'lines+markers')
+    return [
+        page.Chart('Position bound along the lanes', bounds,
+                   page.axes(label, f'standard deviation [{unit}]', log_y=True)),
+        page.Chart('Detection along the lanes', detection,
+                   page.axes(label, 'probability per frame')),
+        page.Chart('Missed passes', [misses], page.axes(
+            f'lateral distance from the centre of the sensors [{unit}]', 'probability of a miss',
+            log_y=True))]

@@ -12,18 +12,8 @@ from mag_tracking.apps.replay import Run
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics import bounds
 from mag_tracking.quantities import quantity
-from mag_tracking.report.page import NOTE, WARNING, Note, Page, Table, write_page
-from mag_tracking.report.page_scene import (
-    MAX_SENSORS,
-    MAX_TRACKS,
-    facts_of,
-    max_poses_of,
-    path_entry,
-    scene_of,
-    strongest_sensors,
-    thin_poses,
-    track_entry,
-)
+from mag_tracking.report import page_scene
+from mag_tracking.report.page import NOTE, WARNING, Note, Page, Table
 from mag_tracking.report.road import road_of
 from mag_tracking.results.result_folder import REPORT
 from mag_tracking.run import no_track_reason
@@ -56,14 +46,14 @@ def write_report(run: Run, network: SensorNetwork, out: Path) -> Path:
     if summary['interrupted']:
         notes.insert(0, Note(NOTE, 'the replay was interrupted; results are incomplete'))
     if logs:
-        scene = _scene(run, network, logs[:MAX_TRACKS], notes)
+        scene = _scene(run, network, logs[:page_scene.MAX_TRACKS], notes)
     counts = summary['counts']
     numbers = (quantity(counts['align'].get('frames', 0), 'frame'),
                quantity(counts['detect'].get('onsets', 0), 'detection'),
                quantity(len(summary['disturbances']), 'disturbance'))
     path = out / REPORT
-    write_page(Page(f'{summary["recording"]}: {quantity(len(logs), "track")}', ', '.join(numbers),
-                    notes, scene, tables=[_sensor_table(summary, run, network)]), path)
+    Page(f'{summary["recording"]}: {quantity(len(logs), "track")}', ', '.join(numbers), notes,
+         scene, tables=[_sensor_table(summary, run, network)]).write(path)
     return path
 
 
@@ -72,32 +62,33 @@ def _scene(run: Run, network: SensorNetwork, logs: Sequence[TrackLog],
     """Create the map of the tracks; append a note to `notes` for each omission."""
     if len(logs) < len(run.logs):
         notes.append(Note(NOTE, f'the page shows the first {len(logs)} of {len(run.logs)} tracks'))
-    max_poses = max_poses_of(logs)
+    max_poses = page_scene.max_poses_of(logs)
     if any(len(log.stamp_ns) > max_poses for log in logs):
         notes.append(Note(NOTE, f'the page shows {max_poses} poses per track; poses.csv contains '
                           'all poses'))
-    if len(network) > MAX_SENSORS:
-        notes.append(Note(NOTE, f'fields are shown for the {MAX_SENSORS} sensors (of '
+    if len(network) > page_scene.MAX_SENSORS:
+        notes.append(Note(NOTE, f'fields are shown for the {page_scene.MAX_SENSORS} sensors (of '
                           f'{len(network)}) with the strongest field of each track'))
     begin_ns = min(log.stamp_ns[0] for log in logs)
     entries = {t['id']: t for t in run.summary['tracks']}
     tracks = []
     for log in logs:
-        rows, facts = thin_poses(log, max_poses), entries[log.id]
-        entry = track_entry(log, begin_ns, strongest_sensors(log), rows)
-        entry['facts'] = facts_of(facts)
+        rows, facts = page_scene.thin_poses(log, max_poses), entries[log.id]
+        entry = page_scene.track_entry(log, begin_ns, page_scene.strongest_sensors(log), rows)
+        entry['facts'] = page_scene.facts_of(facts)
         if log.id in run.smoothed:
             path = np.array(run.smoothed[log.id].position)
-            entry['smoothed'] = path_entry(path[::-(-len(path) // max_poses)])
+            entry['smoothed'] = page_scene.path_entry(path[::-(-len(path) // max_poses)])
         if 'truth' in facts:
-            entry['truth'] = path_entry(interpolate_truth(
+            entry['truth'] = page_scene.path_entry(interpolate_truth(
                 run.truth[facts['truth']['name']], [log.stamp_ns[k] for k in rows]))
         tracks.append(entry)
     # The road is along the vehicles whose tracks ended unambiguously.
     road = road_of(network.positions[:, :2], [
         np.array(run.smoothed[log.id].position)[:, :2] for log in logs
         if log.kind[-1] and not log.ambiguous[-1] and log.id in run.smoothed])
-    return scene_of(network, begin_ns, max(log.stamp_ns[-1] for log in logs), tracks, road)
+    return page_scene.scene_of(network, begin_ns, max(log.stamp_ns[-1] for log in logs), tracks,
+                               road)
 
 
 def _sensor_table(summary: Mapping[str, Any], run: Run, network: SensorNetwork) -> Table:

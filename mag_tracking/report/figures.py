@@ -11,16 +11,8 @@ from scipy.special import chdtri
 from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
+from mag_tracking.report import style
 from mag_tracking.report.page_scene import strongest_sensors
-from mag_tracking.report.style import (
-    AXIS_COLOURS,
-    SERIES_COLOURS,
-    VERMILLION,
-    field_unit,
-    legend_beside,
-    literal,
-    scale_of,
-)
 
 SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
 """Radius of a 90 % ellipse in the plane, in standard deviations."""
@@ -40,7 +32,7 @@ def ellipse_points(position: FloatArray, covariance: FloatArray, n: int = 48) ->
 def _colours(log: TrackLog) -> dict[str, str]:
     """Assign a colour to each arrival direction, in alphabetical order."""
     names = sorted({name for row in log.arrivals for name in row})
-    return {name: SERIES_COLOURS[i % len(SERIES_COLOURS)] for i, name in enumerate(names)}
+    return {name: style.series_colour(i) for i, name in enumerate(names)}
 
 
 def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -66,7 +58,7 @@ def map_figure(log: TrackLog, network: SensorNetwork, truth: FloatArray | None =
     map_points = np.vstack([positions, network.positions[:, :2]])
     low, high = map_points.min(axis=0), map_points.max(axis=0)
     span = max((high - low).max(), 1e-6)
-    f, unit = scale_of(span)
+    f, unit = style.scale_of(span)
     _draw_arrivals(axes, log, f)
     for k in range(0, len(positions), max(1, len(positions) // 14)):
         axes.fill(*(f * ellipse_points(positions[k], covariance[k])).T, color='k', lw=0,
@@ -79,7 +71,7 @@ def map_figure(log: TrackLog, network: SensorNetwork, truth: FloatArray | None =
     if truth is not None and np.isfinite(truth).any():
         axes.plot(f * truth[:, 0], f * truth[:, 1], '--', color='0.5', lw=1.4, label='truth')
     if smoothed is not None:
-        axes.plot(*(f * np.asarray(smoothed)[:, :2]).T, color=VERMILLION, lw=1.4,
+        axes.plot(*(f * np.asarray(smoothed)[:, :2]).T, color=style.VERMILLION, lw=1.4,
                   label='smoothed')
     axes.plot(f * network.positions[:, 0], f * network.positions[:, 1], 'k^', ms=8,
               label='magnetometers')
@@ -89,7 +81,7 @@ def map_figure(log: TrackLog, network: SensorNetwork, truth: FloatArray | None =
              xlabel=f'x [{unit}]', ylabel=f'y [{unit}]',
              title=f'Track {log.id} with 90 % ellipses')
     axes.grid(alpha=0.3)
-    legend_beside(axes)
+    style.legend_beside(axes)
     return figure
 
 
@@ -109,7 +101,7 @@ def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
                                    np.array([C for *_, C in rows]))
         weight = log.arrivals[-1].get(name, (0.0,))[0]
         axes.plot(*(f * points).T, color=colour, lw=3.0 if weight > 0.5 else 1.2, alpha=0.8,
-                  label=f'from {literal(name)} ({weight:.0%} at the end)')
+                  label=f'from {style.literal(name)} ({weight:.0%} at the end)')
 
 
 def weights_figure(log: TrackLog) -> Figure:
@@ -119,9 +111,9 @@ def weights_figure(log: TrackLog) -> Figure:
     t = log.seconds()
     for name, colour in _colours(log).items():
         w = np.array([row[name][0] if name in row else 0.0 for row in log.arrivals])
-        top.plot(t, w, color=colour, label=literal(name) or 'all hypotheses')
+        top.plot(t, w, color=colour, label=style.literal(name) or 'all hypotheses')
         bottom.semilogy(t, np.where(w > 0.0, w, np.nan), color=colour)
-    legend_beside(top)
+    style.legend_beside(top)
     subject = 'each arrival direction (a line ends when its direction is pruned)' \
         if any(_colours(log)) else 'the hypotheses, which have no arrival directions'
     top.set(ylim=(-0.03, 1.03), ylabel='weight', title=f'Track {log.id}: weight of {subject}')
@@ -142,17 +134,17 @@ def field_figure(log: TrackLog, network: SensorNetwork) -> Figure:
     n_rows = -(-len(sensors) // n_columns)
     figure = Figure(figsize=(9.5, 1.2 + 2.4 * n_rows), layout='constrained')
     grid = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True)
-    f, unit = field_unit(np.nan_to_num(np.abs(measured)).max())
+    f, unit = style.field_unit(np.nan_to_num(np.abs(measured)).max())
     t = log.seconds()
     for axes in grid.flat[len(sensors):]:
         axes.set_visible(False)
     for axes, j in zip(grid.flat, sensors, strict=False):
-        for a, colour in enumerate(AXIS_COLOURS):
+        for a, colour in enumerate(style.AXIS_COLOURS):
             axes.plot(t, f * measured[:, j, a], '.', ms=4, color=colour,
                       label=f'{"xyz"[a]} measured' if j == sensors[0] else None)
             axes.plot(t, f * predicted[:, j, a], '-', lw=1.2, color=colour,
                       label=f'{"xyz"[a]} predicted' if j == sensors[0] else None)
-        axes.set_title(literal(network.names[j]), fontsize=9)
+        axes.set_title(style.literal(network.names[j]), fontsize=9)
         axes.set_ylabel(f'field [{unit}]')
         axes.grid(alpha=0.3)
     for axes in grid[-1]:
@@ -174,11 +166,11 @@ def time_figure(stamp_ns: IntArray, values: FloatArray, std: FloatArray | None,
     for k, group in enumerate(dict.fromkeys(groups)):
         rows = np.array([g == group for g in groups])
         axis.errorbar(times[rows], values[rows], None if std is None else std[rows], fmt='o',
-                      color=SERIES_COLOURS[k % len(SERIES_COLOURS)], label=literal(group))
+                      color=style.series_colour(k), label=style.literal(group))
     axis.set(xlabel='time (UTC)', ylabel=label)
     axis.grid(True, alpha=0.3)
     if len(groups):
-        legend_beside(axis)
+        style.legend_beside(axis)
     else:
         axis.text(0.5, 0.5, 'nothing was found', transform=axis.transAxes, ha='center')
     return figure

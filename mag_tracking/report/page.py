@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.files import json_text, replace_text
-from mag_tracking.report.style import SERIES_COLOURS
+from mag_tracking.report.style import series_colour
 
 SCRIPTS = ('scene', 'map', 'body', 'overview', 'curves', 'tables', 'live', 'main', 'start')
 """Script files, in loading order."""
@@ -67,10 +67,9 @@ class Page:
     charts: Sequence[Chart] = ()
     tables: Sequence[Table] = ()
 
-
-def write_page(page: Page, path: str | PathLike[str]) -> None:
-    """Write the HTML of a report; raises OutputError if it cannot be written."""
-    replace_text(path, report_html(page))
+    def write(self, path: str | PathLike[str]) -> None:
+        """Write the page as HTML; raises OutputError if it cannot be written."""
+        replace_text(path, report_html(self))
 
 
 def report_html(page: Page) -> str:
@@ -113,7 +112,7 @@ def curve(x: ArrayLike, y: ArrayLike, name: str, k: int, mode: str = 'lines') ->
 
     An empty `name` omits the legend entry.
     """
-    colour = SERIES_COLOURS[k % len(SERIES_COLOURS)]
+    colour = series_colour(k)
     return {'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y),
             'name': escape(name, quote=False), 'showlegend': bool(name),
             'line': {'color': colour, 'dash': DASHES[k % len(DASHES)], 'width': 2},
@@ -142,7 +141,7 @@ def sensor_trace(points: FloatArray, names: Sequence[str]) -> dict[str, Any]:
                        'line': {'color': '#000000', 'width': 1.5}}}
 
 
-def axes_layout(x: str, y: str, is_map: bool = False, log_y: bool = False) -> dict[str, Any]:
+def axes(x: str, y: str, is_map: bool = False, log_y: bool = False) -> dict[str, Any]:
     """Plotly layout with axis titles; both axes of a map have the same scale."""
     grid = {'gridcolor': '#e3e3e3', 'zeroline': False, 'exponentformat': 'none',
             'automargin': True}

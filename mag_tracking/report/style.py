@@ -26,6 +26,11 @@ SCALE_1D = 1.645
 _ZERO_WIDTH_SPACE = '\u200b'
 
 
+def series_colour(k: int) -> str:
+    """Colour of the curve with the index `k`."""
+    return SERIES_COLOURS[k % len(SERIES_COLOURS)]
+
+
 def scale_of(extent: float) -> tuple[float, str]:
     """Factor from metres to a readable unit for lengths up to `extent` [m], and its symbol."""
     return (1.0, 'm') if extent > 1.0 else (1e3, 'mm')

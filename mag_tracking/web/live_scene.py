@@ -12,16 +12,9 @@ from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.arrays import FloatArray
 from mag_tracking.files import json_text
 from mag_tracking.records import FieldFrame, Track
+from mag_tracking.report import page_scene
 from mag_tracking.report.page import Note, Table
-from mag_tracking.report.page_scene import (
-    Sensors,
-    facts_of,
-    packed,
-    path_entry,
-    scene_of,
-    strongest_sensors,
-    track_entry,
-)
+from mag_tracking.report.page_scene import Sensors, packed
 from mag_tracking.units import NS
 
 MAX_TRACK_POSES, N_REMOVED = 8_000, 1_000
@@ -93,10 +86,11 @@ class LiveTrack:
         """JSON object with the poses of `rows`, and the fields at the sensors with the strongest
         fields at the latest poses."""
         recent = range(max(0, rows.stop - max(N_RECENT, len(rows))), rows.stop)
-        entry = track_entry(self.log, begin_ns, strongest_sensors(self.log, recent), rows)
+        sensors = page_scene.strongest_sensors(self.log, recent)
+        entry = page_scene.track_entry(self.log, begin_ns, sensors, rows)
         entry['key'], entry['smoothed'] = self.key, self.smoothed
         if self.log.ended:
-            entry['facts'] = facts_of(self.log.summary())
+            entry['facts'] = page_scene.facts_of(self.log.summary())
         return entry
 
 
@@ -171,7 +165,7 @@ class LiveScene:
         with self._lock:
             live = self._latest_by_id.get(track_id)
             if live is not None:
-                live.smoothed = {**path_entry(points), 'key': live.key}
+                live.smoothed = {**page_scene.path_entry(points), 'key': live.key}
                 live.is_smoothed_new = True
 
     def set_health(self, notes: Iterable[Note], tables: Iterable[Table]) -> None:
@@ -229,7 +223,7 @@ class LiveScene:
         if not len(self._network):
             return []
         begin_ns = self._begin_ns or 0
-        scene = scene_of(self._network, begin_ns, max(self._end_ns, begin_ns), tracks)
+        scene = page_scene.scene_of(self._network, begin_ns, max(self._end_ns, begin_ns), tracks)
         return [json_text({'type': 'scene', 'title': self.title, 'subtitle': self.subtitle,
                            'scene': scene})]
 
