@@ -6,7 +6,7 @@ from typing import TypeAlias, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mag_tracking.analysis.track_log import SmoothedLog, TrackLog
+from mag_tracking.analysis.track_log import PoseLog, TrackLog
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.geometry import rotation_from_quaternion
 
@@ -58,8 +58,7 @@ def interpolate_truth(truth: Truth, stamps_ns: ArrayLike) -> FloatArray:
                      for k in range(3)], axis=1)
 
 
-def pass_errors(log: TrackLog | SmoothedLog, truth: Truth,
-                centre: FloatArray) -> PassErrors | None:
+def pass_errors(log: PoseLog, truth: Truth, centre: FloatArray) -> PassErrors | None:
     """Horizontal errors of a vehicle's track within `NEAR_M` of `centre` (3,).
 
     None if no pose has a true position.
@@ -123,9 +122,8 @@ def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> Unflag
     return {'n': n, 'wrong': n_wrong, 'without_truth': n_without}
 
 
-def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray) -> IntArray:
-    """Indices (k,) of the poses whose true position is horizontally within `NEAR_M` of `centre`
-    (3,).
+def near_poses(log: PoseLog, truth: Truth, centre: FloatArray) -> IntArray:
+    """Indices (k,) of the poses whose true position is horizontally within `NEAR_M` of `centre`.
 
     If there are none, the index of the closest pose; empty if no pose has a true position.
     """
@@ -142,7 +140,7 @@ MAGNET_SKIP = 3
 """Number of poses at the start of a magnet's track that are not evaluated."""
 
 
-def magnet_errors(log: TrackLog | SmoothedLog, truth: Truth, axis: ArrayLike = (0.0, 0.0, 1.0),
+def magnet_errors(log: PoseLog, truth: Truth, axis: ArrayLike = (0.0, 0.0, 1.0),
                   skip: int = MAGNET_SKIP) -> MagnetErrors | None:
     """Errors of a magnet's track, relative to the truth nearest in time.
 
