@@ -30,7 +30,6 @@ MAX_MARGIN_RATIO = 6.0
 SINGLE_SENSOR_MARGIN_M = 10.0
 """Maximum margin of the map around a network without extent, such as a single sensor [m]."""
 
-NO_ROAD = Road()
 
 @dataclass(frozen=True, eq=False)
 class SensorLayout:
@@ -46,6 +45,7 @@ class SensorLayout:
         return len(self.names)
 
 
+NO_ROAD = Road()
 Sensors: TypeAlias = SensorNetwork | SensorLayout
 Packed: TypeAlias = dict[str, str]
 """Maps the type of the numbers of an array to little-endian base64, which `scene.js` decodes."""
@@ -69,23 +69,20 @@ def scene_of(network: Sensors, begin_ns: int, end_ns: int,
     xy = network.positions[:, :2]
     low, high = xy.min(axis=0), xy.max(axis=0)
     span = float((high - low).max())
-    max_margin = MAX_MARGIN_RATIO * span if span > 0.0 else SINGLE_SENSOR_MARGIN_M
-    margin = 0.15 * span if span > 0.0 else 1.0
-    factor, unit = scale_of(span if span > 0.0 else SINGLE_SENSOR_MARGIN_M)
+    margin, max_margin = 1.0, SINGLE_SENSOR_MARGIN_M
+    if span > 0.0:
+        margin, max_margin = 0.15 * span, MAX_MARGIN_RATIO * span
+    # Extents [x0, x1, y0, y1] [m].
+    reach, most_reach = (np.stack([low - m, high + m], axis=1).ravel().tolist()
+                         for m in (margin, max_margin))
+    factor, unit = scale_of(span or SINGLE_SENSOR_MARGIN_M)
     return {'frame': network.frame, 'begin_ns': str(begin_ns), 'begin': 0.0,
             'end': (end_ns - begin_ns) / NS, 'scale': {'factor': factor, 'unit': unit},
             'sensors': {'names': list(network.names), 'x': packed(xy[:, 0]), 'y': packed(xy[:, 1]),
                         'z': packed(network.positions[:, 2])},
             'road': {name: [{'x': packed(line[:, 0]), 'y': packed(line[:, 1])} for line in lines]
                      for name, lines in (('areas', road.areas), ('markings', road.markings))},
-            'reach': _box(low - margin, high + margin),
-            'most_reach': _box(low - max_margin, high + max_margin),
-            'tracks': list(tracks)}
-
-
-def _box(low: FloatArray, high: FloatArray) -> list[float]:
-    """Bounding box [x0, x1, y0, y1] [m] with the corners `low` and `high`."""
-    return [float(low[0]), float(high[0]), float(low[1]), float(high[1])]
+            'reach': reach, 'most_reach': most_reach, 'tracks': list(tracks)}
 
 
 def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None) -> IntArray:
