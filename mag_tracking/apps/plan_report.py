@@ -246,10 +246,11 @@ def _log_ticks(low: float, high: float) -> dict[str, Any]:
 
 def _site_traces(plan: Plan, f: float) -> list[dict[str, Any]]:
     """Traces of the lanes and sensors on a map whose coordinates are scaled by `f`."""
-    traces = [{'type': 'scatter', 'mode': 'lines', 'x': points[:, 0].tolist(),
-               'y': points[:, 1].tolist(), 'hoverinfo': 'skip', 'showlegend': False,
-               'line': {'color': '#ffffff', 'dash': 'dash', 'width': 1.5}}
-              for points in _lane_points(plan, f)]
+    traces: list[dict[str, Any]] = [
+        {'type': 'scatter', 'mode': 'lines', 'x': points[:, 0].tolist(),
+         'y': points[:, 1].tolist(), 'hoverinfo': 'skip', 'showlegend': False,
+         'line': {'color': '#ffffff', 'dash': 'dash', 'width': 1.5}}
+        for points in _lane_points(plan, f)]
     return [*traces, page.sensor_trace(f * plan.network.positions, plan.network.names)]
 
 
