@@ -15,6 +15,8 @@ from geometry_msgs.msg import PoseStamped
 from mag_tracking_msgs.msg import HypothesisArray, NetworkFrame, SmoothedTrack, TrackArray
 from rclpy.node import Node
 
+from mag_tracking.analysis.track_errors import interpolate_truth, pass_errors
+from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.errors import MagTrackingError, OutputError
 from mag_tracking.files import replace_text
 from mag_tracking.messages.frame import frame_of
@@ -25,7 +27,6 @@ from mag_tracking.nodes.runner import pose_line, run
 from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
 from mag_tracking.pipeline import settings_for
 from mag_tracking.report.figures import field_figure, map_figure, weights_figure
-from mag_tracking.report.metrics import interpolate_truth, pass_errors
 from mag_tracking.report.page import Page, report_html
 from mag_tracking.report.page_scene import (
     facts_of,
@@ -34,7 +35,6 @@ from mag_tracking.report.page_scene import (
     strongest_sensors,
     track_entry,
 )
-from mag_tracking.report.track_log import TrackLog
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDING = ROOT / 'test' / 'data' / 'vehicles' / 'junction_left_turns_to_rear.mcap'
@@ -125,9 +125,8 @@ def write_page(spectator, out):
         entry = track_entry(log, begin_ns, strongest_sensors(log))
         entry['facts'] = facts_of(log.summary())
         if log.id in spectator.smoothed:
-            entry['smoothed'] = path_entry(log.id, spectator.smoothed[log.id])
-        entry['truth'] = path_entry(log.id, interpolate_truth(spectator.truth_arrays(),
-                                                              log.stamp_ns))
+            entry['smoothed'] = path_entry(spectator.smoothed[log.id])
+        entry['truth'] = path_entry(interpolate_truth(spectator.truth_arrays(), log.stamp_ns))
         tracks.append(entry)
     scene = scene_of(spectator.network, begin_ns, max(log.stamp_ns[-1] for log in logs), tracks)
     path = out / 'report.html'

@@ -11,8 +11,8 @@ import argparse
 from pathlib import Path
 
 from mag_tracking.apps.fit import fit
+from mag_tracking.apps.fit_report import order_figure
 from mag_tracking.network.file import read_network
-from mag_tracking.report.fit_figures import order_figure
 
 ROOT = Path(__file__).resolve().parents[1]
 VEHICLES = ('straight_small_left', 'straight_car_right', 'straight_car_fast_left',

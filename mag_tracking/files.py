@@ -1,10 +1,12 @@
-"""Path validation, and creation of result files without following links."""
+"""Path validation, creation of result files without following links, and JSON without NaN."""
 
+import json
+import math
 import os
 import secrets
 from os import PathLike, fspath
 from pathlib import Path
-from typing import BinaryIO, TextIO
+from typing import Any, BinaryIO, TextIO
 
 from mag_tracking.errors import MagTrackingError, OutputError
 
@@ -64,6 +66,27 @@ def replace_text(path: str | PathLike[str], text: str) -> None:
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise OutputError(f'cannot write {path}: {error.strerror}') from error
+
+
+def json_text(value: Any) -> str:
+    """Serialise nested dicts and lists as JSON, with null for NaN and infinity."""
+    return json.dumps(_without_nan(value), allow_nan=False)
+
+
+def write_json(path: str | PathLike[str], value: Any) -> None:
+    """Write `json_text` with indentation to a new file, with the errors of `new_text_file`."""
+    with new_text_file(path) as stream:
+        json.dump(_without_nan(value), stream, indent=1, allow_nan=False)
+        stream.write('\n')
+
+
+def _without_nan(value: Any) -> Any:
+    """Replace NaN and infinity by None in a copy of nested dicts and lists; tuples become lists."""
+    if isinstance(value, dict):
+        return {k: _without_nan(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _unlinked_path(path: str | PathLike[str]) -> Path:

@@ -18,7 +18,7 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.recorder import Recorder
 from mag_tracking.recording.repair import repair
 from mag_tracking.recording.writer import RecordingWriter
-from mag_tracking.report.figure_file import save_figure
+from mag_tracking.report.style import save_figure
 from mag_tracking.results.event_tables import write_events
 from mag_tracking.results.fit_folder import FitFolder
 from mag_tracking.results.result_folder import ResultFolder

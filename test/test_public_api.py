@@ -97,8 +97,9 @@ def test_tracking_imports_neither_matplotlib_nor_pandas_nor_ros():
 
 
 def test_figure_modules_do_not_change_the_matplotlib_backend():
-    modules = [f'mag_tracking.report.{p.stem}'
-               for p in (ROOT / 'mag_tracking' / 'report').glob('*figures.py')]
+    folder = ROOT / 'mag_tracking'
+    modules = ['.'.join(p.relative_to(ROOT).with_suffix('').parts) for p in (
+        *folder.glob('report/[a-z]*.py'), *folder.glob('apps/*_report.py'))]
     assert len(modules) > 4
     assert run_python('import matplotlib; matplotlib.use("svg"); import '
                       f'{", ".join(modules)}; print(matplotlib.get_backend())') == 'svg'

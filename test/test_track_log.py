@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mag_tracking.report.track_log import TrackLog
+from mag_tracking.analysis.track_log import TrackLog
 
 
 @pytest.mark.parametrize('ambiguous, verdict', [

@@ -13,7 +13,7 @@ import yaml
 
 from mag_tracking.network.file import read_network
 from mag_tracking.network.topics import absolute
-from mag_tracking.report.palette import AXIS_COLOURS, BLUE, ORANGE, VERMILLION
+from mag_tracking.report.style import AXIS_COLOURS, BLUE, ORANGE, VERMILLION
 
 ROOT = Path(__file__).resolve().parents[1]
 TRACKER = '/tracker_node'

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import mag_tracking as mt
 from mag_tracking.apps.calibrate import calibrate
+from mag_tracking.apps.calibrate_report import calibration_figure
+from mag_tracking.apps.fit_report import pass_figure
+from mag_tracking.apps.plan_report import position_figure, sensor_figure
 from mag_tracking.cli import main as command
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
-from mag_tracking.report.calibration_figures import calibration_figure
-from mag_tracking.report.fit_figures import pass_figure
-from mag_tracking.report.plan_figures import position_figure, sensor_figure
 from support.browser import Page, browser
 from support.bundled import DATA, NETWORK_FILE, vehicle_path
 

@@ -11,7 +11,7 @@ number of dipoles.
 from pathlib import Path
 
 import mag_tracking as mt
-from mag_tracking.report.fit_figures import order_figure, pass_figure
+from mag_tracking.apps.fit_report import order_figure, pass_figure
 
 DATA = Path(mt.__file__).parents[1] / 'test' / 'data'
 NETWORK = Path(mt.__file__).parents[1] / 'config' / 'network.yaml'

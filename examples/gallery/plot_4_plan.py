@@ -10,7 +10,7 @@ sensor help most? Cramér-Rao bounds answer these questions before any sensor is
 from pathlib import Path
 
 import mag_tracking as mt
-from mag_tracking.report.plan_figures import detection_figure, position_figure, sensor_figure
+from mag_tracking.apps.plan_report import detection_figure, position_figure, sensor_figure
 
 NETWORK = Path(mt.__file__).parents[1] / 'config' / 'network.yaml'
 

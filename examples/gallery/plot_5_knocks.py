@@ -14,9 +14,9 @@ import numpy as np
 
 import mag_tracking as mt
 from mag_tracking.apps.calibrate import calibrate
+from mag_tracking.apps.calibrate_report import calibration_figure
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.reader import Recording
-from mag_tracking.report.calibration_figures import calibration_figure
 
 DATA = Path(mt.__file__).parents[1] / 'test' / 'data' / 'corridor'
 network = mt.read_network(DATA / 'network.yaml')

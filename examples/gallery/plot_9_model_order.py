@@ -9,7 +9,7 @@ Wahlström and Gustafsson (2014).
 # %%
 import tsp14_model_order as tsp14
 
-from mag_tracking.report.fit_figures import order_figure
+from mag_tracking.apps.fit_report import order_figure
 
 rate = next(iter(tsp14.RATES))
 found = tsp14.fit_passes(rate)

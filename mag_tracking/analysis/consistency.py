@@ -2,13 +2,13 @@
 
 import numpy as np
 
+from mag_tracking.analysis.track_errors import interpolate_truth
+from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.crlb import path_bound
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.physics.motion import constant_velocity, integrator_noise
-from mag_tracking.report.metrics import interpolate_truth
-from mag_tracking.report.track_log import TrackLog
 
 MIN_VELOCITY_STD = 1e-9
 """[m/s] Minimum standard deviation of the velocity prior, for targets at rest."""

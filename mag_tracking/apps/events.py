@@ -70,7 +70,7 @@ class EventsResult(DisplayedResult):
         matplotlib.figure.Figure
         """
         # Imported here because it loads matplotlib.
-        from mag_tracking.report.time_figures import time_figure
+        from mag_tracking.report.figures import time_figure
 
         return time_figure(np.array([e.closest_ns for e in self.events], dtype=np.int64),
                            np.array([1e9 * np.sqrt(np.nansum(e.peak**2)) for e in self.events]),

@@ -76,7 +76,7 @@ class FitResult(DisplayedResult):
             If there is no such pass, or nothing could be fitted to it.
         """
         # Imported here because it loads matplotlib.
-        from mag_tracking.report.fit_figures import pass_figure
+        from mag_tracking.apps.fit_report import pass_figure
 
         drawn = self.passes[number].drawn if 0 <= number < len(self.passes) else None
         if drawn is None:

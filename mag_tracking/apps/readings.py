@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mag_tracking.analysis.track_errors import Truth
 from mag_tracking.apps.user_tables import (
     is_table,
     nanoseconds,
@@ -22,7 +23,6 @@ from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings
-from mag_tracking.report.metrics import Truth
 from mag_tracking.run import ArraySource, RecordingSource, Source
 from mag_tracking.units import LATEST_NS, NS
 

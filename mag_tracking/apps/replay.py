@@ -11,7 +11,16 @@ import numpy as np
 from mag_tracking.analysis.consistency import error_over_bound
 from mag_tracking.analysis.correlated_motion import contradicts_delays, correlated_motion
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.apps.replay_notes import diagnosis_entries
+from mag_tracking.analysis.track_errors import (
+    MAGNET_SKIP,
+    Truth,
+    interpolate_truth,
+    magnet_errors,
+    near_poses,
+    pass_errors,
+    unflagged_poses,
+)
+from mag_tracking.analysis.track_log import SmoothedLog, TrackLog
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.geometry import heading_of, speed_of
@@ -21,16 +30,6 @@ from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.truth import read_truth_table
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
-from mag_tracking.report.metrics import (
-    MAGNET_SKIP,
-    Truth,
-    interpolate_truth,
-    magnet_errors,
-    near_poses,
-    pass_errors,
-    unflagged_poses,
-)
-from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.results.result_folder import ResultFolder, figure_name
 from mag_tracking.results.tum_file import write_tum
 from mag_tracking.run import (
@@ -185,7 +184,9 @@ def summarise(source: Source, pipeline: Pipeline, history: TrackHistory,
     return {'recording': source.name, 'target': pipeline.settings.track.target,
             'counts': report.counts, 'rejected': report.rejected, 'lost': report.lost,
             'no_detection_reason': report.no_detection_reason,
-            'diagnoses': diagnosis_entries(report.diagnoses),
+            'diagnoses': [
+                {'cause': d.finding.cause.value, 'serious': d.serious, 'text': str(d)}
+                for d in report.diagnoses],
             'close_network': len(pipeline.network) > 1 and pipeline.network.is_compact,
             'frames_too_long': frame_period_warning(pipeline.settings.align, pipeline.network),
             'lanes': lane_note(pipeline.settings.track.vehicle, pipeline.network),
@@ -299,8 +300,8 @@ def write_figures(run: Run, network: SensorNetwork, out: Path, max_tracks: int =
     `stopped` is called before each track.
     """
     # Imported here because it loads matplotlib.
-    from mag_tracking.report.figure_file import save_figure
     from mag_tracking.report.figures import field_figure, map_figure, weights_figure
+    from mag_tracking.report.style import save_figure
 
     paths = []
     for log in list(run.logs.values())[:max_tracks]:

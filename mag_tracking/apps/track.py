@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
+from mag_tracking.analysis.track_errors import Truth, interpolate_truth
+from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
 from mag_tracking.apps.readings import RecordedReadings, UserSource, network_of, source_of
 from mag_tracking.apps.replay import TrackHistory, errors_against_truth
@@ -16,8 +18,6 @@ from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.records import Detection, SmoothedPose, Track
-from mag_tracking.report.metrics import Truth, interpolate_truth
-from mag_tracking.report.track_log import TrackLog
 from mag_tracking.results.columns import COMPLETE, DETECTIONS, POSES, SMOOTHED
 from mag_tracking.results.dataframes import array_dataframe, with_time_index
 from mag_tracking.results.result_arrays import detection_array, pose_array, smoothed_array

@@ -100,7 +100,7 @@ class TrafficResult(DisplayedResult):
         matplotlib.figure.Figure
         """
         # Imported here because it loads matplotlib.
-        from mag_tracking.report.time_figures import time_figure
+        from mag_tracking.report.figures import time_figure
 
         passages = [v.passage for v in self.vehicles]
         return time_figure(np.array([p.stamp_ns for p in passages], dtype=np.int64),

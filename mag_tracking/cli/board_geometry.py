@@ -108,8 +108,8 @@ def _geometry(args: argparse.Namespace) -> int:
                       f'{(args.sensors or args.network).name}.')
         if args.figure is not None:
             # Imported here because it loads matplotlib.
-            from mag_tracking.report.figure_file import save_figure
-            from mag_tracking.report.geometry_figures import geometry_figure
+            from mag_tracking.apps.calibrate_report import geometry_figure
+            from mag_tracking.report.style import save_figure
 
             save_figure(geometry_figure(survey), args.figure)
     print(f'network written to {args.out}')

@@ -84,8 +84,8 @@ def _calibrate(args: argparse.Namespace) -> int:
         write_report(result, network, args.recording.name, args.report)
     if args.figure is not None:
         # Imported here because it loads matplotlib.
-        from mag_tracking.report.calibration_figures import calibration_figure
-        from mag_tracking.report.figure_file import save_figure
+        from mag_tracking.apps.calibrate_report import calibration_figure
+        from mag_tracking.report.style import save_figure
 
         save_figure(calibration_figure(result, network), args.figure)
     print(f'network written to {args.out}')

@@ -353,8 +353,8 @@ def _draw(fitted_pass: FittedPass, out: Path) -> None:
     if fit is None:
         return
     # Imported here because it loads matplotlib.
-    from mag_tracking.report.figure_file import save_figure
-    from mag_tracking.report.fit_figures import pass_figure
+    from mag_tracking.apps.fit_report import pass_figure
+    from mag_tracking.report.style import save_figure
 
     title = f'{fitted_pass.recording}, {fitted_pass.label}, {quantity(fit.n_dipoles, "dipole")}'
     title += ' (without the field of other vehicles)' if fitted_pass.n_vehicles > 1 else ''
@@ -365,7 +365,7 @@ def _draw(fitted_pass: FittedPass, out: Path) -> None:
 
 def _draw_orders(passes: Sequence[FittedPass], out: Path) -> None:
     """Draw the normalised cost over the number of dipoles for all passes."""
-    from mag_tracking.report.figure_file import save_figure
-    from mag_tracking.report.fit_figures import order_figure
+    from mag_tracking.apps.fit_report import order_figure
+    from mag_tracking.report.style import save_figure
 
     save_figure(order_figure(passes), out / 'orders.png')

@@ -1,7 +1,6 @@
 """Command `mag-tracking plan`."""
 
 import argparse
-import json
 from pathlib import Path
 
 from tqdm import tqdm
@@ -10,11 +9,10 @@ from mag_tracking.apps.plan import Plan
 from mag_tracking.apps.plan_inputs import PlanInputs, plan_inputs
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.errors import SettingsError
-from mag_tracking.files import new_text_file, output_folder
+from mag_tracking.files import output_folder, write_json
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Settings, settings_for
-from mag_tracking.report.json_text import without_nan
 from mag_tracking.settings import read_parameter_file
 
 _PLAN_HELP = '''
@@ -126,13 +124,11 @@ def _write(p: Plan, out: Path) -> None:
         'lanes': [{'name': lane.name, 'along': lane.along.tolist(),
                    'filter_std': lane.filter_std.tolist(), 'pass_std': lane.pass_std.tolist(),
                    'detection': lane.detection.tolist()} for lane in p.lanes]}
-    with new_text_file(out / 'plan.json') as stream:
-        json.dump(without_nan(content), stream, indent=1, allow_nan=False)
-        stream.write('\n')
+    write_json(out / 'plan.json', content)
     # Imported here because it loads matplotlib.
-    from mag_tracking.report import plan_figures
-    from mag_tracking.report.figure_file import save_figure
+    from mag_tracking.apps import plan_report
+    from mag_tracking.report.style import save_figure
 
     for name in ('position', 'detection', 'sensor', 'lane'):
-        figure = getattr(plan_figures, f'{name}_figure')(p)
+        figure = getattr(plan_report, f'{name}_figure')(p)
         save_figure(figure, out / f'plan_{name}{"s" * (name == "lane")}.png')

@@ -12,9 +12,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from tqdm import tqdm
 
+from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.apps.replay import Run, replay, write_figures, write_trajectories
-from mag_tracking.apps.replay_notes import notes_of
-from mag_tracking.apps.replay_report import write_report
+from mag_tracking.apps.replay_report import notes_of, write_report
 from mag_tracking.apps.traffic import check_vehicles
 from mag_tracking.cli.events import Events
 from mag_tracking.cli.fit import ORDERS, Fits
@@ -41,7 +41,6 @@ from mag_tracking.pipeline import STAGES, Pipeline, Settings
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.report.page import WARNING
-from mag_tracking.report.track_log import TrackLog
 from mag_tracking.results.rerun_file import RERUN_FILE, check_rerun, write_rerun
 from mag_tracking.run import RecordingSource, Sink, output_error, run
 from mag_tracking.stages.track.doubts import MEANINGS

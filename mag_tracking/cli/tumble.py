@@ -85,8 +85,8 @@ def _tumble(args: argparse.Namespace) -> int:
     write_network(args.out, calibrated, f'{", ".join(converged_names)} tumbled in '
                   f'{args.recording.name}; based on {args.network.name}.')
     if args.figure is not None:
-        from mag_tracking.report.calibration_figures import tumble_figure
-        from mag_tracking.report.figure_file import save_figure
+        from mag_tracking.apps.calibrate_report import tumble_figure
+        from mag_tracking.report.style import save_figure
 
         save_figure(tumble_figure({name: fits[name] for name in converged_names}, readings),
                     args.figure)

@@ -5,7 +5,6 @@ import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from visualization_msgs.msg import MarkerArray
 
-from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.messages.frame import frame_of
@@ -29,6 +27,7 @@ from mag_tracking.nodes.stage_node import LATCHED_QOS, RESULT_QOS, STREAM_QOS, m
 from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.quantities import quantity
 from mag_tracking.report.page import ERROR, WARNING, Note, Table
+from mag_tracking.report.page_scene import SensorLayout
 from mag_tracking.web.live_scene import LiveScene
 from mag_tracking.web.page_server import UPDATE_INTERVAL_S, PageServer
 
@@ -43,22 +42,6 @@ STALE_TIMEOUT_S = 5.0
 """[s] A diagnostic status that has not been repeated for this time is stale."""
 _LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warning',
            DiagnosticStatus.ERROR: 'error', DiagnosticStatus.STALE: 'stale'}
-
-
-@dataclass(frozen=True, eq=False)
-class SensorLayout:
-    """Names and positions of the sensors, as published by the tracker."""
-
-    frame: str
-    """Name of the world frame."""
-    names: tuple[str, ...]
-    positions: FloatArray
-    """(n, 3) [m], world frame."""
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-
 EMPTY_LAYOUT = SensorLayout('', (), np.zeros((0, 3)))
 """Placeholder until the tracker has published its sensors."""
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mag_tracking.analysis.track_errors import Truth
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.message_arrays import magnetic_fields
@@ -27,7 +28,6 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sensor_topics import FrameCheck, examine_topics, fault_of
 from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
-from mag_tracking.report.metrics import Truth
 from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.stages.health.input_findings import ZERO_STAMP
 

@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mag_tracking.analysis.track_errors import Truth
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import quaternion_between
@@ -16,7 +17,6 @@ from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.messages.types import ODOMETRY, POSE, POSE_WITH_COVARIANCE
 from mag_tracking.recording.csv_file import Lines, number, read_csv
 from mag_tracking.recording.message_block import MessageBlock
-from mag_tracking.report.metrics import Truth
 from mag_tracking.units import LATEST_NS, NS
 
 TRUTH_TYPES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY)

@@ -1,1 +1,1 @@
-"""Figures, tables, pages and metrics of a run."""
+"""Figures of tracks, and what figures and pages share."""

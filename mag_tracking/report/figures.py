@@ -1,9 +1,6 @@
-"""Figures of a run; each function returns one figure.
+"""Figures of tracks, with 90 % regions, and of values over time; each function returns one."""
 
-All figures show uncertainty as 90 % regions.
-"""
-
-from typing import Protocol
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,32 +8,16 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from mag_tracking.arrays import FloatArray
-from mag_tracking.report.literal_text import literal
-from mag_tracking.report.palette import AXIS_COLOURS, SERIES_COLOURS, VERMILLION
-from mag_tracking.report.scales import field_unit, scale_of
-from mag_tracking.report.style import legend_beside
-from mag_tracking.report.track_log import TrackLog
+from mag_tracking.analysis.track_log import TrackLog
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.network import SensorNetwork
+from mag_tracking.report import style
+from mag_tracking.report.page_scene import strongest_sensors
 
 SCALE_2D = float(np.sqrt(chdtri(2, 0.1)))
 """Radius of a 90 % ellipse in the plane, in standard deviations."""
-SCALE_1D = 1.645
-"""Half width of a 90 % interval, in standard deviations."""
-
 MIN_WEIGHT = 0.01
 """Minimum weight of a plotted hypothesis. Less probable hypotheses are omitted for clarity."""
-
-
-class _Network(Protocol):
-    """Attributes of a `SensorNetwork` that the figures use."""
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-
-    @property
-    def positions(self) -> FloatArray: ...
-
-    def __len__(self) -> int: ...
 
 
 def ellipse_points(position: FloatArray, covariance: FloatArray, n: int = 48) -> FloatArray:
@@ -51,7 +32,7 @@ def ellipse_points(position: FloatArray, covariance: FloatArray, n: int = 48) ->
 def _colours(log: TrackLog) -> dict[str, str]:
     """Assign a colour to each arrival direction, in alphabetical order."""
     names = sorted({name for row in log.arrivals for name in row})
-    return {name: SERIES_COLOURS[i % len(SERIES_COLOURS)] for i, name in enumerate(names)}
+    return {name: style.series_colour(i) for i, name in enumerate(names)}
 
 
 def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -63,7 +44,7 @@ def _without_switches(points: FloatArray, covariances: FloatArray) -> FloatArray
     return np.insert(points, switches, np.nan, axis=0)
 
 
-def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None,
+def map_figure(log: TrackLog, network: SensorNetwork, truth: FloatArray | None = None,
                smoothed: ArrayLike | None = None) -> Figure:
     """Plot a track with 90 % ellipses, its hypotheses by arrival direction, sensors and truth.
 
@@ -77,7 +58,7 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
     map_points = np.vstack([positions, network.positions[:, :2]])
     low, high = map_points.min(axis=0), map_points.max(axis=0)
     span = max((high - low).max(), 1e-6)
-    f, unit = scale_of(span)
+    f, unit = style.scale_of(span)
     _draw_arrivals(axes, log, f)
     for k in range(0, len(positions), max(1, len(positions) // 14)):
         axes.fill(*(f * ellipse_points(positions[k], covariance[k])).T, color='k', lw=0,
@@ -90,19 +71,17 @@ def map_figure(log: TrackLog, network: _Network, truth: FloatArray | None = None
     if truth is not None and np.isfinite(truth).any():
         axes.plot(f * truth[:, 0], f * truth[:, 1], '--', color='0.5', lw=1.4, label='truth')
     if smoothed is not None:
-        axes.plot(*(f * np.asarray(smoothed)[:, :2]).T, color=VERMILLION, lw=1.4,
+        axes.plot(*(f * np.asarray(smoothed)[:, :2]).T, color=style.VERMILLION, lw=1.4,
                   label='smoothed')
     axes.plot(f * network.positions[:, 0], f * network.positions[:, 1], 'k^', ms=8,
               label='magnetometers')
     middle, half = 0.5 * (low + high), 0.5 * span + 0.12 * span
-    axes.set_xlim(f * (middle[0] - half), f * (middle[0] + half))
-    axes.set_ylim(f * (middle[1] - half), f * (middle[1] + half))
-    axes.set_aspect('equal')
-    axes.set_xlabel(f'x [{unit}]')
-    axes.set_ylabel(f'y [{unit}]')
+    axes.set(xlim=(f * (middle[0] - half), f * (middle[0] + half)),
+             ylim=(f * (middle[1] - half), f * (middle[1] + half)), aspect='equal',
+             xlabel=f'x [{unit}]', ylabel=f'y [{unit}]',
+             title=f'Track {log.id} with 90 % ellipses')
     axes.grid(alpha=0.3)
-    legend_beside(axes)
-    axes.set_title(f'Track {log.id} with 90 % ellipses')
+    style.legend_beside(axes)
     return figure
 
 
@@ -122,7 +101,7 @@ def _draw_arrivals(axes: Axes, log: TrackLog, f: float) -> None:
                                    np.array([C for *_, C in rows]))
         weight = log.arrivals[-1].get(name, (0.0,))[0]
         axes.plot(*(f * points).T, color=colour, lw=3.0 if weight > 0.5 else 1.2, alpha=0.8,
-                  label=f'from {literal(name)} ({weight:.0%} at the end)')
+                  label=f'from {style.literal(name)} ({weight:.0%} at the end)')
 
 
 def weights_figure(log: TrackLog) -> Figure:
@@ -132,47 +111,40 @@ def weights_figure(log: TrackLog) -> Figure:
     t = log.seconds()
     for name, colour in _colours(log).items():
         w = np.array([row[name][0] if name in row else 0.0 for row in log.arrivals])
-        top.plot(t, w, color=colour, label=literal(name) or 'all hypotheses')
+        top.plot(t, w, color=colour, label=style.literal(name) or 'all hypotheses')
         bottom.semilogy(t, np.where(w > 0.0, w, np.nan), color=colour)
-    top.set_ylim(-0.03, 1.03)
-    top.set_ylabel('weight')
-    legend_beside(top)
+    style.legend_beside(top)
     subject = 'each arrival direction (a line ends when its direction is pruned)' \
         if any(_colours(log)) else 'the hypotheses, which have no arrival directions'
-    top.set_title(f'Track {log.id}: weight of {subject}')
-    bottom.set_ylim(1e-13, 3.0)
-    bottom.set_ylabel('weight (log)')
-    bottom.set_xlabel('time since the first pose [s]')
+    top.set(ylim=(-0.03, 1.03), ylabel='weight', title=f'Track {log.id}: weight of {subject}')
+    bottom.set(ylim=(1e-13, 3.0), ylabel='weight (log)', xlabel='time since the first pose [s]')
     for axes in (top, bottom):
         axes.grid(alpha=0.3)
     return figure
 
 
-def field_figure(log: TrackLog, network: _Network, max_sensors: int = 8) -> Figure:
+def field_figure(log: TrackLog, network: SensorNetwork) -> Figure:
     """Plot the measured field and the field of the best hypothesis, per sensor and axis.
 
-    In a network of more than `max_sensors`, only the sensors with the strongest fields are plotted,
-    and the title states how many.
+    In a large network, only the `strongest_sensors` are plotted, and the title states how many.
     """
     measured, predicted = np.array(log.measured), np.array(log.predicted)
-    strength = np.nan_to_num(np.nanmax(np.abs(np.where(np.isnan(measured), 0.0, measured)),
-                                       axis=(0, 2)))
-    sensors = np.sort(np.argsort(-strength, kind='stable')[:max_sensors])
+    sensors = strongest_sensors(log)
     n_columns = 2 if len(sensors) > 1 else 1
     n_rows = -(-len(sensors) // n_columns)
     figure = Figure(figsize=(9.5, 1.2 + 2.4 * n_rows), layout='constrained')
     grid = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True)
-    f, unit = field_unit(strength.max())
+    f, unit = style.field_unit(np.nan_to_num(np.abs(measured)).max())
     t = log.seconds()
     for axes in grid.flat[len(sensors):]:
         axes.set_visible(False)
     for axes, j in zip(grid.flat, sensors, strict=False):
-        for a, colour in enumerate(AXIS_COLOURS):
+        for a, colour in enumerate(style.AXIS_COLOURS):
             axes.plot(t, f * measured[:, j, a], '.', ms=4, color=colour,
                       label=f'{"xyz"[a]} measured' if j == sensors[0] else None)
             axes.plot(t, f * predicted[:, j, a], '-', lw=1.2, color=colour,
                       label=f'{"xyz"[a]} predicted' if j == sensors[0] else None)
-        axes.set_title(literal(network.names[j]), fontsize=9)
+        axes.set_title(style.literal(network.names[j]), fontsize=9)
         axes.set_ylabel(f'field [{unit}]')
         axes.grid(alpha=0.3)
     for axes in grid[-1]:
@@ -182,4 +154,23 @@ def field_figure(log: TrackLog, network: _Network, max_sensors: int = 8) -> Figu
     selection = '' if len(sensors) == len(network) \
         else f' (the strongest {len(sensors)} of {len(network)})'
     figure.suptitle(f'Track {log.id}: measured and predicted field, sensor frame{selection}')
+    return figure
+
+
+def time_figure(stamp_ns: IntArray, values: FloatArray, std: FloatArray | None,
+                groups: Sequence[str], label: str) -> Figure:
+    """Draw values (n,), with standard deviations if known, over time, a colour per group."""
+    figure = Figure(figsize=(8.0, 3.5), layout='constrained')
+    axis = figure.add_subplot()
+    times = np.asarray(stamp_ns, dtype='datetime64[ns]')
+    for k, group in enumerate(dict.fromkeys(groups)):
+        rows = np.array([g == group for g in groups])
+        axis.errorbar(times[rows], values[rows], None if std is None else std[rows], fmt='o',
+                      color=style.series_colour(k), label=style.literal(group))
+    axis.set(xlabel='time (UTC)', ylabel=label)
+    axis.grid(True, alpha=0.3)
+    if len(groups):
+        style.legend_beside(axis)
+    else:
+        axis.text(0.5, 0.5, 'nothing was found', transform=axis.transAxes, ha='center')
     return figure

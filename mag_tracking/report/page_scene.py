@@ -1,16 +1,20 @@
 """Map with a time slider as JSON: sensors, tracks, hypotheses and fields."""
 
+import base64
+from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.report.packed import Packed, packed
+from mag_tracking.analysis.track_log import TrackLog
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.network import SensorNetwork
 from mag_tracking.report.road import Road
-from mag_tracking.report.scales import scale_of
-from mag_tracking.report.track_log import TrackLog
+from mag_tracking.report.style import scale_of
 from mag_tracking.units import NS
 
 MAX_SENSORS = 8
@@ -27,29 +31,37 @@ SINGLE_SENSOR_MARGIN_M = 10.0
 """Maximum margin of the map around a network without extent, such as a single sensor [m]."""
 
 
+@dataclass(frozen=True, eq=False)
+class SensorLayout:
+    """Names and positions of the sensors, as published by the tracker."""
+
+    frame: str
+    """Name of the world frame."""
+    names: tuple[str, ...]
+    positions: FloatArray
+    """(n, 3) [m], world frame."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
 NO_ROAD = Road()
+Sensors: TypeAlias = SensorNetwork | SensorLayout
+Packed: TypeAlias = dict[str, str]
+"""Maps the type of the numbers of an array to little-endian base64, which `scene.js` decodes."""
 
 
-class Sensors(Protocol):
-    """Attributes of a `SensorNetwork` that a page uses."""
+def packed(values: ArrayLike, kind: str = 'f8') -> Packed:
+    """Encode an array (n,) as JSON object in a third of the space of decimal numbers.
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Sensor names."""
-
-    @property
-    def positions(self) -> FloatArray:
-        """Sensor positions, (n, 3) m, world frame."""
-
-    @property
-    def frame(self) -> str:
-        """Name of the world frame."""
-
-    def __len__(self) -> int: ...
+    `kind` is 'f8', 'u1', or 'f4', which is sufficient for values that are only plotted.
+    """
+    raw = np.ascontiguousarray(values, dtype=f'<{kind}').tobytes()
+    return {kind: base64.b64encode(raw).decode('ascii')}
 
 
-def scene_of(network: Sensors, begin_ns: int, end_ns: int, tracks: Sequence[Mapping[str, Any]],
-             road: Road = NO_ROAD) -> dict[str, Any]:
+def scene_of(network: Sensors, begin_ns: int, end_ns: int,
+             tracks: Sequence[Mapping[str, Any]], road: Road = NO_ROAD) -> dict[str, Any]:
     """JSON object of the map with a time slider, of tracks from `track_entry`.
 
     The page shows seconds since `begin_ns`.
@@ -57,50 +69,42 @@ def scene_of(network: Sensors, begin_ns: int, end_ns: int, tracks: Sequence[Mapp
     xy = network.positions[:, :2]
     low, high = xy.min(axis=0), xy.max(axis=0)
     span = float((high - low).max())
-    max_margin = MAX_MARGIN_RATIO * span if span > 0.0 else SINGLE_SENSOR_MARGIN_M
-    margin = 0.15 * span if span > 0.0 else 1.0
-    factor, unit = scale_of(span if span > 0.0 else SINGLE_SENSOR_MARGIN_M)
+    margin, max_margin = 1.0, SINGLE_SENSOR_MARGIN_M
+    if span > 0.0:
+        margin, max_margin = 0.15 * span, MAX_MARGIN_RATIO * span
+    # Extents [x0, x1, y0, y1] [m].
+    reach, most_reach = (np.stack([low - m, high + m], axis=1).ravel().tolist()
+                         for m in (margin, max_margin))
+    factor, unit = scale_of(span or SINGLE_SENSOR_MARGIN_M)
     return {'frame': network.frame, 'begin_ns': str(begin_ns), 'begin': 0.0,
             'end': (end_ns - begin_ns) / NS, 'scale': {'factor': factor, 'unit': unit},
             'sensors': {'names': list(network.names), 'x': packed(xy[:, 0]), 'y': packed(xy[:, 1]),
                         'z': packed(network.positions[:, 2])},
             'road': {name: [{'x': packed(line[:, 0]), 'y': packed(line[:, 1])} for line in lines]
                      for name, lines in (('areas', road.areas), ('markings', road.markings))},
-            'reach': _box(low - margin, high + margin),
-            'most_reach': _box(low - max_margin, high + max_margin),
-            'tracks': list(tracks)}
+            'reach': reach, 'most_reach': most_reach, 'tracks': list(tracks)}
 
 
-def _box(low: FloatArray, high: FloatArray) -> list[float]:
-    """Bounding box [x0, x1, y0, y1] [m] with the corners `low` and `high`."""
-    return [float(low[0]), float(high[0]), float(low[1]), float(high[1])]
-
-
-def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None,
-                      max_sensors: int = MAX_SENSORS) -> IntArray:
-    """Indices (k,), ascending, of the sensors with the strongest fields at the poses `rows`.
-
-    All poses are evaluated by default.
-    """
+def strongest_sensors(log: TrackLog, rows: Iterable[int] | None = None) -> IntArray:
+    """Indices, ascending, of up to `MAX_SENSORS` sensors with the strongest fields at the poses
+    `rows`, by default all."""
     chosen = log.measured if rows is None else [log.measured[k] for k in rows]
     measured = np.abs(np.array(chosen).reshape(-1, len(log.measured[0]), 3))
     strength = np.nan_to_num(measured).max(axis=(0, 2), initial=0.0)
-    return np.sort(np.argsort(-strength, kind='stable')[:max_sensors])
+    return np.sort(np.argsort(-strength, kind='stable')[:MAX_SENSORS])
 
 
-def max_poses_of(logs: Sequence[TrackLog], max_bytes: int = MAX_BYTES) -> int:
-    """Maximum number of poses per track that keeps a report below `max_bytes`; at least
+def max_poses_of(logs: Sequence[TrackLog]) -> int:
+    """Maximum number of poses per track that keeps a report below `MAX_BYTES`; at least
     `MIN_POSES`."""
     lengths = np.array([len(log.stamp_ns) for log in logs])
     sizes = np.array([_pose_size(log) for log in logs])
-    low, high = MIN_POSES, max(int(lengths.max()), MIN_POSES)
-    while low < high:
-        middle = (low + high + 1) // 2
-        if TRACK_SIZE * len(logs) + (np.minimum(lengths, middle) * sizes).sum() > max_bytes:
-            high = middle - 1
-        else:
-            low = middle
-    return low
+
+    def size(max_poses: int) -> int:
+        return TRACK_SIZE * len(logs) + int((np.minimum(lengths, max_poses) * sizes).sum())
+
+    numbers = range(MIN_POSES + 1, int(lengths.max()) + 1)
+    return MIN_POSES + bisect_right(numbers, MAX_BYTES, key=size)
 
 
 def _pose_size(log: TrackLog) -> int:
@@ -127,36 +131,52 @@ def track_entry(log: TrackLog, begin_ns: int, sensors: IntArray,
     `begin_ns` is the start of the scene.
     """
     rows = range(len(log.stamp_ns)) if rows is None else rows
+
+    def column(name: str, *shape: int) -> FloatArray:
+        values = getattr(log, name)
+        return np.array([values[k] for k in rows], dtype=float).reshape(-1, *shape)
+
     times = (np.array([log.stamp_ns[k] for k in rows], dtype=np.int64) - begin_ns) / NS
-    columns = _columns(times, _array([log.position[k] for k in rows], 3),
-                       _array([log.velocity[k] for k in rows], 3),
-                       _array([log.covariance[k] for k in rows], 6, 6),
-                       np.array([log.ambiguous[k] for k in rows], bool))
     # A magnet, which has no kind, is drawn by its moment in place of its length.
     length = np.array([log.length[k] if log.kind[k] else np.nan for k in rows], dtype=float)
-    columns |= _body(length, _array([log.moment[k] for k in rows], 3))
-    columns |= _innovation(np.array([log.nis[k] for k in rows], dtype=float),
-                           np.array([log.degrees_of_freedom[k] for k in rows], dtype=float))
-    return {'id': log.id, 'key': log.id, 'ended': log.ended, 'columns': columns,
-            'arrivals': _arrivals(log, rows), 'fields': _fields(log, rows, sensors),
-            'doubts': [', '.join(log.doubts[k]) for k in rows],
-            'smoothed': None, 'truth': None, 'facts': None}
+    measured, predicted = (column(name, len(log.measured[0]), 3)
+                           for name in ('measured', 'predicted'))
+    return {**pose_entry(log.id, times, np.hstack([column('position', 3), column('velocity', 3)]),
+                         column('covariance', 6, 6), column('ambiguous'), length,
+                         column('moment', 3), column('nis'), column('degrees_of_freedom')),
+            'ended': log.ended, 'arrivals': _arrivals(log, rows),
+            'fields': [field_entry(j, measured[:, j], predicted[:, j]) for j in sensors.tolist()],
+            'doubts': [', '.join(log.doubts[k]) for k in rows]}
 
 
-def fitted_entry(track_id: int, times: FloatArray, state: FloatArray, covariance: FloatArray,
-                 ambiguous: bool, length: float,
-                 fields: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """JSON object of a fitted pass, as a track with constant velocity.
+def pose_entry(track_id: int, times: FloatArray, state: FloatArray, C: FloatArray,
+               ambiguous: ArrayLike, length: FloatArray, moment: FloatArray, nis: FloatArray,
+               degrees_of_freedom: FloatArray) -> dict[str, Any]:
+    """JSON object of an ended track with n poses, without fields and arrival directions.
 
-    `times` (n,) [s] are since the start of the scene; `state` (n, 6) [m and m/s] is in the world
-    frame; `length` [m] is that of the row of dipoles; `fields` are from `field_entry`.
+    `times` (n,) [s] are since the start of the scene; `state` (n, 6) [m and m/s] and its covariance
+    `C` are in the world frame. `length` (n,) [m] is that of the row of dipoles, NaN for a magnet,
+    and `moment` (n, 3) [A m²] is drawn only for a magnet. Without degrees of freedom, there is no
+    NIS.
     """
-    n = len(times)
-    columns = _columns(times, state[:, :3], state[:, 3:], covariance, np.full(n, ambiguous))
-    columns |= _body(np.full(n, length), np.full((n, 3), np.nan))
-    columns |= _innovation(np.full(n, np.nan), np.zeros(n))
+    u = state[:, 3:5] / np.maximum(np.linalg.norm(state[:, 3:5], axis=1, keepdims=True), 1e-12)
+    # Variance of the horizontal speed, to first order.
+    speed_variance = np.einsum('na,nab,nb->n', u, C[:, 3:5, 3:5], u)
+    # NIS per axis, and the 90 % band that is expected of a consistent filter.
+    n, axes = degrees_of_freedom, np.maximum(degrees_of_freedom, 1.0)
+    low, high = (np.where(n > 0.0, chdtri(axes, p) / axes, np.nan) for p in (0.95, 0.05))
+    columns = {
+        't': packed(times),
+        **{name: packed(state[:, k]) for k, name in enumerate(('x', 'y', 'z', 'vx', 'vy'))},
+        **{a + b: packed(C[:, 'xyz'.index(a), 'xyz'.index(b)], 'f4')
+           for a, b in ('xx', 'xy', 'yy', 'xz', 'zz')},
+        'speed_sd': packed(np.sqrt(np.maximum(speed_variance, 0.0)), 'f4'),
+        'ambiguous': packed(ambiguous, 'u1'), 'length': packed(length, 'f4'),
+        **{f'm{axis}': packed(moment[:, a], 'f4') for a, axis in enumerate('xyz')},
+        'nis': packed(np.where(n > 0.0, nis / axes, np.nan), 'f4'),
+        'nis_low': packed(low, 'f4'), 'nis_high': packed(high, 'f4')}
     return {'id': track_id, 'key': track_id, 'ended': True, 'columns': columns, 'arrivals': {},
-            'fields': list(fields), 'doubts': [''] * n, 'smoothed': None, 'truth': None,
+            'fields': [], 'doubts': [''] * len(times), 'smoothed': None, 'truth': None,
             'facts': None}
 
 
@@ -171,9 +191,9 @@ def field_entry(sensor: int, measured: FloatArray, predicted: FloatArray,
         for name, values in (('measured', measured), ('predicted', predicted))}}
 
 
-def path_entry(track_id: int, points: FloatArray) -> dict[str, Any]:
+def path_entry(points: FloatArray) -> dict[str, Packed]:
     """JSON object of the smoothed or the true path (n, 3) [m, world frame] of a track."""
-    return {'id': track_id, **{name: packed(points[:, a]) for a, name in enumerate('xyz')}}
+    return {name: packed(points[:, a]) for a, name in enumerate('xyz')}
 
 
 def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -192,46 +212,6 @@ def facts_of(entry: Mapping[str, Any]) -> dict[str, Any]:
             'verdict': entry['verdict'], 'error': error,
             'doubts': ', '.join(f'{name.replace("_", " ")} ({n})'
                                 for name, n in entry['doubts'].items())}
-
-
-def _array(values: Sequence[FloatArray], *shape: int) -> FloatArray:
-    """Stack n arrays into one array (n, *shape), also for n = 0."""
-    return np.array(values, dtype=float).reshape(-1, *shape)
-
-
-def _speed_std(velocity: FloatArray, C: FloatArray) -> FloatArray:
-    """Standard deviation (n,) [m/s] of the horizontal speed, to first order."""
-    flat = velocity[:, :2]
-    u = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
-    variance = np.einsum('na,nab,nb->n', u, C[:, 3:5, 3:5], u)
-    std: FloatArray = np.sqrt(np.maximum(variance, 0.0))
-    return std
-
-
-def _columns(times: FloatArray, position: FloatArray, velocity: FloatArray, C: FloatArray,
-             ambiguous: BoolArray) -> dict[str, Packed]:
-    """Encode the times, states, covariances and ambiguity flags of n poses by column."""
-    return {
-        't': packed(times), 'x': packed(position[:, 0]), 'y': packed(position[:, 1]),
-        'z': packed(position[:, 2]), 'vx': packed(velocity[:, 0]), 'vy': packed(velocity[:, 1]),
-        'xx': packed(C[:, 0, 0], 'f4'), 'xy': packed(C[:, 0, 1], 'f4'),
-        'yy': packed(C[:, 1, 1], 'f4'), 'xz': packed(C[:, 0, 2], 'f4'),
-        'zz': packed(C[:, 2, 2], 'f4'), 'speed_sd': packed(_speed_std(velocity, C), 'f4'),
-        'ambiguous': packed(ambiguous, 'u1')}
-
-
-def _body(length: FloatArray, moment: FloatArray) -> dict[str, Packed]:
-    """Lengths (n,) of the rows of dipoles, NaN for magnets, and moments (n, 3) of n poses."""
-    return {'length': packed(length, 'f4'),
-            **{f'm{axis}': packed(moment[:, a], 'f4') for a, axis in enumerate('xyz')}}
-
-
-def _innovation(nis: FloatArray, degrees_of_freedom: FloatArray) -> dict[str, Packed]:
-    """NIS per axis of each pose, and the 90 % band that is expected of a consistent filter."""
-    n, axes = degrees_of_freedom, np.maximum(degrees_of_freedom, 1.0)
-    low, high = (np.where(n > 0.0, chdtri(axes, p) / axes, np.nan) for p in (0.95, 0.05))
-    return {'nis': packed(np.where(n > 0.0, nis / axes, np.nan), 'f4'),
-            'nis_low': packed(low, 'f4'), 'nis_high': packed(high, 'f4')}
 
 
 def _arrivals(log: TrackLog, rows: Sequence[int]) -> dict[str, dict[str, Packed]]:
@@ -253,10 +233,3 @@ def _arrivals(log: TrackLog, rows: Sequence[int]) -> dict[str, dict[str, Packed]
         out[name] = {key: packed(column, 'f8' if key in 'xy' else 'f4') for key, column in zip(
             ('weight', 'x', 'y', 'xx', 'xy', 'yy'), values.T, strict=True)}
     return out
-
-
-def _fields(log: TrackLog, rows: Sequence[int], sensors: IntArray) -> list[dict[str, Any]]:
-    """Measured and predicted fields of the selected sensors, as returned by `field_entry`."""
-    measured = np.array([log.measured[k] for k in rows]).reshape(-1, len(log.measured[0]), 3)
-    predicted = np.array([log.predicted[k] for k in rows]).reshape(measured.shape)
-    return [field_entry(j, measured[:, j], predicted[:, j]) for j in sensors.tolist()]

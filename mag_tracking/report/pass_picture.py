@@ -1,18 +1,16 @@
 """Picture of a pass: road, sensors, vehicle to scale, published track and smoothed path."""
 
-from typing import Protocol
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.network import SensorNetwork
 from mag_tracking.report.figures import ellipse_points
-from mag_tracking.report.literal_text import literal
-from mag_tracking.report.palette import BLUE, VERMILLION
 from mag_tracking.report.road import road_of
-from mag_tracking.report.track_log import TrackLog
+from mag_tracking.report.style import BLUE, VERMILLION, literal
 from mag_tracking.units import NS
 
 N_VEHICLES = 5
@@ -30,17 +28,7 @@ WIDTHS_M = ((1.0, 0.8), (5.0, 1.8), (np.inf, 2.5))
 GRASS, ASPHALT, LINE, DARK = '#eef1ea', '#d3d4d6', '#ffffff', '#333333'
 
 
-class _Network(Protocol):
-    """Attributes of a `SensorNetwork` that the picture uses."""
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-
-    @property
-    def positions(self) -> FloatArray: ...
-
-
-def pass_figure(log: TrackLog, network: _Network, smoothed: ArrayLike | None = None,
+def pass_figure(log: TrackLog, network: SensorNetwork, smoothed: ArrayLike | None = None,
                 max_std: float = float('inf')) -> Figure:
     """Draw the pass of a vehicle as a picture with a scale bar.
 
@@ -55,13 +43,21 @@ def pass_figure(log: TrackLog, network: _Network, smoothed: ArrayLike | None = N
     points = np.vstack([network.positions[:, :2], *(_shapes(log, k)[0] for k in drawn[shown])])
     low, high = points.min(axis=0) - MARGIN_M, points.max(axis=0) + MARGIN_M
     figure, axes = _empty_map(low, high)
-    _draw_road(axes, network.positions[:, :2], path)
+    road = road_of(network.positions[:, :2], [path])
+    for area in road.areas:
+        axes.fill(*area.T, color=ASPHALT, lw=0, zorder=1)
+    for marking in road.markings:
+        axes.plot(*marking.T, color=LINE, lw=2.5, dashes=(7.0, 7.0), zorder=2)
     _draw_regions(axes, log, drawn)
     axes.plot(*path.T, color=VERMILLION, lw=2.5, zorder=4, label='smoothed path',
               solid_capstyle='round')
     _draw_vehicles(axes, log, drawn[shown], network.positions[:, :2])
     axes.plot(*positions[drawn].T, 'o', color=DARK, ms=2.5, zorder=6, label='published poses')
-    _draw_sensors(axes, network)
+    axes.plot(*network.positions[:, :2].T, '^', ms=13, mfc=DARK, mec=LINE, mew=1.5, zorder=7,
+              ls='none', label='magnetometers')
+    for name, position in zip(network.names, network.positions, strict=True):
+        axes.annotate(literal(name), position[:2], xytext=(12, 0), textcoords='offset points',
+                      va='center', fontsize=12, color=DARK, zorder=8)
     _draw_scale(axes, low, high)
     figure.legend(loc='lower center', ncol=4, fontsize=11, frameon=False)
     return figure
@@ -130,15 +126,6 @@ def _shapes(log: TrackLog, k: int) -> list[FloatArray]:
             for shape in (body, *windows)]
 
 
-def _draw_road(axes: Axes, sensors: FloatArray, path: FloatArray) -> None:
-    """Draw the road along a path, with its lanes."""
-    road = road_of(sensors, [path])
-    for area in road.areas:
-        axes.fill(*area.T, color=ASPHALT, lw=0, zorder=1)
-    for marking in road.markings:
-        axes.plot(*marking.T, color=LINE, lw=2.5, dashes=(7.0, 7.0), zorder=2)
-
-
 def _draw_vehicles(axes: Axes, log: TrackLog, shown: IntArray, sensors: FloatArray) -> None:
     """Draw the vehicle at the given poses, with the time since the first of them."""
     for rank, k in enumerate(shown):
@@ -153,15 +140,6 @@ def _draw_vehicles(axes: Axes, log: TrackLog, shown: IntArray, sensors: FloatArr
         place = max(sides, key=lambda side: np.hypot(*(sensors - side).T).min())
         axes.annotate(f'{(log.stamp_ns[k] - log.stamp_ns[shown[0]]) / NS:.1f} s', place,
                       ha='center', va='center', fontsize=11, color=DARK, zorder=8)
-
-
-def _draw_sensors(axes: Axes, network: _Network) -> None:
-    """Draw the sensors with their names."""
-    axes.plot(*network.positions[:, :2].T, '^', ms=13, mfc=DARK, mec=LINE, mew=1.5, zorder=7,
-              ls='none', label='magnetometers')
-    for name, position in zip(network.names, network.positions, strict=True):
-        axes.annotate(literal(name), position[:2], xytext=(12, 0), textcoords='offset points',
-                      va='center', fontsize=12, color=DARK, zorder=8)
 
 
 def _draw_scale(axes: Axes, low: FloatArray, high: FloatArray) -> None:

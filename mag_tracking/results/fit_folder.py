@@ -1,7 +1,6 @@
 """Table of fitted passes, written as CSV during the run and as JSON at its end."""
 
 import csv
-import json
 import math
 from collections.abc import Iterable
 from os import PathLike
@@ -13,8 +12,7 @@ from mag_tracking.analysis.fitted_pass import FittedPass
 from mag_tracking.analysis.pass_result import Bearing, PassFit
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import OutputError
-from mag_tracking.files import new_text_file, output_folder
-from mag_tracking.report.json_text import without_nan
+from mag_tracking.files import new_text_file, output_folder, write_json
 from mag_tracking.results.columns import FITS, names_of
 
 _NAMES = names_of(FITS)
@@ -102,10 +100,7 @@ class FitFolder:
 
     def __exit__(self, *_: object) -> None:
         self._stream.close()
-        with new_text_file(self.folder / 'fits.json') as stream:
-            json.dump(without_nan({'fits': self.rows, **self.summary}), stream, indent=1,
-                      allow_nan=False)
-            stream.write('\n')
+        write_json(self.folder / 'fits.json', {'fits': self.rows, **self.summary})
 
     def add(self, fitted_pass: FittedPass) -> None:
         """Write the rows of a fitted pass."""

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
+from mag_tracking.analysis.track_log import SmoothedLog, TrackLog
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import MissingDependencyError, OutputError
 from mag_tracking.files import new_binary_file
 from mag_tracking.geometry import quaternion_from_rotation
-from mag_tracking.report.page_scene import Sensors
-from mag_tracking.report.track_log import SmoothedLog, TrackLog
+from mag_tracking.network import SensorNetwork
 from mag_tracking.units import NS
 
 RERUN_FILE = 'tracks.rrd'
@@ -35,7 +35,7 @@ def check_rerun() -> None:
             f'{sys.executable} -m pip install rerun-sdk')
 
 
-def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, TrackLog],
+def write_rerun(path: str | PathLike[str], network: SensorNetwork, logs: Mapping[int, TrackLog],
                 smoothed: Mapping[int, SmoothedLog]) -> None:
     """Write sensors and tracks (poses, 90 % regions, speeds, fields) to a Rerun recording.
 
@@ -63,7 +63,7 @@ def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, 
     stream.disconnect()
 
 
-def _write_track(rerun: Any, stream: Any, network: Sensors, log: TrackLog) -> None:
+def _write_track(rerun: Any, stream: Any, network: SensorNetwork, log: TrackLog) -> None:
     """Log the poses of a track, and clear the track one period after its last pose."""
     root = f'{network.frame}/track_{log.id}'
     for k, ns in enumerate(log.stamp_ns):

@@ -1,7 +1,6 @@
 """Results of an offline run: CSV tables and a recording, written continuously, and a summary."""
 
 import csv
-import json
 import re
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -12,18 +11,18 @@ import numpy as np
 
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import Disturbance
-from mag_tracking.files import new_text_file, output_folder
+from mag_tracking.files import new_text_file, output_folder, write_json
 from mag_tracking.network import SensorNetwork
 from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.recording import core
 from mag_tracking.recording.writer import check_no_other_recording
 from mag_tracking.records import Detection, FieldFrame, Hypotheses, SmoothedPose, Track
-from mag_tracking.report.json_text import without_nan
-from mag_tracking.report.page import REPORT
 from mag_tracking.results.columns import RESULT_TABLES, names_of, row_of
 from mag_tracking.results.rerun_file import RERUN_FILE
 from mag_tracking.results.track_recording import TrackRecording
 
+REPORT = 'report.html'
+"""File name of the report in a result folder."""
 _QUOTE, _SPECIAL = '"', {'"', ',', '\r', '\n'}
 _SUMMARY, _RECORDING = 'summary.json', 'tracks.mcap'
 _RESULTS = (*RESULT_TABLES, _SUMMARY, _RECORDING, 'metadata.yaml', REPORT, RERUN_FILE)
@@ -133,9 +132,7 @@ class ResultFolder(RecordReceiver):
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Write `summary.json`; NaN is written as null."""
-        with new_text_file(self.folder / _SUMMARY) as stream:
-            json.dump(without_nan(summary), stream, indent=1, allow_nan=False)
-            stream.write('\n')
+        write_json(self.folder / _SUMMARY, summary)
 
 
 def _csv_cell(text: str) -> str:

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from logging import getLogger
-from typing import Protocol
+from typing import TYPE_CHECKING
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from websockets.asyncio.server import ServerConnection, broadcast, serve
@@ -18,8 +18,12 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from mag_tracking.errors import DeviceError
-from mag_tracking.report.json_text import json_text
+from mag_tracking.files import json_text
 from mag_tracking.report.page import live_html
+
+if TYPE_CHECKING:
+    # Loads scipy.
+    from mag_tracking.web.live_scene import LiveScene
 
 LOOPBACK = '127.0.0.1'
 DEFAULT_PORT = 8765
@@ -36,26 +40,6 @@ STOP_TIMEOUT_S = 10.0
 """[s] Maximum time to wait for the end of the server thread."""
 PAGE, STREAM = '/', '/stream'
 LOG = getLogger('mag_tracking.web')
-
-
-class Source(Protocol):
-    """Source of the messages, such as a `LiveScene`."""
-
-    def snapshot(self) -> list[str]:
-        """Messages that give a new viewer the current state.
-
-        Returns
-        -------
-        list of str
-        """
-
-    def updates(self) -> list[str]:
-        """Messages with all changes since the last call, for all viewers.
-
-        Returns
-        -------
-        list of str
-        """
 
 
 class PageServer:
@@ -77,7 +61,7 @@ class PageServer:
     n_lagged : number of times that messages to a lagging viewer were suspended
     """
 
-    def __init__(self, source: Source, host: str = LOOPBACK, port: int = DEFAULT_PORT) -> None:
+    def __init__(self, source: 'LiveScene', host: str = LOOPBACK, port: int = DEFAULT_PORT) -> None:
         self._source, self._host = source, host
         self._token = '' if is_loopback(host) else secrets.token_urlsafe(16)
         self._page = gzip.compress(live_html().encode('utf-8'), 6)
@@ -89,7 +73,8 @@ class PageServer:
         self.n_lagged = 0
         self._socket = _open_socket(host, port)
         self.port = int(self._socket.getsockname()[1])
-        host_name = _reachable_name(host)
+        host_name = socket.gethostname() if host in ('0.0.0.0', '::') else \
+            f'[{host}]' if ':' in host else host
         self.url = f'http://{host_name}:{self.port}/' + (
             f'?token={self._token}' if self._token else '')
         self._loop = asyncio.new_event_loop()
@@ -217,17 +202,15 @@ class PageServer:
         origins = [_parsed_address(text) for text in request.headers.get_all('Origin')]
         if address is None or not address.path.startswith('/') or len(hosts) != 1 \
                 or len(origins) > 1 or not all(map(_is_origin, origins)):
-            return _response(HTTPStatus.BAD_REQUEST, b'Malformed address, Host or Origin.\n',
-                             'text/plain')
+            return _response(HTTPStatus.BAD_REQUEST, b'Malformed address, Host or Origin.\n')
         refusal = self._refusal(hosts[0], [origin.netloc for origin in origins if origin],
                                 self._tokens_of(request, address.query))
         if refusal:
-            return _response(HTTPStatus.FORBIDDEN, refusal.encode('utf-8'), 'text/plain')
+            return _response(HTTPStatus.FORBIDDEN, refusal.encode('utf-8'))
         if address.path == STREAM:
             return None
         if address.path != PAGE:
-            return _response(HTTPStatus.NOT_FOUND, b'Not found.\n',
-                             'text/plain')
+            return _response(HTTPStatus.NOT_FOUND, b'Not found.\n')
         response = _response(HTTPStatus.OK, self._page, 'text/html', 'gzip')
         if self._token:
             # The page removes the token from its address; reloads and the stream use the cookie.
@@ -260,13 +243,6 @@ class PageServer:
         if any(origin != host for origin in origins):
             return 'Connections from pages of other origins are refused.\n'
         return ''
-
-
-def _reachable_name(host: str) -> str:
-    """Host part of the URL of the page; the host name of this machine for a wildcard address."""
-    if host in ('0.0.0.0', '::'):
-        return socket.gethostname()
-    return f'[{host}]' if ':' in host else host
 
 
 def check_port(host: str, port: int) -> None:
@@ -328,7 +304,8 @@ def _open_socket(host: str, port: int) -> socket.socket:
                           'check the address or choose another port') from error
 
 
-def _response(status: HTTPStatus, body: bytes, media_type: str, encoding: str = '') -> Response:
+def _response(status: HTTPStatus, body: bytes, media_type: str = 'text/plain',
+              encoding: str = '') -> Response:
     """HTTP response with security headers."""
     headers = Headers({
         'Content-Type': f'{media_type}; charset=utf-8', 'Content-Length': str(len(body)),

@@ -16,13 +16,13 @@ import numpy as np
 from tqdm import tqdm
 
 from bench.figures import Figures
+from mag_tracking.analysis.track_errors import pass_errors
+from mag_tracking.analysis.track_log import SmoothedLog, TrackLog
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
-from mag_tracking.report.metrics import pass_errors
-from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.simulation.scenario import Path, SensorErrorModel, random_vehicle
 from support.samples import one, recorded, simulate
 

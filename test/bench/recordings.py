@@ -20,13 +20,13 @@ import numpy as np
 from tqdm import tqdm
 
 from bench.figures import Figures
+from mag_tracking.analysis.track_errors import interpolate_truth
 from mag_tracking.apps.replay import replay
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.recording.importers import import_pose_table
 from mag_tracking.recording.reader import Recording
 from mag_tracking.records import Track
-from mag_tracking.report.metrics import interpolate_truth
 from support.bundled import DATA, NETWORK_FILE, ROOT, VEHICLES, vehicle_path
 from support.random_passes import KINDS, SIMULATORS, WRONG_M, errors_of
 from support.situation_worlds import FOUR, car, random_pass_world, straight

@@ -6,6 +6,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from mag_tracking.analysis.track_errors import magnet_errors
+from mag_tracking.analysis.track_log import SmoothedLog
 from mag_tracking.apps.replay import replay, write_trajectories
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import header_dict
@@ -23,8 +25,6 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.truth import TruthTopics, read_truth_table
 from mag_tracking.recording.writer import RecordingWriter
-from mag_tracking.report.metrics import magnet_errors
-from mag_tracking.report.track_log import SmoothedLog
 from mag_tracking.results.tum_file import write_tum
 from support.bundled import QUICK, vehicle_path
 from support.counters import assert_counts

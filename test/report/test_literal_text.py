@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from mag_tracking.analysis.track_log import TrackLog
+from mag_tracking.apps.calibrate_report import calibration_figure, geometry_figure, tumble_figure
+from mag_tracking.apps.fit_report import order_figure, pass_figure
+from mag_tracking.apps.plan_report import lane_figure
 from mag_tracking.network import SensorNetwork
-from mag_tracking.report.calibration_figures import calibration_figure, tumble_figure
 from mag_tracking.report.figures import field_figure, map_figure, weights_figure
-from mag_tracking.report.fit_figures import order_figure, pass_figure
-from mag_tracking.report.geometry_figures import geometry_figure
-from mag_tracking.report.literal_text import literal
-from mag_tracking.report.plan_figures import lane_figure
-from mag_tracking.report.track_log import TrackLog
+from mag_tracking.report.style import literal
 
 NAMES = ('$\\foo$', '_hidden $^{$', '\\$5$')
 

@@ -6,9 +6,9 @@ import functools
 import numpy as np
 
 import mag_tracking as mt
+from mag_tracking.analysis.track_errors import interpolate_truth
 from mag_tracking.apps.doctor import Doctor
 from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.report.metrics import interpolate_truth
 from mag_tracking.stages.calibrate.prescan import prescan
 from support.bundled import DATA, NETWORK_FILE, vehicle_path
 from support.spoiler import apply

@@ -10,13 +10,13 @@ import json
 import numpy as np
 import pytest
 
+from mag_tracking.analysis.track_errors import interpolate_truth
 from mag_tracking.apps.replay import replay
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Track
-from mag_tracking.report.metrics import interpolate_truth
 from support.bundled import DATA, VEHICLES, vehicle_path
 from support.counters import count_of
 from support.samples import one, recorded

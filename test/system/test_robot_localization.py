@@ -9,11 +9,11 @@ import pytest
 import yaml
 from filterpy.kalman import KalmanFilter
 
+from mag_tracking.analysis.track_errors import interpolate_truth
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Track
-from mag_tracking.report.metrics import interpolate_truth
 from support.bundled import ROOT, VEHICLES, vehicle_path
 
 CONFIGURATION = ROOT / 'config' / 'robot_localization.yaml'

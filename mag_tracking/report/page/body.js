@@ -17,12 +17,11 @@ function bodyRadius(length) {
 }
 
 function roadTraces(scene, f) {
-  const scaled = values => Array.from(values, v => f * v);
   // One trace per area: where areas of one trace overlap, they are not filled.
   return [
-    ...scene.road.areas.map(area => line(scaled(area.x), scaled(area.y), '', {width: 0},
+    ...scene.road.areas.map(area => line(scaled(area.x, f), scaled(area.y, f), '', {width: 0},
       {fill: 'toself', fillcolor: '#e9e9e7'})),
-    ...scene.road.markings.map(mark => line(scaled(mark.x), scaled(mark.y), '',
+    ...scene.road.markings.map(mark => line(scaled(mark.x, f), scaled(mark.y, f), '',
       {color: '#ffffff', width: 2.5, dash: '12px,10px'}))];
 }
 

@@ -56,9 +56,9 @@ function chosenFields(scene, track, choice, range) {
 }
 
 function drawFields(scene, track, choice, t, range) {
-  const holder = document.getElementById('field');
+  const holder = at('field');
   const fields = chosenFields(scene, track, choice, range);
-  document.getElementById('no-field').hidden = fields.length > 0;
+  at('no-field').hidden = fields.length > 0;
   while (holder.children.length > fields.length) {
     Plotly.purge(holder.lastChild);
     holder.lastChild.remove();
@@ -77,12 +77,12 @@ function drawFields(scene, track, choice, t, range) {
     AXES.forEach(([colour, dash], a) => {
       const name = 'xyz'[a];
       traces.push({type: 'scatter', mode: 'markers', x: field.t, name: `${name} measured`,
-        y: Array.from(field.measured[a], v => f * v), showlegend: false,
+        y: scaled(field.measured[a], f), showlegend: false,
         marker: {color: colour, symbol: SYMBOLS[a], ...dots}});
       for (const {t: times, field: predicted} of field.predictions) {
-        traces.push({type: 'scatter', mode: 'lines', x: times, name: `${name} predicted`,
-          y: Array.from(predicted[a], v => f * v), showlegend: false,
-          line: {color: many ? BLACK : colour, width: 1.8, dash: dash}});
+        traces.push(line(times, scaled(predicted[a], f), `${name} predicted`,
+          {color: many ? BLACK : colour, width: 1.8, dash: dash},
+          {hoverinfo: 'all', showlegend: false}));
       }
     });
     const layout = curveLayout(`${plain(field.name)} [${unit}]`, t, range);
@@ -92,48 +92,38 @@ function drawFields(scene, track, choice, t, range) {
 }
 
 function drawWeights(track, t, range) {
-  const traces = !track ? [] : Object.entries(stylesOf(page.scene)).filter(
-    ([name]) => name in track.arrivals).map(([name, [colour, dash]]) => ({
-    type: 'scatter', mode: 'lines', x: track.columns.t, y: track.arrivals[name].weight,
-    name: plain(name) || 'all hypotheses', showlegend: true,
-    line: {color: colour, dash: dash, width: 2}}));
+  const traces = Object.entries(stylesOf(page.scene)).filter(([name]) => name in track.arrivals).map(
+    ([name, [colour, dash]]) => line(track.columns.t, track.arrivals[name].weight,
+      plain(name) || 'all hypotheses', {color: colour, dash: dash, width: 2}, {hoverinfo: 'all'}));
   Plotly.react('weights', traces, curveLayout('weight', t, range, {range: [-0.03, 1.03]}), CONFIG);
 }
 
+// Curve of a quantity with its 90 % band.
+function drawBand(id, t, range, title, band, low, high, curve) {
+  Plotly.react(id, [line(curve.x, low, '', {width: 0}),
+    line(curve.x, high, band, {width: 0},
+      {fill: 'tonexty', fillcolor: 'rgba(0,114,178,0.18)', hoverinfo: 'skip'}),
+    {type: 'scatter', mode: 'lines', line: {color: BLACK, width: 1.5}, ...curve}],
+  curveLayout(title, t, range, {rangemode: 'tozero'}), CONFIG);
+}
+
 function drawInnovation(track, t, range) {
-  const c = track && track.columns;
-  const traces = !track ? [] : [
-    {type: 'scatter', mode: 'lines', x: c.t, y: c.nis_low, line: {width: 0}, hoverinfo: 'skip',
-      showlegend: false},
-    {type: 'scatter', mode: 'lines', x: c.t, y: c.nis_high, line: {width: 0}, fill: 'tonexty',
-      fillcolor: 'rgba(0,114,178,0.18)', name: '90 % band (consistent filter)', hoverinfo: 'skip'},
-    {type: 'scatter', mode: 'lines+markers', x: c.t, y: c.nis, marker: {size: 4}, name: 'NIS per axis',
-      line: {color: BLACK, width: 1.5}}];
-  Plotly.react('innovation', traces,
-    curveLayout('NIS per axis', t, range, {rangemode: 'tozero'}), CONFIG);
+  const c = track.columns;
+  drawBand('innovation', t, range, 'NIS per axis', '90 % band (consistent filter)', c.nis_low,
+    c.nis_high, {x: c.t, y: c.nis, name: 'NIS per axis', mode: 'lines+markers', marker: {size: 4}});
 }
 
 function drawSpeed(track, t, range) {
-  const c = track && track.columns;
-  const traces = [];
-  if (track) {
-    const speed = Array.from(c.t, (_, k) => Math.hypot(c.vx[k], c.vy[k]));
-    const edge = sign => speed.map((v, k) => Math.max(0, v + sign * SCALE_1D * c.speed_sd[k]));
-    traces.push(
-      {type: 'scatter', mode: 'lines', x: c.t, y: edge(-1), line: {width: 0}, hoverinfo: 'skip',
-        showlegend: false},
-      {type: 'scatter', mode: 'lines', x: c.t, y: edge(1), line: {width: 0}, fill: 'tonexty',
-        fillcolor: 'rgba(0,114,178,0.18)', name: '90 % band', hoverinfo: 'skip'},
-      {type: 'scatter', mode: 'lines', x: c.t, y: speed, name: 'speed',
-        line: {color: BLACK, width: 1.5}});
-  }
-  Plotly.react('speed', traces, curveLayout('m/s', t, range, {rangemode: 'tozero'}), CONFIG);
+  const c = track.columns, speed = Array.from(c.t, (_, k) => Math.hypot(c.vx[k], c.vy[k]));
+  const edge = sign => speed.map((v, k) => Math.max(0, v + sign * SCALE_1D * c.speed_sd[k]));
+  drawBand('speed', t, range, 'm/s', '90 % band', edge(-1), edge(1),
+    {x: c.t, y: speed, name: 'speed'});
 }
 
 // Move the time line without redrawing the plots.
 function moveLines(t) {
   for (const plot of [...document.querySelectorAll('#field .plot'),
-    ...['weights', 'innovation', 'speed'].map(id => document.getElementById(id))]) {
+    ...['weights', 'innovation', 'speed'].map(at)]) {
     if (plot.layout) Plotly.relayout(plot, {'shapes[0].x0': t, 'shapes[0].x1': t});
   }
 }

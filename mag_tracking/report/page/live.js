@@ -49,14 +49,14 @@ function receive(message) {
 function addRows(message) {
   const scene = page.scene;
   for (const rows of message.tracks) {
-    const track = scene.tracks.find(other => other.key === rows.key);
+    const track = trackOf(scene, rows.key);
     if (track) append(track, rows); else scene.tracks.push(rows);
     extendReach(scene, scene.reach, rows);
     if (!track) showPanels(scene);
     if (!track || rows.ended) page.tableDue = 0;
   }
   for (const one of message.smoothed) {
-    const track = scene.tracks.find(other => other.key === one.key);
+    const track = trackOf(scene, one.key);
     if (track) track.smoothed = one;
   }
   for (const frame of message.frames) addFrame(scene.recent, frame);

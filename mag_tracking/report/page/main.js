@@ -12,8 +12,6 @@ const LIVE_MARGIN = 0.3, MAX_HEIGHT = 0.5;
 // Public for debugging and tests.
 window.magTracking = page;
 
-const at = id => document.getElementById(id);
-
 function begin(data) {
   at('title').textContent = data.title;
   at('subtitle').textContent = data.subtitle || '';

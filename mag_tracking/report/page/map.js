@@ -23,18 +23,21 @@ const CONFIG = {responsive: true, displaylogo: false,
   displayModeBar: IS_TOUCHED ? false : 'hover', plotlyServerURL: '', showSendToCloud: false,
   modeBarButtons: [['toImage'], ['zoom2d', 'pan2d'], ['zoomIn2d', 'zoomOut2d', 'resetScale2d']]};
 
-// Outline [xs, ys] of the 90 % region of a position.
-function ellipse(x, y, xx, xy, yy) {
+const scaled = (values, f) => Array.from(values, v => f * v);
+
+// 90 % region of the position in row `k` of columns; `axis` is 'y', or 'z' in the side view.
+function regionTrace(c, k, f, axis, name, style, more) {
+  const xx = c.xx[k], xy = c[`x${axis}`][k], yy = c[axis + axis][k];
   const middle = 0.5 * (xx + yy), half = Math.hypot(0.5 * (xx - yy), xy);
   const long = SCALE_2D * Math.sqrt(Math.max(middle + half, 0));
   const short = SCALE_2D * Math.sqrt(Math.max(middle - half, 0));
   const angle = 0.5 * Math.atan2(2 * xy, xx - yy), xs = [], ys = [];
   for (let i = 0; i <= 48; i++) {
     const u = long * Math.cos(i * Math.PI / 24), v = short * Math.sin(i * Math.PI / 24);
-    xs.push(x + u * Math.cos(angle) - v * Math.sin(angle));
-    ys.push(y + u * Math.sin(angle) + v * Math.cos(angle));
+    xs.push(f * (c.x[k] + u * Math.cos(angle) - v * Math.sin(angle)));
+    ys.push(f * (c[axis][k] + u * Math.sin(angle) + v * Math.cos(angle)));
   }
-  return [xs, ys];
+  return line(xs, ys, name, style, more);
 }
 
 // {arrival: [colour, dash]} of all tracks, in a fixed order.
@@ -65,8 +68,7 @@ function labelsOf(x, y, sensors) {
 
 // Sensors on a map whose vertical axis is 'y', or 'z' in the side view.
 function sensorTrace(scene, f, vertical) {
-  const sensors = scene.sensors, scaled = values => Array.from(values, v => f * v);
-  const x = scaled(sensors.x), y = scaled(sensors[vertical]);
+  const sensors = scene.sensors, x = scaled(sensors.x, f), y = scaled(sensors[vertical], f);
   return {type: 'scatter', mode: sensors.names.length > MAX_LABELS ? 'markers' : 'markers+text',
     x: x, y: y, text: labelsOf(x, y, sensors), hovertext: sensors.names.map(plain),
     textposition: 'top center', hoverinfo: 'text', name: 'magnetometers', cliponaxis: false,
@@ -75,18 +77,16 @@ function sensorTrace(scene, f, vertical) {
 
 // Paths of a track up to pose `k`; `axis` is 'y', or 'z' in the side view.
 function pathTraces(track, k, f, named, axis) {
-  const c = track.columns, traces = [], scaled = values => Array.from(values, v => f * v);
-  if (track.truth) {
-    traces.push(line(scaled(track.truth.x), scaled(track.truth[axis]), named('truth'),
-      {color: '#666666', width: 1.5, dash: 'dash'}));
-  }
-  if (track.smoothed) {
-    traces.push(line(scaled(track.smoothed.x), scaled(track.smoothed[axis]), named('smoothed'),
-      {color: VERMILLION, width: 1.5}));
+  const c = track.columns, traces = [];
+  for (const [name, style] of [['truth', {color: '#666666', width: 1.5, dash: 'dash'}],
+    ['smoothed', {color: VERMILLION, width: 1.5}]]) {
+    const path = track[name];
+    if (path) traces.push(line(scaled(path.x, f), scaled(path[axis], f), named(name), style));
   }
   // Ambiguous poses may jump, so they are not connected by a line.
   const sure = values => Array.from(values, (v, i) => c.ambiguous[i] ? null : f * v);
-  const doubtful = values => scaled(values.slice(0, k + 1).filter((_, i) => c.ambiguous[i]));
+  const doubtful = values => scaled(
+    values.slice(0, k + 1).filter((_, i) => c.ambiguous[i]), f);
   traces.push(line(sure(c.x), sure(c[axis]), '', {color: '#a8a8a8', width: 1.5}));
   traces.push(line(sure(c.x).slice(0, k + 1), sure(c[axis]).slice(0, k + 1),
     named('track'), {color: BLACK, width: 2.5}));
@@ -101,8 +101,7 @@ function mapTraces(scene, t) {
   const f = scene.scale.factor, traces = roadTraces(scene, f), current = currentTrack(scene, t);
   const reach = reachAt(scene, current).map;
   const there = tracksAt(scene, t);
-  for (const track of there.concat(current ? [current] : [])
-    .filter((track, i, all) => all.indexOf(track) === i)) {
+  for (const track of new Set(current ? [...there, current] : there)) {
     const k = Math.max(0, indexAt(track.columns.t, t)), named = name => track === current ? name : '';
     traces.push(...pathTraces(track, k, f, named, 'y'), ...timeMarks(track, reach, f));
     if (there.includes(track)) traces.push(...nowTraces(scene, track, k, f, named));
@@ -118,17 +117,14 @@ function nowTraces(scene, track, k, f, named) {
     ([name, a]) => name !== '' && a.weight[k] > MIN_DRAWN);
   for (const [name, a] of arrivals) {
     const [colour, dash] = styles[name];
-    const [xs, ys] = ellipse(f * a.x[k], f * a.y[k], f * f * a.xx[k], f * f * a.xy[k],
-      f * f * a.yy[k]);
-    traces.push(line(xs, ys, named(`from ${plain(name)}, ${Math.round(100 * a.weight[k])} %`),
+    traces.push(regionTrace(a, k, f, 'y',
+      named(`from ${plain(name)}, ${Math.round(100 * a.weight[k])} %`),
       {color: colour, width: 1 + 2 * a.weight[k], dash: dash}));
     traces.push({type: 'scatter', mode: 'markers', x: [f * a.x[k]], y: [f * a.y[k]],
       showlegend: false, hoverinfo: 'skip',
       marker: {symbol: 'cross-thin', size: 9, line: {color: colour, width: 2}}});
   }
-  const [xs, ys] = ellipse(f * c.x[k], f * c.y[k], f * f * c.xx[k], f * f * c.xy[k],
-    f * f * c.yy[k]);
-  traces.push(line(xs, ys, named('90 % region'), {color: BLACK, width: 1},
+  traces.push(regionTrace(c, k, f, 'y', named('90 % region'), {color: BLACK, width: 1},
     {fill: 'toself', fillcolor: c.ambiguous[k] ? 'rgba(0,0,0,0.05)' : 'rgba(0,0,0,0.16)'}));
   traces.push(...bodyTraces(scene.reach.map, c, k, f, named, 'y'));
   traces.push({type: 'scatter', mode: 'lines+markers', x: [f * c.x[k], f * (c.x[k] + c.vx[k])],

@@ -12,46 +12,44 @@ function arrivalOf(track) {
 
 // Smoothed path of a track, or its unambiguous poses.
 function pathOf(track, f) {
-  const scaled = values => Array.from(values, v => f * v);
-  if (track.smoothed) return [scaled(track.smoothed.x), scaled(track.smoothed.y)];
+  if (track.smoothed) return [scaled(track.smoothed.x, f), scaled(track.smoothed.y, f)];
   const sure = (_, i) => !track.columns.ambiguous[i];
-  return [scaled(track.columns.x.filter(sure)), scaled(track.columns.y.filter(sure))];
+  return [scaled(track.columns.x.filter(sure), f), scaled(track.columns.y.filter(sure), f)];
 }
 
 // One trace per arrival direction; a null ends the path of a track. The current track is wider.
 function overviewTraces(scene, current) {
-  const f = scene.scale.factor, styles = stylesOf(scene), groups = new Map(), ends = new Map();
+  const f = scene.scale.factor, styles = stylesOf(scene), groups = new Map();
   for (const track of scene.tracks) {
-    const name = arrivalOf(track), [xs, ys] = pathOf(track, f);
-    if (xs.length < 2) continue;
-    const [colour] = styles[name] || [BLACK];
-    const title = name ? `from ${plain(name)}` : 'tracks';
-    const style = {type: 'scatter', name: title, hoverinfo: 'text'};
-    if (!groups.has(name)) {
-      groups.set(name, {...style, mode: 'lines', x: [], y: [], text: [], customdata: [],
-        showlegend: true, line: {color: colour, width: 1.5}});
-      ends.set(name, {...style, mode: 'markers', x: [], y: [], text: [], customdata: [],
-        showlegend: false, marker: {symbol: 'arrow', size: 9, color: colour, angle: []}});
-    }
+    const name = arrivalOf(track), [xs, ys] = pathOf(track, f), n = xs.length;
+    if (n < 2) continue;
+    if (!groups.has(name)) groups.set(name, overviewGroup(name, (styles[name] || [BLACK])[0]));
+    const [paths, ends] = groups.get(name), from = Math.max(0, n - 4);
     const label = `track ${plain((track.facts || {}).label || track.id)}, ` +
       `${beginOf(track).toFixed(1)} s`;
-    const group = groups.get(name), end = ends.get(name), n = xs.length;
-    group.x.push(...xs, null);
-    group.y.push(...ys, null);
-    for (const _ of [...xs, null]) {
-      group.text.push(label);
-      group.customdata.push(track.key);
-    }
-    const from = Math.max(0, n - 4);
-    end.x.push(xs[n - 1]);
-    end.y.push(ys[n - 1]);
-    end.text.push(label);
-    end.customdata.push(track.key);
-    end.marker.angle.push(90 - 180 / Math.PI * Math.atan2(ys[n - 1] - ys[from], xs[n - 1] - xs[from]));
+    const add = (trace, x, y) => {
+      for (const [key, value] of Object.entries({x, y, text: label, customdata: track.key})) {
+        trace[key].push(value);
+      }
+    };
+    xs.forEach((x, i) => add(paths, x, ys[i]));
+    add(paths, null, null);
+    add(ends, xs[n - 1], ys[n - 1]);
+    ends.marker.angle.push(90 - 180 / Math.PI * Math.atan2(ys[n - 1] - ys[from], xs[n - 1] - xs[from]));
   }
-  const [xs, ys] = pathOf(current, f);
-  return [...roadTraces(scene, f), ...groups.values(), ...ends.values(), sensorTrace(scene, f, 'y'),
+  const [xs, ys] = pathOf(current, f), pairs = [...groups.values()];
+  return [...roadTraces(scene, f), ...pairs.map(([paths]) => paths), ...pairs.map(([, ends]) => ends),
+    sensorTrace(scene, f, 'y'),
     line(xs, ys, 'current track', {color: BLACK, width: 3.5}, {hoverinfo: 'skip'})];
+}
+
+// Empty traces of the paths and of their ends.
+function overviewGroup(name, colour) {
+  const empty = more => ({type: 'scatter', name: name ? `from ${plain(name)}` : 'tracks',
+    hoverinfo: 'text', x: [], y: [], text: [], customdata: [], ...more});
+  return [empty({mode: 'lines', showlegend: true, line: {color: colour, width: 1.5}}),
+    empty({mode: 'markers', showlegend: false,
+      marker: {symbol: 'arrow', size: 9, color: colour, angle: []}})];
 }
 
 // Draw all tracks once; later only the current track changes.
@@ -68,8 +66,7 @@ function drawOverview(scene, current) {
   Plotly.newPlot(plot, traces, mapLayout(scene, scene.reach.map, ''), CONFIG);
   showLegend('overview-legend', traces);
   plot.on('plotly_click', event => {
-    const key = event.points[0].customdata;
-    const track = scene.tracks.find(other => other.key === key);
+    const track = trackOf(scene, event.points[0].customdata);
     if (track) jump(track);
   });
 }
@@ -81,10 +78,8 @@ function drawSide(scene, current, t) {
   const f = scene.scale.factor, traces = [], reach = reachAt(scene, current);
   for (const track of tracksAt(scene, t).filter(isMagnet)) {
     const c = track.columns, k = Math.max(0, indexAt(c.t, t)), named = name => name;
-    const [xs, ys] = ellipse(f * c.x[k], f * c.z[k], f * f * c.xx[k], f * f * c.xz[k],
-      f * f * c.zz[k]);
     traces.push(...pathTraces(track, k, f, named, 'z'),
-      line(xs, ys, '90 % region', {color: BLACK, width: 1},
+      regionTrace(c, k, f, 'z', '90 % region', {color: BLACK, width: 1},
         {fill: 'toself', fillcolor: 'rgba(0,0,0,0.12)'}),
       ...bodyTraces(reach.map, c, k, f, named, 'z'));
   }

@@ -1,6 +1,8 @@
 // Data of a page: decoding, appending live rows, and lookup by time.
 'use strict';
 
+const at = id => document.getElementById(id);
+
 const ARRAYS = {f8: Float64Array, f4: Float32Array, u1: Uint8Array};
 
 // Maximum number of poses of a live track, and number removed when it is exceeded.
@@ -23,7 +25,12 @@ function decodedAll(value) {
   if (keys.length === 1 && keys[0] in ARRAYS && typeof value[keys[0]] === 'string') {
     return decoded(value);
   }
-  return Object.fromEntries(keys.map(key => [key, decodedAll(value[key])]));
+  return mapped(value, decodedAll);
+}
+
+// Object with the same keys, and the values `change(value, key)`.
+function mapped(object, change) {
+  return Object.fromEntries(Object.entries(object).map(([key, value]) => [key, change(value, key)]));
 }
 
 function joined(one, other) {
@@ -36,16 +43,12 @@ function joined(one, other) {
 // Append the columns of `rows` to `track`; a new direction of arrival had weight 0 before.
 function append(track, rows) {
   const before = track.columns.t.length, added = rows.columns.t.length;
-  for (const name of Object.keys(track.columns)) {
-    track.columns[name] = joined(track.columns[name], rows.columns[name]);
-  }
-  const names = new Set([...Object.keys(track.arrivals), ...Object.keys(rows.arrivals)]);
-  for (const name of names) {
+  track.columns = mapped(track.columns, (values, name) => joined(values, rows.columns[name]));
+  track.arrivals = mapped({...track.arrivals, ...rows.arrivals}, (_, name) => {
     const old = track.arrivals[name] || absent(rows.arrivals[name], before);
     const more = rows.arrivals[name] || absent(old, added);
-    track.arrivals[name] = Object.fromEntries(
-      Object.keys(old).map(key => [key, joined(old[key], more[key])]));
-  }
+    return mapped(old, (values, key) => joined(values, more[key]));
+  });
   track.fields = joinedFields(track.fields, before, rows.fields, added);
   track.doubts = track.doubts.concat(rows.doubts);
   const excess = track.columns.t.length - MAX_TRACK_POSES;
@@ -58,23 +61,19 @@ function append(track, rows) {
 function joinedFields(fields, before, more, added) {
   const bySensor = list => new Map(list.map(field => [field.sensor, field]));
   const old = bySensor(fields), news = bySensor(more);
-  const empty = n => [0, 1, 2].map(() => new Float32Array(n).fill(NaN));
-  const both = (a, b) => a.map((axis, i) => joined(axis, b[i]));
+  const axis = (field, key, a, n) => field ? field[key][a] : new Float32Array(n).fill(NaN);
   return [...new Set([...old.keys(), ...news.keys()])].sort((a, b) => a - b).map(sensor => {
-    const one = old.get(sensor), other = news.get(sensor);
-    return {sensor: sensor, t: null,
-      measured: both(one ? one.measured : empty(before), other ? other.measured : empty(added)),
-      predicted: both(one ? one.predicted : empty(before), other ? other.predicted : empty(added))};
+    const both = key => [0, 1, 2].map(a => joined(
+      axis(old.get(sensor), key, a, before), axis(news.get(sensor), key, a, added)));
+    return {sensor: sensor, t: null, measured: both('measured'), predicted: both('predicted')};
   });
 }
 
 // Remove the first `n` poses.
 function forget(track, n) {
-  const cut = columns => Object.fromEntries(
-    Object.entries(columns).map(([name, values]) => [name, values.slice(n)]));
+  const cut = columns => mapped(columns, values => values.slice(n));
   track.columns = cut(track.columns);
-  track.arrivals = Object.fromEntries(
-    Object.entries(track.arrivals).map(([name, columns]) => [name, cut(columns)]));
+  track.arrivals = mapped(track.arrivals, cut);
   for (const field of track.fields) {
     for (const key of ['measured', 'predicted']) field[key] = field[key].map(axis => axis.slice(n));
   }
@@ -83,8 +82,8 @@ function forget(track, n) {
 
 // Columns of an arrival direction for `n` poses that have no hypothesis from this direction.
 function absent(like, n) {
-  return Object.fromEntries(Object.keys(like).map(
-    key => [key, new like[key].constructor(n).fill(key === 'weight' ? 0 : NaN)]));
+  return mapped(like,
+    (values, key) => new values.constructor(n).fill(key === 'weight' ? 0 : NaN));
 }
 
 // Index of the last time not after `t`; -1 if all are later.
@@ -108,6 +107,8 @@ function tracksAt(scene, t) {
   return scene.tracks.filter(
     track => beginOf(track) <= t + 1e-9 && t <= endOf(track) + SHOWN_AFTER_S);
 }
+
+const trackOf = (scene, key) => scene.tracks.find(track => track.key === key);
 
 // Track shown in the plots at `t`: the newest track on the map, otherwise the nearest in time.
 function currentTrack(scene, t) {

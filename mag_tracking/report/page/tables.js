@@ -9,14 +9,15 @@ function element(tag, text, more) {
 
 function table(columns, rows, classes) {
   const out = element('table'), head = element('tr');
+  const kind = cell => ({className: typeof cell === 'number' ? 'number' : ''});
   columns.forEach((name, i) => head.append(element('th', name,
-    {className: rows.some(row => typeof row[i] === 'number') ? 'number' : ''})));
+    kind(rows.map(row => row[i]).find(cell => typeof cell === 'number')))));
   out.append(element('thead'), element('tbody'));
   out.firstChild.append(head);
   rows.forEach((row, i) => {
     const tr = element('tr', null, {className: classes ? classes[i] : ''});
     for (const cell of row) {
-      const td = element('td', null, {className: typeof cell === 'number' ? 'number' : ''});
+      const td = element('td', null, kind(cell));
       td.append(cell instanceof Node ? cell : shown(cell));
       tr.append(td);
     }
@@ -33,10 +34,9 @@ function shown(cell) {
 }
 
 function showNotes(notes) {
-  const list = document.getElementById('notes');
-  list.replaceChildren(...notes.map(
+  at('notes').replaceChildren(...notes.map(
     note => element('li', note.text, {className: note.level})));
-  list.hidden = !notes.length;
+  at('notes').hidden = !notes.length;
 }
 
 function card(title) {
@@ -46,7 +46,7 @@ function card(title) {
 }
 
 function showTables(tables) {
-  document.getElementById('tables').replaceChildren(...tables.map(one => {
+  at('tables').replaceChildren(...tables.map(one => {
     const out = card(one.title), holder = element('div', null, {className: 'table'});
     holder.append(table(one.columns, one.rows));
     out.append(holder);
@@ -58,7 +58,7 @@ const isEmpty = trace => !(trace.z || trace.y).flat().some(value => value !== nu
 
 // A chart consists of Plotly traces and a layout. Charts without a value are omitted.
 function showCharts(all) {
-  const holder = document.getElementById('charts');
+  const holder = at('charts');
   const charts = all.filter(chart => !chart.traces.every(isEmpty));
   for (const chart of charts) {
     const out = card(chart.title), plot = element('div', null, {className: 'plot'});
@@ -91,7 +91,7 @@ function showTrackTable(scene, jump) {
   scene.tracks.forEach((track, i) => {
     found.tBodies[0].rows[i].dataset.key = track.key;
   });
-  document.getElementById('tracks').replaceChildren(found);
+  at('tracks').replaceChildren(found);
 }
 
 function markTrack(key) {

@@ -25,8 +25,8 @@ from mag_tracking.network.counting_line import (
     counting_lines,
 )
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
-from mag_tracking.report.traffic_intervals import TrafficIntervals
 from mag_tracking.stages.traffic.field_direction import FieldDirection
+from mag_tracking.stages.traffic.intervals import TrafficIntervals
 from mag_tracking.stages.traffic.settings import TrafficSettings, VehicleClass
 from mag_tracking.units import NS
 

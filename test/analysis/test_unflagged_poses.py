@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from mag_tracking.apps.replay_notes import notes_of
-from mag_tracking.report.metrics import unflagged_poses
-from mag_tracking.report.track_log import TrackLog
+from mag_tracking.analysis.track_errors import unflagged_poses
+from mag_tracking.analysis.track_log import TrackLog
+from mag_tracking.apps.replay_report import notes_of
 from support.track_records import frame, track_pose
 
 T = np.arange(0.0, 5.0, 0.1)

@@ -6,29 +6,31 @@ from typing import TypeAlias, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mag_tracking.analysis.track_log import PoseLog, TrackLog
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.geometry import rotation_from_quaternion
-from mag_tracking.report.track_log import SmoothedLog, TrackLog
 
 Truth: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
 """Timestamps (n,) [ns], positions (n, 3) [m] and quaternions (n, 4) xyzw of a target; quaternions
 are NaN if the orientation is unknown."""
+NEAR_M = 5.0
+"""Horizontal distance from the centre of the network within which vehicles are evaluated [m]."""
 
 
 class PassErrors(TypedDict):
     """Errors of a vehicle's track, as returned by `pass_errors`."""
 
     rms: float | None
-    """Horizontal RMS error of the poses within the radius [m]; None if there are no such poses."""
+    """Horizontal RMS error of the poses within `NEAR_M` [m]; None if there are no such poses."""
     closest: float
     """Horizontal error of the pose whose true position is closest to the centre [m]."""
     closest_distance: float
     """Horizontal distance of this true position from the centre [m]."""
     anees: float
-    """Mean NEES per axis of the poses within the radius, or of the closest pose if no pose is
-    within the radius."""
+    """Mean NEES per axis of the poses within `NEAR_M`, or of the closest pose if no pose is
+    within `NEAR_M`."""
     n: int
-    """Number of poses whose true position is within the radius."""
+    """Number of poses whose true position is within `NEAR_M`."""
 
 
 class MagnetErrors(TypedDict):
@@ -56,21 +58,20 @@ def interpolate_truth(truth: Truth, stamps_ns: ArrayLike) -> FloatArray:
                      for k in range(3)], axis=1)
 
 
-def pass_errors(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
-                radius: float = 5.0) -> PassErrors | None:
-    """Horizontal errors of a vehicle's track within `radius` [m] of `centre` (3,).
+def pass_errors(log: PoseLog, truth: Truth, centre: FloatArray) -> PassErrors | None:
+    """Horizontal errors of a vehicle's track within `NEAR_M` of `centre` (3,).
 
     None if no pose has a true position.
     """
     true = interpolate_truth(truth, log.stamp_ns)[:, :2]
-    rows = near_poses(log, truth, centre, radius)
+    rows = near_poses(log, truth, centre)
     if not len(rows):
         return None
     error = np.array(log.position)[:, :2] - true
     magnitude = np.hypot(*error.T)
     distance = np.hypot(*(true - centre[:2]).T)
     closest = int(np.nanargmin(distance))
-    near = distance[rows] < radius
+    near = distance[rows] < NEAR_M
     nees = [error[k] @ np.linalg.solve(log.covariance[k][:2, :2], error[k]) / 2 for k in rows]
     return {'rms': float(np.sqrt(np.mean(magnitude[rows] ** 2))) if near.all() else None,
             'closest': float(magnitude[closest]), 'closest_distance': float(distance[closest]),
@@ -121,10 +122,8 @@ def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> Unflag
     return {'n': n, 'wrong': n_wrong, 'without_truth': n_without}
 
 
-def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
-               radius: float = 5.0) -> IntArray:
-    """Indices (k,) of the poses whose true position is horizontally within `radius` of `centre`
-    (3,).
+def near_poses(log: PoseLog, truth: Truth, centre: FloatArray) -> IntArray:
+    """Indices (k,) of the poses whose true position is horizontally within `NEAR_M` of `centre`.
 
     If there are none, the index of the closest pose; empty if no pose has a true position.
     """
@@ -133,7 +132,7 @@ def near_poses(log: TrackLog | SmoothedLog, truth: Truth, centre: FloatArray,
     if not has_truth.any():
         return np.zeros(0, dtype=int)
     distance = np.where(has_truth, np.hypot(*(true - centre[:2]).T), np.inf)
-    near = np.flatnonzero(distance < radius)
+    near = np.flatnonzero(distance < NEAR_M)
     return near if len(near) else np.array([np.argmin(distance)])
 
 
@@ -141,7 +140,7 @@ MAGNET_SKIP = 3
 """Number of poses at the start of a magnet's track that are not evaluated."""
 
 
-def magnet_errors(log: TrackLog | SmoothedLog, truth: Truth, axis: ArrayLike = (0.0, 0.0, 1.0),
+def magnet_errors(log: PoseLog, truth: Truth, axis: ArrayLike = (0.0, 0.0, 1.0),
                   skip: int = MAGNET_SKIP) -> MagnetErrors | None:
     """Errors of a magnet's track, relative to the truth nearest in time.
 

@@ -14,9 +14,13 @@ Arrival: TypeAlias = tuple[float, FloatArray, FloatArray]
 """Weight of an arrival direction; position (3,) and covariance (2, 2) of its best hypothesis."""
 
 
+POSE = 'stamp_ns', 'position', 'velocity', 'covariance', 'moment', 'orientation'
+"""Attributes that `Track` and `SmoothedPose` have in common."""
+
+
 @dataclass
-class SmoothedLog:
-    """History of one smoothed track; lists have one element per pose, as in `SmoothedPose`."""
+class PoseLog:
+    """History of one track; lists have one element per pose."""
 
     id: int
     stamp_ns: list[int] = field(default_factory=list)
@@ -26,9 +30,13 @@ class SmoothedLog:
     moment: list[FloatArray] = field(default_factory=list)
     orientation: list[FloatArray] = field(default_factory=list)
 
+
+class SmoothedLog(PoseLog):
+    """History of one smoothed track."""
+
     def add(self, pose: SmoothedPose) -> None:
         """Add a smoothed pose."""
-        for name in ('stamp_ns', 'position', 'velocity', 'covariance', 'moment', 'orientation'):
+        for name in POSE:
             getattr(self, name).append(getattr(pose, name))
 
     def summary(self) -> dict[str, float]:
@@ -41,16 +49,9 @@ class SmoothedLog:
 
 
 @dataclass
-class TrackLog:
+class TrackLog(PoseLog):
     """History of one track; lists have one value per pose, of the `Track` or of its frame."""
 
-    id: int
-    stamp_ns: list[int] = field(default_factory=list)
-    position: list[FloatArray] = field(default_factory=list)
-    velocity: list[FloatArray] = field(default_factory=list)
-    covariance: list[FloatArray] = field(default_factory=list)
-    moment: list[FloatArray] = field(default_factory=list)
-    orientation: list[FloatArray] = field(default_factory=list)
     nis: list[float] = field(default_factory=list)
     nis_by_sensor: list[FloatArray] = field(default_factory=list)
     degrees_of_freedom: list[int] = field(default_factory=list)
@@ -75,8 +76,7 @@ class TrackLog:
         if track.ended:
             self.ended = True
             return
-        for name in ('stamp_ns', 'position', 'velocity', 'covariance', 'moment', 'orientation',
-                     'nis', 'nis_by_sensor', 'degrees_of_freedom', 'ambiguous', 'doubts',
+        for name in (*POSE, 'nis', 'nis_by_sensor', 'degrees_of_freedom', 'ambiguous', 'doubts',
                      'predicted', 'mounting', 'mounting_std', 'kind', 'kind_weight', 'length'):
             getattr(self, name).append(getattr(track, name))
         self.measured.append(frame.field)
