@@ -17,8 +17,8 @@ MAX_FILE_LINES, MAX_FUNCTION_LINES = 350, 40
 """Maximum lines of a file and of a function, without docstrings."""
 BUDGETS = {
     'cli': 3100, 'nodes': 4300, 'apps': 5800, 'results': 1550, 'drivers': 5400, 'recording': 4850,
-    'web': 650, 'stages': 12200, 'analysis': 4050, 'messages': 1750, 'simulation': 250,
-    'physics': 2450, 'inference': 3100, 'calibration': 4700, 'network': 850, 'report': 2300,
+    'web': 650, 'stages': 12200, 'analysis': 2850, 'messages': 1750, 'simulation': 250,
+    'physics': 2450, 'inference': 3100, 'calibration': 6150, 'network': 850, 'report': 2300,
     'modules': 2900}
 """Maximum lines of each package, and of the modules outside packages, in Python and C++ with
 docstrings. A change may lower a budget; one that raises it says why."""
@@ -34,7 +34,7 @@ def checked_layers():
 def documented_layers():
     """Packages and modules of each layer, highest first, from docs/contributing/architecture.md."""
     text = (ROOT / 'docs' / 'contributing' / 'architecture.md').read_text()
-    rows = re.findall(r'^\| (\d) \| ([^|]+)\|', text, re.M)
+    rows = re.findall(r'^\| (\d+) \| ([^|]+)\|', text, re.M)
     assert [int(n) for n, _ in rows] == list(range(len(rows), 0, -1))
     return [{name.removesuffix('.py').rstrip('/') for name in re.findall(r'`([^`]+)`', packages)}
             for _, packages in rows]

@@ -4,8 +4,8 @@ from functools import cache
 
 import numpy as np
 
-from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
-from mag_tracking.analysis.network_readings import (
+from mag_tracking.calibration.network_geometry import GeometrySettings, calibrate_geometry
+from mag_tracking.calibration.network_readings import (
     TrackedMagnet,
     predicted_readings,
     rotation,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.analysis.magnet_pose import PoseSettings, locate_magnet
+from mag_tracking.calibration.magnet_pose import PoseSettings, locate_magnet
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.pose_table import read_pose_table, read_sensor_positions
 from support.bundled import DATA

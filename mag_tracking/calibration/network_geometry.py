@@ -9,14 +9,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mag_tracking.analysis.network_fit import (
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.calibration.network_fit import (
     GeometryProblem,
     NormalEquations,
     Unknowns,
     median_ratio,
     solve,
 )
-from mag_tracking.analysis.network_readings import (
+from mag_tracking.calibration.network_readings import (
     N_POSE,
     N_SENSOR,
     N_SHARED,
@@ -25,7 +26,6 @@ from mag_tracking.analysis.network_readings import (
     rotation,
     tool_rotations,
 )
-from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.settings import param
 

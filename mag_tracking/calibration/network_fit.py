@@ -9,7 +9,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from scipy.stats import chi2
 
-from mag_tracking.analysis.network_readings import (
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration.network_readings import (
     N_POSE,
     N_SENSOR,
     N_SHARED,
@@ -18,7 +19,6 @@ from mag_tracking.analysis.network_readings import (
     predicted_readings,
     tool_rotations,
 )
-from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 
 OUTLIER_PROBABILITY = 1e-3

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mag_tracking.analysis.magnet_pose import PoseSettings, locate_magnet
-from mag_tracking.analysis.network_geometry import (
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.calibration.magnet_pose import PoseSettings, locate_magnet
+from mag_tracking.calibration.network_geometry import (
     MIN_POSES,
     GeometrySettings,
     NetworkGeometry,
     fitted_geometry,
 )
-from mag_tracking.analysis.network_readings import N_SHARED
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.calibration.network_readings import N_SHARED
 from mag_tracking.network import SensorNetwork
 
 COARSE_ERROR = 0.1

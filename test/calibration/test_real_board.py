@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mag_tracking.analysis.network_blind import calibrate_geometry_blind
-from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
-from mag_tracking.analysis.network_readings import rotation, tool_rotations
+from mag_tracking.calibration.network_blind import calibrate_geometry_blind
+from mag_tracking.calibration.network_geometry import GeometrySettings, calibrate_geometry
+from mag_tracking.calibration.network_readings import rotation, tool_rotations
 from support.marks import studied
 from support.real_board import BOX, MOMENT, assert_within_limits, board_of_41, errors, print_errors
 

@@ -7,7 +7,6 @@ and the field of the Earth give the orientations.
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -27,12 +26,16 @@ from mag_tracking.calibration.orientation import (
 from mag_tracking.geometry import yaw_between
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import AccelerationSample
-from mag_tracking.stages.survey.settings import COMPASS_BIAS_STD, SurveySettings
+from mag_tracking.settings import param
 from mag_tracking.units import NS
 
 MAX_GAP_S = 3600.0
 """[s] Maximum gap between accelerations. After a longer gap or a backward jump, earlier readings
 belong to another recording and are discarded."""
+
+COMPASS_BIAS_STD = 6e-7
+"""[T] Prior standard deviation, per axis, of the field that a sensor and nearby iron add to that of
+the Earth. The survey updates this prior with the biases estimated from the readings."""
 
 ACCELEROMETER_BIAS = 0.05
 """[m/s²] Bias of an accelerometer, per axis; it tilts the estimated vertical by 0.3 degrees."""
@@ -46,6 +49,21 @@ MAX_ACCELERATIONS = 60_000
 
 MIN_NOMINAL_STD = 1e-3
 """[rad] Minimum standard deviation of an orientation in the network file."""
+
+
+@dataclass(frozen=True)
+class SurveySettings:
+    """Settings of the survey of orientations and clock offsets."""
+
+    offset_std: float = param(
+        5e-6, 'Standard deviation, per axis, of the constant offset of an uncalibrated sensor, '
+        'including iron nearby. An offset does not affect tracks. If the background of a sensor '
+        'contradicts the field of the Earth by more than this offset and the uncertainty of its '
+        'orientation explain, its gain, its axes or its orientation are wrong, and its tracks are '
+        'ambiguous. 0 disables this flag.', 'T', (0.0, 1e-3))
+    nominal_std_deg: float = param(
+        5.0, 'Standard deviation, about each axis, of the orientations in the network file, for '
+        'sensors without orientation_std_deg.', 'deg', (0.06, 180.0))
 
 
 @dataclass(frozen=True)
@@ -287,25 +305,14 @@ class Survey:
                        calibrated=tuple(calibrated))
 
 
-class NoiseSource(Protocol):
-    """Part of the interface of `Calibrate` that `with_measured_noise` uses."""
-
-    def backgrounds(self) -> Mapping[str, RunningBackground]:
-        """Background estimator of each sensor, in the order of the network.
-
-        Returns
-        -------
-        mapping of str to RunningBackground
-        """
-
-
-def with_measured_noise(network: SensorNetwork, calibrate: NoiseSource) -> SensorNetwork:
-    """Network with the noise that a `Calibrate` stage has measured.
+def with_measured_noise(network: SensorNetwork,
+                        backgrounds: Mapping[str, RunningBackground]) -> SensorNetwork:
+    """Network with the noise of the backgrounds of its sensors, in the order of the network.
 
     A sensor retains its previous noise if the measured noise of any axis is unknown.
     """
     noise = list(network.noise_std)
-    for j, background in enumerate(calibrate.backgrounds().values()):
+    for j, background in enumerate(backgrounds.values()):
         std = None if background.covariance is None else np.sqrt(np.diagonal(background.covariance))
         # The network file requires all three axes, but an axis that is not reported has no noise.
         if std is not None and not np.isnan(std).any():
