@@ -66,7 +66,7 @@ class PassData:
         """Number of independent values.
 
         Repeated readings of a coarse sensor at rest are not independent and have an increased
-        variance (`calibration.resolution`). Such a value counts as the smallest variance of its
+        variance (`calibration/resolution.hpp`). Such a value counts as the smallest variance of its
         axis over its own.
         """
         total = 0.0

@@ -6,9 +6,8 @@ from functools import partial
 
 import numpy as np
 
-from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
-from mag_tracking.analysis.pass_description import PATH_TOLERANCE, fits_at_minimum
+from mag_tracking.analysis.pass_description import PATH_TOLERANCE, SensorErrors, fits_at_minimum
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.detection_theory import energy_threshold

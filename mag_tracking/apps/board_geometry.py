@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.calibration.network_blind import calibrate_geometry_blind
 from mag_tracking.calibration.network_geometry import (
     GeometrySettings,
     NetworkGeometry,
     calibrate_geometry,
+    calibrate_geometry_blind,
 )
 from mag_tracking.errors import NetworkError, RecordingError
 from mag_tracking.network import SensorNetwork

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.pass_mounting import (
+from mag_tracking.calibration.orientation import (
     MountingEvidence,
     fuse_mounting,
     with_pass_mounting,

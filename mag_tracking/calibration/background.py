@@ -16,17 +16,32 @@ from typing import NamedTuple
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, StructArray
-from mag_tracking.calibration.background_level import BackgroundLevel
-from mag_tracking.calibration.blocks import Block, Blocks, block_of, pooled_covariance, stacked
+from mag_tracking.calibration.background_level import (
+    SHORTENED_FRACTION,
+    BackgroundLevel,
+    FormerLevel,
+    LevelDeparture,
+    is_steep,
+)
+from mag_tracking.calibration.blocks import (
+    Block,
+    Blocks,
+    LearningWindow,
+    QuietInterval,
+    block_of,
+    line_of,
+    pooled_covariance,
+    stacked,
+)
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, doubtful_since, updated
-from mag_tracking.calibration.drift import FormerLevel, is_steep
-from mag_tracking.calibration.frequent_level import MIN_DURATION_RATIO
-from mag_tracking.calibration.learning_window import LearningWindow
+from mag_tracking.calibration.frequent_level import (
+    MIN_DURATION_RATIO,
+    MIN_OBSERVED_S,
+    FrequentLevel,
+    ProvisionalLevel,
+)
 from mag_tracking.calibration.level_change import ChangeEvaluator, SharedChanges
-from mag_tracking.calibration.level_departure import SHORTENED_FRACTION, LevelDeparture
-from mag_tracking.calibration.provisional import MIN_OBSERVED_S, FrequentLevel, ProvisionalLevel
-from mag_tracking.calibration.quiet_interval import QuietInterval, line_of
-from mag_tracking.calibration.resolution import MIN_STD, corrected_steps
+from mag_tracking.calibration.sensor_state import MIN_STD, corrected_steps
 from mag_tracking.units import NS
 
 MAX_CHANGES = 16

@@ -1,20 +1,54 @@
-"""Linear trend and noise of the background of one sensor, in arrays for compiled code."""
+"""Levels of one sensor: its background with trend and noise, the former one, departures from it."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import inf
 from typing import TypeAlias
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, StructArray
+from mag_tracking.arrays import FloatArray, Record, StructArray
 from mag_tracking.calibration import core
 from mag_tracking.calibration.blocks import Block, Blocks, has_noisy_block, line_through, stacked
-from mag_tracking.calibration.resolution import MIN_STD, completed_steps, corrected_steps
+from mag_tracking.calibration.frequent_level import MIN_DURATION_RATIO
+from mag_tracking.calibration.level_change import NO_CHANGE, ChangeEvaluator, level_change
+from mag_tracking.calibration.sensor_state import MIN_STD, completed_steps, corrected_steps
 from mag_tracking.records import plain
+from mag_tracking.units import NS
 
 _Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
 """Centre [s], mean (3,) [T], slope (3,) [T/s], and horizon [s], after which the trend is
 constant."""
+
+TYPICAL_DRIFT = 3e-9
+"""[T/s] Typical drift of a background."""
+
+STEEP_DRIFT = 1e-8
+"""[T/s] Maximum drift of a background, reached by a sensor that is warming up. A faster change may
+be due to an approaching target."""
+
+MAX_AGE_S = 600.0
+"""[s] Maximum age of a former level."""
+
+MAX_DRIFT = 4.0
+"""Maximum drift of a former level, in multiples of the tolerance of a block mean. With a wider
+tolerance, any stopped vehicle would match a former level."""
+
+MIN_SLOPE_STDS = 4.0
+"""Number of standard deviations by which a slope must exceed `STEEP_DRIFT`."""
+
+MIN_RELEARN_S = 10.0
+"""[s] Minimum duration of another steady level that replaces a resumed or briefly observed
+background."""
+
+SHORTENED_FRACTION = 2.0 / 3.0
+"""Required duration of the level after a vehicle has departed, and of a former level, as a fraction
+of the usual duration."""
+
+MAX_EVALUATED_BLOCKS = 240
+"""Maximum number of blocks (a minute of the usual length) for which arrivals and departures are
+evaluated, since each evaluation uses all blocks."""
 
 
 class BackgroundLevel:
@@ -131,3 +165,122 @@ class BackgroundLevel:
         residual = np.abs(blocks.mean - mean - slope * (blocks.time - centre)[:, None])
         return not has_noisy_block(blocks, self._state['step_variance']) \
             and bool(np.nanmax(residual / self.limits) <= 1.0)
+
+
+@dataclass(frozen=True)
+class FormerLevel:
+    """Level of the previous background."""
+
+    until: float
+    """[s] Time at which the level ceased to be the background."""
+    level: FloatArray
+    """(3,) [T] Field of the level."""
+    observed_s: float
+    """[s] Duration for which the level was observed."""
+
+    def is_at(self, block: Block, limits: FloatArray) -> bool:
+        """Whether a block is within `limits` (3,) T of this level and at most `MAX_AGE_S` later."""
+        age = block.time - self.until
+        tolerance = limits + np.minimum(TYPICAL_DRIFT * age, MAX_DRIFT * limits)
+        # A comparison with NaN is false: an axis that is not reported does not differ.
+        differs = bool((np.abs(block.mean - self.level) > tolerance).any())
+        return age <= MAX_AGE_S and not differs
+
+
+def is_steep(blocks: Blocks, slope: FloatArray, variance: FloatArray) -> bool:
+    """Whether a line's slope (3,) T/s significantly exceeds `STEEP_DRIFT` on any axis.
+
+    `variance` (3,) in T² is that of one reading; NaN for an unreported axis.
+    """
+    relative_time = blocks.time - blocks.time.mean()
+    spread = (blocks.n * np.square(relative_time)[:, None]).sum(axis=0)
+    std = np.sqrt(variance / np.where(spread > 0.0, spread, np.nan))
+    # A comparison with NaN is false: an axis that is not reported has no slope.
+    return bool((np.abs(slope) > STEEP_DRIFT + MIN_SLOPE_STDS * std).any())
+
+
+class LevelDeparture:
+    """Interval in which the blocks of a sensor depart from its frozen background.
+
+    Attributes
+    ----------
+    blocks : blocks since the departure began
+    former : previous background
+    has_arrived : whether a vehicle has arrived and is present
+    was_steady : whether the sensor stayed at another steady level for the required duration
+    departed_at : s, time by which a vehicle that was part of the first background had departed
+    """
+
+    def __init__(self, learn: float, relearn: float, state: Record, level: BackgroundLevel,
+                 evaluate_change: ChangeEvaluator) -> None:
+        self._learn, self._relearn = learn, relearn
+        self._state, self._level = state, level
+        self._evaluate_change = evaluate_change
+        self.forget()
+
+    def forget(self) -> None:
+        """Reset all attributes, including the former level."""
+        self.departed_at: float | None = None
+        self.former: FormerLevel | None = None
+        self._evaluate_change(NO_CHANGE)
+        self.end()
+
+    def end(self) -> None:
+        """End the departure, because the sensor is at its background again."""
+        self.blocks: deque[Block] = deque()
+        self._blocks_before: list[Block] = []
+        self._has_first_block = True
+        self.has_arrived = self.was_steady = False
+
+    def add(self, block: Block, before: Iterable[Block]) -> None:
+        """Add a block; `before` are the blocks before the departure, used with its first block."""
+        if not self.blocks:
+            self._blocks_before = list(before)
+        self.blocks.append(block)
+
+    def shorten(self) -> None:
+        """Discard the first block; the later blocks may be steady."""
+        self.blocks.popleft()
+        self._has_first_block = False
+
+    def steady_end(self, ratio: float = 1.0) -> deque[Block] | None:
+        """Latest blocks if steady for `ratio` of the usual time, else None; set `was_steady`."""
+        new_blocks = self._level.steady_end(self.blocks, ratio * self._learn)
+        self.was_steady |= new_blocks is not None
+        return new_blocks
+
+    def relearn_time(self, observed_s: float, relearns_soon: bool) -> float:
+        """Time [s] on another steady level until it becomes the background; 0 if it never does.
+
+        `observed_s` is the time for which the background was observed; `relearns_soon` means that
+        the sensor may have been moved, or its surroundings changed.
+        """
+        if relearns_soon:
+            return min(self._relearn or inf, max(self._learn, MIN_RELEARN_S))
+        if self.has_arrived:
+            return self._relearn
+        # A vehicle present from the start may have departed.
+        return self._relearn and min(
+            self._relearn, max(self._learn, MIN_RELEARN_S, MIN_DURATION_RATIO * observed_s))
+
+    def former_observed_s(self) -> float:
+        """Duration [s] for which the former level was observed; 0 if the latest block left it."""
+        former = self.former
+        is_at_former = former is not None and former.is_at(self.blocks[-1], self._level.limits)
+        return former.observed_s if former is not None and is_at_former else 0.0
+
+    def has_departed(self, new_blocks: deque[Block]) -> bool | None:
+        """Determine and store whether a vehicle in the background has departed.
+
+        False if a vehicle has arrived, None if unknown.
+        """
+        if self.has_arrived or not self._has_first_block or len(self.blocks) > MAX_EVALUATED_BLOCKS:
+            return False if self.has_arrived else None
+        blocks = stacked([*self._blocks_before, *self.blocks])
+        has_departed = self._evaluate_change(level_change(
+            blocks, len(new_blocks), self._level.at_all(blocks.time), self._state['noise_std'],
+            int(self._state['first_ns']) / NS))
+        self.has_arrived = has_departed is False
+        if has_departed and self.former is None and self.departed_at is None:
+            self.departed_at = new_blocks[0].time
+        return has_departed

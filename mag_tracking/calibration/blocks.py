@@ -1,6 +1,7 @@
-"""Summaries of short intervals of readings (blocks), to which the background line is fitted."""
+"""Summaries of short intervals of readings (blocks), windows of them, and lines through them."""
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -107,3 +108,92 @@ def pooled_covariance(blocks: Blocks) -> FloatArray | None:
     NaN for an axis with too few samples; None if all axes have too few.
     """
     return core.pooled_covariance(plain(blocks.scatter), plain(blocks.n))
+
+
+class QuietInterval:
+    """Window of the latest quiet blocks.
+
+    A block enters only after the guard time in s, so that the gradual onset of a target is
+    excluded; until then it is `pending`.
+    """
+
+    def __init__(self, guard: float, max_blocks: int) -> None:
+        self._guard = guard
+        self._window = BlockWindow(max_blocks)
+        self.pending: deque[Block] = deque()
+
+    def __len__(self) -> int:
+        return len(self._window)
+
+    def clear(self) -> None:
+        """Discard all blocks."""
+        self._window.clear()
+        self.pending.clear()
+
+    def begin(self, blocks: Iterable[Block]) -> None:
+        """Restart the interval with the given blocks."""
+        self._window.clear()
+        for block in blocks:
+            self._window.append(block)
+
+    def extend(self, block: Block) -> Iterator[Blocks]:
+        """Queue the next quiet block, and yield the window after each block that enters it."""
+        self.pending.append(block)
+        while self.pending and self.pending[0].time <= block.time - self._guard:
+            self._window.append(self.pending.popleft())
+            yield self.blocks()
+
+    def blocks(self) -> Blocks:
+        """Blocks of the interval, in no particular order."""
+        return self._window.blocks()
+
+    def scatter(self) -> FloatArray:
+        """Pooled variance (3,) T² of the readings within the blocks; NaN if unknown."""
+        covariance = pooled_covariance(self.blocks()) if self else None
+        return np.full(3, np.nan) if covariance is None else covariance.diagonal()
+
+
+def line_of(blocks: Blocks) -> tuple[float, FloatArray, FloatArray, float]:
+    """Linear trend as in `BackgroundLevel`: centre [s], mean [T], slope [T/s] and horizon [s].
+
+    The drift is extrapolated for at most twice the duration of the blocks.
+    """
+    first, last = float(blocks.time.min()), float(blocks.time.max())
+    return *line_through(blocks), last + 2.0 * (last - first)
+
+
+class LearningWindow:
+    """Window of the latest blocks, which provides candidates for the first quiet interval.
+
+    `learn` [s] is the required duration of a quiet interval, `length` [s] that of a block. At most
+    `max_blocks` blocks whose readings are all equal are stored.
+    """
+
+    def __init__(self, learn: float, length: float, max_blocks: int) -> None:
+        # Measured between block centres; the blocks of a slow sensor may be longer than `length`.
+        self._min_duration = learn - 1.5 * length
+        self._constant_blocks: deque[Block] = deque(maxlen=max_blocks)
+        self._recent: deque[Block] = deque()
+
+    def clear(self) -> None:
+        """Discard all blocks."""
+        self._constant_blocks.clear()
+        self._recent.clear()
+
+    def segments(self, block: Block, is_stuck: bool) -> Iterator[deque[Block]]:
+        """Add a block; yield the candidate intervals that are long enough, best first.
+
+        `is_stuck` means that all readings of the block are equal.
+        """
+        self._recent.append(block)
+        if is_stuck:
+            # The steps are unknown until the first change, which may be due to a target.
+            self._constant_blocks.append(block)
+        elif self._constant_blocks \
+                and self._constant_blocks[-1].time - self._constant_blocks[0].time \
+                >= self._min_duration:
+            yield self._constant_blocks
+        while len(self._recent) > 3 and block.time - self._recent[1].time >= self._min_duration:
+            self._recent.popleft()
+        if len(self._recent) >= 3 and block.time - self._recent[0].time >= self._min_duration:
+            yield self._recent

@@ -163,7 +163,7 @@ def steps_of(sensors: StructArray, are_corrected: bool) -> FloatArray:
     """
 
 def complete_steps(variance: FloatArray, steps: FloatArray) -> None:
-    """Complete unknown steps in place; see `resolution.completed_steps`.
+    """Complete unknown steps in place; see `sensor_state.completed_steps`.
 
     Parameters
     ----------

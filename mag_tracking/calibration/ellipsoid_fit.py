@@ -11,9 +11,14 @@ from typing import TypedDict
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray
-from mag_tracking.calibration.ellipsoid_refinement import BASIS, Quality, refine_ellipsoid
-from mag_tracking.calibration.missing_marks import are_marked, missing_marks
-from mag_tracking.calibration.quadric import POSSIBLE_CAUSES, fit_quadric
+from mag_tracking.calibration.ellipsoid import (
+    BASIS,
+    POSSIBLE_CAUSES,
+    Quality,
+    fit_quadric,
+    refine_ellipsoid,
+)
+from mag_tracking.calibration.reading_faults import are_marked, missing_marks
 from mag_tracking.calibration.saturation import saturated_readings, with_margin
 
 MIN_READINGS = 50

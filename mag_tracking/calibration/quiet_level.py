@@ -4,8 +4,8 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.background import RunningBackground
+from mag_tracking.calibration.background_level import TYPICAL_DRIFT
 from mag_tracking.calibration.blocks import Block, block_of, stacked
-from mag_tracking.calibration.drift import TYPICAL_DRIFT
 from mag_tracking.calibration.frequent_level import (
     LEVEL_WIDTH,
     MIN_BLOCKS,
@@ -13,7 +13,7 @@ from mag_tracking.calibration.frequent_level import (
     MostFrequentLevel,
     most_frequent_level,
 )
-from mag_tracking.calibration.resolution import corrected_steps, raw_steps
+from mag_tracking.calibration.sensor_state import corrected_steps, raw_steps
 
 NEAR_STDS = 8.0
 """Maximum difference between the initial and the most frequent level that an approaching target may

@@ -1,16 +1,247 @@
-"""Faults of a driver that are visible in the raw readings: marks and regular repetitions."""
+"""Faults of a driver that are visible in the raw readings: marks and regular repetitions.
+
+Marks for missing readings are values that a driver publishes when it has no reading: 0, 99999, the
+end of the range, the largest number of a type. A mark is entered and left by a jump, and always has
+exactly the same value, which noise prevents for readings.
+
+A driver that publishes readings faster than its sensor measures repeats each of them a regular
+number of times. A sensor with coarse steps also repeats readings at rest, but at random: the number
+of repetitions has a geometric distribution.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration import core
-from mag_tracking.calibration.missing_marks import are_marked, missing_marks
-from mag_tracking.calibration.repetition import changes_of, repetition_of, with_lost_readings
+
+MIN_READINGS = 3
+"""Minimum number of readings with the value of a mark."""
+MIN_OTHERS = 12
+"""Minimum number of other readings of the axis."""
+MIN_JUMP = 30.0
+"""Minimum difference between a mark and its neighbours, in standard deviations or steps."""
+MIN_ISOLATION = 10.0
+"""Minimum difference between a mark and its neighbours, relative to the changes next to it."""
+MIN_ISOLATED = 0.5
+"""Minimum fraction of the occurrences that are isolated; during a pass they are not."""
+MIN_COARSE = 0.5
+"""Fraction of repeated readings above which the value of a reading at rest is no coincidence."""
+MAX_PLAUSIBLE = 1.5
+"""Minimum ratio of a mark of such a sensor to the largest median of an axis, unless it is zero or
+equal on all axes."""
+MIN_TOGETHER = 0.9
+"""Minimum fraction of the occurrences of a mark in which another axis has a mark as well."""
+LARGEST = 1e30
+"""[T] Limit to which values are clipped, so that differences do not overflow."""
+
+MIN_REPETITION = 1.2
+"""Minimum number of readings per measurement; timing jitter causes fewer repetitions."""
+MAX_REPETITION = 40.0
+"""Maximum number of readings per measurement."""
+MIN_LOG_ODDS = 24.0
+"""Minimum significance of the regularity: random repetitions reach the power of a frequency with a
+probability of exp(-24), at each of some thousand frequencies."""
+MIN_RESULTANT = 0.85
+"""Minimum regularity of the changes, relative to a perfectly regular source."""
+MAX_JITTER = 0.2
+"""Maximum deviation of an interval from a multiple of the median interval, relative to it."""
+MIN_REGULAR = 0.9
+"""Minimum fraction of the intervals with less jitter, to know where readings were lost."""
+MAX_LOST = 2.0
+"""Maximum ratio of all readings, including lost ones, to the received readings."""
+OVERSAMPLING = 4
+"""Oversampling of the frequencies at which the regularity is evaluated."""
 
 MAX_MARKS = core.MAX_MARKS
 """Maximum number of different marks of a sensor."""
+
+
+def missing_marks(fields: FloatArray) -> FloatArray:
+    """Find the marks (k, 3) among chronological raw readings (n, 3) in T, NaN for a missing axis.
+
+    A mark is NaN for an axis that it does not concern. Values of several axes that always occur
+    together are one mark.
+    """
+    fields = np.where(np.isinf(fields), np.nan, fields)
+    marks_of_axis = [_marks_of_axis(fields, axis) for axis in range(3)]
+    if not any(marks_of_axis):
+        return np.zeros((0, 3))
+    changes = np.abs(np.diff(np.clip(fields, -LARGEST, LARGEST), axis=0, prepend=np.nan))
+    is_jump = changes > MIN_JUMP * np.array([typical_change(values) for values in fields.T])
+    # By bytes, because NaN differs from NaN.
+    marks: dict[bytes, FloatArray] = {}
+    for axis, of_axis in enumerate(marks_of_axis):
+        for mark in of_axis:
+            is_mark, vector = fields[:, axis] == mark, np.full(3, np.nan)
+            for b in range(3):
+                # A background close to zero does not stand out from a mark of zero.
+                vector[b] = next((v for v in (mark, *marks_of_axis[b])
+                                  if np.mean(fields[is_mark, b] == v) > MIN_TOGETHER), np.nan)
+            # Where other axes jump to other values, an equal value is a coincidence.
+            if not (np.mean(is_jump[is_mark], axis=0) > MIN_ISOLATED)[np.isnan(vector)].any():
+                marks[vector.tobytes()] = vector
+    return np.array(list(marks.values())).reshape(-1, 3)
+
+
+def are_marked(fields: FloatArray, marks: FloatArray) -> BoolArray:
+    """Axes (n, 3) of fields that hold a mark of `missing_marks`."""
+    found = np.zeros(fields.shape, dtype=bool)
+    for mark in marks:
+        concerned = ~np.isnan(mark)
+        found |= (fields == mark)[:, concerned].all(axis=1)[:, None] & concerned
+    return found
+
+
+def describe_marks(marks: FloatArray) -> str:
+    """Format marks (k, 3) in T, with axis names unless a mark concerns all axes."""
+    return ' or '.join(map(_describe_mark, marks))
+
+
+def _describe_mark(mark: FloatArray) -> str:
+    """Format a mark (3,) [T]."""
+    values = [(f'{axis} = ', v) for axis, v in zip('xyz', mark.tolist(), strict=True)
+              if not np.isnan(v)]
+    if len(values) == 3 and len({v for _, v in values}) == 1:
+        values = [('', values[0][1])]
+    return ', '.join(axis + (f'{1e9 * v:.6g} nT' if abs(v) < 1.0 else f'{v:.6g} T')
+                     for axis, v in values)
+
+
+def _marks_of_axis(fields: FloatArray, axis: int) -> list[float]:
+    """Marks of one axis."""
+    fields = fields[~np.isnan(fields[:, axis])]
+    marks: list[float] = []
+    while True:
+        runs, jumps, lengths = _isolated_runs(fields[:, axis])
+        candidates, index = np.unique(runs, return_inverse=True)
+        n = np.bincount(index, lengths, len(candidates)).astype(int)
+        mark = next((float(candidates[k]) for k in np.argsort(-n) if n[k] >= MIN_READINGS
+                     and _is_mark(fields, axis, candidates[k],
+                                  float(np.median(jumps[index == k])), n[k])), None)
+        if mark is None:
+            return marks
+        marks.append(mark)
+        fields = fields[fields[:, axis] != mark]
+
+
+def _isolated_runs(values: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Runs of equal values that are entered and left by a jump: values, jumps, and lengths."""
+    starts = np.flatnonzero(np.append(True, values[1:] != values[:-1])[:len(values)])
+    if len(starts) < 3:
+        return np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64)
+    # A neighbour of a run is compared with both runs on its other side, because the nearest one may
+    # be another occurrence of the mark.
+    before3, before2, before, run, after, after2, after3 = np.lib.stride_tricks.sliding_window_view(
+        np.pad(np.clip(values[starts], -LARGEST, LARGEST), 3, 'edge'), 7).T
+    jump = np.minimum(np.abs(run - before), np.abs(run - after))
+    change_after = np.minimum(np.abs(after - after2), np.abs(after - after3))
+    change = np.maximum.reduce([
+        np.abs(after - before), np.minimum(np.abs(before - before2), np.abs(before - before3)),
+        change_after])
+    # The reading before the first run is unknown; the last run may continue.
+    jump[0], change[0] = np.abs(run - after)[0], change_after[0]
+    is_isolated = jump > MIN_ISOLATION * change
+    is_isolated[-1] = False
+    lengths = np.diff(np.append(starts, len(values)))
+    return values[starts][is_isolated], jump[is_isolated], lengths[is_isolated]
+
+
+def typical_change(values: FloatArray) -> float:
+    """Median of the changes of an axis (n,), without repetitions; 0 if there are none."""
+    changes = np.abs(np.diff(np.clip(values, -LARGEST, LARGEST)))
+    return float(np.median(changes[changes > 0.0])) if (changes > 0.0).any() else 0.0
+
+
+def _is_mark(fields: FloatArray, axis: int, value: float, jump: float, n_isolated: int) -> bool:
+    """Whether a value with a number of isolated readings of an axis, without NaN, is a mark."""
+    values = fields[:, axis]
+    is_value = values == value
+    others = values[~is_value]
+    n_inside = np.count_nonzero(is_value)
+    if is_value[-1] and not is_value.all():
+        # The last run may continue.
+        n_inside -= int(np.argmin(is_value[::-1]))
+    if len(others) < MIN_OTHERS or n_isolated < MIN_ISOLATED * n_inside:
+        return False
+    if jump <= MIN_JUMP * typical_change(others):
+        return False
+    # A first run that nothing was measured before may be a level that has changed.
+    is_left_again = n_isolated > int(np.argmin(is_value))
+    if value == 0.0 or is_left_again and np.mean(others[1:] != others[:-1]) > 1.0 - MIN_COARSE:
+        return True
+    if len(others) < len(values) / 2:
+        return False
+    largest = max(abs(float(np.median(v[~np.isnan(v)]))) for v in fields[~is_value].T
+                  if not np.isnan(v).all())
+    return abs(value) > MAX_PLAUSIBLE * largest or bool((fields[is_value] == value).all())
+
+
+def changes_of(fields: FloatArray) -> BoolArray:
+    """Whether each reading (n, 3) differs from the previous one; True for the first."""
+    before, after = fields[:-1], fields[1:]
+    equal = (after == before) | np.isnan(after) & np.isnan(before)
+    return np.append(np.ones(min(1, len(fields)), dtype=bool), ~equal.all(axis=1))
+
+
+def with_lost_readings(fields: FloatArray, stamps: IntArray) -> FloatArray:
+    """Insert a NaN row wherever a reading was lost, by the timestamps (n,) in ns.
+
+    Unchanged if the timestamps are irregular, or most readings are lost.
+    """
+    intervals = np.diff(stamps) / max(1.0, float(np.median(np.diff(stamps)))) if len(stamps) > 1 \
+        else np.zeros(0)
+    steps = np.round(intervals)
+    if np.mean(np.abs(intervals - steps) > MAX_JITTER) > 1.0 - MIN_REGULAR or not len(steps) \
+            or steps.min() < 1.0 or steps.sum() > MAX_LOST * len(stamps):
+        return fields
+    index = np.append(0, np.cumsum(steps.astype(np.int64)))
+    out: FloatArray = np.full((int(index[-1]) + 1, 3), np.nan)
+    out[index] = fields
+    return out
+
+
+def repetition_of(fields: FloatArray) -> float:
+    """Number of chronological readings (n, 3) per measurement, from the regularity of the changes.
+
+    A source that is read every r readings changes at the readings ceil(k r). The phases of the
+    changes modulo r then cover 1/r of the circle, so their resultant is sin(π/r) / (π/r). Changes
+    missing because two measurements are equal do not matter. 1 if readings are not repeated
+    regularly; an integer unless the rates are incommensurate.
+    """
+    n, present = len(fields), np.flatnonzero(~np.isnan(fields).all(axis=1))
+    is_change = np.zeros(n, dtype=bool)
+    is_change[present] = changes_of(fields[present])
+    changes = np.flatnonzero(is_change[1:])
+    n_changes = len(changes)
+    if n_changes < MIN_LOG_ODDS or n_changes > len(present) / MIN_REPETITION:
+        return 1.0
+    size = OVERSAMPLING * 2 ** int(np.ceil(np.log2(n)))
+    resultant = np.abs(np.fft.rfft(is_change[1:].astype(float), size)) / n_changes
+    frequency = np.arange(len(resultant)) / size
+    # A rate above half the rate of publishing is aliased. Equal measurements only lower the number
+    # of changes, so a source is at least as fast as the changes.
+    frequency = np.where(frequency < 0.95 * n_changes / n, 1.0 - frequency, frequency)
+    period = 1.0 / np.maximum(frequency, 1e-9)
+    expected = np.sinc(1.0 / period)
+    is_regular = (period >= MIN_REPETITION) & (period <= MAX_REPETITION) \
+        & (resultant > MIN_RESULTANT * expected) & (n_changes * resultant**2 > MIN_LOG_ODDS)
+    if not is_regular.any():
+        return 1.0
+    # Multiples of the rate are regular as well: the slowest source decides.
+    slowest = np.flatnonzero(is_regular & (period > 0.9 * period[is_regular].max()))
+    bin_of_best = slowest[np.argmax(resultant[slowest])]
+    best = _refined(changes, float(frequency[bin_of_best]), 1.0 / size)
+    nearest = round(best)
+    return float(nearest) if abs(best - nearest) * n < 2.0 * best**2 / OVERSAMPLING else best
+
+
+def _refined(changes: IntArray, frequency: float, width: float) -> float:
+    """Period of the most regular `frequency` [1/reading] within `width`, at the changed indices."""
+    frequencies = frequency + width * np.linspace(-1.0, 1.0, 65)
+    resultant = np.abs(np.exp(2j * np.pi * np.outer(frequencies, changes)).sum(axis=1))
+    return float(1.0 / frequencies[np.argmax(resultant)])
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import erf
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.calibration.repetition import changes_of
+from mag_tracking.calibration.reading_faults import changes_of
 
 MIN_RUN = 3
 """Minimum number of consecutive equal readings at the limit of a saturated axis."""

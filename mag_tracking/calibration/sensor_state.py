@@ -1,12 +1,15 @@
-"""Sensor state that is updated with every reading, in one structured array for all sensors.
+"""State of the sensors that compiled code updates with every reading, and their quantisation steps.
 
-Compiled code accesses it for each reading, Python for each block.
+It is one structured array for all sensors, which Python accesses for each block. If the steps of a
+sensor exceed its noise, a reading is constant while the field changes by up to a step. Averaging
+does not remove that error, and a repeated reading adds little information (`resolution.hpp`).
 """
 
 import numpy as np
 
-from mag_tracking.arrays import StructArray
+from mag_tracking.arrays import FloatArray, Record, StructArray
 from mag_tracking.calibration import core
+from mag_tracking.records import plain
 from mag_tracking.units import NEVER
 
 N_RECENT = core.N_RECENT
@@ -23,6 +26,27 @@ SENSOR = core.SENSOR
 """Data type of the state of one sensor, defined in `sensor.hpp`. Values are in [T] and [s], or in
 [ns] if the name ends with `_ns`."""
 
+MIN_CHANGES = core.MIN_CHANGES
+"""Minimum number of changes before a sensor can be stuck; with fewer changes, its steps may be so
+coarse that long repetitions are normal."""
+COARSE_FRACTION = core.COARSE_FRACTION
+"""Fraction of repeated readings above which the steps of a sensor are coarse: at rest, it may
+repeat a reading indefinitely. With a noise of one step or more on three axes, the fraction is
+lower."""
+
+PASSES, HELD, SPIKE, RELEASED = core.PASSES, core.HELD, core.SPIKE, core.RELEASED
+"""Verdicts: the reading passes; the reading is held; the held readings are a spike; the held
+readings and the current reading pass."""
+
+MAX_ROUNDING = core.MAX_ROUNDING
+"""Maximum relative difference of two values that is due to rounding (single precision)."""
+
+MIN_STD = core.MIN_STD
+"""[T] Minimum standard deviation of the readings of an axis that is not constant."""
+
+TOGGLE_TOLERANCE = core.TOGGLE_TOLERANCE
+"""[steps] Tolerance of an axis at rest, which may toggle between two adjacent values."""
+
 
 def new_sensors(n: int) -> StructArray:
     """Create the state of `n` sensors without any reading, (n,) SENSOR array."""
@@ -34,3 +58,42 @@ def new_sensors(n: int) -> StructArray:
     sensors['step'], sensors['n_averaged'] = np.inf, 1.0
     sensors['window_due'], sensors['repetition'] = FIRST_WINDOW, 1.0
     return sensors
+
+
+def clear_spikes(sensor: Record) -> None:
+    """Reset spike detection: discard the previous and the held readings."""
+    sensor['before_ns'], sensor['n_steps'] = NEVER, 0
+    sensor['n_held'] = sensor['n_released'] = 0
+
+
+def corrected_steps(sensors: StructArray) -> FloatArray:
+    """Quantisation steps (3,) T after soft-iron correction; 0 if too fine, inf if unchanged."""
+    return core.steps_of(sensors, True)
+
+
+def raw_steps(sensors: StructArray) -> FloatArray:
+    """Quantisation steps (3,) T before soft-iron correction; 0 if too fine, inf if unchanged."""
+    return core.steps_of(sensors, False)
+
+
+def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
+    """Replace unknown steps (3,) T by those of other axes at rest; NaN for a dead axis.
+
+    An axis that has never changed is dead if another axis of the sensor changes with every reading.
+    If no axis has changed, all may be at rest: inf. `variance` (3,) in T² is that of quiet
+    readings.
+    """
+    out = plain(steps).copy()
+    core.complete_steps(plain(variance), out)
+    return out
+
+
+def smallest_steps(fields: FloatArray) -> FloatArray:
+    """Smallest non-zero change (3,) T between consecutive readings (n, 3); inf if none."""
+    out = np.full(3, np.inf)
+    for axis, values in enumerate(fields.T):
+        values = values[~np.isnan(values)]
+        change = np.abs(np.diff(values))
+        change = change[change > MAX_ROUNDING * np.abs(values[1:])]
+        out[axis] = change.min(initial=np.inf)
+    return out

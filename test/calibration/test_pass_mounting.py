@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from mag_tracking.calibration.pass_mounting import (
+from mag_tracking.calibration.orientation import (
     MountingEvidence,
     fuse_mounting,
     with_pass_mounting,

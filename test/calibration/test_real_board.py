@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mag_tracking.calibration.network_blind import calibrate_geometry_blind
-from mag_tracking.calibration.network_geometry import GeometrySettings, calibrate_geometry
-from mag_tracking.calibration.network_readings import rotation, tool_rotations
+from mag_tracking.calibration.network_fit import rotation, tool_rotations
+from mag_tracking.calibration.network_geometry import (
+    GeometrySettings,
+    calibrate_geometry,
+    calibrate_geometry_blind,
+)
 from support.marks import studied
 from support.real_board import BOX, MOMENT, assert_within_limits, board_of_41, errors, print_errors
 

@@ -5,12 +5,12 @@ import pytest
 
 from mag_tracking.calibration import core
 from mag_tracking.calibration.core import DITHERED, MAX_REST_NS
-from mag_tracking.calibration.resolution import (
+from mag_tracking.calibration.sensor_state import (
     completed_steps,
+    new_sensors,
     raw_steps,
     smallest_steps,
 )
-from mag_tracking.calibration.sensor_state import new_sensors
 from support.fed_background import FedBackground
 
 MS = 1_000_000

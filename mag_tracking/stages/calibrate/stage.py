@@ -21,8 +21,7 @@ from mag_tracking.calibration.doubtful_times import (
 from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.level_change import SharedChanges
 from mag_tracking.calibration.reading_faults import ReadingFaults
-from mag_tracking.calibration.screening import clear_spikes
-from mag_tracking.calibration.sensor_state import new_sensors
+from mag_tracking.calibration.sensor_state import clear_spikes, new_sensors
 from mag_tracking.calibration.survey import SurveySettings
 from mag_tracking.errors import NetworkError
 from mag_tracking.network import SensorNetwork
