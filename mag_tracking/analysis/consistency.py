@@ -20,21 +20,13 @@ def error_over_bound(network: SensorNetwork, log: TrackLog,
                      rows: IntArray, axes: int) -> float | None:
     """Ratio of the RMS error of a track to the posterior Cramér-Rao bound along the true path.
 
-    The bound applies to a point target with the estimated moment of the track, because the true
-    moment is unknown, and assumes the tracker's motion model, sensor noise and relative field
-    error. The backgrounds are states, and the prior of the first pose is wide. The extent of the
-    vehicle is neglected. None if fewer than two poses have a ground truth, or no evaluated pose has
-    one. T10 Alg. 2, linearised at the truth; [Tichavsky98]_.
-
-    Parameters
-    ----------
-    truth : timestamps [ns], positions [m] and quaternions (xyzw) of the ground truth
-    acceleration : (3,), spectral density of the acceleration, m²/s³
-    moment_walk : random walk of the moment relative to its magnitude, 1/s^0.5
-    field_error : model error relative to the field
-    background_std : prior std of the backgrounds, T
-    rows : indices of the evaluated poses in the log
-    axes : 2 for the horizontal error, 3 for the error in space
+    The bound applies to a point target with the estimated moment, because the true one is unknown,
+    and the tracker's motion model, sensor noise and relative field error; the backgrounds are
+    states. None if fewer than two poses have a ground truth, or none of the evaluated `rows` of the
+    log. T10 Alg. 2, linearised at the truth; [Tichavsky98]_. `truth` is timestamps [ns], positions
+    [m] and quaternions (xyzw); `acceleration` (3,) its spectral density [m²/s³]; `moment_walk` the
+    relative random walk of the moment [1/s^0.5]; `background_std` in T is that of the prior; `axes`
+    is 2 for the horizontal error, 3 for the error in space.
     """
     true_path = interpolate_truth(truth, log.stamp_ns)
     truth_rows = np.flatnonzero(np.isfinite(true_path).all(axis=1))

@@ -15,10 +15,9 @@ from mag_tracking.inference.detection_theory import energy_threshold
 def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
     """Bayesian information criterion (Schwarz) of each fit of one pass, minus the smallest value.
 
-    Each unknown adds log(n) to the cost, which is -2 times the log-likelihood up to a constant. If
-    the normalised cost of the fit with the most dipoles exceeds one, all costs are divided by it: a
-    residual that no order explains is no evidence for a higher order. Infinite for a fit that is
-    not determined. TSP14 section V.C does not specify a criterion.
+    Infinite for a fit that is not determined. If the normalised cost of the fit with the most
+    dipoles exceeds one, all costs are divided by it: a residual that no order explains is no
+    evidence for a higher order. TSP14 section V.C does not specify a criterion.
     """
     determined_fits = [f for f in fits if f.determined]
     if not determined_fits:
@@ -34,8 +33,7 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
 def choose_order(fits: Sequence[PassFit]) -> PassFit | None:
     """Return the fit with the smallest criterion, or None if that fit is rejected.
 
-    Another order does not replace a rejected fit, because a fit with fewer dipoles does not always
-    reveal that the target turned.
+    A fit with fewer dipoles does not replace it, because it may not reveal that the target turned.
     """
     criteria = order_criteria(fits)
     if not len(fits) or not np.isfinite(criteria).any():

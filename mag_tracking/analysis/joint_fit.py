@@ -16,7 +16,6 @@ from mag_tracking.analysis.fitted_pass import order_criteria
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
 from mag_tracking.analysis.pass_description import (
     PATH_TOLERANCE,
-    SensorErrors,
     assignment,
     fits_at_minimum,
 )
@@ -50,19 +49,18 @@ INITIAL_LENGTH = 3.0
 """[m] Initial length of a row of dipoles that replaces a point."""
 
 MIN_GAP, VEHICLE_WIDTH = 3.0, 1.5
-"""[m] Minimum distance between the rows of dipoles of two vehicles, along and across their heading.
-A body is longer than its row. Closer rows are parts of one vehicle."""
+"""[m] Minimum distance between the rows of dipoles of two vehicles, along and across their
+heading."""
 
 MAX_DETECTION_RANGE = 15.0
 """[m] Maximum distance at which a sensor detects a target."""
 
 MAX_ROUNDS = 3
-"""Maximum number of rounds of the order selection. Each round selects the order of every target in
-turn, given the current orders of the other targets."""
+"""Maximum number of rounds of the order selection, each of all targets in turn."""
 
 MAX_VELOCITY_DIFFERENCE, MAX_TRACK_DISTANCE = 0.5, 5.0
-"""Maximum relative difference of velocity, and maximum distance [m], between two fits of one
-target, or between a fit and its track. Tracks have RMS errors of 0.3 to 0.9 m (`bench.busy`)."""
+"""Maximum relative difference of velocity and maximum distance [m] of two fits, or of fit and
+track."""
 
 MAX_TARGETS = 3
 """Maximum number of targets in a joint fit, each with about twelve unknowns."""
@@ -71,8 +69,7 @@ MAX_LENGTH = 18.75
 """[m] Maximum length of the iron of one vehicle: the limit for road trains (Directive 96/53/EC)."""
 
 MAX_VELOCITY_SPREAD = 0.25
-"""Maximum difference between the velocity of a part of a vehicle and the mean velocity of all
-parts, relative to the mean."""
+"""Maximum relative difference of the velocity of a part of a vehicle from the mean of all parts."""
 
 
 @dataclass(frozen=True)
@@ -90,17 +87,15 @@ class GroundPrior:
     def prior(self, orders: Sequence[int]) -> tuple[FloatArray, FloatArray]:
         """Prior mean and std (n_theta,) of the paths of rows of dipoles, 0 and inf without a
         prior."""
-        means, stds = [], []
-        for n_dipoles in orders:
-            mean, std = np.zeros(6 + (n_dipoles > 1)), np.full(6 + (n_dipoles > 1), np.inf)
-            (mean[2], std[2]), std[5] = self.height, self.climb_std
-            means.append(mean)
-            stds.append(std)
-        return np.concatenate(means), np.concatenate(stds)
+        first = np.append(0, np.cumsum([6 + (n > 1) for n in orders]))
+        mean, std = np.zeros(first[-1]), np.full(first[-1], np.inf)
+        mean[first[:-1] + 2], std[first[:-1] + 2] = self.height
+        std[first[:-1] + 5] = self.climb_std
+        return mean, std
 
 
 def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
-              orders: Sequence[int] = (1, 2, 3, 4), errors: SensorErrors = DEFAULT_ERRORS,
+              orders: Sequence[int] = (1, 2, 3, 4),
               stopped: Callable[[], bool] | None = None) -> tuple[tuple[PassFit, ...], ...]:
     """Fit several rows of dipoles, each at constant velocity, to the sum of their fields.
 
@@ -108,14 +103,8 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
     targets then have their selected orders. Targets are sorted by the time at which they pass the
     centre of the sensors; time zero is at the strongest field of each. `reason` is set if the best
     fit of a target differs from its track, or another fit from the best fit. Empty if there are too
-    few measurements or `stopped()` was true.
-
-    Parameters
-    ----------
-    data : readings of at least two sensors
-    paths : (K, 6), approximate positions at time zero of `data` and velocities, m and m/s
-    orders : candidate numbers of dipoles of each target
-    errors : sensor errors included in the robust covariance
+    few measurements or `stopped()` was true. `paths` (K, 6) are approximate positions [m] at time
+    zero of `data` and velocities [m/s].
     """
     n_targets, begin_ns = len(paths), data.stamp_ns
     orders = [n for n in orders if not unusable_reason(data, n_targets * (n,))]
@@ -124,7 +113,7 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
     data, averaged = centred_on_peak(data)
     paths = propagated_path(paths, (data.stamp_ns - begin_ns) / NS)
     initial_paths = np.vstack([paths.ravel(), _initial_paths(averaged, n_targets, ground)])
-    fits = _JointFits(data, averaged, initial_paths, ground, errors)
+    fits = _JointFits(data, averaged, initial_paths, ground)
     selected_orders = [min(orders, key=lambda n: (abs(n - 2), n))] * n_targets
     for _ in range(MAX_ROUNDS):
         previous_orders = list(selected_orders)
@@ -150,10 +139,9 @@ def _initial_paths(averaged: PassData, n_targets: int, ground: GroundPrior) -> F
     for n in range(1, n_targets + 1):
         orders = n * (1,)
         create_model, prior = partial(SuperposedPasses.from_orders, orders), ground.prior(orders)
-        starts = []
-        for known_path, residual_data in zip(paths, residuals, strict=True):
-            target_starts = starting_paths(residual_data, 1)
-            starts.append(np.hstack([np.tile(known_path, (len(target_starts), 1)), target_starts]))
+        starts = [np.hstack([np.tile(known_path, (len(target_starts), 1)), target_starts])
+                  for known_path, target_starts in zip(
+                      paths, (starting_paths(r, 1) for r in residuals), strict=True)]
         coarse = separable_problem(averaged, create_model, prior=prior)
         paths, _ = coarse_minima(separable_problem(averaged, create_model, COARSE_ERROR, prior),
                                  coarse, np.concatenate(starts), np.tile(PATH_TOLERANCE[:6], n),
@@ -175,8 +163,8 @@ class _JointFits:
     """
 
     def __init__(self, data: PassData, averaged: PassData, initial_paths: FloatArray,
-                 ground: GroundPrior, errors: SensorErrors) -> None:
-        self._data, self._averaged, self._ground, self._errors = data, averaged, ground, errors
+                 ground: GroundPrior) -> None:
+        self._data, self._averaged, self._ground = data, averaged, ground
         # Sort the targets of each solution in the order of the tracks.
         split = [np.split(paths, paths.size // 6) for paths in initial_paths]
         self._initial_paths = [[paths[i] for i in assignment(split[0], paths)] for paths in split]
@@ -200,8 +188,7 @@ class _JointFits:
                         previous: Sequence[PassFit] | None) -> FloatArray:
         """Starting paths (n, n_theta) for given numbers of dipoles.
 
-        `previous` is a joint fit that may differ in the number of dipoles of target `k`; None if
-        there is no such fit.
+        `previous` is a joint fit, if any, that may differ in the number of dipoles of target `k`.
         """
         starts = [_with_orders(paths, orders) for paths in self._initial_paths]
         if previous is not None and all(len(fit.x) for fit in previous):
@@ -234,7 +221,7 @@ class _JointFits:
             minimum.theta, fine.linear(minimum.theta))
         unexplained = max(minimum.cost - self._noise_dof, 0.0) / (fine.energy - self._noise_dof)
         return fits_at_minimum(data, orders, replace(minimum, theta=theta), p, 1.0 - unexplained,
-                               self._errors, path_std=prior[1])
+                               DEFAULT_ERRORS, path_std=prior[1])
 
 
 def _exclude_solutions(cost: FloatArray, is_allowed: BoolArray, max_ratio: float) -> FloatArray:
@@ -306,8 +293,7 @@ def _time_of_peak(fit: PassFit) -> float:
 def _shift_to_peak(fits: Sequence[PassFit], best: int) -> tuple[float, tuple[PassFit, ...]]:
     """Shift time zero of the fits of one target to the strongest field of the `best` fit.
 
-    Returns also the time [s since 1970] at which the best fit is closest to the centre of the
-    sensors.
+    Returns also the time [s since 1970] at which that is closest to the centre of the sensors.
     """
     fit = fits[best]
     if not len(fit.x):
@@ -323,18 +309,11 @@ def fit_targets(data: PassData, single_fits: Sequence[PassFit], paths: FloatArra
                 stopped: Callable[[], bool] | None = None) -> tuple[tuple[PassFit, ...], ...]:
     """Select between a fit of a pass as one target and a joint fit of the tracked targets.
 
-    A fit alone does not determine the number of targets: a long row of dipoles can explain two
-    vehicles in a line, and two targets on straight paths can explain a single target that turns.
-    `single_fits` are returned if one target explains the field equally well, or if the fitted
-    targets are parts of one vehicle (long vehicles are sometimes tracked as two). They are returned
-    with a reason if the joint fit is impossible or is rejected.
-
-    Parameters
-    ----------
-    single_fits : fits as a single target, one for each number of dipoles
-    paths : (K, 6), tracked positions at time zero of `data` and velocities, m and m/s
-    orders : candidate numbers of dipoles of each target in a joint fit
-    stopped : whether to abandon the fit, whose result is then not valid
+    A long row of dipoles can explain two vehicles in a line, and two targets on straight paths a
+    single one that turns. `single_fits`, one for each number of dipoles, are returned if one target
+    explains the field equally well, or if the fitted targets are parts of one vehicle (long
+    vehicles are sometimes tracked as two), and with a reason if the joint fit is impossible or is
+    rejected.
     """
     n_targets = len(paths)
     if n_targets < 2 or len(data.sensors) < 2:

@@ -23,12 +23,10 @@ from mag_tracking.physics.passes import SuperposedPasses
 
 MIDDLE_FRACTION, MIN_MIDDLE_STD, MIDDLE_ACROSS_STD = 0.15, 0.4, 0.1
 """Standard deviation of the distance from the centre of the row to the middle of the vehicle: along
-the vehicle relative to the length of the row, and at least [m]; across it and vertically [m]. The
-engine of a truck is at one end, the engine and the axles of a car are nearly symmetrical."""
+the vehicle relative to the length of the row, and at least [m]; across it and vertically [m]."""
 
 PATH_TOLERANCE = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2, 0.3])
-"""Maximum difference between two paths that count as equal: position [m], velocity [m/s] and length
-[m]."""
+"""Maximum difference between equal paths: position [m], velocity [m/s] and length [m]."""
 
 CPA_UNIT_STD = 1e-4
 """[m] Standard deviation of an assumed CPA range. Such a range only defines the unit of length."""
@@ -39,9 +37,8 @@ class SensorErrors:
     """Sensor errors that cannot be estimated from one pass."""
 
     rotation_std: float = float(np.deg2rad(2.0))
-    """Standard deviation of the orientation about each axis [rad], for sensors without
-    `orientation_std` in the network. The default is for mounting by hand with a spirit level.
-    For two sensors at a distance of 0.5 m, this error is equivalent to a delay of milliseconds."""
+    """[rad] about each axis, for sensors without `orientation_std` in the network; the default is
+    for mounting by hand with a spirit level."""
     gain_std: float = 0.01
     """Standard deviation of the gain of each axis; 1 to 3 % according to data sheets."""
 
@@ -51,12 +48,26 @@ def robust_covariance(data: PassData, whitened: FloatArray, residuals: FloatArra
                       errors: SensorErrors) -> FloatArray:
     """Covariance (n_x, n_x) due to noise (`covariance`), model error and sensor errors.
 
-    `whitened` (n, 3, n_x) are whitened derivatives of the field, `residuals` (n, 3) are whitened,
-    and `target` (n, 3) [T, sensor frame] is the field of the target.
+    `whitened` (n, 3, n_x) derivatives and `residuals` (n, 3) are of the field, `target` (n, 3) [T,
+    sensor frame] is the field of the target.
     """
     model_error = model_error_covariance(*_split_by_sensor(data, whitened, residuals), covariance)
-    robust: FloatArray = covariance + model_error + _sensor_error_covariance(
-        data, whitened, target, covariance, errors)
+    sensor_error = np.zeros_like(covariance)
+    R_sw = data.network.R_sw
+    for j in data.sensors:
+        sensor_mask = data.sensor == j
+        configured_std = data.network.orientation_std[j]
+        std = np.full(3, errors.rotation_std) if configured_std is None else configured_std
+        rotation_covariance = R_sw[j] @ np.diag(np.square(std)) @ R_sw[j].T
+        field = target[sensor_mask]
+        G = np.concatenate([np.stack([np.cross(axis, field) for axis in np.eye(3)], axis=2),
+                            field[:, :, None] * np.eye(3)], axis=2)
+        shift = covariance @ np.einsum('nax,nab->xb', whitened[sensor_mask],
+                                       data.whitening[sensor_mask] @ G)
+        P = np.zeros((6, 6))
+        P[:3, :3], P[3:, 3:] = rotation_covariance, errors.gain_std**2 * np.eye(3)
+        sensor_error += shift @ P @ shift.T
+    robust: FloatArray = covariance + model_error + sensor_error
     return robust
 
 
@@ -67,8 +78,7 @@ def shape_covariance(data: PassData, whitened: FloatArray, covariance: FloatArra
     The field of iron that extends by `reach` beyond the dipoles resembles that of dipoles at
     another distance; the relative difference is the square of reach over distance. Sensors on one
     side of a road measure a wrong range without a residual, whereas the errors of two sides cancel.
-    The row is moreover not centred in the vehicle. `position_index` is the index of the unknown x
-    in `whitened` (n, 3, n_x); y and z follow.
+    `position_index` is the index of the unknown x in `whitened` (n, 3, n_x); y and z follow.
     """
     xyz = slice(position_index, position_index + 3)
     length = abs(float(theta[6])) if n_dipoles > 1 else 0.0
@@ -95,34 +105,12 @@ def _split_by_sensor(data: PassData, whitened: FloatArray, residuals: FloatArray
     return [data.t[r] for r in rows], [whitened[r] for r in rows], [residuals[r] for r in rows]
 
 
-def _sensor_error_covariance(data: PassData, whitened: FloatArray, target: FloatArray,
-                             covariance: FloatArray, errors: SensorErrors) -> FloatArray:
-    """Covariance due to orientation and gain errors of the sensors."""
-    total = np.zeros_like(covariance)
-    R_sw = data.network.R_sw
-    for j in data.sensors:
-        sensor_mask = data.sensor == j
-        configured_std = data.network.orientation_std[j]
-        std = np.full(3, errors.rotation_std) if configured_std is None else configured_std
-        rotation_covariance = R_sw[j] @ np.diag(np.square(std)) @ R_sw[j].T
-        field = target[sensor_mask]
-        G = np.concatenate([np.stack([np.cross(axis, field) for axis in np.eye(3)], axis=2),
-                            field[:, :, None] * np.eye(3)], axis=2)
-        shift = covariance @ np.einsum('nax,nab->xb', whitened[sensor_mask],
-                                       data.whitening[sensor_mask] @ G)
-        P = np.zeros((6, 6))
-        P[:3, :3], P[3:, 3:] = rotation_covariance, errors.gain_std**2 * np.eye(3)
-        total += shift @ P @ shift.T
-    return total
-
-
 def velocity_change(data: PassData, whitened: FloatArray, residuals: FloatArray, x_index: int,
                     velocity: FloatArray, duration_s: float) -> tuple[float, float]:
     """Relative change of the velocity during `duration_s`, and its std including model error.
 
-    A constant horizontal acceleration is estimated by one Gauss-Newton step from the minimum; its
-    derivatives are t²/2 times those of x and y. `x_index` is the index of the unknown x in
-    `whitened` (n, 3, n_x); y follows.
+    A constant horizontal acceleration is estimated by one Gauss-Newton step from the minimum.
+    `x_index` is the index of the unknown x in `whitened` (n, 3, n_x); y follows.
     """
     by_acceleration = 0.5 * np.square(data.t)[:, None, None] * whitened[:, :, x_index:x_index + 2]
     extended = np.concatenate([whitened, by_acceleration], axis=2)
@@ -146,14 +134,10 @@ def fits_at_minimum(data: PassData, orders: Sequence[int], minimum: Minimum, p: 
                     path_std: FloatArray | None = None) -> tuple[PassFit, ...]:
     """Create the `PassFit` of each target from the minimum of a fit.
 
-    Parameters
-    ----------
-    data : readings of several sensors, or of one sensor and one target
-    minimum : its parameters are the concatenated paths of the targets
-    p : (k,), linear parameters of `SuperposedPasses`
-    explained : fraction of the energy that all targets explain
-    cpa_range : CPA range and its std; see `fit_pass`
-    path_std : (n_theta,), prior stds of the paths; infinite without a prior
+    The parameters of `minimum` are the concatenated paths of the targets, `p` (k,) the linear
+    parameters of `SuperposedPasses`, `explained` the fraction of the energy that all targets
+    explain, and `path_std` (n_theta,) the prior stds of the paths, infinite without a prior. The
+    data of one sensor has one target and may have a `cpa_range`; see `fit_pass`.
     """
     if len(data.sensors) == 1:
         return (_fit_of_one_sensor(data, orders[0], minimum, p, explained, cpa_range, errors),)
@@ -213,9 +197,8 @@ class _LinearisedFit:
     H: FloatArray
     """(3 n, n_x) the same derivatives, sensor frame, not whitened, [T] per unit of an unknown."""
     T: FloatArray
-    """(n_x, n_x) transformation of the parameters of `H` into the unknowns `x`."""
+    """(n_x, n_x) transformation of the parameters of `H` into the unknowns `x` (n_x,)."""
     x: FloatArray
-    """(n_x,) unknowns."""
     target_indices: tuple[IntArray, ...]
     """For each target, the indices of its unknowns, followed by the indices of the backgrounds."""
     names: tuple[str, ...]
@@ -240,8 +223,8 @@ class _LinearisedFit:
         fields = np.stack([(A[:, m] @ p[m]).reshape(-1, 3) for m in model.moment_slices])
         y = np.nan_to_num(data.field) - fields.sum(axis=0)
         backgrounds = np.asarray(np.linalg.lstsq(
-            _flatten(W @ columns.reshape(*W.shape[:2], -1)), np.einsum('nij,nj->ni', W, y).ravel(),
-            rcond=None)[0], dtype=np.float64)
+            (W @ columns.reshape(*W.shape[:2], -1)).reshape(columns.shape),
+            np.einsum('nij,nj->ni', W, y).ravel(), rcond=None)[0], dtype=np.float64)
         H = np.hstack([*(part for path, m in zip(model.path_slices, model.moment_slices,
                                                  strict=True)
                          for part in (D[:, path], A[:, m])), columns])
@@ -263,11 +246,6 @@ class _LinearisedFit:
         return cls(data, tuple(orders), tuple(model.split(theta)),
                    W @ H.reshape(len(W), 3, -1), H, T, T @ x, tuple(target_indices),
                    tuple(names), fields, background, np.einsum('nij,nj->ni', W, residuals))
-
-
-def _flatten(A: FloatArray) -> FloatArray:
-    """Reshape (n, 3, q) to (3 n, q)."""
-    return A.reshape(-1, A.shape[-1])
 
 
 def _partial_fits(linear: _LinearisedFit, minimum: Minimum, explained: float, errors: SensorErrors,
@@ -305,10 +283,7 @@ def _partial_fits(linear: _LinearisedFit, minimum: Minimum, explained: float, er
 
 
 def assignment(paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> tuple[int, ...]:
-    """For each path, the index of its match in `others`, so that the total distance is minimal.
-
-    The order of the targets in a solution of a joint fit is arbitrary.
-    """
+    """For each path, the index of its match in `others`, so that the total distance is minimal."""
     distance = [[float(np.square((other[:6] - path[:6]) / PATH_TOLERANCE[:6]).sum())
                  for other in others] for path in paths]
     return min(permutations(range(len(paths))),

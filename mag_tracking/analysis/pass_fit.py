@@ -92,8 +92,7 @@ def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
 def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
     """Create starting paths (n, 6 or 7) of the search with various headings, offsets and speeds.
 
-    They pass the sensor with the strongest field. The duration of the field at this sensor
-    determines the ratio of speed to distance.
+    They pass the sensor with the strongest field, whose duration determines speed over distance.
     """
     field_change = data.field_change
     energy = np.einsum('ni,ni->n', field_change, field_change)
@@ -116,11 +115,8 @@ def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
 
 
 def shorter_rows(path: FloatArray) -> FloatArray:
-    """Create starting paths of a row (7,): seven shorter rows and one longer row.
-
-    If a dipole at the end of a row has no moment, a shorter row with a different centre fits almost
-    as well.
-    """
+    """Create starting paths of a row (7,): seven shorter rows, which fit almost as well, and a
+    longer one."""
     rows = []
     for ratio, offset in ((0.7, 0.15), (0.7, 0.0), (0.7, -0.15), (0.4, 0.25), (0.4, 0.0),
                           (0.4, -0.25), (0.1, 0.0), (1.5, 0.0)):

@@ -101,8 +101,7 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
 
     `points` (n, 2) are in the world frame. Each item is a slice of `points` with n_p points, the
     fields (n_p, 7, k, n_sensors, 3) [T] at the k times of `sampling`, and their derivatives with
-    respect to [r, v, m]. The target is at the point at time zero; `heading` is anticlockwise from
-    x.
+    respect to [r, v, m] at time zero, when the target is at the point.
     """
     t, _ = sampling.times()
     v = target.speed * np.array([np.cos(heading), np.sin(heading), 0.0])
@@ -175,8 +174,7 @@ def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: Pla
                             background_std: float = 0.0) -> FloatArray:
     """Detection probability (n, 7) in one frame at each point (n, 2), for each moment direction.
 
-    `background_std` [T] of the background errors is added to the noise. T10 eq. (5.14)-(5.19),
-    applied to all sensors at once.
+    `background_std` [T] of the background errors is added to the noise. T10 eq. (5.14)-(5.19).
     """
     single_frame = Sampling(sampling.period, sampling.noise_std, half_window=0.0)
     energy_ratio = np.empty((len(points), len(DIRECTIONS)))

@@ -49,16 +49,16 @@ class Signature:
 
 
 def features(signature: Signature) -> FloatArray:
-    """Compute features (n_features,) of the shape and magnitude of a signature.
+    """Compute features (n_features,) of the shape and magnitude of a signature, not of its
+    duration.
 
     For each axis: logarithm of the range, fraction of the energy, numbers of maxima and minima,
     positions of the largest and the smallest value, fraction of the power in the upper third of the
     spectrum. For the field magnitude: logarithm of its maximum, number of maxima, autocorrelation,
-    DCT coefficients. The duration is not a feature, because the speed is unknown. Raises ValueError
-    if there are too few samples, a value is not finite, times do not increase, or the field is
-    constant.
+    DCT coefficients. Raises ValueError if there are too few samples, a value is not finite, times
+    do not increase, or the field is constant.
     """
-    t, field = np.asarray(signature.t, dtype=float), np.asarray(signature.field, dtype=float)
+    t, field = (np.asarray(a, dtype=float) for a in (signature.t, signature.field))
     if len(t) < MIN_SAMPLES:
         raise ValueError(f'too few samples for a signature: {len(t)}; at least {MIN_SAMPLES} are '
                          'required')

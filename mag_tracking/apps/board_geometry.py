@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration.network_fit import GeometrySettings
 from mag_tracking.calibration.network_geometry import (
-    GeometrySettings,
     NetworkGeometry,
     calibrate_geometry,
     calibrate_geometry_blind,

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, Record, StructArray
+from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration import core
 from mag_tracking.calibration.blocks import Block, Blocks, has_noisy_block, line_through, stacked
 from mag_tracking.calibration.frequent_level import MIN_DURATION_RATIO
@@ -17,38 +17,33 @@ from mag_tracking.calibration.sensor_state import MIN_STD, completed_steps, corr
 from mag_tracking.records import plain
 from mag_tracking.units import NS
 
-_Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
-"""Centre [s], mean (3,) [T], slope (3,) [T/s], and horizon [s], after which the trend is
-constant."""
-
 TYPICAL_DRIFT = 3e-9
 """[T/s] Typical drift of a background."""
 
 STEEP_DRIFT = 1e-8
-"""[T/s] Maximum drift of a background, reached by a sensor that is warming up. A faster change may
-be due to an approaching target."""
+"""[T/s] Maximum drift of a background, reached by a sensor that is warming up."""
+
+MIN_SLOPE_STDS = 4.0
+"""Number of standard deviations by which a slope must exceed `STEEP_DRIFT`."""
 
 MAX_AGE_S = 600.0
 """[s] Maximum age of a former level."""
 
 MAX_DRIFT = 4.0
-"""Maximum drift of a former level, in multiples of the tolerance of a block mean. With a wider
-tolerance, any stopped vehicle would match a former level."""
-
-MIN_SLOPE_STDS = 4.0
-"""Number of standard deviations by which a slope must exceed `STEEP_DRIFT`."""
+"""Maximum drift of a former level in tolerances of a block mean; more would match stopped
+vehicles."""
 
 MIN_RELEARN_S = 10.0
-"""[s] Minimum duration of another steady level that replaces a resumed or briefly observed
-background."""
+"""[s] Minimum duration of another steady level that replaces a resumed or short background."""
 
 SHORTENED_FRACTION = 2.0 / 3.0
-"""Required duration of the level after a vehicle has departed, and of a former level, as a fraction
-of the usual duration."""
+"""Required duration of a former level, or of that after a departure, relative to the usual one."""
 
 MAX_EVALUATED_BLOCKS = 240
-"""Maximum number of blocks (a minute of the usual length) for which arrivals and departures are
-evaluated, since each evaluation uses all blocks."""
+"""Maximum number of blocks (a minute of the usual length) of an evaluated arrival or departure."""
+
+Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
+"""Centre [s], mean (3,) [T], slope (3,) [T/s], and horizon [s], after which it is constant."""
 
 
 class BackgroundLevel:
@@ -56,7 +51,7 @@ class BackgroundLevel:
 
     Attributes
     ----------
-    line : centre [s], mean (3,) [T], slope (3,) [T/s], and horizon [s], after which it is constant
+    line : trend of the background; None if unknown
     noise : (3, 3) [T²] covariance of one reading, without the quantisation variance
     limits : (3,) [T] maximum difference of a block mean from the background: `freeze_std` noise std
     is_provisional : whether the trend is preliminary and may differ from the background
@@ -67,18 +62,18 @@ class BackgroundLevel:
         self._state = sensors[0]
         self.limits = np.full(3, np.nan)
         self.set_uncertainty()
-        self.set(None, None)
+        self.set_trend(None, None)
 
     @property
-    def is_ready(self) -> bool:
-        """Whether both the trend and the noise are known."""
+    def ready(self) -> bool:
+        """Whether background and noise are known, possibly provisionally."""
         return self.line is not None and self.noise is not None
 
-    def set(self, line: _Line | None, noise: FloatArray | None) -> None:
+    def set_trend(self, line: Line | None, noise: FloatArray | None) -> None:
         """Set trend and noise, and copy them to the sensor state that compiled code reads."""
         s = self._state
         self.line, self.noise = line, noise
-        s['is_ready'] = self.is_ready
+        s['is_ready'] = self.ready
         if line is not None:
             s['centre'], s['mean'], s['slope'], s['horizon'] = line
         s['noise'] = np.nan if noise is None else noise
@@ -87,6 +82,11 @@ class BackgroundLevel:
     def apply_steps(self) -> None:
         """Update the quantisation variance of the sensor, its total noise and `limits`."""
         core.apply_steps(self._sensors, self._freeze_std, self.limits)
+
+    def set_uncertainty(self, std: FloatArray | float = 0.0, is_provisional: bool = False) -> None:
+        """Set the std of the level, (3,) or scalar T, and whether the trend is preliminary."""
+        self.is_provisional = is_provisional
+        self._state['level_variance'] = np.where(np.isnan(std), 0.0, np.square(std))
 
     def without_dead_axes(self, noise: FloatArray) -> FloatArray:
         """Noise (3, 3) with NaN for dead axes: constant although their steps are not coarse."""
@@ -103,17 +103,9 @@ class BackgroundLevel:
         is_unknown = (covariance.diagonal() <= MIN_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
         return np.where(is_unknown[:, None] | is_unknown, np.nan, covariance)
 
-    def set_uncertainty(self, std: FloatArray | float = 0.0, is_provisional: bool = False) -> None:
-        """Set the std of the level, (3,) or scalar T, and whether the trend is preliminary."""
-        self.is_provisional = is_provisional
-        self._state['level_variance'] = np.where(np.isnan(std), 0.0, np.square(std))
-
     @property
     def covariance(self) -> FloatArray | None:
-        """Noise covariance of one sample, (3, 3) T²; None if unknown, NaN for an unreported axis.
-
-        The quantisation variance of the sensor is included.
-        """
+        """Noise (3, 3) T² of one sample with quantisation; None if unknown, NaN if unreported."""
         if self.noise is None:
             return None
         covariance: FloatArray = self.noise + np.diag(self._state['step_variance'])
@@ -121,26 +113,21 @@ class BackgroundLevel:
 
     @property
     def drift(self) -> FloatArray:
-        """Drift of the background, (3,) T/s; NaN while unknown and for an unreported axis."""
+        """Drift, (3,) T/s; NaN before the background is ready, and for unreported axes."""
         return np.full(3, np.nan) if self.line is None else self.line[2]
 
-    def at(self, time: float) -> FloatArray:
+    def level(self, time: float) -> FloatArray:
         """Background (3,) T at a time in s; raises ValueError if it is not ready."""
-        return -self.departure(time, np.zeros(3))
+        return -self.difference(time, np.zeros(3))
 
-    def set_constant(self, blocks: Blocks) -> None:
-        """Set a constant level, the mean of the given blocks."""
-        self.set((0.0, line_through(blocks)[1], np.zeros(3), 0.0), self.noise)
-
-    def at_all(self, times: FloatArray) -> FloatArray:
-        """Background (k, 3) T at times (k,) in s; raises ValueError if it is not ready."""
-        if self.line is None:
-            raise ValueError('the background has not been learnt yet')
+    def levels(self, times: FloatArray) -> FloatArray:
+        """Background (k, 3) T at times (k,) in s; it must be ready."""
+        assert self.line is not None
         centre, mean, slope, horizon = self.line
         out: FloatArray = mean + (np.minimum(times, horizon) - centre)[:, None] * slope
         return out
 
-    def departure(self, time: float, field: FloatArray) -> FloatArray:
+    def difference(self, time: float, field: FloatArray) -> FloatArray:
         """Field (3,) T minus the background; raises ValueError if the background is not ready."""
         if self.line is None:
             raise ValueError('the background has not been learnt yet')
@@ -148,23 +135,23 @@ class BackgroundLevel:
         core.subtract(self._sensors, time, plain(field), out)
         return out
 
-    def steady_end(self, blocks: Sequence[Block], length: float) -> deque[Block] | None:
-        """Latest blocks over `length` s; None if not steady, fewer than three, or too short."""
-        start = blocks[-1].time - length
-        latest_blocks: deque[Block] = deque()
-        for block in reversed(blocks):
-            if block.time <= start and len(latest_blocks) >= 3:
-                break
-            latest_blocks.appendleft(block)
-        is_long = len(blocks) >= 3 and blocks[0].time <= start
-        return latest_blocks if is_long and self.are_steady(stacked(latest_blocks)) else None
-
     def are_steady(self, blocks: Blocks) -> bool:
         """Whether blocks lie on one line within `limits`, and have similar noise."""
         centre, mean, slope = line_through(blocks)
         residual = np.abs(blocks.mean - mean - slope * (blocks.time - centre)[:, None])
         return not has_noisy_block(blocks, self._state['step_variance']) \
             and bool(np.nanmax(residual / self.limits) <= 1.0)
+
+    def is_steep(self, blocks: Blocks, slope: FloatArray) -> bool:
+        """Whether the slope (3,) T/s of a line through blocks significantly exceeds
+        `STEEP_DRIFT`."""
+        assert self.noise is not None
+        variance = self.noise.diagonal() + self._state['step_variance']
+        relative_time = blocks.time - blocks.time.mean()
+        spread = (blocks.n * np.square(relative_time)[:, None]).sum(axis=0)
+        std = np.sqrt(variance / np.where(spread > 0.0, spread, np.nan))
+        # A comparison with NaN is false: an axis that is not reported has no slope.
+        return bool((np.abs(slope) > STEEP_DRIFT + MIN_SLOPE_STDS * std).any())
 
 
 @dataclass(frozen=True)
@@ -187,18 +174,6 @@ class FormerLevel:
         return age <= MAX_AGE_S and not differs
 
 
-def is_steep(blocks: Blocks, slope: FloatArray, variance: FloatArray) -> bool:
-    """Whether a line's slope (3,) T/s significantly exceeds `STEEP_DRIFT` on any axis.
-
-    `variance` (3,) in T² is that of one reading; NaN for an unreported axis.
-    """
-    relative_time = blocks.time - blocks.time.mean()
-    spread = (blocks.n * np.square(relative_time)[:, None]).sum(axis=0)
-    std = np.sqrt(variance / np.where(spread > 0.0, spread, np.nan))
-    # A comparison with NaN is false: an axis that is not reported has no slope.
-    return bool((np.abs(slope) > STEEP_DRIFT + MIN_SLOPE_STDS * std).any())
-
-
 class LevelDeparture:
     """Interval in which the blocks of a sensor depart from its frozen background.
 
@@ -211,10 +186,10 @@ class LevelDeparture:
     departed_at : s, time by which a vehicle that was part of the first background had departed
     """
 
-    def __init__(self, learn: float, relearn: float, state: Record, level: BackgroundLevel,
+    def __init__(self, learn: float, relearn: float, sensors: StructArray, level: BackgroundLevel,
                  evaluate_change: ChangeEvaluator) -> None:
         self._learn, self._relearn = learn, relearn
-        self._state, self._level = state, level
+        self._state, self._level = sensors[0], level
         self._evaluate_change = evaluate_change
         self.forget()
 
@@ -243,11 +218,21 @@ class LevelDeparture:
         self.blocks.popleft()
         self._has_first_block = False
 
-    def steady_end(self, ratio: float = 1.0) -> deque[Block] | None:
-        """Latest blocks if steady for `ratio` of the usual time, else None; set `was_steady`."""
-        new_blocks = self._level.steady_end(self.blocks, ratio * self._learn)
-        self.was_steady |= new_blocks is not None
-        return new_blocks
+    def steady_end(self, ratio: float = 1.0) -> Sequence[Block] | None:
+        """Latest blocks, at least three, if steady for `ratio` of the usual time; set
+        `was_steady`."""
+        blocks, latest = self.blocks, deque[Block]()
+        start = blocks[-1].time - ratio * self._learn
+        if len(blocks) < 3 or blocks[0].time > start:
+            return None
+        for block in reversed(blocks):
+            if block.time <= start and len(latest) >= 3:
+                break
+            latest.appendleft(block)
+        if not self._level.are_steady(stacked(latest)):
+            return None
+        self.was_steady = True
+        return latest
 
     def relearn_time(self, observed_s: float, relearns_soon: bool) -> float:
         """Time [s] on another steady level until it becomes the background; 0 if it never does.
@@ -269,16 +254,13 @@ class LevelDeparture:
         is_at_former = former is not None and former.is_at(self.blocks[-1], self._level.limits)
         return former.observed_s if former is not None and is_at_former else 0.0
 
-    def has_departed(self, new_blocks: deque[Block]) -> bool | None:
-        """Determine and store whether a vehicle in the background has departed.
-
-        False if a vehicle has arrived, None if unknown.
-        """
+    def has_departed(self, new_blocks: Sequence[Block]) -> bool | None:
+        """Determine and store whether a vehicle in the background has departed (None: unknown)."""
         if self.has_arrived or not self._has_first_block or len(self.blocks) > MAX_EVALUATED_BLOCKS:
             return False if self.has_arrived else None
         blocks = stacked([*self._blocks_before, *self.blocks])
         has_departed = self._evaluate_change(level_change(
-            blocks, len(new_blocks), self._level.at_all(blocks.time), self._state['noise_std'],
+            blocks, len(new_blocks), self._level.levels(blocks.time), self._state['noise_std'],
             int(self._state['first_ns']) / NS))
         self.has_arrived = has_departed is False
         if has_departed and self.former is None and self.departed_at is None:

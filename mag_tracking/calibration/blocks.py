@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,13 +11,11 @@ from mag_tracking.calibration import core
 from mag_tracking.records import plain
 
 MAX_VARIANCE_RATIO = 100.0
-"""Maximum ratio of the variance of a block to the variance of the quietest block. A target that
-passes within a block, as in the long blocks of a slow sensor, causes a higher ratio. Noise and
-coarse steps cause much lower ratios."""
+"""Maximum variance of a block relative to the quietest block; a target within a block exceeds
+it."""
 
 
-@dataclass(frozen=True)
-class Block:
+class Block(NamedTuple):
     """Time, mean and scatter of the readings in a short interval."""
 
     time: float
@@ -45,39 +42,8 @@ class Blocks(NamedTuple):
     n: FloatArray
 
 
-class BlockWindow:
-    """Ring buffer of the latest blocks, stored as arrays to speed up line fits."""
-
-    def __init__(self, max_blocks: int) -> None:
-        self._time, self._n = np.zeros(max_blocks), np.zeros((max_blocks, 3))
-        self._mean, self._scatter = np.zeros((max_blocks, 3)), np.zeros((max_blocks, 3, 3))
-        self.clear()
-
-    def __len__(self) -> int:
-        return min(self._count, len(self._time))
-
-    def clear(self) -> None:
-        """Remove all blocks."""
-        self._count = 0
-
-    def append(self, block: Block) -> None:
-        """Append a block; if the window is full, it replaces the oldest block."""
-        i = self._count % len(self._time)
-        self._time[i], self._mean[i], self._scatter[i] = block.time, block.mean, block.scatter
-        self._n[i] = block.n
-        self._count += 1
-
-    def blocks(self) -> Blocks:
-        """Stored blocks, in no particular order."""
-        k = len(self)
-        return Blocks(self._time[:k], self._mean[:k], self._scatter[:k], self._n[:k])
-
-
 def line_through(blocks: Blocks) -> tuple[float, FloatArray, FloatArray]:
-    """Weighted least-squares line through block means: mean time [s], value there, slope [T/s].
-
-    The value is NaN for an axis that no block reports.
-    """
+    """Weighted least-squares line through block means: mean time [s], value there, slope [T/s]."""
     centre = float(blocks.time.mean())
     return centre, *core.line_through(
         plain(blocks.time), plain(blocks.n), plain(blocks.mean), centre)
@@ -85,15 +51,12 @@ def line_through(blocks: Blocks) -> tuple[float, FloatArray, FloatArray]:
 
 def stacked(blocks: Iterable[Block]) -> Blocks:
     """Convert blocks to arrays."""
-    return Blocks(*(np.array(values, dtype=float) for values in zip(*(
-        (b.time, b.mean, b.scatter, b.n) for b in blocks), strict=True)))
+    return Blocks(*(np.array(values, dtype=float) for values in zip(*blocks, strict=True)))
 
 
 def has_noisy_block(blocks: Blocks, step_variance: FloatArray) -> bool:
-    """Whether the variance of a block far exceeds that of the quietest block, on any axis.
-
-    `step_variance` (3,) in T² is the quantisation variance, the least variance compared.
-    """
+    """Whether the variance of a block, at least `step_variance` (3,) T², far exceeds the lowest
+    one."""
     n = blocks.n
     variance = np.where(n > 1, np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1, 1), np.nan)
     variance = np.maximum(variance, step_variance)
@@ -111,41 +74,49 @@ def pooled_covariance(blocks: Blocks) -> FloatArray | None:
 
 
 class QuietInterval:
-    """Window of the latest quiet blocks.
+    """Ring buffer of the latest quiet blocks, as arrays, to which a background is fitted.
 
-    A block enters only after the guard time in s, so that the gradual onset of a target is
-    excluded; until then it is `pending`.
+    A block is `pending` for the guard time in s, to exclude the gradual onset of a target.
     """
 
     def __init__(self, guard: float, max_blocks: int) -> None:
         self._guard = guard
-        self._window = BlockWindow(max_blocks)
+        self._window = Blocks(np.zeros(max_blocks), np.zeros((max_blocks, 3)),
+                              np.zeros((max_blocks, 3, 3)), np.zeros((max_blocks, 3)))
         self.pending: deque[Block] = deque()
+        self._count = 0
 
     def __len__(self) -> int:
-        return len(self._window)
+        return min(self._count, len(self._window.time))
 
     def clear(self) -> None:
         """Discard all blocks."""
-        self._window.clear()
+        self.begin(())
         self.pending.clear()
 
     def begin(self, blocks: Iterable[Block]) -> None:
         """Restart the interval with the given blocks."""
-        self._window.clear()
+        self._count = 0
         for block in blocks:
-            self._window.append(block)
+            self._append(block)
+
+    def _append(self, block: Block) -> None:
+        """Append a block; if the interval is full, it replaces the oldest block."""
+        i = self._count % len(self._window.time)
+        for values, value in zip(self._window, block, strict=True):
+            values[i] = value
+        self._count += 1
 
     def extend(self, block: Block) -> Iterator[Blocks]:
-        """Queue the next quiet block, and yield the window after each block that enters it."""
+        """Queue the next quiet block, and yield the interval after each block that enters it."""
         self.pending.append(block)
         while self.pending and self.pending[0].time <= block.time - self._guard:
-            self._window.append(self.pending.popleft())
+            self._append(self.pending.popleft())
             yield self.blocks()
 
     def blocks(self) -> Blocks:
         """Blocks of the interval, in no particular order."""
-        return self._window.blocks()
+        return Blocks(*(values[:len(self)] for values in self._window))
 
     def scatter(self) -> FloatArray:
         """Pooled variance (3,) T² of the readings within the blocks; NaN if unknown."""
@@ -153,20 +124,11 @@ class QuietInterval:
         return np.full(3, np.nan) if covariance is None else covariance.diagonal()
 
 
-def line_of(blocks: Blocks) -> tuple[float, FloatArray, FloatArray, float]:
-    """Linear trend as in `BackgroundLevel`: centre [s], mean [T], slope [T/s] and horizon [s].
-
-    The drift is extrapolated for at most twice the duration of the blocks.
-    """
-    first, last = float(blocks.time.min()), float(blocks.time.max())
-    return *line_through(blocks), last + 2.0 * (last - first)
-
-
 class LearningWindow:
     """Window of the latest blocks, which provides candidates for the first quiet interval.
 
-    `learn` [s] is the required duration of a quiet interval, `length` [s] that of a block. At most
-    `max_blocks` blocks whose readings are all equal are stored.
+    `learn` [s] is the required duration, `length` [s] that of a block; at most `max_blocks` blocks
+    of equal readings are stored.
     """
 
     def __init__(self, learn: float, length: float, max_blocks: int) -> None:
@@ -181,10 +143,7 @@ class LearningWindow:
         self._recent.clear()
 
     def segments(self, block: Block, is_stuck: bool) -> Iterator[deque[Block]]:
-        """Add a block; yield the candidate intervals that are long enough, best first.
-
-        `is_stuck` means that all readings of the block are equal.
-        """
+        """Add a block; yield the candidate intervals that are long enough, best first."""
         self._recent.append(block)
         if is_stuck:
             # The steps are unknown until the first change, which may be due to a target.

@@ -17,12 +17,10 @@ MIN_CORRELATION = 0.7
 """Minimum correlation of two sensors that measured the same knocks."""
 
 MAX_RIVAL_RATIO = 0.9
-"""Correlation at a second lag, relative to that at the best lag, above which the lag is
-ambiguous."""
+"""Maximum correlation at a second lag, relative to the best one, of an unambiguous lag."""
 
 CONTEXT_S = 5.0
-"""[s] Interval before the first and after the last knock that is compared in a long recording, so
-that the signal at rest is included."""
+"""[s] Compared interval before the first and after the last knock, with the signal at rest."""
 
 MARGIN_S = 0.1
 """[s] Interval before and after a knock that is compared."""
@@ -51,10 +49,8 @@ def _no_lag(reason: str, correlation: float = float('nan')) -> Lag:
 
 
 def shock(acceleration: FloatArray) -> FloatArray:
-    """Magnitude (n,) of shocks in an acceleration (n, 3), m/s², in any orientation of the sensor.
-
-    It is the distance from the median acceleration, minus the median of all distances.
-    """
+    """Magnitude (n,) of shocks in an acceleration (n, 3), m/s²: the distance from the median, above
+    rest."""
     a = np.asarray(acceleration, dtype=float)
     magnitude = np.linalg.norm(a - np.nanmedian(a, axis=0), axis=1)
     above_rest: FloatArray = magnitude - np.nanmedian(magnitude)
@@ -68,8 +64,7 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
     `reference` and `signal` are shocks (see `shock`) at increasing times in s since the same zero;
     `max_lag` bounds the absolute offset, which is positive if the sensor's clock is ahead. The lag
     of the largest correlation ([T10]_ section 6.3) is refined below the sampling interval by least
-    squares, which also yields the std. Raises ValueError for differing shapes, or times that do not
-    increase.
+    squares. Raises ValueError for differing shapes, or times that do not increase.
     """
     a, b = (_validated_series(t_reference, reference, 'reference'),
             _validated_series(t, signal, 'sensor'))

@@ -9,9 +9,8 @@ from mag_tracking.arrays import FloatArray
 ATTENUATION_DB = 60.0
 """Attenuation of the frequencies that alias into the pass band."""
 PASS_FRACTION = 0.5
-"""Pass band as a fraction of half the output rate. The transition band ends at the edge of
-the pass band mirrored about half the output rate, so that only frequencies above the pass band
-alias. A wider pass band would increase the delay, which is about four output intervals."""
+"""Pass band as a fraction of half the output rate; only frequencies above the pass band alias. The
+delay is about four output intervals, and more for a wider pass band."""
 GAP_TOLERANCE = 0.5
 """Relative difference from the median interval beyond which an interval is a gap."""
 RATE_SAMPLES = 32
@@ -23,8 +22,7 @@ def lowpass(factor: int) -> FloatArray:
     # The import takes 0.3 s, and most sensors need no filter.
     from scipy.signal import firwin, kaiserord
 
-    width = 2.0 * (1.0 - PASS_FRACTION) / factor
-    n, beta = kaiserord(ATTENUATION_DB, width)
+    n, beta = kaiserord(ATTENUATION_DB, 2.0 * (1.0 - PASS_FRACTION) / factor)
     taps: FloatArray = firwin(n | 1, 1.0 / factor, window=('kaiser', beta))
     return taps
 
@@ -32,10 +30,10 @@ def lowpass(factor: int) -> FloatArray:
 class Decimator:
     """Decimator of one sensor to about `rate` Hz, an integer fraction of the sensor's rate.
 
-    The filter has linear phase (`scipy.signal.firwin`), and its delay is subtracted from the
-    timestamps ([T10]_ section 6.3 reduces 100 Hz to 12.5 Hz likewise). The rate is measured from
-    the first samples; `factor`, the ratio of input to output rate, is None until then. After a gap
-    or a clock step the filter restarts, because filtering across it would produce an invalid field.
+    The filter has linear phase, and its delay is subtracted from the timestamps ([T10]_ section 6.3
+    reduces 100 Hz to 12.5 Hz likewise). The rate is measured from the first samples; `factor`, the
+    ratio of input to output rate, is None until then. The filter restarts after a gap or clock
+    step.
     """
 
     def __init__(self, rate: float) -> None:
@@ -53,8 +51,7 @@ class Decimator:
     def feed(self, stamp_ns: int, field: FloatArray) -> list[tuple[int, FloatArray]]:
         """Add a sample (3,) T; return the outputs that become available, usually none.
 
-        An output is the timestamp [ns] of the filter's centre and a field; NaN for an axis that any
-        sample of the filter lacks.
+        An output is the timestamp [ns] of the filter's centre and a field, NaN for incomplete axes.
         """
         if self._window and self._is_gap(stamp_ns):
             self.reset()

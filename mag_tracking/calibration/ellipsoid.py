@@ -1,7 +1,7 @@
 """Ellipsoid through the readings of a tumbled sensor: directions, quadric and robust refinement."""
 
 from itertools import product
-from typing import TypedDict
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -19,6 +19,7 @@ MAX_CELL_WEIGHT = 3.0
 """Maximum total weight of a cell, in multiples of the median number of readings per cell."""
 
 _OCTANTS = np.array(list(product([1.0, -1.0], repeat=3)))
+_OCTANT_NAMES = [''.join(name) for name in product(('+x', '-x'), ('+y', '-y'), ('+z', '-z'))]
 
 OUTLIER_STDS = 4.0
 """[std] Distance from the ellipsoid beyond which a reading is an outlier."""
@@ -31,15 +32,12 @@ POSSIBLE_CAUSES = ('possible causes are too few directions, a sensor at rest, or
 """Possible causes if the readings do not fit an ellipsoid."""
 
 LOSS_SCALE = 2.0
-"""[std] Residual at which the loss changes from quadratic to linear; the loss of efficiency for
-Gaussian noise is small."""
+"""[std] Residual at which the loss changes from quadratic to linear."""
 
 N_BLOCKS = 40
-"""Number of intervals of the block jackknife for the covariance. Each interval must be long
-compared with the correlation time of the residuals."""
+"""Number of intervals of the block jackknife, longer than the correlation time of the residuals."""
 
-_UPPER = np.triu_indices(3)
-_ROWS, _COLUMNS = _UPPER
+_ROWS, _COLUMNS = np.triu_indices(3)
 
 BASIS = np.zeros((6, 3, 3))
 """(6, 3, 3) Symmetric basis matrices of `correction`, one for each of its entries."""
@@ -58,12 +56,6 @@ def _cells() -> cKDTree:
 _CELLS = _cells()
 
 
-def _octant_name(signs: FloatArray) -> str:
-    """Name of an octant, e.g. '+x-y+z'."""
-    return ''.join(('-' if sign < 0.0 else '+') + axis
-                   for sign, axis in zip(signs, 'xyz', strict=True))
-
-
 def binned(q: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
     """Unit vectors of `q` (n, 3), the cell of each (n,), and the count of each cell (N_CELLS,)."""
     u = q / np.maximum(np.linalg.norm(q, axis=1), 1e-12)[:, None]
@@ -72,11 +64,7 @@ def binned(q: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
 
 
 def even_weights(q: FloatArray) -> FloatArray:
-    """Weights (n,), 0 to 1, that limit the influence of crowded directions of `q` (n, 3).
-
-    The total weight of a cell is at most `MAX_CELL_WEIGHT` times the median number of directions in
-    the cells that are not empty.
-    """
+    """Weights (n,), 0 to 1, that limit crowded directions of `q` (n, 3) to `MAX_CELL_WEIGHT`."""
     _, cell, n = binned(q)
     return np.minimum(1.0, MAX_CELL_WEIGHT * np.median(n[n > 0]) / n[cell])
 
@@ -98,14 +86,14 @@ def coverage(u: FloatArray, w: FloatArray) -> float:
 def empty_octants(u: FloatArray, w: FloatArray) -> tuple[str, ...]:
     """Octants, e.g. '+x-y+z', whose weight is below `EMPTY_OCTANT` of the mean weight."""
     weight = 8.0 * np.bincount(np.argmax(u @ _OCTANTS.T, axis=1), w, 8) / w.sum()
-    return tuple(_octant_name(signs) for signs in _OCTANTS[weight < EMPTY_OCTANT])
+    return tuple(name for name, w in zip(_OCTANT_NAMES, weight, strict=True) if w < EMPTY_OCTANT)
 
 
 def fit_quadric(z: FloatArray) -> tuple[FloatArray, FloatArray, str]:
     """Fit an ellipsoid to normalised readings (n, 3), excluding outliers ([Renaudin10]_).
 
-    Returns offset, correction, and the reason for a failure, empty if an ellipsoid was found. The
-    weights by direction and the exclusion of outliers are additions of this package.
+    Returns offset, correction, and the reason for a failure. The weights by direction and the
+    exclusion of outliers are additions of this package.
     """
     # The midpoint of the extremes is inside the ellipsoid, even if the sensor was mostly at rest.
     w = even_weights(z - 0.5 * (z.min(axis=0) + z.max(axis=0)))
@@ -147,7 +135,7 @@ def robust_std(d: FloatArray, w: FloatArray) -> float:
     return max(1.4826 * float(median), MIN_SCALE)
 
 
-class Quality(TypedDict):
+class Quality(NamedTuple):
     """Quality measures of a fitted ellipsoid."""
 
     solved: bool
@@ -171,7 +159,7 @@ def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
     the correction, and the quality. [KokSchon16]_ section V.A; the weights by direction and the
     robust loss are additions of this package.
     """
-    theta: FloatArray = np.concatenate([o, C[_UPPER]])
+    theta: FloatArray = np.concatenate([o, C[_ROWS, _COLUMNS]])
     for _ in range(2):
         w = even_weights(_model(theta, z)[0])
         scale = LOSS_SCALE * robust_std(_model(theta, z)[1], w)
@@ -183,13 +171,10 @@ def refine_ellipsoid(z: FloatArray, o: FloatArray, C: FloatArray) -> tuple[
     q, d, J = _model(theta, z)
     is_inlier = np.abs(d) <= OUTLIER_STDS * robust_std(d, w)
     u, _, n = binned(q[is_inlier])
-    quality: Quality = {
-        'solved': fit.status > 0, 'directions': int((n > 0).sum()),
-        'coverage': coverage(u, w[is_inlier]),
-        'scatter': float(np.sqrt(np.average(d[is_inlier]**2, weights=w[is_inlier]))),
-        'n_outliers': int((~is_inlier).sum()), 'empty': empty_octants(u, w[is_inlier])}
-    C = _symmetric(theta)
-    return theta[:3], C, _covariance(d / scale, J / scale, w), quality
+    quality = Quality(fit.status > 0, int((n > 0).sum()), coverage(u, w[is_inlier]),
+                      float(np.sqrt(np.average(d[is_inlier]**2, weights=w[is_inlier]))),
+                      int((~is_inlier).sum()), empty_octants(u, w[is_inlier]))
+    return theta[:3], _symmetric(theta), _covariance(d / scale, J / scale, w), quality
 
 
 def _symmetric(theta: FloatArray) -> FloatArray:
@@ -214,10 +199,10 @@ def _loss(square: FloatArray, w: FloatArray) -> FloatArray:
 
 
 def _covariance(f: FloatArray, J: FloatArray, w: FloatArray) -> FloatArray:
-    """Covariance (9, 9) by a block jackknife in time, one Newton step per block.
+    """Covariance (9, 9) by a block jackknife in time, one Newton step per block; infinite if
+    singular.
 
-    Real residuals are correlated in time, so their number overstates the information. Infinite if
-    the fit is singular without one of the blocks.
+    Real residuals are correlated in time, so their number overstates the information.
     """
     n_blocks = min(N_BLOCKS, len(f))
     starts = np.arange(n_blocks) * len(f) // n_blocks

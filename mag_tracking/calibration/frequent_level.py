@@ -14,12 +14,10 @@ from mag_tracking.calibration.blocks import Block, Blocks, line_through, pooled_
 from mag_tracking.calibration.sensor_state import TOGGLE_TOLERANCE
 
 MAX_CALM_RATIO = 3.0
-"""Maximum standard deviation within a block, relative to the 20 % quantile of all blocks. Blocks
-above this limit are excluded, because a passing target changes the field within a block."""
+"""Maximum std within a block, relative to the 20 % quantile of all blocks; a target exceeds it."""
 
 LEVEL_WIDTH = 4.0
-"""Maximum difference between the mean of a block and its level, in standard deviations of a mean,
-per axis."""
+"""Maximum difference between a block and its level, in standard deviations of a mean, per axis."""
 
 MIN_WIDTH = 5e-9
 """[T] Minimum tolerance of a level, which allows for drift."""
@@ -34,8 +32,7 @@ MIN_LEVEL_DISTANCE = 3.0
 """Minimum distance of another level, in widths. A distant target may change a level by less."""
 
 MIN_DURATION_RATIO = 4.0
-"""Minimum duration of a level that replaces the initial level, relative to the duration of the
-initial level. Such a level indicates that a target present at the start has left."""
+"""Minimum duration of a level that replaces the initial level, relative to that of the latter."""
 
 BATCH_SIZE = 64
 """Number of blocks that are compared with all other blocks in one operation, to limit memory."""
@@ -53,8 +50,7 @@ SEARCH_GROWTH = 1.1
 """Factor by which the number of blocks must grow before the level is determined again."""
 
 MIN_OBSERVED_S = 10.0
-"""[s] Minimum total duration of a level that is considered certain. It must also be at least
-`MIN_DURATION_RATIO` times the duration of any other level."""
+"""[s] Minimum total duration of a level that is considered certain."""
 
 MAD_TO_STD = 1.4826
 """Standard deviation of a normal distribution relative to its median absolute deviation."""
@@ -81,6 +77,17 @@ class MostFrequentLevel:
     width: FloatArray
     """(3,) [T] Maximum difference between the mean of a block and the level."""
 
+    @property
+    def observed_s(self) -> float:
+        """Total duration for which the level was observed [s]."""
+        return self.n_blocks * self.block_s
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the level was observed long enough, and longer than any other level."""
+        return self.observed_s >= MIN_OBSERVED_S \
+            and self.n_blocks >= MIN_DURATION_RATIO * self.n_rival
+
     def is_at(self, level: FloatArray) -> bool:
         """Whether a level (3,) T is the same within `MIN_LEVEL_DISTANCE` widths."""
         return not bool((np.abs(self.level - level) > MIN_LEVEL_DISTANCE * self.width).any())
@@ -90,9 +97,10 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int
                         ) -> MostFrequentLevel | None:
     """Find the most frequent level of chronological blocks, from the earliest `max_blocks` at it.
 
-    `steps` (3,) in T are the quantisation steps, 0 if unknown. None if no level has `MIN_BLOCKS`
+    `steps` (3,) in T are the quantisation steps, inf if unknown. None if no level has `MIN_BLOCKS`
     blocks, or the noise is unknown on all axes.
     """
+    steps = np.where(np.isfinite(steps), steps, 0.0)
     n = np.maximum(blocks.n, 1.0)
     variance = np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1.0, 1.0)
     variance = np.where(blocks.n > 1, np.maximum(variance, steps**2 / 12.0), np.nan)
@@ -143,25 +151,6 @@ def _densest(means: FloatArray, width: FloatArray) -> IntArray:
     return np.flatnonzero((np.abs(means - centre) <= width).all(axis=1))
 
 
-@dataclass(frozen=True)
-class FrequentLevel:
-    """The most frequent level of the latest blocks."""
-
-    level: MostFrequentLevel
-    std: FloatArray
-    """(3,) [T] Uncertainty of the level: median distance of all blocks from the level, scaled to a
-    standard deviation. It is large for a level observed for less than half of the time. NaN for an
-    unreported axis."""
-    is_certain: bool
-    """Whether the level was observed for at least `MIN_OBSERVED_S`, and at least
-    `MIN_DURATION_RATIO` times as long as any other level."""
-
-    @property
-    def observed_s(self) -> float:
-        """Total duration for which the level was observed [s]."""
-        return self.level.n_blocks * self.level.block_s
-
-
 class ProvisionalLevel:
     """Collects the blocks of a sensor and periodically determines their most frequent level."""
 
@@ -179,23 +168,19 @@ class ProvisionalLevel:
         self._blocks.append(block)
         self._n_new += 1
 
-    def frequent_level(self, steps: FloatArray) -> FrequentLevel | None:
-        """Most frequent level; None if none is frequent enough, or too few blocks are new.
-
-        `steps` (3,) in T are the quantisation steps; inf if unknown.
-        """
+    def frequent_level(self, steps: FloatArray) -> MostFrequentLevel | None:
+        """Most frequent level; None if none is frequent enough, or too few blocks are new."""
         blocks = self._blocks
         if self._n_new < self._n_required \
                 or blocks[-1].time - blocks[0].time < self._min_duration_s:
             return None
         self._n_new, self._n_required = 0, max(1, int((SEARCH_GROWTH - 1.0) * len(blocks)))
-        arrays = stacked(blocks)
-        level = most_frequent_level(arrays, np.where(np.isfinite(steps), steps, 0.0), MAX_BLOCKS)
-        if level is None:
-            return None
-        distance, is_known = np.full(3, np.nan), ~np.isnan(level.level)
-        distance[is_known] = np.nanmedian(
-            np.abs(arrays.mean[:, is_known] - level.level[is_known]), axis=0)
-        is_certain = level.n_blocks * level.block_s >= MIN_OBSERVED_S \
-            and level.n_blocks >= MIN_DURATION_RATIO * level.n_rival
-        return FrequentLevel(level, MAD_TO_STD * distance, is_certain)
+        return most_frequent_level(stacked(blocks), steps, MAX_BLOCKS)
+
+    def std(self, frequent: MostFrequentLevel) -> FloatArray:
+        """Uncertainty (3,) T of a frequent level: median distance of all blocks, scaled to a
+        std."""
+        distance, is_known = np.full(3, np.nan), ~np.isnan(frequent.level)
+        means = np.array([block.mean for block in self._blocks])[:, is_known]
+        distance[is_known] = np.nanmedian(np.abs(means - frequent.level[is_known]), axis=0)
+        return MAD_TO_STD * distance

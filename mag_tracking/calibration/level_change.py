@@ -3,8 +3,8 @@
 The field of a vehicle that approaches at constant speed grows with the inverse cube of its
 distance: its relative growth accelerates. The change due to a vehicle that starts or stops grows
 with the square of time: its relative growth decelerates. The far end of a change (distant vehicle)
-therefore lasts longer than the near end (vehicle at the sensor): growth accelerates at the far end
-and decelerates at the near end. The test is an addition of this package.
+therefore lasts longer than the near end (vehicle at the sensor). The test is an addition of this
+package.
 """
 
 from collections.abc import Callable
@@ -18,8 +18,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.blocks import Blocks
 
 MAX_GAP = 2.5
-"""Maximum interval between blocks, in median intervals; across a longer gap the growth is
-unknown."""
+"""Maximum interval between blocks, in median intervals."""
 
 MAX_SMALL_FRACTION = 0.3
 """Maximum magnitude of the evaluated ends of a change, as a fraction of the total magnitude."""
@@ -34,9 +33,8 @@ MIN_GROWTH = 3.5
 """Minimum ratio of the largest evaluated magnitude to the detection limit."""
 
 MAX_QUARTER_FRACTION = 0.5
-"""Maximum duration of a quarter, less one block, as a fraction of the total growth time; a longer
-quarter is a stall. The theoretical fraction is 0.3 to 0.54 for growth by a factor of 4 to 300. Half
-of that growth takes only a few blocks."""
+"""Maximum duration of a quarter, less one block, relative to the growth time; longer is a stall.
+The theoretical fraction is 0.3 to 0.54 for growth by a factor of 4 to 300."""
 
 MAX_START_RATIO = 0.9
 """Maximum ratio of the first to the second half of the growth time at the near end. The theoretical
@@ -46,8 +44,8 @@ MIN_BLOCKS = 2.0
 """Minimum duration of the longer end in blocks; a step is neither an arrival nor a departure."""
 
 CLEAR_SIZE = 60.0
-"""Minimum magnitude of a clear change in standard deviations of one reading. A clear change is
-classified alone; a smaller change may be classified by a larger change at another sensor."""
+"""Minimum magnitude, in standard deviations of one reading, of a change that is classified
+alone."""
 
 MAX_TIME_DIFFERENCE_S = 3.0
 """[s] Maximum time between the starts of the new levels at sensors near the same target."""
@@ -109,13 +107,12 @@ class LevelChange:
     size: float
     """Magnitude of the change in standard deviations of one reading."""
     has_departed: bool | None
-    """True: a vehicle that caused the earlier level has departed. False: a vehicle that causes the
-    later level has arrived. None: unknown."""
+    """Whether a vehicle at the earlier level departed (or one at the later arrived); None:
+    unknown."""
 
 
 ChangeEvaluator: TypeAlias = Callable[[LevelChange], bool | None]
-"""Function of the `LevelChange` of a sensor that returns whether a vehicle has departed, as
-`LevelChange.has_departed`."""
+"""Function that classifies the `LevelChange` of a sensor like `LevelChange.has_departed`."""
 
 
 def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: FloatArray,
@@ -123,9 +120,8 @@ def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: F
     """Evaluate a change to a steady level from chronological blocks that begin at the old level.
 
     The last `n_steady` blocks are at the later level. `before` (k, 3) in T is the earlier level at
-    the times of the blocks; `noise_std` (3,) in T is that of one reading. NaN marks an
-    unreported axis. `origin` in s is the zero
-    of the block times in the time common to all sensors.
+    the times of the blocks; `noise_std` (3,) in T is that of one reading. NaN marks an unreported
+    axis. `origin` in s is the zero of the block times in the time common to all sensors.
     """
     after = np.average(blocks.mean[-n_steady:], axis=0)
     distance_before, distance_after = (
@@ -152,9 +148,9 @@ def _asymmetry(time: FloatArray, distance_before: FloatArray, distance_after: Fl
                detection_limit: float, largest: float) -> float:
     """Binary logarithm of the asymmetry between the ends of a change; positive for a departure.
 
-    Zero if the growth stalls at one end, e.g. because a second vehicle stops behind the first, or
-    if neither end matches a starting or stopping vehicle. The distances (k,) from the two levels
-    are in std of a reading; the ends are evaluated from `detection_limit` to `largest`.
+    Zero if the growth stalls at one end, or neither end matches a starting or stopping vehicle. The
+    distances (k,) from the two levels are in std of a reading; the ends are evaluated from
+    `detection_limit` to `largest`.
     """
     block_length = float(np.median(np.diff(time)))
     first = growth_of(time, distance_before, detection_limit, largest)

@@ -17,8 +17,7 @@ N_UNKNOWNS = 5
 """Number of unknowns of a pose; the roll of a dipole is not observable."""
 
 EXACT_COST = 1e-9
-"""Maximum sum of squared residuals of readings without noise. Rounding prevents a further
-reduction, so the fit counts as converged."""
+"""Maximum sum of squared residuals of exact readings, which rounding keeps above zero."""
 
 MAX_COST = 100.0
 """Maximum normalised cost; a larger cost means that the readings do not fit the dipole."""
@@ -51,16 +50,18 @@ class MagnetPose:
     axis: FloatArray
     """(3,) unit vector, world: direction of the moment."""
     covariance: FloatArray
-    """(6, 6) covariance of position and axis, singular along the axis. Scaled by the normalised
-    cost if this cost exceeds one."""
+    """(6, 6) of position and axis, singular along the axis; scaled by a cost above one."""
     ambient: FloatArray
     """(3,) [T], world: change of the ambient field since the biases were estimated."""
     normalised_cost: float
     """Cost per degree of freedom; about one if moment, noise and field error are correct."""
-    converged: bool
-    """Whether the pose is valid."""
     reason: str
     """Reason why the pose is not valid; empty if it is valid."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether the pose is valid."""
+        return not self.reason
 
 
 def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low: ArrayLike,
@@ -68,10 +69,9 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     """Estimate the pose of a dipole of known moment from one reading of all sensors.
 
     The best points of a grid in the box between the corners `low` and `high` (3,) [m, world frame]
-    are refined; the solution with the smallest cost is returned. `field` (n, 3) [T, sensor frame]
-    is corrected for bias and gain (`NetworkGeometry.signal`); NaN if not measured. All values are
-    NaN if too few axes were measured. Raises ValueError for an invalid reading, moment or box, or a
-    sensor without `noise_std`. PHD15 Paper A eq. (3).
+    are refined. `field` (n, 3) [T, sensor frame] is corrected for bias and gain
+    (`NetworkGeometry.signal`); NaN if not measured. Raises ValueError for an invalid reading,
+    moment or box, or a sensor without `noise_std`. PHD15 Paper A eq. (3).
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
     _check_input(network, field, moment, low, high)
@@ -80,8 +80,8 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     if n_values <= N_UNKNOWNS:
         nan_vector = np.full(3, np.nan)
         return MagnetPose(nan_vector, nan_vector, np.full((6, 6), np.nan), nan_vector, np.nan,
-                          False, f'number of measured axes is {n_values}; more than '
-                          f'{N_UNKNOWNS} are required')
+                          f'number of measured axes is {n_values}; more than {N_UNKNOWNS} are '
+                          'required')
     squared_norm = np.nansum(np.square(field), axis=1)[:, None]
     std = np.sqrt(np.square(np.array(network.noise_std)) + settings.field_error**2 * squared_norm)
     problem = _residual_function(network, field, std, is_measured, moment, settings.ambient_std)
@@ -154,7 +154,7 @@ def _pose_of_minimum(x: FloatArray, covariance: FloatArray, cost: float, converg
     else:
         reason = ''
     return MagnetPose(x[:3], u, max(1.0, cost) * T @ covariance @ T.T,
-                      settings.ambient_std * x[6:], float(cost), not reason, reason)
+                      settings.ambient_std * x[6:], float(cost), reason)
 
 
 def _check_input(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
@@ -163,10 +163,15 @@ def _check_input(network: SensorNetwork, field: FloatArray, moment: float, low: 
     if field.shape != (len(network), 3) or low.shape != (3,) or high.shape != (3,):
         raise ValueError(f'expected field ({len(network)}, 3) and corners (3,), got '
                          f'{field.shape}, {low.shape}, {high.shape}')
-    if not (np.isfinite(moment) and moment > 0.0):
-        raise ValueError(f'moment is {moment} A m^2; it must be finite and above 0')
     if not (np.isfinite(high - low).all() and (high > low).all()):
         raise ValueError(f'the box from {low.tolist()} to {high.tolist()} m has no volume')
+    check_moment_and_noise(network, field, moment)
+
+
+def check_moment_and_noise(network: SensorNetwork, field: FloatArray, moment: float) -> None:
+    """Raise ValueError for an invalid moment, an infinite reading or a sensor without noise."""
+    if not (np.isfinite(moment) and moment > 0.0):
+        raise ValueError(f'moment is {moment} A m^2; it must be finite and above 0')
     if np.isinf(field).any():
         raise ValueError('field contains an infinite reading')
     for name, std in zip(network.names, network.noise_std, strict=True):

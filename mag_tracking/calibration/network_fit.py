@@ -1,12 +1,11 @@
 """Least-squares fit of the geometry of a network to readings of a magnet on a tracked tool.
 
-`TrackedMagnet.poses` and `predicted_readings` define the unknowns and their order. Readings couple
-each pose to the sensors but not to other poses. The poses are therefore eliminated from the normal
-equations block by block.
+Readings couple each pose to the sensors but not to other poses. The poses are therefore eliminated
+from the normal equations block by block.
 """
 
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.stats import chi2
@@ -21,6 +20,7 @@ from mag_tracking.geometry import (
 )
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import dipole_field, dipole_jacobians
+from mag_tracking.settings import param
 
 N_SENSOR, N_SHARED, N_POSE = 10, 12, 8
 """Numbers of unknowns: per sensor (bias, gain, rotation, position); shared (shift and rotation of
@@ -52,9 +52,7 @@ Weights: TypeAlias = tuple[FloatArray, Unknowns, float, FloatArray]
 def tool_rotations(axes: FloatArray) -> FloatArray:
     """Minimal rotations (K, 3, 3) from the tool frame to the tracker frame, from the tool's z axes.
 
-    The roll about a tracked axis is not measured. The minimal rotation is exact if the tool is
-    tilted without roll; otherwise, a rotated vector has a wrong component perpendicular to the
-    axis.
+    The roll about a tracked axis is not measured; the rotation is exact for a tilt without roll.
     """
     return rotation_from_quaternion(np.array([quaternion_between(UP, a) for a in axes]))
 
@@ -81,16 +79,12 @@ class TrackedMagnet:
             FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Positions [m] and moments [A m²] of the magnet, world frame, and their derivatives.
 
-        Each is (K, 3), and is first differentiated by `shared`, (K, 3, 12), then by `pose`,
-        (K, 3, 8).
-
-        Parameters
-        ----------
-        shared : shift [m] and rotation vector [rad] from the tracker to the board (world) frame;
-            offset [m] and tilt [slope] of the magnet in the tool frame; log of the moment over its
-            nominal value
-        pose : corrections of position [m, world frame] and tilt [slope, tool frame]; change of the
-            ambient field [T, world frame], which does not affect the pose
+        `shared` is shift [m] and rotation vector [rad] from the tracker to the board (world) frame,
+        offset [m] and tilt [slope] of the magnet in the tool frame, log of the moment over its
+        nominal value; `pose` is corrections of position [m, world frame] and tilt [slope, tool
+        frame], and the change of the ambient field [T, world frame], which does not affect the
+        pose. Each result is (K, 3), and is first differentiated by `shared`, (K, 3, 12), then by
+        `pose`, (K, 3, 8).
         """
         K = len(self.tool)
         R_b, J_b = rotation(shared[3:6]), left_jacobian(shared[3:6])
@@ -114,17 +108,22 @@ class TrackedMagnet:
         dm_pose[:, :, 3:5] = dm_dtilt
         return self.pivot + shared[:3] + arm + pose[:, :3], m, dr, dm, dr_pose, dm_pose
 
+    def positions_and_axes(self, shared: FloatArray,
+                           pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Positions [m] and unit axes of the magnet, each (K, 3), world frame; see `poses`."""
+        r, m, *_ = self.poses(shared, pose)
+        return r, m / np.linalg.norm(m, axis=1)[:, None]
+
 
 def predicted_readings(network: SensorNetwork, magnet: TrackedMagnet, sensor: FloatArray,
                        shared: FloatArray, pose: FloatArray) -> Prediction:
     """Predict the reading of each sensor at each pose, and its derivatives.
 
     `sensor` (n, 10) is bias [T, sensor frame], gain minus one, rotation vector [rad, nominal sensor
-    frame] and position minus the nominal position [m, world frame]; `shared` and `pose` are as for
-    `TrackedMagnet.poses`. Returns readings and readings without the bias (n, K, 3) [T, sensor
-    frame], then derivatives by `sensor`, `shared` and `pose`, NaN for a magnet at a sensor.
-    TSP14 eq. (2), (30) for the dipole; T10 section 6.3 for the corrections, here with finite
-    rotations.
+    frame] and position minus the nominal position [m, world frame]. Returns readings and readings
+    without the bias (n, K, 3) [T, sensor frame], then derivatives by `sensor`, `shared` and `pose`,
+    NaN for a magnet at a sensor. TSP14 eq. (2), (30) for the dipole; T10 section 6.3 for the
+    corrections, here with finite rotations.
     """
     r, m, *derivatives = magnet.poses(shared, pose)
     d = (network.positions + sensor[:, 7:])[:, None] - r
@@ -148,53 +147,61 @@ def predicted_readings(network: SensorNetwork, magnet: TrackedMagnet, sensor: Fl
     return (signal + sensor[:, None, :3], signal, by_sensor, dB_dm @ dm - dB_dr @ dr, by_pose)
 
 
-class Priors(Protocol):
-    """Priors of a sensor and limits of the fit, as in `GeometrySettings`."""
+@dataclass(frozen=True)
+class GeometrySettings:
+    """Prior standard deviations, where zero means exactly known, and limits of the fit."""
 
-    @property
-    def gain_std(self) -> float:
-        """Standard deviation of the gain."""
-
-    @property
-    def rotation_std_deg(self) -> float:
-        """Standard deviation of the orientation, per axis [deg]."""
-
-    @property
-    def position_std(self) -> float:
-        """Standard deviation of the position, per axis [m]."""
-
-    @property
-    def field_error(self) -> float:
-        """Error of the dipole model relative to the field."""
-
-    @property
-    def iterations(self) -> int:
-        """Maximum number of steps."""
+    gain_std: float = param(0.03, 'Standard deviation of the gain of a sensor.', '',
+                            (0.0, 1.0))
+    rotation_std_deg: float = param(
+        2.0, 'Standard deviation of the orientation of a sensor, per axis.', 'deg', (0.0, 45.0))
+    position_std: float = param(
+        1e-3, 'Standard deviation of the position of a sensor, per axis.', 'm', (0.0, 100.0))
+    moment_std: float = param(
+        0.0, 'Standard deviation of the moment of the magnet, relative to its magnitude.', '',
+        (0.0, 1.0))
+    board_shift_std: float = param(
+        0.01, 'Standard deviation of the position of the network relative to the tracker, per '
+        'axis.', 'm', (0.0, 100.0))
+    board_rotation_std_deg: float = param(
+        2.0, 'Standard deviation of the orientation of the network relative to the tracker, per '
+        'axis.', 'deg', (0.0, 45.0))
+    tool_offset_std: float = param(
+        0.01, 'Standard deviation of the offset of the magnet from the tracked point, per axis.',
+        'm', (0.0, 100.0))
+    tool_tilt_std_deg: float = param(
+        3.0, 'Standard deviation of the tilt of the magnet from the tracked axis, per axis.',
+        'deg', (0.0, 45.0))
+    tracker_position_std: float = param(
+        3e-4, 'Standard deviation of the tracked position of one pose, per axis.', 'm',
+        (0.0, 100.0))
+    tracker_tilt_std_deg: float = param(
+        0.2, 'Standard deviation of the tracked tilt of one pose, per axis.', 'deg', (0.0, 45.0))
+    start_position_std: float = param(
+        0.1, 'Standard deviation of the starting position of an untracked magnet, per axis.', 'm',
+        (0.0, 100.0))
+    start_tilt_std_deg: float = param(
+        30.0, 'Standard deviation of the starting tilt of an untracked magnet, per axis.', 'deg',
+        (0.0, 60.0))
+    ambient_std: float = param(
+        1e-7, 'Standard deviation of the change of the ambient field from pose to pose, per axis; '
+        'the change is the same at all sensors.', 'T', (0.0, 1e-3))
+    field_error: float = param(
+        0.01, 'Error of the dipole model relative to the field.', '', (0.0, 1.0))
+    iterations: int = param(60, 'Maximum number of steps.', '', (1, 10000))
 
 
 class GeometryProblem:
     """Least-squares problem of a geometry calibration: readings, priors and predictions.
 
-    The methods take the unknowns `x` in units of their prior stds; see `Unknowns`.
-
-    Parameters
-    ----------
-    field : (K, n, 3), validated readings; see `calibrate_geometry`
-    positions, axes : (K, 3), tracked poses, m and unit vectors, tracker frame
-    moment : nominal moment of the magnet, A m²
-    shared_unit, pose_unit : (12,) and (8,), prior stds; zero fixes an unknown
-
-    Attributes
-    ----------
-    sensor_unit : (n, 10), units of the unknowns of the sensors
-    field : (n, K, 3), T, sensor frame
-    variance : (n, 1, 3), noise variances, T²
-    has_readings : (n, 3), whether an axis has any reading
+    The arguments are those of `fitted_geometry`; `field` is stored as (n, K, 3), with `variance`
+    (n, 1, 3) T², and `has_readings` (n, 3) tells whether an axis has any reading. The methods take
+    the unknowns `x` in units of their prior stds, such as `sensor_unit` (n, 10).
     """
 
     def __init__(self, network: SensorNetwork, field: FloatArray, positions: FloatArray,
-                 axes: FloatArray, moment: float, settings: Priors, shared_unit: FloatArray,
-                 pose_unit: FloatArray) -> None:
+                 axes: FloatArray, moment: float, settings: GeometrySettings,
+                 shared_unit: FloatArray, pose_unit: FloatArray) -> None:
         self.network, self.settings = network, settings
         self.shared_unit, self.pose_unit = shared_unit, pose_unit
         self.field = np.ascontiguousarray(np.swapaxes(field, 0, 1))
@@ -202,11 +209,10 @@ class GeometryProblem:
         self.magnet = TrackedMagnet(positions, tool_rotations(axes), positions.mean(axis=0),
                                     float(moment))
         self.has_readings: BoolArray = np.any(~np.isnan(self.field), axis=1)
-        n = len(network)
         s = settings
-        self.sensor_unit = np.hstack([
-            np.array(network.noise_std), np.tile(np.repeat(
-                [s.gain_std, np.deg2rad(s.rotation_std_deg), s.position_std], [1, 3, 3]), (n, 1))])
+        self.sensor_unit = np.hstack([np.array(network.noise_std), np.tile(np.repeat(
+            [s.gain_std, np.deg2rad(s.rotation_std_deg), s.position_std], [1, 3, 3]),
+            (len(network), 1))])
 
     def predicted(self, x: Unknowns) -> Prediction:
         """`predicted_readings` with derivatives in units of the priors."""
@@ -246,8 +252,7 @@ class GeometryProblem:
         """Robust weights of readings and priors, noise scale, and robust weights (n, K), 0 to 1.
 
         The weights of the readings (n, K, 3) are over the scaled variance. The scale is the median
-        of `median_ratio` over all sensors and poses with readings, at least one. `f`, `signal` are
-        as for `squared_residuals`.
+        of `median_ratio` over all sensors and poses with readings, at least one.
         """
         e2, count, variance = self.squared_residuals(f, signal)
         d2 = e2.sum(axis=2)
@@ -255,17 +260,14 @@ class GeometryProblem:
         robust_weights = _robust_weights(d2 / scale, count)
         W = robust_weights[:, :, None] / (variance * scale)
         W[np.isnan(self.field)] = 0.0
-        return W, self._prior_weights(x), scale, robust_weights
-
-    def _prior_weights(self, x: Unknowns) -> Unknowns:
-        """Robust weights of the priors."""
         # The square root limits the down-weighting: a large correction is an error to be estimated,
         # not an outlier to be ignored.
         sensor, pose = (np.sqrt(_robust_weights(np.square(v).sum(axis=1), v.shape[1]))[:, None]
                         for v in (x[0][:, 3:], x[2]))
         # A bias has no prior, except on an axis without readings, where it would be undetermined.
-        return (np.hstack([1.0 * ~self.has_readings, np.tile(sensor, N_SENSOR - 3)]),
-                np.ones(N_SHARED), np.tile(pose, N_POSE))
+        prior_weights = (np.hstack([1.0 * ~self.has_readings, np.tile(sensor, N_SENSOR - 3)]),
+                         np.ones(N_SHARED), np.tile(pose, N_POSE))
+        return W, prior_weights, scale, robust_weights
 
     def cost(self, x: Unknowns, f: FloatArray, W: FloatArray, prior_weights: Unknowns) -> float:
         """Weighted sum of the squared residuals and of the squared unknowns (priors); infinite if a
@@ -291,11 +293,8 @@ def _robust_weights(d2: FloatArray, count: IntArray | int) -> FloatArray:
 class NormalEquations:
     """Normal equations of a geometry calibration; the poses are eliminated block by block.
 
-    Attributes
-    ----------
-    A, g : (N, N) and (N,), information and negative gradient of [sensors, shared]
-    A_pose, g_pose : (K, 8, 8) and (K, 8), the same of each pose
-    C : (K, N, 8), cross information between [sensors, shared] and each pose
+    `A` (N, N) and `g` (N,) are information and negative gradient of [sensors, shared], `A_pose`
+    (K, 8, 8) and `g_pose` (K, 8) those of each pose, `C` (K, N, 8) is the cross information.
     """
 
     def __init__(self, problem: GeometryProblem, x: Unknowns, predicted: Prediction, W: FloatArray,
@@ -333,7 +332,8 @@ class NormalEquations:
     def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """Steps of [sensors, shared] (N,) and of the poses (K, 8), with diagonals increased by
         `damping`."""
-        A, A_pose = self._damped(damping)
+        A = self.A + damping * np.diag(np.diagonal(self.A))
+        A_pose = self.A_pose * (1.0 + damping * np.eye(N_POSE))
         CB = self.C @ np.linalg.inv(A_pose)
         S = A - self._lost_information(CB)
         dx = np.linalg.solve(S, self.g - np.einsum('kip,kp->i', CB, self.g_pose))
@@ -355,11 +355,6 @@ class NormalEquations:
                             @ np.swapaxes(self.C, 0, 1).reshape(N, -1).T)
         return lost
 
-    def _damped(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Information of [sensors, shared] and of the poses, with damped (increased) diagonals."""
-        return (self.A + damping * np.diag(np.diagonal(self.A)),
-                self.A_pose * (1.0 + damping * np.eye(N_POSE)))
-
 
 def solve(problem: GeometryProblem,
           iterations: int) -> tuple[Unknowns, Weights, Prediction, bool]:
@@ -368,13 +363,13 @@ def solve(problem: GeometryProblem,
     x, damping, converged = problem.initial_unknowns(), 1e-3, False
     predicted = problem.predicted(x)
     for _ in range(iterations):
-        weights = problem.weights(predicted[0], predicted[1], x)
-        W, prior_weights = weights[:2]
+        W, prior_weights, *_ = problem.weights(predicted[0], predicted[1], x)
         equations = NormalEquations(problem, x, predicted, W, prior_weights)
         cost = problem.cost(x, predicted[0], W, prior_weights)
         while damping < MAX_DAMPING:
             dx, dpose = equations.step(damping)
-            candidate = _add_step(x, dx, dpose)
+            m = len(dx) - N_SHARED
+            candidate = x[0] + dx[:m].reshape(-1, N_SENSOR), x[1] + dx[m:], x[2] + dpose
             candidate_predicted = problem.predicted(candidate)
             if problem.cost(candidate, candidate_predicted[0], W, prior_weights) <= cost:
                 break
@@ -385,11 +380,4 @@ def solve(problem: GeometryProblem,
         if dx @ equations.g + (dpose * equations.g_pose).sum() < STEP_TOLERANCE:
             converged = True
             break
-    weights = problem.weights(predicted[0], predicted[1], x)
-    return x, weights, predicted, converged
-
-
-def _add_step(x: Unknowns, dx: FloatArray, dpose: FloatArray) -> Unknowns:
-    """Return the unknowns after a step."""
-    m = len(dx) - N_SHARED
-    return x[0] + dx[:m].reshape(-1, N_SENSOR), x[1] + dx[m:], x[2] + dpose
+    return x, problem.weights(predicted[0], predicted[1], x), predicted, converged

@@ -29,8 +29,8 @@ MIN_ISOLATED = 0.5
 MIN_COARSE = 0.5
 """Fraction of repeated readings above which the value of a reading at rest is no coincidence."""
 MAX_PLAUSIBLE = 1.5
-"""Minimum ratio of a mark of such a sensor to the largest median of an axis, unless it is zero or
-equal on all axes."""
+"""Minimum ratio of such a mark to the largest median of an axis, unless zero or equal on all
+axes."""
 MIN_TOGETHER = 0.9
 """Minimum fraction of the occurrences of a mark in which another axis has a mark as well."""
 LARGEST = 1e30
@@ -41,8 +41,7 @@ MIN_REPETITION = 1.2
 MAX_REPETITION = 40.0
 """Maximum number of readings per measurement."""
 MIN_LOG_ODDS = 24.0
-"""Minimum significance of the regularity: random repetitions reach the power of a frequency with a
-probability of exp(-24), at each of some thousand frequencies."""
+"""Minimum significance of the regularity; random repetitions reach it with probability exp(-24)."""
 MIN_RESULTANT = 0.85
 """Minimum regularity of the changes, relative to a perfectly regular source."""
 MAX_JITTER = 0.2
@@ -61,8 +60,7 @@ MAX_MARKS = core.MAX_MARKS
 def missing_marks(fields: FloatArray) -> FloatArray:
     """Find the marks (k, 3) among chronological raw readings (n, 3) in T, NaN for a missing axis.
 
-    A mark is NaN for an axis that it does not concern. Values of several axes that always occur
-    together are one mark.
+    Values of several axes that always occur together are one mark, NaN for the other axes.
     """
     fields = np.where(np.isinf(fields), np.nan, fields)
     marks_of_axis = [_marks_of_axis(fields, axis) for axis in range(3)]
@@ -186,10 +184,7 @@ def changes_of(fields: FloatArray) -> BoolArray:
 
 
 def with_lost_readings(fields: FloatArray, stamps: IntArray) -> FloatArray:
-    """Insert a NaN row wherever a reading was lost, by the timestamps (n,) in ns.
-
-    Unchanged if the timestamps are irregular, or most readings are lost.
-    """
+    """Insert a NaN row for each lost reading if the timestamps (n,) in ns are regular enough."""
     intervals = np.diff(stamps) / max(1.0, float(np.median(np.diff(stamps)))) if len(stamps) > 1 \
         else np.zeros(0)
     steps = np.round(intervals)
@@ -206,9 +201,8 @@ def repetition_of(fields: FloatArray) -> float:
     """Number of chronological readings (n, 3) per measurement, from the regularity of the changes.
 
     A source that is read every r readings changes at the readings ceil(k r). The phases of the
-    changes modulo r then cover 1/r of the circle, so their resultant is sin(π/r) / (π/r). Changes
-    missing because two measurements are equal do not matter. 1 if readings are not repeated
-    regularly; an integer unless the rates are incommensurate.
+    changes modulo r then cover 1/r of the circle, so their resultant is sin(π/r) / (π/r). 1 if
+    readings are not repeated regularly; an integer unless the rates are incommensurate.
     """
     n, present = len(fields), np.flatnonzero(~np.isnan(fields).all(axis=1))
     is_change = np.zeros(n, dtype=bool)
@@ -284,10 +278,8 @@ NO_FAULTS = ReadingFaults(np.zeros((0, 3)), 1.0)
 
 
 def reading_faults(fields: FloatArray, stamps: IntArray | None = None) -> ReadingFaults:
-    """Find marks and repetitions in chronological raw readings (n, 3) in T, NaN for a missing axis.
-
-    The timestamps (n,) in ns show where readings were lost.
-    """
+    """Find marks and repetitions in chronological raw readings (n, 3) in T with timestamps (n,) in
+    ns."""
     marks = missing_marks(fields)
     kept = np.where(are_marked(fields, marks), np.nan, fields)
     return ReadingFaults(marks, repetition_of(

@@ -1,8 +1,7 @@
 """Detection of saturated readings and of isolated faulty readings.
 
 The limit of the range cuts the peak off an excursion: several equal readings, far from the level
-at rest, between steep flanks. A peak that is not cut off is round, and noise makes equal readings
-rare.
+at rest, between steep flanks. Other peaks are round, and noise makes equal readings rare.
 """
 
 import numpy as np
@@ -14,8 +13,7 @@ from mag_tracking.calibration.reading_faults import changes_of
 MIN_RUN = 3
 """Minimum number of consecutive equal readings at the limit of a saturated axis."""
 MAX_RUN = 50.0
-"""Default of the maximum number of readings for which a single excursion stays at the limit; a
-target that stands for a longer time may cause equal readings as well."""
+"""Default maximum number of readings for which a single excursion stays at the limit."""
 MIN_DISTANCE = 4.0
 """Minimum distance of the limit from the level at rest, in standard deviations or steps."""
 N_FLANK = 3
@@ -23,20 +21,19 @@ N_FLANK = 3
 MIN_NOISE_RATIO = 8.0
 """Minimum height of a flank in standard deviations of the noise."""
 MAX_FLATNESS = 4
-"""Exponent of the flattest peak that is not cut off: its height falls with this power of the
-distance from its centre. The peak of a pass is a parabola, and a sum of peaks is flatter."""
+"""Exponent of the flattest peak that is not cut off; the peak of a pass is a parabola."""
 MAX_ENTRY = 0.7
-"""Maximum distance of the nearest flank reading from the limit, relative to that of the level at
-rest. A jump over a larger part of the distance is no excursion."""
+"""Maximum jump from the nearest flank reading to the limit, relative to that from the level at
+rest."""
 MIN_LOG_PROBABILITY = np.log(1e-9)
 """Log-probability of equal readings below which they are not due to chance."""
 N_MARGIN = 6
-"""Number of readings excluded before and after each saturated reading. Noise pushes some of these
-readings beyond the limit, which biases the remaining readings."""
+"""Number of readings excluded beside each saturated reading, some of which noise pushes beyond
+it."""
 
 MIN_ISOLATION = 10.0
-"""Minimum difference between an isolated reading (a bus error) and both neighbours, relative to the
-differences between and next to these neighbours."""
+"""Minimum difference of an isolated reading (a bus error) from both neighbours, relative to
+theirs."""
 
 
 def isolated_readings(values: FloatArray, min_height: float = 0.0) -> IntArray:

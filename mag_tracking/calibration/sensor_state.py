@@ -1,8 +1,7 @@
 """State of the sensors that compiled code updates with every reading, and their quantisation steps.
 
-It is one structured array for all sensors, which Python accesses for each block. If the steps of a
-sensor exceed its noise, a reading is constant while the field changes by up to a step. Averaging
-does not remove that error, and a repeated reading adds little information (`resolution.hpp`).
+If the steps of a sensor exceed its noise, a reading is constant while the field changes by up to a
+step, so that repeated readings are not independent (`resolution.hpp`).
 """
 
 import numpy as np
@@ -12,34 +11,15 @@ from mag_tracking.calibration import core
 from mag_tracking.records import plain
 from mag_tracking.units import NEVER
 
-N_RECENT = core.N_RECENT
-"""Number of differences between consecutive readings that a spike is compared with."""
-MAX_HELD = core.MAX_HELD
-"""Maximum number of readings of a spike; a longer change is a step."""
-
 N_WINDOW = core.N_WINDOW
 """Number of raw readings in which faults of the driver are searched."""
 FIRST_WINDOW = 64
 """Number of raw readings between the searches in the first `N_WINDOW` readings of a sensor."""
 
-SENSOR = core.SENSOR
-"""Data type of the state of one sensor, defined in `sensor.hpp`. Values are in [T] and [s], or in
-[ns] if the name ends with `_ns`."""
-
 MIN_CHANGES = core.MIN_CHANGES
-"""Minimum number of changes before a sensor can be stuck; with fewer changes, its steps may be so
-coarse that long repetitions are normal."""
+"""Minimum number of changes before a sensor can be stuck, because its steps may be coarse."""
 COARSE_FRACTION = core.COARSE_FRACTION
-"""Fraction of repeated readings above which the steps of a sensor are coarse: at rest, it may
-repeat a reading indefinitely. With a noise of one step or more on three axes, the fraction is
-lower."""
-
-PASSES, HELD, SPIKE, RELEASED = core.PASSES, core.HELD, core.SPIKE, core.RELEASED
-"""Verdicts: the reading passes; the reading is held; the held readings are a spike; the held
-readings and the current reading pass."""
-
-MAX_ROUNDING = core.MAX_ROUNDING
-"""Maximum relative difference of two values that is due to rounding (single precision)."""
+"""Fraction of repeated readings above which the steps of a sensor are coarse."""
 
 MIN_STD = core.MIN_STD
 """[T] Minimum standard deviation of the readings of an axis that is not constant."""
@@ -49,8 +29,8 @@ TOGGLE_TOLERANCE = core.TOGGLE_TOLERANCE
 
 
 def new_sensors(n: int) -> StructArray:
-    """Create the state of `n` sensors without any reading, (n,) SENSOR array."""
-    sensors = np.zeros(n, SENSOR)
+    """Create the state of `n` sensors without any reading, (n,) SENSOR array of `sensor.hpp`."""
+    sensors = np.zeros(n, core.SENSOR)
     for name in ('first_ns', 'last_ns', 'unconfirmed_ns', 'before_ns'):
         sensors[name] = NEVER
     for name in ('last', 'before', 'end', 'noise_std', 'noise', 'raw', 'stated_std', 'latest'):
@@ -80,8 +60,7 @@ def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
     """Replace unknown steps (3,) T by those of other axes at rest; NaN for a dead axis.
 
     An axis that has never changed is dead if another axis of the sensor changes with every reading.
-    If no axis has changed, all may be at rest: inf. `variance` (3,) in T² is that of quiet
-    readings.
+    `variance` (3,) in T² is that of quiet readings.
     """
     out = plain(steps).copy()
     core.complete_steps(plain(variance), out)
@@ -94,6 +73,6 @@ def smallest_steps(fields: FloatArray) -> FloatArray:
     for axis, values in enumerate(fields.T):
         values = values[~np.isnan(values)]
         change = np.abs(np.diff(values))
-        change = change[change > MAX_ROUNDING * np.abs(values[1:])]
+        change = change[change > core.MAX_ROUNDING * np.abs(values[1:])]
         out[axis] = change.min(initial=np.inf)
     return out

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from mag_tracking.apps.board_geometry import survey_geometry
-from mag_tracking.calibration.network_fit import TrackedMagnet, rotation, tool_rotations
-from mag_tracking.calibration.network_geometry import GeometrySettings, calibrate_geometry
+from mag_tracking.calibration.network_fit import (
+    GeometrySettings,
+    TrackedMagnet,
+    rotation,
+    tool_rotations,
+)
+from mag_tracking.calibration.network_geometry import calibrate_geometry
 from mag_tracking.network import CalibrationRecord
 from mag_tracking.network.file import read_network, write_network
 from support.geometry_command import calibrated_readings, command, write_table

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mag_tracking.calibration.network_fit import TrackedMagnet, rotation, tool_rotations
-from mag_tracking.calibration.network_geometry import GeometrySettings, calibrate_geometry
+from mag_tracking.calibration.network_fit import (
+    GeometrySettings,
+    TrackedMagnet,
+    rotation,
+    tool_rotations,
+)
+from mag_tracking.calibration.network_geometry import calibrate_geometry
 from support.magnet_boards import MOMENT, SETTINGS, board, calibrated_boards, estimated, simulated
 
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mag_tracking.calibration.network_fit import rotation, tool_rotations
+from mag_tracking.calibration.network_fit import GeometrySettings, rotation, tool_rotations
 from mag_tracking.calibration.network_geometry import (
-    GeometrySettings,
     calibrate_geometry,
     calibrate_geometry_blind,
 )

@@ -9,7 +9,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from mag_tracking.calibration.magnet_pose import PoseSettings, locate_magnet
-from mag_tracking.calibration.network_geometry import GeometrySettings, calibrate_geometry
+from mag_tracking.calibration.network_fit import GeometrySettings
+from mag_tracking.calibration.network_geometry import calibrate_geometry
 from mag_tracking.network.file import read_network, write_network
 from support.geometry_command import calibrated_readings, command, write_table
 from support.magnet_boards import MOMENT, board, simulated

@@ -5,12 +5,13 @@ from functools import cache
 import numpy as np
 
 from mag_tracking.calibration.network_fit import (
+    GeometrySettings,
     TrackedMagnet,
     predicted_readings,
     rotation,
     tool_rotations,
 )
-from mag_tracking.calibration.network_geometry import GeometrySettings, calibrate_geometry
+from mag_tracking.calibration.network_geometry import calibrate_geometry
 from mag_tracking.network import SensorNetwork
 
 MOMENT = 0.264
