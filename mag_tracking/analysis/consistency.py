@@ -37,18 +37,28 @@ def error_over_bound(network: SensorNetwork, log: TrackLog,
     if len(truth_rows) < 2 or not len(rows):
         return None
     t = log.seconds()[truth_rows]
-    H, C = _measurement_model(network, log, true_path[truth_rows], t, truth_rows, field_error)
-    F, Q = _motion_model(t, acceleration, moment_walk, log, truth_rows, H.shape[-1])
-    P = path_bound(F, Q, H, C,
-                   _prior_covariance(network, true_path[truth_rows], t, log, truth_rows,
-                                     background_std))
+    H, C = _measurement_model(network, log, true_path[truth_rows], truth_rows, field_error)
+    n_x, moments = H.shape[-1], np.array(log.moment)[truth_rows]
+    F, Q = np.tile(np.eye(n_x), (len(t), 1, 1)), np.zeros((len(t), n_x, n_x))
+    for k, dt in enumerate(np.diff(t), 1):
+        F[k, :6, :6] = constant_velocity(dt)
+        Q[k, :6, :6] = integrator_noise(dt, acceleration)
+        Q[k, 6:9, 6:9] = moment_walk**2 * dt * np.square(moments[k]).sum() * np.eye(3)
+    # The prior has the extent and speed of the path as standard deviations.
+    steps = np.linalg.norm(np.diff(true_path[truth_rows], axis=0), axis=1)
+    std = np.full(n_x, background_std)
+    std[:3] = max(np.ptp(true_path[truth_rows], axis=0).max(),
+                  np.ptp(network.positions, axis=0).max())
+    std[3:6] = max(steps.max() / np.diff(t).min(), MIN_VELOCITY_STD)
+    std[6:9] = np.linalg.norm(moments[0])
+    P = path_bound(F, Q, H, C, np.diag(std**2))
     is_evaluated = np.isin(truth_rows, rows)
     variance = np.einsum('kii->ki', P[is_evaluated])[:, :axes].sum(axis=1)
     error = np.array(log.position)[truth_rows[is_evaluated]] - true_path[truth_rows[is_evaluated]]
     return float(np.sqrt(np.mean(np.square(error[:, :axes]).sum(axis=1)) / np.mean(variance)))
 
 
-def _measurement_model(network: SensorNetwork, log: TrackLog, true_path: FloatArray, t: FloatArray,
+def _measurement_model(network: SensorNetwork, log: TrackLog, true_path: FloatArray,
                        truth_rows: IntArray, field_error: float) -> tuple[FloatArray, FloatArray]:
     """Jacobians (k, n_sensors, 3, n_x) of the field with respect to [r, v, m, backgrounds], NaN
     without a measurement, and noise covariances (k, n_sensors, 3, 3)."""
@@ -66,28 +76,3 @@ def _measurement_model(network: SensorNetwork, log: TrackLog, true_path: FloatAr
     C = np.array(log.noise)[truth_rows] + field_error**2 * np.square(h).sum(axis=-1)[
         ..., None, None] * np.eye(3)
     return H, C
-
-
-def _motion_model(t: FloatArray, acceleration: FloatArray, moment_walk: float, log: TrackLog,
-                  truth_rows: IntArray, n_x: int) -> tuple[FloatArray, FloatArray]:
-    """F and Q (k, n_x, n_x); F[i] and Q[i] lead from pose i - 1 to pose i, F[0] = I and Q[0]
-    = 0."""
-    F, Q = np.tile(np.eye(n_x), (len(t), 1, 1)), np.zeros((len(t), n_x, n_x))
-    for k, dt in enumerate(np.diff(t), 1):
-        F[k, :6, :6] = constant_velocity(dt)
-        Q[k, :6, :6] = integrator_noise(dt, acceleration)
-        walk = moment_walk**2 * dt * np.square(log.moment[truth_rows[k]]).sum()
-        Q[k, 6:9, 6:9] = walk * np.eye(3)
-    return F, Q
-
-
-def _prior_covariance(network: SensorNetwork, true_path: FloatArray, t: FloatArray, log: TrackLog,
-                      truth_rows: IntArray, background_std: float) -> FloatArray:
-    """Diagonal covariance (n_x, n_x) of the first state, with extent and speed of the path as
-    stds."""
-    extent = max(np.ptp(true_path, axis=0).max(), np.ptp(network.positions, axis=0).max())
-    speed = max(np.linalg.norm(np.diff(true_path, axis=0), axis=1).max()
-                / np.diff(t).min(), MIN_VELOCITY_STD)
-    std = np.full(9 + 3 * len(network), background_std)
-    std[:3], std[3:6], std[6:9] = extent, speed, np.linalg.norm(log.moment[truth_rows[0]])
-    return np.diag(std**2)

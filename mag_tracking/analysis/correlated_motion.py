@@ -15,6 +15,7 @@ import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.geometry import cross_matrix
 from mag_tracking.inference.least_squares import model_error_covariance
 from mag_tracking.network.sensor_network import MIN_DELAY_BASELINE
 from mag_tracking.physics.bounds import ADVICE, MAX_SPEED, TOO_FAST
@@ -98,7 +99,11 @@ def correlated_motion(data: PassData) -> CorrelatedMotion:
     """Estimate the velocity of a target from the delays between the sensors that it passed."""
     if len(data.sensors) < 2:
         return CorrelatedMotion('one sensor: a delay requires two sensors')
-    delays = [d for d in (_estimate_delay(data, i, j) for i, j in _nearest_pairs(data))
+    positions = data.network.positions[:, :2]
+    pairs = list(combinations(data.sensors.tolist(), 2))
+    distance = np.array([np.linalg.norm(positions[i] - positions[j]) for i, j in pairs])
+    nearest = [k for k in np.argsort(distance, kind='stable') if distance[k] > MIN_DELAY_BASELINE]
+    delays = [d for d in (_estimate_delay(data, *pairs[k]) for k in nearest[:MAX_PAIRS])
               if d is not None]
     if not delays:
         return CorrelatedMotion('no pair of separate sensors has simultaneous readings of a '
@@ -136,15 +141,6 @@ def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
     difference = abs(speed[0] / cosine - delay.speed)
     return bool(difference > MIN_DIFFERENCE_STDS * np.hypot(std, delay.speed_std)
                 and difference > MIN_RELATIVE_DIFFERENCE * delay.speed)
-
-
-def _nearest_pairs(data: PassData) -> list[tuple[int, int]]:
-    """The closest pairs of sensors, at most `MAX_PAIRS`, none closer than `MIN_DELAY_BASELINE`."""
-    positions = data.network.positions[:, :2]
-    pairs = list(combinations(data.sensors.tolist(), 2))
-    distance = np.array([np.linalg.norm(positions[i] - positions[j]) for i, j in pairs])
-    nearest = [k for k in np.argsort(distance, kind='stable') if distance[k] > MIN_DELAY_BASELINE]
-    return [pairs[k] for k in nearest[:MAX_PAIRS]]
 
 
 def _fit_velocity(data: PassData, pairs: Sequence[PairDelay],
@@ -325,8 +321,7 @@ def _residuals(pair: _SmoothedPair, t: FloatArray, y: FloatArray,
     tau, background, angles, gain = theta[0], theta[1:1 + k], theta[1 + k:4 + k], theta[4 + k:]
     field, slope = (np.stack([np.interp(t - tau, pair.t, v) for v in values.T], axis=1)
                     for values in (pair.first, pair.slope))
-    by_angle = np.stack([np.cross(axis, field) for axis in np.eye(3)], axis=2) if k == 3 \
-        else np.zeros((len(t), k, 3))
+    by_angle = -cross_matrix(field) if k == 3 else np.zeros((len(t), k, 3))
     rotated = field + by_angle @ angles
     J = np.concatenate([-slope[:, :, None] * (1.0 + gain)[:, None],
                         np.broadcast_to(np.eye(k), (len(t), k, k)), by_angle,

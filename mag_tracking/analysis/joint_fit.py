@@ -278,16 +278,15 @@ def _agrees_with_path(fit: PassFit, path: FloatArray) -> bool:
     of the same time zero."""
     if not len(fit.x):
         return False
-    seconds = _time_of_peak(fit)
+    seconds = _fitted_peak_s(fit)
     offset = propagated_path(fit.x, seconds)[:2] - propagated_path(path, seconds)[:2]
     return bool(np.linalg.norm(offset) <= MAX_TRACK_DISTANCE and np.linalg.norm(
         fit.velocity - path[3:6]) <= MAX_VELOCITY_DIFFERENCE * np.linalg.norm(path[3:6]))
 
 
-def _time_of_peak(fit: PassFit) -> float:
+def _fitted_peak_s(fit: PassFit) -> float:
     """Time [s] at which the fitted field of a target is strongest."""
-    field = replace(fit.data, field=fit.predicted).field_change
-    return float(fit.data.t[np.argmax(np.einsum('ni,ni->n', field, field))])
+    return replace(fit.data, field=fit.predicted).peak_s
 
 
 def _shift_to_peak(fits: Sequence[PassFit], best: int) -> tuple[float, tuple[PassFit, ...]]:
@@ -298,7 +297,7 @@ def _shift_to_peak(fits: Sequence[PassFit], best: int) -> tuple[float, tuple[Pas
     fit = fits[best]
     if not len(fit.x):
         return np.inf, tuple(fits)
-    seconds = _time_of_peak(fit)
+    seconds = _fitted_peak_s(fit)
     centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
     cpa_time = fit.data.stamp_ns / NS + fit.closest_approach(centre)[0]
     return cpa_time, tuple(f.shifted(seconds) if len(f.x) else f for f in fits)

@@ -126,6 +126,12 @@ class PassData:
         t, sensor, field, covariance, n = (np.concatenate(c) for c in zip(*columns, strict=True))
         return replace(self, t=t, sensor=sensor, field=field, covariance=covariance, count=n)
 
+    @property
+    def peak_s(self) -> float:
+        """Time [s] of the strongest field."""
+        return float(self.t[np.argmax(np.einsum('ni,ni->n', self.field_change,
+                                                self.field_change))])
+
     @cached_property
     def field_change(self) -> FloatArray:
         """Field minus its median at each sensor, (n, 3) T: approximately the target's field."""

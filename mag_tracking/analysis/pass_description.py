@@ -16,6 +16,7 @@ from mag_tracking.analysis.pass_trust import (
     trusted_quantities,
 )
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.geometry import cross_matrix
 from mag_tracking.inference.crlb import bound, cpa_information, information
 from mag_tracking.inference.least_squares import model_error_covariance
 from mag_tracking.inference.separable_fit import Minimum
@@ -60,8 +61,7 @@ def robust_covariance(data: PassData, whitened: FloatArray, residuals: FloatArra
         std = np.full(3, errors.rotation_std) if configured_std is None else configured_std
         rotation_covariance = R_sw[j] @ np.diag(np.square(std)) @ R_sw[j].T
         field = target[sensor_mask]
-        G = np.concatenate([np.stack([np.cross(axis, field) for axis in np.eye(3)], axis=2),
-                            field[:, :, None] * np.eye(3)], axis=2)
+        G = np.concatenate([-cross_matrix(field), field[:, :, None] * np.eye(3)], axis=2)
         shift = covariance @ np.einsum('nax,nab->xb', whitened[sensor_mask],
                                        data.whitening[sensor_mask] @ G)
         P = np.zeros((6, 6))

@@ -57,9 +57,8 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
                      PATH_TOLERANCE[:starts.shape[1]], shorter_rows if n_dipoles > 1 else None)
     if not np.isfinite(minimum.cost):
         return PassFit(n_dipoles, data, 'no valid start of the search')
-    theta, p = minimum.theta, problem.linear(minimum.theta)
-    theta, p = create_model(
-        data.t, data.positions, data.whitening).with_nonnegative_length(theta, p)
+    theta, p = create_model(data.t, data.positions, data.whitening).with_nonnegative_length(
+        minimum.theta, problem.linear(minimum.theta))
     unexplained = max(minimum.cost - noise_dof, 0.0) / (problem.energy - noise_dof)
     fit, = fits_at_minimum(data, (n_dipoles,), replace(minimum, theta=theta), p, 1.0 - unexplained,
                            errors, cpa_range)
@@ -70,9 +69,7 @@ def centred_on_peak(data: PassData) -> tuple[PassData, PassData]:
     """Shift time zero to the strongest field; return all samples, and means of at most `N_COARSE`
     per sensor."""
     averaged = data.averaged(N_COARSE)
-    field_change = averaged.field_change
-    seconds = averaged.t[np.argmax(np.einsum('ni,ni->n', field_change, field_change))]
-    return data.shifted(seconds), averaged.shifted(seconds)
+    return data.shifted(averaged.peak_s), averaged.shifted(averaged.peak_s)
 
 
 def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
@@ -117,11 +114,9 @@ def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
 def shorter_rows(path: FloatArray) -> FloatArray:
     """Create starting paths of a row (7,): seven shorter rows, which fit almost as well, and a
     longer one."""
-    rows = []
-    for ratio, offset in ((0.7, 0.15), (0.7, 0.0), (0.7, -0.15), (0.4, 0.25), (0.4, 0.0),
-                          (0.4, -0.25), (0.1, 0.0), (1.5, 0.0)):
-        row = path.copy()
-        row[:3] += offset * path[6] * path[3:6] / np.linalg.norm(path[3:6])
-        row[6] *= ratio
-        rows.append(row)
-    return np.array(rows)
+    ratio, offset = np.array(((0.7, 0.15), (0.7, 0.0), (0.7, -0.15), (0.4, 0.25), (0.4, 0.0),
+                              (0.4, -0.25), (0.1, 0.0), (1.5, 0.0))).T
+    rows = np.tile(path, (len(ratio), 1))
+    rows[:, :3] += (offset * path[6])[:, None] * path[3:6] / np.linalg.norm(path[3:6])
+    rows[:, 6] *= ratio
+    return rows

@@ -81,25 +81,17 @@ def residual_elsewhere(data: PassData, rows: Sequence[FittedRow], residuals: Flo
         squared_norm: FloatArray = np.einsum('ni,ni->n', whitened, whitened)
         return squared_norm
 
-    plausible_energy = sum(
-        (_plausible_residual_fraction(data, row) * energy(row.field) for row in rows),
-        np.zeros(len(residuals)))
+    plausible_energy = np.zeros(len(residuals))
+    for n_dipoles, theta, field in rows:
+        v, length = theta[3:6], float(theta[6]) if n_dipoles > 1 else 0.0
+        positions = theta[:3] + data.t[:, None] * v - data.positions
+        dipoles = (np.linspace(-0.5, 0.5, n_dipoles) * length)[:, None] * (v / np.linalg.norm(v))
+        distance = np.linalg.norm(positions[:, None] + dipoles, axis=2).min(axis=1)
+        plausible_energy += energy(field) * np.minimum(1.0, np.square(
+            reach(n_dipoles, length) / np.maximum(distance, 1e-9)))
     excess_energy = np.square(residuals).sum(axis=1) - plausible_energy - NOISE_ENERGY
     total_energy = energy(np.sum([row.field for row in rows], axis=0))
     return float(np.maximum(excess_energy, 0.0).sum() / total_energy.sum())
-
-
-def _plausible_residual_fraction(data: PassData, row: FittedRow) -> FloatArray:
-    """Fraction (n,) of a target's energy in each sample that may plausibly be unexplained."""
-    n_dipoles, theta, _ = row
-    v, length = theta[3:6], float(theta[6]) if n_dipoles > 1 else 0.0
-    offsets = np.linspace(-0.5, 0.5, n_dipoles) * length if n_dipoles > 1 else np.zeros(1)
-    positions = theta[:3] + data.t[:, None] * v - data.positions
-    distance = np.linalg.norm(positions[:, None] + offsets[:, None] * (v / np.linalg.norm(v)),
-                              axis=2).min(axis=1)
-    fraction: FloatArray = np.minimum(1.0, np.square(
-        reach(n_dipoles, length) / np.maximum(distance, 1e-9)))
-    return fraction
 
 
 def rejection_reason(fit: PassFit) -> str:

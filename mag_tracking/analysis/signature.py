@@ -69,7 +69,7 @@ def features(signature: Signature) -> FloatArray:
     largest = np.abs(field).max()
     if not largest > 0.0 or not np.ptp(field / largest, axis=0).max() > 1e-12:
         raise ValueError('the field is constant')
-    shape = _resample(t, _subtract_baseline(t, field / largest))
+    shape = _resample(t, field / largest)
     magnitude = np.linalg.norm(shape, axis=1)
     energy = np.square(shape).sum(axis=0)
     axis_features = [v for axis, fraction in zip(shape.T, energy / energy.sum(), strict=True)
@@ -78,18 +78,13 @@ def features(signature: Signature) -> FloatArray:
                      *_magnitude_features(magnitude / magnitude.max())])
 
 
-def _subtract_baseline(t: FloatArray, field: FloatArray) -> FloatArray:
-    """Subtract the least-squares line through both ends of a signature."""
+def _resample(t: FloatArray, field: FloatArray) -> FloatArray:
+    """Subtract the line through both ends of a signature, cut off its tails and resample the rest
+    to (N_SAMPLES, n_axes)."""
     n = max(2, round(BASELINE_FRACTION * len(t)))
     ends = np.r_[:n, len(t) - n:len(t)]
     A = np.stack([np.ones_like(t), (t - t[0]) / (t[-1] - t[0])], axis=1)
-    line = np.linalg.lstsq(A[ends], field[ends], rcond=None)[0]
-    corrected_field: FloatArray = field - A @ line
-    return corrected_field
-
-
-def _resample(t: FloatArray, field: FloatArray) -> FloatArray:
-    """Cut off both tails of a signature and resample the rest to (N_SAMPLES, n_axes)."""
+    field = field - A @ np.linalg.lstsq(A[ends], field[ends], rcond=None)[0]
     even_times = np.linspace(t[0], t[-1], max(4 * N_SAMPLES, len(t)))
     fine_field = np.stack([np.interp(even_times, t, axis) for axis in field.T], axis=1)
     energy = np.square(fine_field).sum(axis=1)

@@ -139,9 +139,11 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
     for name, create_estimator in _candidates():
         held_out_logits = np.zeros((len(y), len(classes)))
         for train_rows, test_rows in folds:
-            held_out_logits[test_rows] = _logits(
-                create_estimator().fit(z[train_rows], y[train_rows]), z[test_rows])
-        losses = [_log_loss(held_out_logits / t, y) for t in TEMPERATURES]
+            weights, offsets = _weights_and_offsets(
+                create_estimator().fit(z[train_rows], y[train_rows]), len(classes))
+            held_out_logits[test_rows] = z[test_rows] @ weights.T + offsets
+        losses = [float(-np.mean(np.log(np.maximum(
+            _softmax(held_out_logits / t)[np.arange(len(y)), y], 1e-300)))) for t in TEMPERATURES]
         k = int(np.argmin(losses))
         candidates.append((losses[k], name, create_estimator, float(TEMPERATURES[k])))
     _, name, create_estimator, temperature = min(candidates, key=lambda s: s[0])
@@ -253,13 +255,6 @@ def _weights_and_offsets(fitted: Any, n_classes: int) -> tuple[FloatArray, Float
     return weights, offsets
 
 
-def _logits(fitted: Any, z: FloatArray) -> FloatArray:
-    """Logits (n, n_classes) of a fitted estimator."""
-    weights, offsets = _weights_and_offsets(fitted, len(fitted.classes_))
-    logits: FloatArray = z @ weights.T + offsets
-    return logits
-
-
 def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
     """Stratified folds without splitting groups, as pairs of training and test indices."""
     try:
@@ -309,8 +304,3 @@ def _softmax(logits: FloatArray) -> FloatArray:
     p = np.exp(logits - logits.max(axis=1, keepdims=True))
     out: FloatArray = p / p.sum(axis=1, keepdims=True)
     return out
-
-
-def _log_loss(logits: FloatArray, y: IntArray) -> float:
-    """Mean negative log-probability of the correct class."""
-    return float(-np.mean(np.log(np.maximum(_softmax(logits)[np.arange(len(y)), y], 1e-300))))

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, StructArray
+from mag_tracking.calibration import core
 from mag_tracking.calibration.background_level import (
     SHORTENED_FRACTION,
     BackgroundLevel,
@@ -41,7 +42,7 @@ from mag_tracking.calibration.frequent_level import (
     ProvisionalLevel,
 )
 from mag_tracking.calibration.level_change import ChangeEvaluator, SharedChanges
-from mag_tracking.calibration.sensor_state import MIN_STD, corrected_steps
+from mag_tracking.calibration.sensor_state import corrected_steps
 from mag_tracking.units import NS
 
 MAX_CHANGES = 16
@@ -191,7 +192,7 @@ class RunningBackground(BackgroundLevel):
             return
         block = block_of(self._sensors)
         self._state['is_full'] = False
-        is_constant = (block.n > 1) & (block.scatter.diagonal() < MIN_STD**2 * (block.n - 1))
+        is_constant = (block.n > 1) & (block.scatter.diagonal() < core.MIN_STD**2 * (block.n - 1))
         if self.ready and not self.is_provisional:
             self.apply_steps()
             # A constant axis is at rest if its steps are coarse, and stuck if they are fine.
@@ -206,14 +207,12 @@ class RunningBackground(BackgroundLevel):
                                       self.doubtful)
 
     def _collect_until_quiet(self, block: Block) -> None:
-        """Add a block; adopt the latest quiet interval as the background if it is long enough."""
+        """Add a block; adopt the latest quiet interval as the background if it is long enough, or
+        else the given background or a frequent level, provisional if uncertain."""
         self._start_time = block.time if np.isnan(self._start_time) else self._start_time
         segments = self._learning_window.segments(block, self.stuck)
-        if not any(self._adopt_if_steady(s) for s in segments) and not self.stuck:
-            self._start_provisionally(block)
-
-    def _start_provisionally(self, block: Block) -> None:
-        """Add a block; adopt the given background or a frequent level, provisional if uncertain."""
+        if any(self._adopt_if_steady(s) for s in segments) or self.stuck:
+            return
         self._provisional.collect(block)
         frequent = self._provisional.frequent_level(corrected_steps(self._sensors))
         if frequent is None:

@@ -13,7 +13,7 @@ from mag_tracking.calibration import core
 from mag_tracking.calibration.blocks import Block, Blocks, has_noisy_block, line_through, stacked
 from mag_tracking.calibration.frequent_level import MIN_DURATION_RATIO
 from mag_tracking.calibration.level_change import NO_CHANGE, ChangeEvaluator, level_change
-from mag_tracking.calibration.sensor_state import MIN_STD, completed_steps, corrected_steps
+from mag_tracking.calibration.sensor_state import completed_steps, corrected_steps
 from mag_tracking.records import plain
 from mag_tracking.units import NS
 
@@ -91,16 +91,17 @@ class BackgroundLevel:
     def without_dead_axes(self, noise: FloatArray) -> FloatArray:
         """Noise (3, 3) with NaN for dead axes: constant although their steps are not coarse."""
         steps, variance = corrected_steps(self._sensors), noise.diagonal()
-        if np.isfinite(steps).all() and (variance > MIN_STD**2).all():
+        if np.isfinite(steps).all() and (variance > core.MIN_STD**2).all():
             return noise
         steps = completed_steps(variance, steps)
-        is_dead = ~np.isfinite(steps) | (steps == 0.0) & (variance <= MIN_STD**2)
+        is_dead = ~np.isfinite(steps) | (steps == 0.0) & (variance <= core.MIN_STD**2)
         return np.where(is_dead[:, None] | is_dead, np.nan, noise)
 
     def without_unknown_noise(self, covariance: FloatArray) -> FloatArray:
         """Covariance with NaN for constant axes whose steps are unknown or too fine to observe."""
         steps = corrected_steps(self._sensors)
-        is_unknown = (covariance.diagonal() <= MIN_STD**2) & ~(np.isfinite(steps) & (steps > 0.0))
+        is_unknown = (covariance.diagonal() <= core.MIN_STD**2) & ~(
+            np.isfinite(steps) & (steps > 0.0))
         return np.where(is_unknown[:, None] | is_unknown, np.nan, covariance)
 
     @property

@@ -53,7 +53,9 @@ class Decimator:
 
         An output is the timestamp [ns] of the filter's centre and a field, NaN for incomplete axes.
         """
-        if self._window and self._is_gap(stamp_ns):
+        interval = stamp_ns - self._window[-1][0] if self._window else 1
+        if interval <= 0 or self._window and self.factor is not None and abs(
+                interval - self._interval) > GAP_TOLERANCE * self._interval:
             self.reset()
         self._window.append((stamp_ns, field))
         if self.factor is None:
@@ -73,12 +75,6 @@ class Decimator:
         if self.factor is None:
             raise ValueError('the sampling rate of the sensor is not known yet')
         return 1.0 if self._taps is None else float(self._taps @ self._taps)
-
-    def _is_gap(self, stamp_ns: int) -> bool:
-        """Whether the interval between the previous sample and this sample is a gap."""
-        interval = stamp_ns - self._window[-1][0]
-        return interval <= 0 or (self.factor is not None and abs(
-            interval - self._interval) > GAP_TOLERANCE * self._interval)
 
     def _measure_rate(self) -> list[tuple[int, FloatArray]]:
         """Measure the rate if enough samples are stored; return the outputs of these samples."""

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration import core
 from mag_tracking.calibration.blocks import Block, Blocks, line_through, pooled_covariance, stacked
-from mag_tracking.calibration.sensor_state import TOGGLE_TOLERANCE
 
 MAX_CALM_RATIO = 3.0
 """Maximum std within a block, relative to the 20 % quantile of all blocks; a target exceeds it."""
@@ -114,7 +114,7 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int
     is_calm = (variance[:, is_used] <= MAX_CALM_RATIO**2 * quietest).all(axis=1)
     width = np.full(3, np.nan)
     width[is_used] = np.maximum(LEVEL_WIDTH * np.sqrt(quietest / np.median(n[:, is_used], axis=0)),
-                                np.maximum(TOGGLE_TOLERANCE * steps[is_used], MIN_WIDTH))
+                                np.maximum(core.TOGGLE_TOLERANCE * steps[is_used], MIN_WIDTH))
     calm_rows = np.flatnonzero(is_calm)
     if len(calm_rows) < MIN_BLOCKS:
         return None

@@ -227,16 +227,6 @@ class GeometryProblem:
         sensor, shared, pose = x
         return sensor * self.sensor_unit, shared * self.shared_unit, pose * self.pose_unit
 
-    def initial_unknowns(self) -> Unknowns:
-        """Create the initial unknowns: biases from the median residuals, all other unknowns
-        zero."""
-        n, K = len(self.network), len(self.magnet.tool)
-        x = np.zeros((n, N_SENSOR)), np.zeros(N_SHARED), np.zeros((K, N_POSE))
-        residuals = self.field - self.predicted(x)[0]
-        for j, a in zip(*np.nonzero(self.has_readings), strict=True):
-            x[0][j, a] = np.nanmedian(residuals[j, :, a]) / self.sensor_unit[j, a]
-        return x
-
     def squared_residuals(self, f: FloatArray,
                           signal: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
         """Squared residuals over their variance, numbers of measured axes (n, K), and the variance.
@@ -358,9 +348,13 @@ class NormalEquations:
 
 def solve(problem: GeometryProblem,
           iterations: int) -> tuple[Unknowns, Weights, Prediction, bool]:
-    """Minimise a `GeometryProblem` by Levenberg-Marquardt; the last value is whether it
-    converged."""
-    x, damping, converged = problem.initial_unknowns(), 1e-3, False
+    """Minimise a `GeometryProblem` by Levenberg-Marquardt, from the median residuals as biases; the
+    last value is whether it converged."""
+    n, K, damping, converged = len(problem.network), len(problem.magnet.tool), 1e-3, False
+    x = np.zeros((n, N_SENSOR)), np.zeros(N_SHARED), np.zeros((K, N_POSE))
+    residuals = problem.field - problem.predicted(x)[0]
+    for j, a in zip(*np.nonzero(problem.has_readings), strict=True):
+        x[0][j, a] = np.nanmedian(residuals[j, :, a]) / problem.sensor_unit[j, a]
     predicted = problem.predicted(x)
     for _ in range(iterations):
         W, prior_weights, *_ = problem.weights(predicted[0], predicted[1], x)

@@ -248,21 +248,16 @@ def _suspects(problem: GeometryProblem, x: Unknowns, sensor_residual: FloatArray
             tuple(int(k) for k in np.flatnonzero(is_suspect_pose)))
 
 
-def _is_magnet_at_rest(problem: GeometryProblem, x: Unknowns) -> bool:
-    """Whether position and axis of the magnet vary by less than `MIN_POSE_VARIATION`."""
-    r, u = problem.magnet.positions_and_axes(*problem.in_si(x)[1:])
-    nearest_distance = np.linalg.norm(problem.network.positions - r.mean(axis=0), axis=1).min()
-    return bool((np.ptp(r, axis=0) < MIN_POSE_VARIATION * nearest_distance).all()
-                and (np.ptp(u, axis=0) < MIN_POSE_VARIATION).all())
-
-
 def _failure_reason(problem: GeometryProblem, x: Unknowns, converged: bool, cost: float) -> str:
     """Reason why the fit is not valid; empty if it is valid."""
     K = len(problem.magnet.tool)
     if K < MIN_POSES:
         return (f'number of poses is {K}; at least {MIN_POSES} are required to separate the '
                 'biases from the field of the magnet')
-    if _is_magnet_at_rest(problem, x):
+    r, u = problem.magnet.positions_and_axes(*problem.in_si(x)[1:])
+    nearest_distance = np.linalg.norm(problem.network.positions - r.mean(axis=0), axis=1).min()
+    if (np.ptp(r, axis=0) < MIN_POSE_VARIATION * nearest_distance).all() \
+            and (np.ptp(u, axis=0) < MIN_POSE_VARIATION).all():
         return 'the poses are almost equal: the geometry is not observable; move the magnet'
     if not converged:
         return f'no minimum found (maximum number of steps: {problem.settings.iterations})'

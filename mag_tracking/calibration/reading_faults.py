@@ -53,9 +53,6 @@ MAX_LOST = 2.0
 OVERSAMPLING = 4
 """Oversampling of the frequencies at which the regularity is evaluated."""
 
-MAX_MARKS = core.MAX_MARKS
-"""Maximum number of different marks of a sensor."""
-
 
 def missing_marks(fields: FloatArray) -> FloatArray:
     """Find the marks (k, 3) among chronological raw readings (n, 3) in T, NaN for a missing axis.
@@ -94,17 +91,14 @@ def are_marked(fields: FloatArray, marks: FloatArray) -> BoolArray:
 
 def describe_marks(marks: FloatArray) -> str:
     """Format marks (k, 3) in T, with axis names unless a mark concerns all axes."""
-    return ' or '.join(map(_describe_mark, marks))
-
-
-def _describe_mark(mark: FloatArray) -> str:
-    """Format a mark (3,) [T]."""
-    values = [(f'{axis} = ', v) for axis, v in zip('xyz', mark.tolist(), strict=True)
-              if not np.isnan(v)]
-    if len(values) == 3 and len({v for _, v in values}) == 1:
-        values = [('', values[0][1])]
-    return ', '.join(axis + (f'{1e9 * v:.6g} nT' if abs(v) < 1.0 else f'{v:.6g} T')
-                     for axis, v in values)
+    texts = []
+    for mark in marks.tolist():
+        values = [(f'{axis} = ', v) for axis, v in zip('xyz', mark, strict=True) if not np.isnan(v)]
+        if len(values) == 3 and len({v for _, v in values}) == 1:
+            values = [('', values[0][1])]
+        texts.append(', '.join(axis + (f'{1e9 * v:.6g} nT' if abs(v) < 1.0 else f'{v:.6g} T')
+                               for axis, v in values))
+    return ' or '.join(texts)
 
 
 def _marks_of_axis(fields: FloatArray, axis: int) -> list[float]:
@@ -225,17 +219,12 @@ def repetition_of(fields: FloatArray) -> float:
         return 1.0
     # Multiples of the rate are regular as well: the slowest source decides.
     slowest = np.flatnonzero(is_regular & (period > 0.9 * period[is_regular].max()))
-    bin_of_best = slowest[np.argmax(resultant[slowest])]
-    best = _refined(changes, float(frequency[bin_of_best]), 1.0 / size)
+    frequencies = frequency[slowest[np.argmax(resultant[slowest])]] \
+        + 1.0 / size * np.linspace(-1.0, 1.0, 65)
+    resultant = np.abs(np.exp(2j * np.pi * np.outer(frequencies, changes)).sum(axis=1))
+    best = float(1.0 / frequencies[np.argmax(resultant)])
     nearest = round(best)
     return float(nearest) if abs(best - nearest) * n < 2.0 * best**2 / OVERSAMPLING else best
-
-
-def _refined(changes: IntArray, frequency: float, width: float) -> float:
-    """Period of the most regular `frequency` [1/reading] within `width`, at the changed indices."""
-    frequencies = frequency + width * np.linspace(-1.0, 1.0, 65)
-    resultant = np.abs(np.exp(2j * np.pi * np.outer(frequencies, changes)).sum(axis=1))
-    return float(1.0 / frequencies[np.argmax(resultant)])
 
 
 @dataclass(frozen=True)
@@ -260,7 +249,7 @@ class ReadingFaults:
         """Add the marks, or the repetition, found in later readings."""
         marks = [*self.marks, *(mark for mark in latest.marks if not any(
             np.array_equal(mark, known, equal_nan=True) for known in self.marks))]
-        return ReadingFaults(np.array(marks[:MAX_MARKS]).reshape(-1, 3),
+        return ReadingFaults(np.array(marks[:core.MAX_MARKS]).reshape(-1, 3),
                              self.repetition if self.repetition > 1.0 else latest.repetition,
                              latest.rate)
 

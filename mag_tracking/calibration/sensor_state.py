@@ -11,21 +11,12 @@ from mag_tracking.calibration import core
 from mag_tracking.records import plain
 from mag_tracking.units import NEVER
 
-N_WINDOW = core.N_WINDOW
-"""Number of raw readings in which faults of the driver are searched."""
+N_WINDOW, MIN_CHANGES, COARSE_FRACTION = core.N_WINDOW, core.MIN_CHANGES, core.COARSE_FRACTION
+"""Number of raw readings in which faults of the driver are searched; minimum number of changes, and
+minimum fraction of repetitions, of a sensor that is stuck, or coarse (`screening.hpp`)."""
+
 FIRST_WINDOW = 64
 """Number of raw readings between the searches in the first `N_WINDOW` readings of a sensor."""
-
-MIN_CHANGES = core.MIN_CHANGES
-"""Minimum number of changes before a sensor can be stuck, because its steps may be coarse."""
-COARSE_FRACTION = core.COARSE_FRACTION
-"""Fraction of repeated readings above which the steps of a sensor are coarse."""
-
-MIN_STD = core.MIN_STD
-"""[T] Minimum standard deviation of the readings of an axis that is not constant."""
-
-TOGGLE_TOLERANCE = core.TOGGLE_TOLERANCE
-"""[steps] Tolerance of an axis at rest, which may toggle between two adjacent values."""
 
 
 def new_sensors(n: int) -> StructArray:
