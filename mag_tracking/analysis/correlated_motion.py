@@ -26,8 +26,8 @@ MIN_CORRELATION = 0.97
 MIN_PEAK = 0.7
 """Minimum height of a correlation maximum relative to the highest maximum."""
 
-N_COARSE = 512
-"""Number of field samples in the search for correlation maxima."""
+N_COARSE, MAX_PAIRS = 512, 12
+"""Number of samples in the search for correlation maxima, and of compared pairs (the closest)."""
 
 SCALE_STD, GAIN_STD, ROTATION_STD = 0.05, 0.02, np.deg2rad(2.0)
 """Prior standard deviations of the differences between the fields at two sensors: common scale
@@ -36,11 +36,9 @@ SCALE_STD, GAIN_STD, ROTATION_STD = 0.05, 0.02, np.deg2rad(2.0)
 MIN_DELAY = 3.0
 """Minimum delay in standard deviations; a smaller delay is not significant."""
 
-RELATIVE_KERNEL_WIDTH = 0.3
-"""Width of the smoothing kernel relative to the RMS duration of the field."""
-
-MAX_DELAY_SHIFT = 4.0
-"""Maximum shift of a delay during the refinement, in widths of the smoothing kernel."""
+RELATIVE_KERNEL_WIDTH, MAX_DELAY_SHIFT = 0.3, 4.0
+"""Width of the smoothing kernel relative to the RMS duration of the field, and maximum shift of a
+delay during the refinement in these widths."""
 
 MAX_PRIOR_CHI2 = 22.5
 """Maximum joint chi-square of rotation, scale and gains of equal fields (probability 0.001)."""
@@ -51,14 +49,8 @@ MIN_DIFFERENCE_STDS, MIN_RELATIVE_DIFFERENCE = 3.0, 0.1
 MIN_COSINE = 0.3
 """Minimum cosine of the angle between the heading and the line through both sensors."""
 
-MAX_READINGS = 1_000_000
-"""Maximum number of resampled readings of a pair, which irregular timestamps may exceed."""
-
-MAX_PAIRS = 12
-"""Maximum number of pairs of sensors; the closest pairs are compared."""
-
-MIN_SAMPLES = 10
-"""Minimum number of readings of each sensor."""
+MIN_SAMPLES, MAX_READINGS = 10, 1_000_000
+"""Minimum number of readings of each sensor, and maximum number of resampled readings of a pair."""
 
 _MAX_GAUSS_NEWTON_STEPS = 20
 

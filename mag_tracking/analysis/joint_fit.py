@@ -36,21 +36,15 @@ from mag_tracking.inference.separable_fit import coarse_minima, fine_minimum
 from mag_tracking.physics.passes import SuperposedPasses
 from mag_tracking.units import NS
 
-N_REFINED, N_STEPS = 150, 6
-"""Number of starting points that are refined in the coarse search, and number of steps of each."""
-
-N_CONVERGED = 10
-"""Number of coarse solutions that are refined until convergence."""
-
-N_FINE_STARTS = 2
-"""Number of coarse minima from which the fit to all measurements starts."""
+N_REFINED, N_STEPS, N_CONVERGED, N_FINE_STARTS = 150, 6, 10, 2
+"""Number of starting points that are refined in the coarse search, steps of each, number of coarse
+solutions that are refined until convergence, and of those from which the final fit starts."""
 
 INITIAL_LENGTH = 3.0
 """[m] Initial length of a row of dipoles that replaces a point."""
 
 MIN_GAP, VEHICLE_WIDTH = 3.0, 1.5
-"""[m] Minimum distance between the rows of dipoles of two vehicles, along and across their
-heading."""
+"""[m] Minimum distance between the rows of two vehicles, along and across their heading."""
 
 MAX_DETECTION_RANGE = 15.0
 """[m] Maximum distance at which a sensor detects a target."""
@@ -59,8 +53,7 @@ MAX_ROUNDS = 3
 """Maximum number of rounds of the order selection, each of all targets in turn."""
 
 MAX_VELOCITY_DIFFERENCE, MAX_TRACK_DISTANCE = 0.5, 5.0
-"""Maximum relative difference of velocity and maximum distance [m] of two fits, or of fit and
-track."""
+"""Maximum relative difference of velocity, and distance [m], of two fits, or of fit and track."""
 
 MAX_TARGETS = 3
 """Maximum number of targets in a joint fit, each with about twelve unknowns."""

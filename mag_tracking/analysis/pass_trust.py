@@ -20,12 +20,9 @@ the field is the reach over r. Four real cars at 4.5 m had normalised costs of 1
 (T10 Table 6.1, TSP14 Table I), with 87 times the noise energy per value on average over the
 pass."""
 
-ROW_REACH = 0.45
-"""Reach of the iron from a row, relative to the spacing of its dipoles; 0.15 to 0.45 from the costs
-of cars and trucks with three dipoles in T10 Table 6.5 and TSP14 Table II."""
-
-MIN_ROW_REACH = 0.4
-"""[m] Minimum reach of the iron from a row, from the cars in T10 Table 6.5 and TSP14 Table II."""
+ROW_REACH, MIN_ROW_REACH = 0.45, 0.4
+"""Reach of the iron from a row, relative to the spacing of its dipoles, and at least [m], from the
+costs of cars and trucks with three dipoles in T10 Table 6.5 and TSP14 Table II."""
 
 NOISE_ENERGY = 16.3
 """Whitened energy of three axes that noise exceeds with a probability of 0.001."""
@@ -37,22 +34,13 @@ the field energy (gain errors, a swerve), and fraction of the total residual."""
 MIN_PASS_DISTANCE = 0.3
 """Minimum distance travelled during a pass, relative to the distance of the nearest sensor."""
 
-MAX_VELOCITY_CHANGE = 0.3
-"""Maximum apparent relative change of the velocity: a turn of 17 degrees; model errors reach
-0.2."""
+MAX_VELOCITY_CHANGE, MIN_VELOCITY_CHANGE_STDS = 0.3, 2.5
+"""Maximum relative change of the velocity (a turn of 17 degrees; model errors of vehicles cause up
+to 0.2), and minimum significant change in standard deviations."""
 
-MIN_VELOCITY_CHANGE_STDS = 2.5
-"""Minimum significant change of the velocity, in standard deviations."""
-
-MAX_SPEED_STD = 0.25
-"""Maximum standard deviation of a trusted speed relative to the speed."""
-
-MAX_HEADING_STD = np.pi / 6.0
-"""[rad] Maximum standard deviation of a trusted direction: a third of a right angle."""
-
-MAX_TIME_STD = 0.25
-"""Maximum std of a trusted CPA time, relative to the distance of the nearest sensor over the
-speed."""
+MAX_SPEED_STD, MAX_HEADING_STD, MAX_TIME_STD = 0.25, np.pi / 6.0, 0.25
+"""Maximum standard deviation of a trusted speed relative to the speed, of a direction [rad], and of
+a CPA time relative to the distance of the nearest sensor over the speed."""
 
 
 class FittedRow(NamedTuple):

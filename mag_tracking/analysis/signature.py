@@ -6,14 +6,12 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 
-N_SAMPLES = 64
-"""Number of samples of a resampled signature."""
+N_SAMPLES, MIN_SAMPLES = 64, 8
+"""Number of samples of a resampled signature, and minimum number of a recorded one."""
 
-BASELINE_FRACTION = 0.1
-"""Fraction of a signature, at each end, to which the baseline is fitted."""
-
-TAIL_FRACTION = 0.005
-"""Fraction of the energy that is cut off at each end of a signature."""
+BASELINE_FRACTION, TAIL_FRACTION = 0.1, 0.005
+"""Fraction of a signature to which the baseline is fitted, and of its energy that is cut off, at
+each end."""
 
 MIN_PROMINENCE = 0.1
 """Minimum prominence of an extremum relative to the range of its axis."""
@@ -23,9 +21,6 @@ AUTOCORRELATION_LAGS = (2, 4, 8, 16)
 
 N_DCT_COEFFICIENTS = 8
 """Number of coefficients of the discrete cosine transform of the field magnitude."""
-
-MIN_SAMPLES = 8
-"""Minimum number of samples of a signature."""
 
 
 @dataclass(frozen=True)

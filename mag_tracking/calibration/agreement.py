@@ -35,18 +35,12 @@ is below the second value for one axis, and below the third for all axes."""
 UNIT_TOLERANCE = 0.1
 """A gain that differs from a power of ten by less than this may be due to a wrong unit."""
 
-MAX_HEADING_STDS = 5.0
-"""Maximum tested heading error, in standard deviations."""
+MAX_HEADING_STDS, YAW_STEP = 5.0, np.deg2rad(0.25)
+"""Maximum tested heading error in standard deviations, and step of the tested headings [rad]."""
 
-YAW_STEP = np.deg2rad(0.25)
-"""[rad] Step of the tested headings; one step rotates a horizontal field of 20 uT by 0.1 uT."""
-
-MAX_REMAINING_FRACTION = 0.3
-"""Maximum remaining fraction of the difference after a partial explanation."""
-
-MAX_RATIO_TO_NEXT = 0.5
-"""Maximum remaining difference relative to that of the next best, equally complex change of
-axes."""
+MAX_REMAINING_FRACTION, MAX_RATIO_TO_NEXT = 0.3, 0.5
+"""Maximum difference that remains after a partial explanation, relative to the original one, and to
+that after the next best, equally complex change of axes."""
 
 UNITS = (('gauss', 1e4), ('millitesla', 1e3), ('microtesla', 1e6), ('nanotesla', 1e9))
 _AXES = 'xyz'

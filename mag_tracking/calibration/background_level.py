@@ -17,21 +17,14 @@ from mag_tracking.calibration.sensor_state import completed_steps, corrected_ste
 from mag_tracking.records import plain
 from mag_tracking.units import NS
 
-TYPICAL_DRIFT = 3e-9
-"""[T/s] Typical drift of a background."""
-
-STEEP_DRIFT = 1e-8
-"""[T/s] Maximum drift of a background, reached by a sensor that is warming up."""
+TYPICAL_DRIFT, STEEP_DRIFT = 3e-9, 1e-8
+"""[T/s] Typical and maximum drift of a background; the latter while a sensor is warming up."""
 
 MIN_SLOPE_STDS = 4.0
 """Number of standard deviations by which a slope must exceed `STEEP_DRIFT`."""
 
-MAX_AGE_S = 600.0
-"""[s] Maximum age of a former level."""
-
-MAX_DRIFT = 4.0
-"""Maximum drift of a former level in tolerances of a block mean; more would match stopped
-vehicles."""
+MAX_AGE_S, MAX_DRIFT = 600.0, 4.0
+"""Maximum age [s] of a former level, and its maximum drift in tolerances of a block mean."""
 
 MIN_RELEARN_S = 10.0
 """[s] Minimum duration of another steady level that replaces a resumed or short background."""

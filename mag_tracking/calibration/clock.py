@@ -19,11 +19,8 @@ MIN_CORRELATION = 0.7
 MAX_RIVAL_RATIO = 0.9
 """Maximum correlation at a second lag, relative to the best one, of an unambiguous lag."""
 
-CONTEXT_S = 5.0
-"""[s] Compared interval before the first and after the last knock, with the signal at rest."""
-
-MARGIN_S = 0.1
-"""[s] Interval before and after a knock that is compared."""
+CONTEXT_S, MARGIN_S = 5.0, 0.1
+"""[s] Interval beside the first and last knock that is compared, and beside a knock."""
 
 _Series: TypeAlias = tuple[FloatArray, FloatArray]
 """Times (n,) [s] and values (n,)."""

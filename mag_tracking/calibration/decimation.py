@@ -63,7 +63,15 @@ class Decimator:
         if self._taps is None:
             self._window = deque(list(self._window)[-2:])
             return [(stamp_ns, field)]
-        return self._filter(self.factor, self._taps)
+        if len(self._window) < len(self._taps):
+            return []
+        if self._n_until_output:
+            self._n_until_output -= 1
+            return []
+        self._n_until_output = self.factor - 1
+        # The filter is symmetric, so its output belongs to the centre sample.
+        return [(self._window[len(self._taps) // 2][0],
+                 self._taps @ np.array([f for _, f in self._window]))]
 
     @property
     def n_waiting(self) -> int:
@@ -87,15 +95,3 @@ class Decimator:
         stored_samples = list(self._window)
         self.reset()
         return [out for stamp, field in stored_samples for out in self.feed(stamp, field)]
-
-    def _filter(self, factor: int, taps: FloatArray) -> list[tuple[int, FloatArray]]:
-        """Return the output of the filter as a list; empty if no output is due."""
-        if len(self._window) < len(taps):
-            return []
-        if self._n_until_output:
-            self._n_until_output -= 1
-            return []
-        self._n_until_output = factor - 1
-        # The filter is symmetric, so its output belongs to the centre sample.
-        middle = self._window[len(taps) // 2][0]
-        return [(middle, taps @ np.array([f for _, f in self._window]))]

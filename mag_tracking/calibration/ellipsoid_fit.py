@@ -19,21 +19,15 @@ from mag_tracking.calibration.ellipsoid import (
 from mag_tracking.calibration.reading_faults import are_marked, missing_marks
 from mag_tracking.calibration.saturation import saturated_readings, with_margin
 
-MIN_READINGS = 50
-"""Minimum number of readings."""
+MIN_READINGS, MIN_DIRECTIONS = 50, 18
+"""Minimum number of readings, and of cells with readings: two for each of the nine parameters."""
 
-MIN_DIRECTIONS = 18
-"""Minimum number of cells with readings: two for each of the nine parameters."""
-
-MIN_COVERAGE = 0.01
-"""Minimum coverage, at which an error shared by adjacent directions is amplified ten times."""
-
-GOOD_COVERAGE = 0.1
-"""Coverage below which a warning is issued; at this value, errors are amplified three times."""
+MIN_COVERAGE, GOOD_COVERAGE = 0.01, 0.1
+"""Coverage at which errors of adjacent directions are amplified ten times (rejected), and three
+times (warning)."""
 
 MIN_THICKNESS = 0.05
-"""Minimum ratio of smallest to largest spread of the readings, which a single axis does not
-reach."""
+"""Minimum ratio of smallest to largest spread of the readings; one axis of rotation has less."""
 
 MAX_AXIS_RATIO = 5.0
 """Maximum ratio of longest to shortest axis; soft iron on a sensor's board causes about two."""
@@ -46,20 +40,14 @@ MAX_OFFSET_STD = 0.1
 """Maximum standard deviation of the offset relative to the radius, in the worst direction."""
 
 GOOD_RESIDUAL = 0.05
-"""Coefficient of variation (std/mean) of the corrected magnitudes above which a warning is
-issued."""
+"""Coefficient of variation (std/mean) of corrected magnitudes above which a warning is issued."""
 
-GOOD_OUTLIER_FRACTION = 0.01
-"""Fraction of outliers above which a warning is issued."""
+GOOD_OUTLIER_FRACTION, MAX_OUTLIER_FRACTION = 0.01, 0.2
+"""Fraction of outliers above which a warning is issued, or the scatter is not meaningful."""
 
-MAX_OUTLIER_FRACTION = 0.2
-"""Maximum fraction of outliers; beyond it, the robust scatter is not meaningful."""
-
-MIN_GLITCH_DISTANCE = 5.0
-"""Minimum distance of a glitch (a data transfer error) from the median, in median distances."""
-
-MAX_GLITCH_FRACTION = 0.02
-"""Maximum fraction of glitches; more are due to a sensor that was mostly at rest."""
+MIN_GLITCH_DISTANCE, MAX_GLITCH_FRACTION = 5.0, 0.02
+"""Minimum distance of glitches (data transfer errors) from the median, in median distances, and
+their maximum fraction; more are due to a sensor that was mostly at rest."""
 
 
 @dataclass(frozen=True)

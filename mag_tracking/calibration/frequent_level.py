@@ -16,11 +16,9 @@ from mag_tracking.calibration.blocks import Block, Blocks, line_through, pooled_
 MAX_CALM_RATIO = 3.0
 """Maximum std within a block, relative to the 20 % quantile of all blocks; a target exceeds it."""
 
-LEVEL_WIDTH = 4.0
-"""Maximum difference between a block and its level, in standard deviations of a mean, per axis."""
-
-MIN_WIDTH = 5e-9
-"""[T] Minimum tolerance of a level, which allows for drift."""
+LEVEL_WIDTH, MIN_WIDTH = 4.0, 5e-9
+"""Maximum difference between a block and its level per axis, in standard deviations of a mean, and
+at least [T], which allows for drift."""
 
 MIN_REPORTED_FRACTION = 0.5
 """An axis is evaluated if more than this fraction of the blocks contain it."""
@@ -40,14 +38,9 @@ BATCH_SIZE = 64
 WAIT_RATIO = 2.0
 """Waiting time for a quiet interval, relative to its required length."""
 
-MIN_SEARCHED_BLOCKS = 12
-"""Minimum number of blocks for the first search, independent of the rate of the sensor."""
-
-MAX_BLOCKS = 240
-"""Maximum number of stored blocks: a minute of blocks of the usual length."""
-
-SEARCH_GROWTH = 1.1
-"""Factor by which the number of blocks must grow before the level is determined again."""
+MIN_SEARCHED_BLOCKS, MAX_BLOCKS, SEARCH_GROWTH = 12, 240, 1.1
+"""Minimum and maximum number of searched blocks (a minute of the usual length), and factor by which
+their number must grow between searches."""
 
 MIN_OBSERVED_S = 10.0
 """[s] Minimum total duration of a level that is considered certain."""

@@ -44,8 +44,7 @@ MIN_BLOCKS = 2.0
 """Minimum duration of the longer end in blocks; a step is neither an arrival nor a departure."""
 
 CLEAR_SIZE = 60.0
-"""Minimum magnitude, in standard deviations of one reading, of a change that is classified
-alone."""
+"""Minimum magnitude, in std of one reading, of a change that is classified alone."""
 
 MAX_TIME_DIFFERENCE_S = 3.0
 """[s] Maximum time between the starts of the new levels at sensors near the same target."""

@@ -30,9 +30,6 @@ ambient field)."""
 Prediction: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 """Predicted readings and their derivatives; see `predicted_readings`."""
 
-UP = np.array([0.0, 0.0, 1.0])
-"""Unit vector of the z axis."""
-
 OUTLIER_PROBABILITY = 1e-3
 """Readings whose residuals are less probable than this under the noise are down-weighted."""
 
@@ -54,7 +51,8 @@ def tool_rotations(axes: FloatArray) -> FloatArray:
 
     The roll about a tracked axis is not measured; the rotation is exact for a tilt without roll.
     """
-    return rotation_from_quaternion(np.array([quaternion_between(UP, a) for a in axes]))
+    return rotation_from_quaternion(
+        np.array([quaternion_between([0.0, 0.0, 1.0], a) for a in axes]))
 
 
 def rotation(v: FloatArray) -> FloatArray:

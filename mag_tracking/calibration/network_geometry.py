@@ -131,11 +131,9 @@ MIN_POSE_VARIATION = 0.1
 """Minimum variation of the axis [rad], or of the position relative to the distance of the nearest
 sensor, of poses that determine the geometry."""
 
-MAX_CORRECTION = 4.0
-"""Maximum correction of a sensor or pose that is not suspect, in prior standard deviations."""
-
-MAX_RESIDUAL_RATIO = 3.0
-"""Maximum residual of a sensor or pose that is not suspect, relative to the median residual."""
+MAX_CORRECTION, MAX_RESIDUAL_RATIO = 4.0, 3.0
+"""Maximum correction in prior standard deviations, and residual relative to the median, of a sensor
+or pose that is not suspect."""
 
 MAX_COST = 100.0
 """Maximum normalised cost; a larger cost means that the readings do not fit the model."""

@@ -21,20 +21,14 @@ from mag_tracking.geometry import (
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Track
 
-GRAVITY = 9.81
-"""[m/s²] Gravity, accurate to 1 % anywhere on Earth."""
-
-MAX_GRAVITY_DIFFERENCE = 1.0
-"""[m/s²] Maximum difference between the magnitude of the acceleration at rest and gravity."""
+GRAVITY, MAX_GRAVITY_DIFFERENCE = 9.81, 1.0
+"""[m/s²] Gravity, and maximum difference of the magnitude of the acceleration at rest."""
 
 OUTLIER_STDS = 5.0
 """Distance from the median, in standard deviations, beyond which a reading is a knock."""
 
-MAX_RIVAL_COST = 9.0
-"""Maximum cost difference between a rival heading and the best heading."""
-
-MAX_EQUAL_COST = 1.0
-"""Maximum cost difference of equally good headings; the closest to the nominal heading is used."""
+MAX_RIVAL_COST, MAX_EQUAL_COST = 9.0, 1.0
+"""Maximum cost difference of a rival heading, and of equally good headings."""
 
 MAX_HEADING_STD = np.deg2rad(60.0)
 """[rad] Maximum standard deviation of a heading."""

@@ -16,8 +16,7 @@ from mag_tracking.calibration.frequent_level import (
 from mag_tracking.calibration.sensor_state import corrected_steps, raw_steps
 
 NEAR_STDS = 8.0
-"""Maximum change of the initial level by an approaching target, in standard deviations of a
-reading."""
+"""Maximum change of the initial level by an approaching target, in std of a reading."""
 NEAR_DURATION_RATIO = 1.5
 """Value that replaces `MIN_DURATION_RATIO` for levels that differ by at most `NEAR_STDS`."""
 

@@ -29,8 +29,7 @@ MIN_ISOLATED = 0.5
 MIN_COARSE = 0.5
 """Fraction of repeated readings above which the value of a reading at rest is no coincidence."""
 MAX_PLAUSIBLE = 1.5
-"""Minimum ratio of such a mark to the largest median of an axis, unless zero or equal on all
-axes."""
+"""Minimum ratio of such a mark, unless zero or equal on all axes, to the largest median."""
 MIN_TOGETHER = 0.9
 """Minimum fraction of the occurrences of a mark in which another axis has a mark as well."""
 LARGEST = 1e30

@@ -23,16 +23,14 @@ MIN_NOISE_RATIO = 8.0
 MAX_FLATNESS = 4
 """Exponent of the flattest peak that is not cut off; the peak of a pass is a parabola."""
 MAX_ENTRY = 0.7
-"""Maximum jump from the nearest flank reading to the limit, relative to that from the level at
-rest."""
+"""Maximum jump from the nearest flank reading to the limit, relative to that from rest."""
 MIN_LOG_PROBABILITY = np.log(1e-9)
 """Log-probability of equal readings below which they are not due to chance."""
 N_MARGIN = 6
-"""Number of readings excluded beside each saturated reading, some of which noise pushes beyond
-it."""
+"""Number of readings excluded beside each saturated reading, some of which are cut off, too."""
 
 MIN_ISOLATION = 10.0
-"""Minimum difference of an isolated reading (a bus error) from both neighbours, relative to
+"""Minimum difference of an isolated reading (a bus error) from its neighbours, relative to
 theirs."""
 
 

@@ -163,17 +163,19 @@ class Survey:
             if surveyed is not None:
                 warnings[name] += _tilt_warning(before, surveyed.R_ws, std, surveyed.std)
         inconsistent = self._disagreements(field, orientations, nominal_std, warnings)
+        faulty = {d.sensor for d in inconsistent}
         bias_std, oriented = self._compass(
-            {j: u for j, u in enumerate(up_directions) if u is not None and names[j] not in
-             {d.sensor for d in inconsistent}}, field, nominal_std, warnings)
+            {j: up for j, up in enumerate(up_directions) if up is not None
+             and names[j] not in faulty}, field, nominal_std, warnings)
         shocks = self._shocks()
         reference, lags = self._lags(shocks)
         sensors = []
         for j, name in enumerate(names):
-            orientation, by = oriented.get(j, (orientations[j], 'accelerometer, nominal heading'))
-            sensors.append(SensorSurvey(
-                name, orientation, 'nominal orientation' if orientation is None else by,
-                lags.get(name), tuple(warnings[name])))
+            orientation = oriented.get(j, orientations[j])
+            by = 'nominal orientation' if orientation is None else \
+                f'accelerometer, {"compass and " if j in oriented else ""}nominal heading'
+            sensors.append(SensorSurvey(name, orientation, by, lags.get(name),
+                                        tuple(warnings[name])))
         return NetworkSurvey(self._updated_network(sensors, reference, date), tuple(sensors),
                              tuple(inconsistent), bias_std, reference, shocks)
 
@@ -208,10 +210,8 @@ class Survey:
                              self._settings.offset_std)
 
     def _compass(self, ups: Mapping[int, UpDirection], field: FloatArray, nominal_std: FloatArray,
-                 warnings: Mapping[str, list[str]]
-                 ) -> tuple[float, dict[int, tuple[Orientation, str]]]:
-        """Std of the compass biases [T], and {sensor index: (orientation from the compass, its
-        source)}."""
+                 warnings: Mapping[str, list[str]]) -> tuple[float, dict[int, Orientation]]:
+        """Std of the compass biases [T], and {sensor index: orientation from the compass}."""
         network, bias_std = self._network, COMPASS_BIAS_STD
         usable = {j: up for j, up in ups.items() if not np.isnan(field[j]).all()}
         if network.earth_field is None or not usable:
@@ -239,7 +239,7 @@ class Survey:
                     f'the compass heading differs by {difference:+.0f} degrees from the network '
                     'file, whose heading is retained')
                 continue
-            out[j] = fused, 'accelerometer, compass and nominal heading'
+            out[j] = fused
             if not np.isnan(orientation.rival):
                 warnings[network.names[j]].append(
                     'the compass allows another heading, which differs by '
