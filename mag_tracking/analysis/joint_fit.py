@@ -118,11 +118,11 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
                 selected_orders[k] = orders[int(np.argmin(criteria))]
         if selected_orders == previous_orders:
             break
-    shifted = [_shift_to_peak(
-        _check_against_track(fits.of_target(k, selected_orders, orders),
-                             orders.index(selected_orders[k]), paths[k]),
-        orders.index(selected_orders[k])) for k in range(n_targets)]
-    return tuple(target_fits for _, target_fits in sorted(shifted, key=lambda pair: pair[0]))
+    finished = []
+    for k, n in enumerate(selected_orders):
+        target_fits = fits.of_target(k, selected_orders, orders)
+        finished.append(_finished(target_fits, orders.index(n), paths[k]))
+    return tuple(target_fits for _, target_fits in sorted(finished, key=lambda pair: pair[0]))
 
 
 def _initial_paths(averaged: PassData, n_targets: int, ground: GroundPrior) -> FloatArray:
@@ -252,18 +252,25 @@ def _with_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[Flo
             if n > 1 else path[:6] for path, n in zip(paths, orders, strict=True)]
 
 
-def _check_against_track(fits: Sequence[PassFit], best: int, path: FloatArray) -> list[PassFit]:
-    """Reject the fits of one target that differ: `best` from the tracked `path` (6,), others from
-    `best`."""
-    out = []
-    for k, fit in enumerate(fits):
-        # The other fits cannot be compared if the best fit has no estimate.
-        agrees = k != best and not len(fits[best].x) or _agrees_with_path(
-            fit, path if k == best else fits[best].x)
-        reason = 'the fit differs from the track in position or velocity' if k == best else \
-            f'the path differs from the selected fit (number of dipoles: {fits[best].n_dipoles})'
-        out.append(fit if agrees or fit.reason else replace(fit, reason=reason, trusted=()))
-    return out
+def _finished(fits: Sequence[PassFit], best: int,
+              path: FloatArray) -> tuple[float, tuple[PassFit, ...]]:
+    """Shift time zero of the fits of one target to the strongest field of the `best` fit, and
+    reject the fits that differ: `best` from the tracked `path` (6,), others from `best`.
+
+    Returns also the time [s since 1970] at which `best` is closest to the centre of the sensors.
+    """
+    fit, checked = fits[best], []
+    if not len(fit.x):
+        return np.inf, tuple(fits)
+    for other in fits:
+        reason = 'the fit differs from the track in position or velocity' if other is fit else \
+            f'the path differs from the selected fit (number of dipoles: {fit.n_dipoles})'
+        agrees = other.reason or _agrees_with_path(other, path if other is fit else fit.x)
+        checked.append(other if agrees else replace(other, reason=reason, trusted=()))
+    centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
+    cpa_time = fit.data.stamp_ns / NS + fit.closest_approach(centre)[0]
+    seconds = _fitted_peak_s(fit)
+    return cpa_time, tuple(f.shifted(seconds) if len(f.x) else f for f in checked)
 
 
 def _agrees_with_path(fit: PassFit, path: FloatArray) -> bool:
@@ -280,20 +287,6 @@ def _agrees_with_path(fit: PassFit, path: FloatArray) -> bool:
 def _fitted_peak_s(fit: PassFit) -> float:
     """Time [s] at which the fitted field of a target is strongest."""
     return replace(fit.data, field=fit.predicted).peak_s
-
-
-def _shift_to_peak(fits: Sequence[PassFit], best: int) -> tuple[float, tuple[PassFit, ...]]:
-    """Shift time zero of the fits of one target to the strongest field of the `best` fit.
-
-    Returns also the time [s since 1970] at which that is closest to the centre of the sensors.
-    """
-    fit = fits[best]
-    if not len(fit.x):
-        return np.inf, tuple(fits)
-    seconds = _fitted_peak_s(fit)
-    centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
-    cpa_time = fit.data.stamp_ns / NS + fit.closest_approach(centre)[0]
-    return cpa_time, tuple(f.shifted(seconds) if len(f.x) else f for f in fits)
 
 
 def fit_targets(data: PassData, single_fits: Sequence[PassFit], paths: FloatArray,

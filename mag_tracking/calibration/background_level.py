@@ -2,9 +2,8 @@
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from math import inf
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -148,24 +147,12 @@ class BackgroundLevel:
         return bool((np.abs(slope) > STEEP_DRIFT + MIN_SLOPE_STDS * std).any())
 
 
-@dataclass(frozen=True)
-class FormerLevel:
-    """Level of the previous background."""
+class FormerLevel(NamedTuple):
+    """Level (3,) [T] of the previous background, until [s], and for how long it was observed."""
 
     until: float
-    """[s] Time at which the level ceased to be the background."""
     level: FloatArray
-    """(3,) [T] Field of the level."""
     observed_s: float
-    """[s] Duration for which the level was observed."""
-
-    def is_at(self, block: Block, limits: FloatArray) -> bool:
-        """Whether a block is within `limits` (3,) T of this level and at most `MAX_AGE_S` later."""
-        age = block.time - self.until
-        tolerance = limits + np.minimum(TYPICAL_DRIFT * age, MAX_DRIFT * limits)
-        # A comparison with NaN is false: an axis that is not reported does not differ.
-        differs = bool((np.abs(block.mean - self.level) > tolerance).any())
-        return age <= MAX_AGE_S and not differs
 
 
 class LevelDeparture:
@@ -244,9 +231,13 @@ class LevelDeparture:
 
     def former_observed_s(self) -> float:
         """Duration [s] for which the former level was observed; 0 if the latest block left it."""
-        former = self.former
-        is_at_former = former is not None and former.is_at(self.blocks[-1], self._level.limits)
-        return former.observed_s if former is not None and is_at_former else 0.0
+        if self.former is None or (age := self.blocks[-1].time - self.former.until) > MAX_AGE_S:
+            return 0.0
+        limits = self._level.limits
+        tolerance = limits + np.minimum(TYPICAL_DRIFT * age, MAX_DRIFT * limits)
+        # A comparison with NaN is false: an axis that is not reported does not differ.
+        differs = (np.abs(self.blocks[-1].mean - self.former.level) > tolerance).any()
+        return 0.0 if differs else self.former.observed_s
 
     def has_departed(self, new_blocks: Sequence[Block]) -> bool | None:
         """Determine and store whether a vehicle in the background has departed (None: unknown)."""

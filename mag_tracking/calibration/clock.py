@@ -71,7 +71,7 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
         return _no_lag(f'the knocks are {separation:.3g} s apart, maximum {max_lag:g} s')
     a, b = _around_knocks(a, b, max_lag), _around_knocks(b, a, max_lag)
     for name, (_, s) in (('reference', a), ('sensor', b)):
-        if len(s) < 8 or not _is_knock(s).any():
+        if not _has_knock(s):
             return _no_lag(f'the {name} measured no knock')
     lag, correlation, reason = _coarse_lag(a, b, max_lag)
     if reason:
@@ -118,7 +118,7 @@ def _without_cut_knocks(t: FloatArray, s: FloatArray) -> _Series:
 
 def _knock_separation(a: _Series, b: _Series, max_lag: float) -> float | None:
     """Smallest interval [s] between knocks of two series; None if none, or within `max_lag`."""
-    if not (len(a[1]) > 7 and len(b[1]) > 7 and _is_knock(a[1]).any() and _is_knock(b[1]).any()):
+    if not (_has_knock(a[1]) and _has_knock(b[1])):
         return None
     s, t = a[0][_is_knock(a[1])], b[0][_is_knock(b[1])]
     next_index = np.clip(np.searchsorted(t, s), 0, len(t) - 1)
@@ -129,7 +129,7 @@ def _knock_separation(a: _Series, b: _Series, max_lag: float) -> float | None:
 
 def _around_knocks(a: _Series, b: _Series, max_lag: float) -> _Series:
     """Part of series `a` around the knocks of `b`; all of `a` if `b` has no knock."""
-    if len(b[1]) < 8 or not _is_knock(b[1]).any():
+    if not _has_knock(b[1]):
         return a
     first, last = _knock_times(*b)
     is_near = (a[0] >= first - max_lag - CONTEXT_S) & (a[0] <= last + max_lag + CONTEXT_S)
@@ -141,6 +141,11 @@ def _is_knock(s: FloatArray) -> BoolArray:
     rest_level = 1.4826 * np.median(np.abs(s - np.median(s)))
     is_loud: BoolArray = s > KNOCK_THRESHOLD * max(rest_level, 1e-3)
     return is_loud
+
+
+def _has_knock(s: FloatArray) -> bool:
+    """Whether a signal is long enough and contains a knock."""
+    return len(s) > 7 and bool(_is_knock(s).any())
 
 
 def _knock_times(t: FloatArray, s: FloatArray) -> tuple[float, float]:

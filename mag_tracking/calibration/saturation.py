@@ -34,10 +34,10 @@ MIN_ISOLATION = 10.0
 theirs."""
 
 
-def isolated_readings(values: FloatArray, min_height: float = 0.0) -> IntArray:
+def isolated_readings(values: FloatArray) -> IntArray:
     """Indices of single readings (n,) that differ from two neighbours that agree with each other.
 
-    NaN next to a reading excludes it. `min_height` is the least difference from both neighbours.
+    NaN next to a reading excludes it.
     """
     if len(values) < 5:
         return np.zeros(0, dtype=np.int64)
@@ -48,8 +48,7 @@ def isolated_readings(values: FloatArray, min_height: float = 0.0) -> IntArray:
     height = np.minimum(np.abs(change_before), np.abs(change_after))
     smallest_change = np.min(np.abs(change), where=np.abs(change) > 0.0, initial=np.inf)
     indices: IntArray = 2 + np.flatnonzero((np.sign(change_before) == -np.sign(change_after)) & (
-        height > MIN_ISOLATION * np.maximum(adjacent_change, smallest_change))
-        & (height > min_height))
+        height > MIN_ISOLATION * np.maximum(adjacent_change, smallest_change)))
     return indices
 
 
