@@ -16,8 +16,12 @@ from mag_tracking.calibration.ellipsoid import (
     fit_quadric,
     refine_ellipsoid,
 )
-from mag_tracking.calibration.reading_faults import are_marked, missing_marks
-from mag_tracking.calibration.saturation import saturated_readings, with_margin
+from mag_tracking.calibration.reading_faults import (
+    are_marked,
+    missing_marks,
+    saturated_readings,
+    with_margin,
+)
 
 MIN_READINGS, MIN_DIRECTIONS = 50, 18
 """Minimum number of readings, and of cells with readings: two for each of the nine parameters."""
