@@ -31,10 +31,8 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
 
 
 def choose_order(fits: Sequence[PassFit]) -> PassFit | None:
-    """Return the fit with the smallest criterion, or None if that fit is rejected.
-
-    A fit with fewer dipoles does not replace it, because it may not reveal that the target turned.
-    """
+    """Return the fit with the smallest criterion, or None if that fit is rejected, because a fit
+    with fewer dipoles may not reveal that the target turned."""
     criteria = order_criteria(fits)
     if not len(fits) or not np.isfinite(criteria).any():
         return None

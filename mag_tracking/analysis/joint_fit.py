@@ -67,10 +67,8 @@ MAX_VELOCITY_SPREAD = 0.25
 
 @dataclass(frozen=True)
 class GroundPrior:
-    """Prior of the height and vertical speed of vehicles.
-
-    Without the prior, two targets that leave the ground can explain a single target that turns.
-    """
+    """Prior of the height and vertical speed of vehicles, without which two targets that leave the
+    ground can explain a single target that turns."""
 
     height: tuple[float, float]
     """Height of the magnetic centre above z = 0 and its standard deviation [m]."""
@@ -179,10 +177,8 @@ class _JointFits:
 
     def _starting_paths(self, orders: tuple[int, ...], k: int,
                         previous: Sequence[PassFit] | None) -> FloatArray:
-        """Starting paths (n, n_theta) for given numbers of dipoles.
-
-        `previous` is a joint fit, if any, that may differ in the number of dipoles of target `k`.
-        """
+        """Starting paths (n, n_theta) for given numbers of dipoles; `previous` is a joint fit, if
+        any, that may differ in that of target `k`."""
         starts = [_with_orders(paths, orders) for paths in self._initial_paths]
         if previous is not None and all(len(fit.x) for fit in previous):
             paths = _with_orders([fit.x[:6 + (fit.n_dipoles > 1)] for fit in previous], orders)

@@ -87,10 +87,8 @@ def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
 
 
 def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
-    """Create starting paths (n, 6 or 7) of the search with various headings, offsets and speeds.
-
-    They pass the sensor with the strongest field, whose duration determines speed over distance.
-    """
+    """Create starting paths (n, 6 or 7) with various headings, offsets and speeds past the sensor
+    with the strongest field, whose duration determines speed over distance."""
     field_change = data.field_change
     energy = np.einsum('ni,ni->n', field_change, field_change)
     strongest = int(np.argmax(energy))

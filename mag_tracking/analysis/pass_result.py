@@ -33,10 +33,8 @@ MAX_DIRECTION_STD = 0.5
 
 @dataclass(frozen=True)
 class Bearing:
-    """Observable quantities of a pass at a single sensor, relative to the sensor.
-
-    A path and its reflection through the sensor have equal fields.
-    """
+    """Observable quantities of a pass relative to a single sensor, at which a path and its
+    reflection have equal fields."""
 
     cpa_direction: FloatArray
     """(3,) unit vector, world, from the sensor to the target at the CPA, in the solution above the
@@ -57,10 +55,8 @@ class Bearing:
 
 @dataclass(frozen=True)
 class PassFit:
-    """Weighted least-squares fit of a pass at constant velocity.
-
-    If `reason` is not empty, only quantities in `trusted` are valid.
-    """
+    """Weighted least-squares fit of a pass at constant velocity; if `reason` is not empty, only
+    quantities in `trusted` are valid."""
 
     n_dipoles: int
     data: PassData
@@ -157,10 +153,8 @@ class PassFit:
 
     @property
     def position_covariance(self) -> FloatArray:
-        """Covariance (3, 3) [m², world frame] of the position of the middle of the vehicle.
-
-        For a single sensor without a known range, it is that of the centre of the row.
-        """
+        """Covariance (3, 3) [m², world frame] of the middle of the vehicle, or of the centre of the
+        row for a single sensor without a known range."""
         P = self.robust_covariance[:3, :3]
         return P if self.bearing is not None else P + self.shape_covariance
 

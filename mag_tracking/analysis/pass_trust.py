@@ -105,10 +105,8 @@ def rejection_reason(fit: PassFit) -> str:
 
 
 def trusted_quantities(fit: PassFit) -> tuple[str, ...]:
-    """Those of speed, direction and time (of the CPA) whose uncertainty is acceptable.
-
-    Empty for a single sensor, or if the pass is not one target at constant velocity.
-    """
+    """Those of speed, direction and time (of the CPA) whose uncertainty is acceptable; none for a
+    single sensor, or if the pass is not one target at constant velocity."""
     if _invalid_pass_reason(fit) or fit.bearing is not None:
         return ()
     speed, speed_std = fit.speed

@@ -102,10 +102,8 @@ class Evaluation:
 
 
 def feature_table(signatures: Sequence[Signature]) -> tuple[FloatArray, IntArray, list[str]]:
-    """Features, indices of the signatures that have features, and reasons for the others.
-
-    Raises LabelsError if the signatures have different axes or units.
-    """
+    """Features, indices of the signatures that have features, and reasons for the others; raises
+    LabelsError if the signatures have different axes or units."""
     axes = Counter((' '.join(s.axes), s.unit) for s in signatures)
     if len(axes) > 1:
         raise LabelsError('the signatures have different axes or units: ' + ', '.join(

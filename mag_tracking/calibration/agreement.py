@@ -82,11 +82,9 @@ class FieldInconsistency:
 
 
 def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
-    """Median per world axis, T, of fields (n, 3) in the sensor frames; NaN for an unreported axis.
-
-    Raises ValueError if fewer than three sensors report all axes: with two, the faulty sensor
-    cannot be identified.
-    """
+    """Median per world axis, T, of the complete fields (n, 3) in the sensor frames; raises
+    ValueError if these are fewer than three, because with two, the faulty sensor cannot be
+    identified."""
     is_complete = ~np.isnan(fields).any(axis=1)
     if np.count_nonzero(is_complete) < 3:
         raise ValueError('if earth_field is unknown, at least three sensors must report all axes, '

@@ -216,11 +216,9 @@ class LevelDeparture:
         return latest
 
     def relearn_time(self, observed_s: float, relearns_soon: bool) -> float:
-        """Time [s] on another steady level until it becomes the background; 0 if it never does.
-
-        `observed_s` is the time for which the background was observed; `relearns_soon` means that
-        the sensor may have been moved, or its surroundings changed.
-        """
+        """Time [s] on another steady level until it becomes the background, observed for
+        `observed_s`; 0 if it never does. It `relearns_soon` if the sensor or its surroundings may
+        have changed."""
         if relearns_soon:
             return min(self._relearn or inf, max(self._learn, MIN_RELEARN_S))
         if self.has_arrived:

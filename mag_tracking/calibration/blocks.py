@@ -66,18 +66,14 @@ def has_noisy_block(blocks: Blocks, step_variance: FloatArray) -> bool:
 
 
 def pooled_covariance(blocks: Blocks) -> FloatArray | None:
-    """Noise covariance (3, 3) T² from the scatter within blocks, pooled over all blocks.
-
-    NaN for an axis with too few samples; None if all axes have too few.
-    """
+    """Noise covariance (3, 3) T² from the scatter within all blocks; NaN for an axis with too few
+    samples, None if all axes have too few."""
     return core.pooled_covariance(plain(blocks.scatter), plain(blocks.n))
 
 
 class QuietInterval:
-    """Ring buffer of the latest quiet blocks, as arrays, to which a background is fitted.
-
-    A block is `pending` for the guard time in s, to exclude the gradual onset of a target.
-    """
+    """Ring buffer of the latest quiet blocks, as arrays, to which a background is fitted; a block
+    is `pending` for the guard time in s, to exclude the gradual onset of a target."""
 
     def __init__(self, guard: float, max_blocks: int) -> None:
         self._guard = guard

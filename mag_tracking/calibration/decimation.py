@@ -49,10 +49,8 @@ class Decimator:
         self._n_until_output = 0
 
     def feed(self, stamp_ns: int, field: FloatArray) -> list[tuple[int, FloatArray]]:
-        """Add a sample (3,) T; return the outputs that become available, usually none.
-
-        An output is the timestamp [ns] of the filter's centre and a field, NaN for incomplete axes.
-        """
+        """Add a sample (3,) T; return the outputs that become available: timestamp [ns] of the
+        filter's centre and field, NaN for incomplete axes."""
         interval = stamp_ns - self._window[-1][0] if self._window else 1
         if interval <= 0 or self._window and self.factor is not None and abs(
                 interval - self._interval) > GAP_TOLERANCE * self._interval:

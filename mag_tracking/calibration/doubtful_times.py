@@ -1,7 +1,5 @@
-"""Intervals in which the input of a sensor was doubtful, as timestamps of its readings.
-
-The tracker marks the tracks that use such readings as ambiguous, for the same reason.
-"""
+"""Intervals, as timestamps of readings, in which the input of a sensor was doubtful; the tracker
+marks tracks that use it as ambiguous."""
 
 from collections.abc import Mapping
 from typing import TypeAlias

@@ -199,11 +199,8 @@ def _loss(square: FloatArray, w: FloatArray) -> FloatArray:
 
 
 def _covariance(f: FloatArray, J: FloatArray, w: FloatArray) -> FloatArray:
-    """Covariance (9, 9) by a block jackknife in time, one Newton step per block; infinite if
-    singular.
-
-    Real residuals are correlated in time, so their number overstates the information.
-    """
+    """Covariance (9, 9) by a block jackknife in time, because real residuals are correlated, with
+    one Newton step per block; infinite if singular."""
     n_blocks = min(N_BLOCKS, len(f))
     starts = np.arange(n_blocks) * len(f) // n_blocks
     scores = np.add.reduceat((w * f / np.sqrt(1.0 + f * f))[:, None] * J, starts)

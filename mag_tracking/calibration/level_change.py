@@ -178,10 +178,8 @@ class SharedChanges:
         self._latest_changes: dict[int, LevelChange] = {}
 
     def evaluate_change(self, sensor: int, change: LevelChange) -> bool | None:
-        """Store a sensor's change; return whether a vehicle has departed (None: unknown).
-
-        A change that is not clear is classified by the largest simultaneous change at any sensor.
-        """
+        """Store a sensor's change; return whether a vehicle has departed (None: unknown), for a
+        change that is not clear from the largest simultaneous change."""
         self._latest_changes[sensor] = change
         if change.size >= CLEAR_SIZE and change.has_departed is not None:
             return change.has_departed

@@ -47,10 +47,8 @@ Weights: TypeAlias = tuple[FloatArray, Unknowns, float, FloatArray]
 
 
 def tool_rotations(axes: FloatArray) -> FloatArray:
-    """Minimal rotations (K, 3, 3) from the tool frame to the tracker frame, from the tool's z axes.
-
-    The roll about a tracked axis is not measured; the rotation is exact for a tilt without roll.
-    """
+    """Minimal rotations (K, 3, 3) from the tool frame to the tracker frame, from the tool's z axes,
+    whose roll is not measured."""
     return rotation_from_quaternion(
         np.array([quaternion_between([0.0, 0.0, 1.0], a) for a in axes]))
 
@@ -227,10 +225,8 @@ class GeometryProblem:
 
     def squared_residuals(self, f: FloatArray,
                           signal: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
-        """Squared residuals over their variance, numbers of measured axes (n, K), and the variance.
-
-        `f` (n, K, 3) [T] is predicted with biases, `signal` without; unmeasured residuals are zero.
-        """
+        """Squared residuals over their variance, 0 if unmeasured, numbers of measured axes (n, K),
+        and the variance, of the prediction `f` (n, K, 3) [T] with biases and `signal` without."""
         squared_signal = np.einsum('nki,nki->nk', signal, signal)[:, :, None]
         variance = self.variance + self.settings.field_error**2 * squared_signal
         e2 = np.square(self.field - f) / variance

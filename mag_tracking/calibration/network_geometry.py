@@ -168,10 +168,8 @@ def calibrate_geometry(network: SensorNetwork, field: FloatArray, positions: Flo
 def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatArray,
                     axes: FloatArray, moment: float, settings: GeometrySettings,
                     shared_unit: FloatArray, pose_unit: FloatArray) -> NetworkGeometry:
-    """`calibrate_geometry` with given prior stds; zero fixes an unknown.
-
-    `shared_unit` (12,) and `pose_unit` (8,) are in the order and units of `TrackedMagnet.poses`.
-    """
+    """`calibrate_geometry` with the prior stds `shared_unit` (12,) and `pose_unit` (8,), in the
+    order of `TrackedMagnet.poses`; zero fixes an unknown."""
     field, positions, axes = (np.asarray(a, dtype=float) for a in (field, positions, axes))
     _check_input(network, field, positions, axes, moment)
     problem = GeometryProblem(network, field, positions, axes, moment, settings, shared_unit,

@@ -152,10 +152,8 @@ def _refined_yaw(fit: Callable[[float], tuple[FloatArray, FloatArray]], yaw: flo
 
 def levelled(up: UpDirection | None, nominal: FloatArray,
              nominal_std: FloatArray) -> Orientation | None:
-    """Correct the tilt of a nominal orientation (3, 3) by a measured up direction; None without it.
-
-    The heading and its std, `nominal_std[2]` in rad, are unchanged.
-    """
+    """Correct the tilt of a nominal orientation (3, 3) by a measured up direction, if any; heading
+    and its std, `nominal_std[2]` in rad, are unchanged."""
     if up is None:
         return None
     correction = rotation_from_quaternion(
@@ -166,10 +164,8 @@ def levelled(up: UpDirection | None, nominal: FloatArray,
 
 def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
                     weight: float = 4.0) -> float:
-    """Standard deviation [T] of the biases in a network, with a prior `bias_std` of a `weight`.
-
-    The bias is not observable across the heading: each sensor contributes one axis less.
-    """
+    """Standard deviation [T] of the biases in a network, which are not observable across the
+    headings, with a prior `bias_std` of a `weight`."""
     square = sum(float(np.nansum(o.bias**2)) for o in orientations)
     n_observed = sum(np.count_nonzero(~np.isnan(o.bias)) - 1 for o in orientations)
     return float(np.sqrt((weight * bias_std**2 + square) / (weight + n_observed)))
@@ -206,11 +202,8 @@ class MountingEvidence:
 
 def fuse_mounting(network: SensorNetwork, prior_std: Iterable[FloatArray],
                   tracks: Sequence[Track]) -> MountingEvidence:
-    """Fuse the mounting angles that the last unambiguous poses of tracks estimate.
-
-    `prior_std` (3,) [rad] are about the world axes. Raises ValueError for another number of
-    sensors.
-    """
+    """Fuse the mounting angles that tracks estimate with priors (3,) [rad] about the world axes;
+    raises ValueError for another number of sensors."""
     n = len(network)
     prior = np.array([np.diag(1.0 / np.square(std)) for std in prior_std])
     gains, vectors = np.zeros((len(tracks), n, 3, 3)), np.zeros((len(tracks), n, 3))

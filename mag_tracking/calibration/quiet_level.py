@@ -50,10 +50,8 @@ class BlockRecorder(RunningBackground):
                                    corrected_steps(self._sensors), self._max_blocks)
 
     def is_known_level(self, initial: FloatArray, found: MostFrequentLevel) -> bool:
-        """Whether the initial level (3,) T of a recording is the level of the background.
-
-        The field drifts from it to the most frequent level, or is there for not much longer.
-        """
+        """Whether the field drifts from the initial level (3,) T of a recording to the most
+        frequent level, or is there for not much longer."""
         level, previous_time, n = initial, 0.0, 0
         for block in self._blocks:
             width = found.width + TYPICAL_DRIFT * (block.time - previous_time)

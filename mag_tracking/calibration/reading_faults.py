@@ -77,10 +77,8 @@ N_MARGIN = 6
 
 
 def missing_marks(fields: FloatArray) -> FloatArray:
-    """Find the marks (k, 3) among chronological raw readings (n, 3) in T, NaN for a missing axis.
-
-    Values of several axes that always occur together are one mark, NaN for the other axes.
-    """
+    """Find the marks (k, 3) among chronological raw readings (n, 3) in T; values of several axes
+    that always occur together are one mark, NaN for the other axes."""
     fields = np.where(np.isinf(fields), np.nan, fields)
     marks_of_axis = [_marks_of_axis(fields, axis) for axis in range(3)]
     if not any(marks_of_axis):
@@ -298,10 +296,8 @@ def reading_faults(fields: FloatArray, stamps: IntArray | None = None) -> Readin
 
 
 def isolated_readings(values: FloatArray) -> IntArray:
-    """Indices of single readings (n,) that differ from two neighbours that agree with each other.
-
-    NaN next to a reading excludes it.
-    """
+    """Indices of single readings (n,), not next to NaN, that differ from two neighbours that
+    agree."""
     if len(values) < 5:
         return np.zeros(0, dtype=np.int64)
     change = np.diff(values)
@@ -316,11 +312,8 @@ def isolated_readings(values: FloatArray) -> IntArray:
 
 
 def saturated_readings(fields: FloatArray, max_run: float = MAX_RUN) -> BoolArray:
-    """Find readings at the limit of the range of an axis among chronological raw readings (n, 3).
-
-    NaN marks a missing axis. `max_run` is the most readings, about half a second, for which a
-    single excursion stays at the limit. See `with_margin` for the adjacent readings.
-    """
+    """Find readings at the limit of the range of an axis among chronological raw readings (n, 3),
+    at which a single excursion stays for at most `max_run`, about half a second."""
     fields = np.asarray(fields, dtype=float)
     is_saturated = np.zeros(fields.shape, dtype=bool)
     # A held reading is equal on all axes.

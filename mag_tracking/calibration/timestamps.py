@@ -65,10 +65,8 @@ class TimestampFault:
 
 
 def timestamp_fault(stamps: IntArray, fields: FloatArray) -> TimestampFault | None:
-    """Find a regular error in the timestamps (n,) [ns] of consecutive readings of one sensor.
-
-    A reading that repeats timestamp and field was published twice, which is another fault.
-    """
+    """Find a regular error in the timestamps (n,) [ns] of consecutive readings of one sensor,
+    except of those that were published twice."""
     if len(stamps) < MIN_READINGS:
         return None
     intervals = np.diff(stamps)
@@ -128,11 +126,8 @@ def _burst_fault(stamps: IntArray, intervals: IntArray) -> TimestampFault | None
 
 
 def _coarse_fault(stamps: IntArray, intervals: IntArray) -> TimestampFault | None:
-    """Fault of timestamps (n,) [ns] of which none are equal, although the clock is coarse.
-
-    The intervals are different multiples of the step, and no lost reading moves the later
-    timestamps.
-    """
+    """Fault of timestamps (n,) [ns] that are different multiples of the step of a coarse clock,
+    without a lost reading that moves the later ones."""
     step_ns = int(np.gcd.reduce(intervals))
     if step_ns < 2.0 * MAX_ERROR_S * NS or not _is_coarse_step(stamps, step_ns) \
             or np.median(intervals) > MAX_INTERVAL_STEPS * step_ns:
