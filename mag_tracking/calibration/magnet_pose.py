@@ -49,8 +49,6 @@ class MagnetPose:
     """(3,) unit vector, world: direction of the moment."""
     covariance: FloatArray
     """(6, 6) of position and axis, singular along the axis; scaled by a cost above one."""
-    ambient: FloatArray
-    """(3,) [T], world: change of the ambient field since the biases were estimated."""
     normalised_cost: float
     """Cost per degree of freedom; about one if moment, noise and field error are correct."""
     reason: str
@@ -67,8 +65,8 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     """Estimate the pose of a dipole of known moment from one reading of all sensors.
 
     The best points of a grid in the box between the corners `low` and `high` (3,) [m, world frame]
-    are refined. `field` (n, 3) [T, sensor frame] is corrected for bias and gain
-    (`NetworkGeometry.signal`); NaN if not measured. Raises ValueError for an invalid reading,
+    are refined. `field` (n, 3) [T, sensor frame] is corrected for bias and gain; NaN if not
+    measured. Raises ValueError for an invalid reading,
     moment or box, or a sensor without `noise_std`. PHD15 Paper A eq. (3).
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
@@ -77,7 +75,7 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     n_values = int(np.count_nonzero(is_measured))
     if n_values <= N_UNKNOWNS:
         nan_vector = np.full(3, np.nan)
-        return MagnetPose(nan_vector, nan_vector, np.full((6, 6), np.nan), nan_vector, np.nan,
+        return MagnetPose(nan_vector, nan_vector, np.full((6, 6), np.nan), np.nan,
                           f'number of measured axes is {n_values}; more than {N_UNKNOWNS} are '
                           'required')
     squared_norm = np.nansum(np.square(field), axis=1)[:, None]
@@ -87,8 +85,7 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     x, cost, covariance, converged = refine(problem, starts, MAX_STEPS, 1e-9)
     best = int(np.argmin(cost))
     return _pose_of_minimum(x[best], covariance[best], cost[best] / (n_values - N_UNKNOWNS),
-                            converged[best] or cost[best] < EXACT_COST, low, high,
-                            settings.ambient_std)
+                            converged[best] or cost[best] < EXACT_COST, low, high)
 
 
 def _residual_function(network: SensorNetwork, field: FloatArray, std: FloatArray,
@@ -134,7 +131,7 @@ def _starting_states(network: SensorNetwork, field: FloatArray, std: FloatArray,
 
 
 def _pose_of_minimum(x: FloatArray, covariance: FloatArray, cost: float, converged: bool,
-                     low: FloatArray, high: FloatArray, ambient_std: float) -> MagnetPose:
+                     low: FloatArray, high: FloatArray) -> MagnetPose:
     """Convert a minimum `x` (9,) to a `MagnetPose`, with a reason if it is not valid."""
     length = np.linalg.norm(x[3:6])
     u = x[3:6] / length
@@ -150,8 +147,7 @@ def _pose_of_minimum(x: FloatArray, covariance: FloatArray, cost: float, converg
         reason = f'the magnet is outside the box: {x[:3].tolist()} m'
     else:
         reason = ''
-    return MagnetPose(x[:3], u, max(1.0, cost) * T @ covariance @ T.T,
-                      ambient_std * x[6:], float(cost), reason)
+    return MagnetPose(x[:3], u, max(1.0, cost) * T @ covariance @ T.T, float(cost), reason)
 
 
 def _check_input(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,

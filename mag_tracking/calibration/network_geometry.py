@@ -29,7 +29,6 @@ from mag_tracking.calibration.network_fit import (
     median_ratio,
     rotation,
     solve,
-    tool_rotations,
 )
 from mag_tracking.network import SensorNetwork
 
@@ -88,19 +87,6 @@ class NetworkGeometry:
     def converged(self) -> bool:
         """Whether the calibration is valid."""
         return not self.reason
-
-    def signal(self, field: FloatArray) -> FloatArray:
-        """Remove biases and gains from readings (..., n, 3) [T, sensor frame]."""
-        signal: FloatArray = (np.asarray(field, dtype=float) - self.bias) / self.gain[:, None]
-        return signal
-
-    def magnet_poses(self, positions: FloatArray,
-                     axes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Convert tracked positions and axes (K, 3), tracker frame, to those of the magnet, world
-        frame."""
-        magnet = replace(self.magnet, tool=np.asarray(positions, dtype=float),
-                         R_tool=tool_rotations(np.asarray(axes, dtype=float)))
-        return magnet.positions_and_axes(self.shared, np.zeros((len(magnet.tool), N_POSE)))
 
     @property
     def moment(self) -> tuple[float, float]:
