@@ -97,8 +97,6 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int
     n = np.maximum(blocks.n, 1.0)
     variance = np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1.0, 1.0)
     variance = np.where(blocks.n > 1, np.maximum(variance, steps**2 / 12.0), np.nan)
-    if np.isnan(variance).all():
-        return None
     # An axis that is rarely reported would exclude the blocks without it.
     is_used = (~np.isnan(variance)).mean(axis=0) > MIN_REPORTED_FRACTION
     if not is_used.any():

@@ -3,6 +3,7 @@
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration import core
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.background_level import TYPICAL_DRIFT
 from mag_tracking.calibration.blocks import Block, block_of, stacked
@@ -13,7 +14,7 @@ from mag_tracking.calibration.frequent_level import (
     MostFrequentLevel,
     most_frequent_level,
 )
-from mag_tracking.calibration.sensor_state import corrected_steps, raw_steps
+from mag_tracking.calibration.sensor_state import corrected_steps
 
 NEAR_STDS = 8.0
 """Maximum change of the initial level by an approaching target, in std of a reading."""
@@ -77,5 +78,5 @@ class BlockRecorder(RunningBackground):
     @property
     def steps(self) -> FloatArray:
         """Quantisation steps of the raw axes, (3,) T; inf if unknown."""
-        steps = raw_steps(self._sensors)
+        steps = core.steps_of(self._sensors, False)
         return np.where(steps > 0.0, steps, np.inf)

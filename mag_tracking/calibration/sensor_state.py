@@ -42,11 +42,6 @@ def corrected_steps(sensors: StructArray) -> FloatArray:
     return core.steps_of(sensors, True)
 
 
-def raw_steps(sensors: StructArray) -> FloatArray:
-    """Quantisation steps (3,) T before soft-iron correction; 0 if too fine, inf if unchanged."""
-    return core.steps_of(sensors, False)
-
-
 def completed_steps(variance: FloatArray, steps: FloatArray) -> FloatArray:
     """Replace unknown steps (3,) T by those of other axes at rest; NaN for a dead axis.
 
