@@ -14,11 +14,7 @@ import numpy as np
 
 from mag_tracking.analysis.fitted_pass import order_criteria
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
-from mag_tracking.analysis.pass_description import (
-    PATH_TOLERANCE,
-    assignment,
-    fits_at_minimum,
-)
+from mag_tracking.analysis.pass_description import PATH_TOLERANCE, assignment, fits_at_minimum
 from mag_tracking.analysis.pass_fit import (
     COARSE_ERROR,
     DEFAULT_ERRORS,

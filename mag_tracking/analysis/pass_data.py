@@ -91,8 +91,7 @@ class PassData:
 
     def shifted(self, seconds: float) -> 'PassData':
         """Return the data with time zero shifted; a positive shift makes it later."""
-        return replace(self, stamp_ns=self.stamp_ns + int(round(1e9 * seconds)),
-                       t=self.t - seconds)
+        return replace(self, stamp_ns=self.stamp_ns + int(round(1e9 * seconds)), t=self.t - seconds)
 
     @cached_property
     def whitening(self) -> FloatArray:
@@ -129,8 +128,7 @@ class PassData:
     @property
     def peak_s(self) -> float:
         """Time [s] of the strongest field."""
-        return float(self.t[np.argmax(np.einsum('ni,ni->n', self.field_change,
-                                                self.field_change))])
+        return float(self.t[np.argmax(np.einsum('ni,ni->n', self.field_change, self.field_change))])
 
     @cached_property
     def field_change(self) -> FloatArray:

@@ -143,8 +143,7 @@ class RunningBackground(BackgroundLevel):
 
         NaN marks an unreported axis. The level remains constant until a quiet interval of `learn`.
         """
-        self._set_constant(np.asarray(background, dtype=float),
-                           np.asarray(covariance, dtype=float))
+        self._set_constant(np.asarray(background, dtype=float), np.asarray(covariance, dtype=float))
         self._is_resumed = self._relearns_soon = True
         self._observed_s, self._is_steep = inf, False
         self.set_uncertainty()

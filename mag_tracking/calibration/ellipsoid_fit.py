@@ -256,8 +256,7 @@ def _rejection_reason(C: FloatArray, P: FloatArray, quality: Quality,
     return '' if quality.solved else 'least squares did not converge in 100 evaluations'
 
 
-def _notes_on_fit(residual: float, quality: Quality,
-                  outlier_fraction: float) -> tuple[str, ...]:
+def _notes_on_fit(residual: float, quality: Quality, outlier_fraction: float) -> tuple[str, ...]:
     """Warnings about coverage, residual and outliers."""
     checks = {
         f'the coverage is {quality.coverage:.2g}, recommended at least {GOOD_COVERAGE}':

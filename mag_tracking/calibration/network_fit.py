@@ -147,8 +147,7 @@ def predicted_readings(network: SensorNetwork, magnet: TrackedMagnet, sensor: Fl
 class GeometrySettings:
     """Prior standard deviations, where zero means exactly known, and limits of the fit."""
 
-    gain_std: float = param(0.03, 'Standard deviation of the gain of a sensor.', '',
-                            (0.0, 1.0))
+    gain_std: float = param(0.03, 'Standard deviation of the gain of a sensor.', '', (0.0, 1.0))
     rotation_std_deg: float = param(
         2.0, 'Standard deviation of the orientation of a sensor, per axis.', 'deg', (0.0, 45.0))
     position_std: float = param(
@@ -340,8 +339,7 @@ class NormalEquations:
         return lost
 
 
-def solve(problem: GeometryProblem,
-          iterations: int) -> tuple[Unknowns, Weights, Prediction, bool]:
+def solve(problem: GeometryProblem, iterations: int) -> tuple[Unknowns, Weights, Prediction, bool]:
     """Minimise a `GeometryProblem` by Levenberg-Marquardt, from the median residuals as biases; the
     last value is whether it converged."""
     n, K, damping, converged = len(problem.network), len(problem.magnet.tool), 1e-3, False

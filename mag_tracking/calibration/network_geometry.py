@@ -261,8 +261,7 @@ def _check_input(network: SensorNetwork, field: FloatArray, positions: FloatArra
         raise ValueError('there are no poses; at least one pose is required')
     check_moment_and_noise(network, field, moment)
     for k in range(K):
-        if not (np.isfinite(positions[k]).all()
-                and abs(np.linalg.norm(axes[k]) - 1.0) <= 1e-3):
+        if not (np.isfinite(positions[k]).all() and abs(np.linalg.norm(axes[k]) - 1.0) <= 1e-3):
             raise ValueError(f'pose {k}: expected a finite position and a unit axis, got '
                              f'{positions[k].tolist()} and {axes[k].tolist()}')
         if (network.positions == positions[k]).all(axis=1).any():

@@ -224,8 +224,7 @@ def fuse_mounting(network: SensorNetwork, prior_std: Iterable[FloatArray],
     scatter = _track_scatter(gains, vectors, rotation, covariance) if len(tracks) > 1 \
         else np.full(n, np.nan)
     inflation = np.maximum(1.0, np.nan_to_num(scatter, nan=1.0))
-    covariance = np.linalg.inv(
-        prior + (total_information - prior) / inflation[:, None, None])
+    covariance = np.linalg.inv(prior + (total_information - prior) / inflation[:, None, None])
     rotation = np.einsum('jik,jk->ji', covariance, total_vector / inflation[:, None])
     return MountingEvidence(rotation, covariance, scatter, len(tracks))
 
