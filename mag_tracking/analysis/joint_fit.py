@@ -72,8 +72,7 @@ class GroundPrior:
     """Standard deviation of the vertical speed [m/s]; its mean is zero."""
 
     def prior(self, orders: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Prior mean and std (n_theta,) of the paths of rows of dipoles, 0 and inf without a
-        prior."""
+        """Prior mean and std (n_theta,) of paths of rows of dipoles, 0 and inf without a prior."""
         first = np.append(0, np.cumsum([6 + (n > 1) for n in orders]))
         mean, std = np.zeros(first[-1]), np.full(first[-1], np.inf)
         mean[first[:-1] + 2], std[first[:-1] + 2] = self.height
@@ -160,8 +159,7 @@ class _JointFits:
 
     def of_target(self, k: int, orders: Sequence[int],
                   candidates: Sequence[int]) -> tuple[PassFit, ...]:
-        """Fits of target `k` with each number in `candidates`; the other targets have those in
-        `orders`."""
+        """Fits of target `k` with each of `candidates`, while the others have their `orders`."""
         previous, fits = self._cache.get(tuple(orders)), []
         for n in candidates:
             combination = (*orders[:k], n, *orders[k + 1:])

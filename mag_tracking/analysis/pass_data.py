@@ -31,8 +31,7 @@ class PassData:
     field: FloatArray
     """(n, 3) [T], sensor frame; NaN for axes that were not measured."""
     covariance: FloatArray
-    """(n, 3, 3) [T²] covariance of each sample, or mean covariance of the samples that were
-    averaged."""
+    """(n, 3, 3) [T²] covariance of each sample, or mean of those of averaged samples."""
     count: IntArray | None = None
     """(n,) number of averaged samples; None if no samples were averaged."""
     doubt: str = ''

@@ -66,8 +66,7 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
 
 
 def centred_on_peak(data: PassData) -> tuple[PassData, PassData]:
-    """Shift time zero to the strongest field; return all samples, and means of at most `N_COARSE`
-    per sensor."""
+    """Shift time zero to the strongest field of all samples, and of `N_COARSE` means per sensor."""
     averaged = data.averaged(N_COARSE)
     return data.shifted(averaged.peak_s), averaged.shifted(averaged.peak_s)
 
@@ -110,8 +109,7 @@ def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
 
 
 def shorter_rows(path: FloatArray) -> FloatArray:
-    """Create starting paths of a row (7,): seven shorter rows, which fit almost as well, and a
-    longer one."""
+    """Create starting paths of a row (7,): shorter rows, which may fit as well, and longer ones."""
     ratio, offset = np.array(((0.7, 0.15), (0.7, 0.0), (0.7, -0.15), (0.4, 0.25), (0.4, 0.0),
                               (0.4, -0.25), (0.1, 0.0), (1.5, 0.0))).T
     rows = np.tile(path, (len(ratio), 1))

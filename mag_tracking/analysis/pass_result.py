@@ -37,8 +37,7 @@ class Bearing:
     reflection have equal fields."""
 
     cpa_direction: FloatArray
-    """(3,) unit vector, world, from the sensor to the target at the CPA, in the solution above the
-    sensor."""
+    """(3,) unit vector, world, from the sensor to the CPA in the solution above the sensor."""
     motion_direction: FloatArray
     """(3,) unit vector, world, of the velocity in the solution above the sensor."""
     moment_direction: FloatArray
@@ -87,8 +86,7 @@ class PassFit:
     residual_elsewhere: float = np.nan
     """Unexplained fraction of the energy outside the reach of the vehicle; see `pass_trust`."""
     trusted: tuple[str, ...] = ()
-    """Those of speed, direction and time (of the CPA) that are valid even if the fit is
-    rejected."""
+    """Those of speed, direction and time of the CPA that are valid even if the fit is rejected."""
     bearing: Bearing | None = None
     """Observable quantities of a fit of one sensor; None otherwise."""
     rivals: tuple[tuple[float, FloatArray], ...] = ()
@@ -255,8 +253,7 @@ def bearing_of(fit: PassFit, sensor_position: FloatArray) -> Bearing:
 
 
 def _direction_std(x: FloatArray, P: FloatArray) -> float:
-    """Largest std [rad] of the direction of x (3,) with covariance P; infinite if P is not
-    finite."""
+    """Largest std [rad] of the direction of x (3,) with covariance P; inf if P is not finite."""
     if not np.isfinite(P).all():
         return np.inf
     u = x / np.linalg.norm(x)

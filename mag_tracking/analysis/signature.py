@@ -10,8 +10,7 @@ N_SAMPLES, MIN_SAMPLES = 64, 8
 """Number of samples of a resampled signature, and minimum number of a recorded one."""
 
 BASELINE_FRACTION, TAIL_FRACTION = 0.1, 0.005
-"""Fraction of a signature to which the baseline is fitted, and of its energy that is cut off, at
-each end."""
+"""Fraction of a signature, at each end, for the baseline, and of its energy that is cut off."""
 
 MIN_PROMINENCE = 0.1
 """Minimum prominence of an extremum relative to the range of its axis."""

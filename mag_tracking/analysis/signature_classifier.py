@@ -97,8 +97,7 @@ class Evaluation:
     unknown: FloatArray
     """(n_sets,) fraction of `unknown` predictions."""
     expected_calibration_error: float
-    """Mean absolute difference between predicted probability and accuracy over bins of the
-    probability."""
+    """Mean absolute difference of probability and accuracy over bins of the probability."""
 
 
 def feature_table(signatures: Sequence[Signature]) -> tuple[FloatArray, IntArray, list[str]]:
@@ -226,8 +225,7 @@ def _evaluate_parts(parts: Sequence[tuple[SignatureModel, FloatArray, Any]]) -> 
 
 def expected_calibration_error(probability: FloatArray, correct: FloatArray, n_bins: int = 10
                                ) -> float:
-    """Expected calibration error of predictions, over `n_bins` equal-width bins of the
-    probability."""
+    """Expected calibration error over `n_bins` equal-width bins of the probability."""
     bins = np.minimum((probability * n_bins).astype(int), n_bins - 1)
     return float(sum(abs(probability[bins == b].mean() - correct[bins == b].mean())
                      * np.mean(bins == b) for b in np.unique(bins)))

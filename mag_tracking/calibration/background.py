@@ -55,8 +55,7 @@ class RelearntBackground(NamedTuple):
     stamp_ns: int
     """Timestamp of the first reading to which the new background applies."""
     has_departed: bool
-    """Whether a target in the background has departed; otherwise another level lasted or
-    returned."""
+    """Whether a target in the background has departed, or else another level lasted or returned."""
     before: FloatArray
     """Previous background, (3,) T, sensor frame. NaN for a missing axis."""
     after: FloatArray

@@ -136,8 +136,7 @@ class BackgroundLevel:
             and bool(np.nanmax(residual / self.limits) <= 1.0)
 
     def is_steep(self, blocks: Blocks, slope: FloatArray) -> bool:
-        """Whether the slope (3,) T/s of a line through blocks significantly exceeds
-        `STEEP_DRIFT`."""
+        """Whether the slope (3,) T/s of a line through blocks clearly exceeds `STEEP_DRIFT`."""
         assert self.noise is not None
         variance = self.noise.diagonal() + self._state['step_variance']
         relative_time = blocks.time - blocks.time.mean()
@@ -200,8 +199,7 @@ class LevelDeparture:
         self._has_first_block = False
 
     def steady_end(self, ratio: float = 1.0) -> Sequence[Block] | None:
-        """Latest blocks, at least three, if steady for `ratio` of the usual time; set
-        `was_steady`."""
+        """Three or more latest blocks if steady for `ratio` of the usual time; set `was_steady`."""
         blocks, latest = self.blocks, deque[Block]()
         start = blocks[-1].time - ratio * self._learn
         if len(blocks) < 3 or blocks[0].time > start:

@@ -11,8 +11,7 @@ from mag_tracking.calibration import core
 from mag_tracking.records import plain
 
 MAX_VARIANCE_RATIO = 100.0
-"""Maximum variance of a block relative to the quietest block; a target within a block exceeds
-it."""
+"""Maximum variance of a block relative to the quietest one; a target within it causes more."""
 
 
 class Block(NamedTuple):
@@ -55,8 +54,7 @@ def stacked(blocks: Iterable[Block]) -> Blocks:
 
 
 def has_noisy_block(blocks: Blocks, step_variance: FloatArray) -> bool:
-    """Whether the variance of a block, at least `step_variance` (3,) T², far exceeds the lowest
-    one."""
+    """Whether the variance of a block, at least `step_variance` (3,) T², far exceeds others."""
     n = blocks.n
     variance = np.where(n > 1, np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1, 1), np.nan)
     variance = np.maximum(variance, step_variance)

@@ -46,8 +46,7 @@ def _no_lag(reason: str, correlation: float = float('nan')) -> Lag:
 
 
 def shock(acceleration: FloatArray) -> FloatArray:
-    """Magnitude (n,) of shocks in an acceleration (n, 3), m/s²: the distance from the median, above
-    rest."""
+    """Magnitude (n,) above rest of the distance of accelerations (n, 3), m/s², from the median."""
     a = np.asarray(acceleration, dtype=float)
     magnitude = np.linalg.norm(a - np.nanmedian(a, axis=0), axis=1)
     above_rest: FloatArray = magnitude - np.nanmedian(magnitude)

@@ -65,8 +65,8 @@ def calibrate_readings(
     `rows` (n,) are the indices of the sensors, negative if unknown, `stamps` (n,) in ns, `fields`
     (n, 3) in T raw, `own` (n,) the states of the covariances (n, 3, 3) in T² of the messages: NONE
     (ignored), VALID or INVALID. Calibrated readings (m, ...) are appended to the outputs from
-    `n_out` on: indices of sensors, timestamps, fields minus the background, noise covariances. One
-    element of `limits` and `batches`. Returns DONE, or the reason for stopping; `row` and
+    `n_out` on: indices of sensors, timestamps, fields minus the background, noise covariances.
+    `limits` and `batches` have one element. Returns DONE, or the reason for stopping; `row` and
     `stamp_ns` of the batch identify the reading. Raises IndexError if an output array is full, or
     the index of a sensor is out of range.
     """

@@ -21,8 +21,7 @@ MAX_INTERVALS = 16
 
 def updated(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool,
             max_intervals: int = MAX_INTERVALS) -> DoubtfulTimes:
-    """Return at most `max_intervals`, updated with the state of the background from a timestamp
-    on."""
+    """Return at most `max_intervals`, updated with the state from a timestamp on."""
     is_open = bool(times) and times[-1][1] is None
     if is_doubtful and not is_open:
         return (*times, (stamp_ns, None))[-max_intervals:]

@@ -64,8 +64,7 @@ class EllipsoidFit:
     """(3, 3) symmetric positive definite, field unit per reading unit: soft iron, scale factors and
     non-orthogonality, up to a rotation."""
     field_magnitude: float
-    """Magnitude of B: the given value, or the mean radius for det(correction) = 1, in reading
-    units."""
+    """Magnitude of B: as given, or the mean radius for det(correction) = 1, in reading units."""
     residual: float
     """Coefficient of variation (std/mean) of ‖B‖ over all readings, including excluded ones."""
     residual_before: float

@@ -169,8 +169,7 @@ class ProvisionalLevel:
         return most_frequent_level(stacked(blocks), steps, MAX_BLOCKS)
 
     def std(self, frequent: MostFrequentLevel) -> FloatArray:
-        """Uncertainty (3,) T of a frequent level: median distance of all blocks, scaled to a
-        std."""
+        """Uncertainty (3,) T of a frequent level: median distance of all blocks, as a std."""
         distance, is_known = np.full(3, np.nan), ~np.isnan(frequent.level)
         means = np.array([block.mean for block in self._blocks])[:, is_known]
         distance[is_known] = np.nanmedian(np.abs(means - frequent.level[is_known]), axis=0)

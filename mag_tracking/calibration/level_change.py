@@ -106,8 +106,8 @@ class LevelChange:
     size: float
     """Magnitude of the change in standard deviations of one reading."""
     has_departed: bool | None
-    """Whether a vehicle at the earlier level departed (or one at the later arrived); None:
-    unknown."""
+    """True: a vehicle that caused the earlier level has departed. False: one that causes the later
+    level has arrived. None: unknown."""
 
 
 ChangeEvaluator: TypeAlias = Callable[[LevelChange], bool | None]

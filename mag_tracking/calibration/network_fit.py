@@ -313,8 +313,7 @@ class NormalEquations:
         self.C = np.concatenate([sensor_pose.reshape(K, m, N_POSE), shared_pose], axis=1)
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Steps of [sensors, shared] (N,) and of the poses (K, 8), with diagonals increased by
-        `damping`."""
+        """Steps of [sensors, shared] (N,) and poses (K, 8), with diagonals damped."""
         A = self.A + damping * np.diag(np.diagonal(self.A))
         A_pose = self.A_pose * (1.0 + damping * np.eye(N_POSE))
         CB = self.C @ np.linalg.inv(A_pose)

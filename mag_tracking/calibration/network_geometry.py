@@ -68,8 +68,7 @@ class NetworkGeometry:
     pose_covariance: FloatArray
     """(K, 8, 8)."""
     covariance: FloatArray
-    """(10 n + 12, 10 n + 12) of the sensor unknowns (bias, gain, rotation, position) and
-    `shared`."""
+    """(10 n + 12, 10 n + 12) of sensor unknowns (bias, gain, rotation, position) and `shared`."""
     normalised_cost: float
     """Cost per degree of freedom; about one if model, noise and field error are correct."""
     sensor_residual: FloatArray

@@ -173,8 +173,7 @@ def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
 
 def with_nominal_heading(orientation: Orientation, nominal: FloatArray, nominal_std: float,
                          limit: float = 3.0) -> Orientation | None:
-    """Fuse a compass heading with a nominal one of std `nominal_std` rad; None beyond `limit`
-    std."""
+    """Fuse a compass heading with a nominal one, std `nominal_std` rad; None beyond `limit` std."""
     difference = yaw_between(orientation.R_ws, nominal)
     compass_std = orientation.std[2]
     if abs(difference) > limit * np.hypot(compass_std, nominal_std):

@@ -287,8 +287,7 @@ NO_FAULTS = ReadingFaults(np.zeros((0, 3)), 1.0)
 
 
 def reading_faults(fields: FloatArray, stamps: IntArray | None = None) -> ReadingFaults:
-    """Find marks and repetitions in chronological raw readings (n, 3) in T with timestamps (n,) in
-    ns."""
+    """Find marks and repetitions in chronological raw readings (n, 3) T at timestamps (n,) ns."""
     marks = missing_marks(fields)
     kept = np.where(are_marked(fields, marks), np.nan, fields)
     return ReadingFaults(marks, repetition_of(
@@ -296,8 +295,7 @@ def reading_faults(fields: FloatArray, stamps: IntArray | None = None) -> Readin
 
 
 def isolated_readings(values: FloatArray) -> IntArray:
-    """Indices of single readings (n,), not next to NaN, that differ from two neighbours that
-    agree."""
+    """Indices of single readings (n,), not beside NaN, that differ from two equal neighbours."""
     if len(values) < 5:
         return np.zeros(0, dtype=np.int64)
     change = np.diff(values)

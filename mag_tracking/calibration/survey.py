@@ -194,8 +194,7 @@ class Survey:
     def _disagreements(self, field: FloatArray, orientations: Sequence[Orientation | None],
                        nominal_std: FloatArray, warnings: Mapping[str, list[str]]
                        ) -> list[FieldInconsistency]:
-        """Find the sensors whose field contradicts the Earth's field; add a warning if that is
-        unknown."""
+        """Find the sensors whose field contradicts that of the Earth; warn if that is unknown."""
         network = self._network
         R = np.array([R if o is None else o.R_ws
                       for o, R in zip(orientations, network.R_ws, strict=True)])
@@ -258,8 +257,7 @@ class Survey:
 
     def _lags(self, signals: Mapping[str, tuple[FloatArray, FloatArray]]
               ) -> tuple[str, dict[str, Lag]]:
-        """Find the reference sensor, '' if none, and estimate the lags of the others from
-        knocks."""
+        """Find the reference sensor, '' if none, and estimate the lags of others from knocks."""
         first_lags: dict[str, Lag] = {}
         for reference, (t, s) in signals.items():
             lags = {name: knock_lag(t, s, *signals[name], MAX_CLOCK_OFFSET_S)
