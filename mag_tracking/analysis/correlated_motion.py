@@ -52,8 +52,6 @@ MIN_COSINE = 0.3
 MIN_SAMPLES, MAX_READINGS = 10, 1_000_000
 """Minimum number of readings of each sensor, and maximum number of resampled readings of a pair."""
 
-_MAX_GAUSS_NEWTON_STEPS = 20
-
 
 @dataclass(frozen=True)
 class PairDelay:
@@ -278,7 +276,7 @@ def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]
         # With such a long delay, the two fields hardly overlap.
         return tau, np.inf, 0.0
     std = norm / np.sqrt(y.size)
-    for _ in range(_MAX_GAUSS_NEWTON_STEPS):
+    for _ in range(20):
         residuals, J = _residuals(pair, t, y, theta)
         # Smoothing reduces noise, but not the quantisation error of a coarse sensor.
         std = max(float(np.linalg.norm(residuals)) / np.sqrt(dof), pair.noise, 1e-6 * norm)

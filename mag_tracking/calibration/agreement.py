@@ -48,13 +48,6 @@ _AXES = 'xyz'
 _AxisChange: TypeAlias = tuple[str, tuple[int, ...], FloatArray]
 """Description, order and signs (3,) of a signed permutation of the axes."""
 
-ADVICE = 'fix the sensor, its orientation in the network file, or earth_field'
-"""Remedy for a misleading sensor."""
-
-OFFSET_ADVICE = 'measure the offset with mag-tracking calibrate tumble if the orientations are '\
-                'calibrated'
-"""Remedy for a sensor with a constant offset."""
-
 
 @dataclass(frozen=True)
 class FieldInconsistency:
@@ -71,7 +64,9 @@ class FieldInconsistency:
     @property
     def advice(self) -> str:
         """Remedy."""
-        return ADVICE if self.misleads else OFFSET_ADVICE
+        return 'fix the sensor, its orientation in the network file, or earth_field' \
+            if self.misleads else 'measure the offset with mag-tracking calibrate tumble if the ' \
+            'orientations are calibrated'
 
     def __str__(self) -> str:
         cause = ' or '.join(self.explanations) or (
@@ -104,8 +99,8 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
     uncalibrated sensor, are in T per axis. A difference within the offset is not misleading.
     """
     B0 = np.asarray(earth_field, dtype=float)
-    sensors = [_Sensor(names[j], fields[j], R_ws[j], orientation_std[j], B0, bias_std)
-               for j in range(len(names))]
+    sensors = [_Sensor(*sensor, B0, bias_std)
+               for sensor in zip(names, fields, R_ws, orientation_std, strict=True)]
     suspects = [s for s in sensors if not s.fits(s.field)]
     inconsistencies = []
     for s in suspects:

@@ -45,9 +45,6 @@ their number must grow between searches."""
 MIN_OBSERVED_S = 10.0
 """[s] Minimum total duration of a level that is considered certain."""
 
-MAD_TO_STD = 1.4826
-"""Standard deviation of a normal distribution relative to its median absolute deviation."""
-
 
 @dataclass(frozen=True)
 class MostFrequentLevel:
@@ -173,4 +170,4 @@ class ProvisionalLevel:
         distance, is_known = np.full(3, np.nan), ~np.isnan(frequent.level)
         means = np.array([block.mean for block in self._blocks])[:, is_known]
         distance[is_known] = np.nanmedian(np.abs(means - frequent.level[is_known]), axis=0)
-        return MAD_TO_STD * distance
+        return 1.4826 * distance
