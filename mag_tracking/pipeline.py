@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeAlias
 
+from mag_tracking.calibration.survey import SurveySettings
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import Disturbance, TrafficSummary, VehiclePassage
 from mag_tracking.network import SensorNetwork
@@ -18,7 +19,6 @@ from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.stage import Stage, rejected
-from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.traffic.settings import TrafficSettings

@@ -1,1 +1,1 @@
-"""Batch analyses of passes and networks: fits, classification, calibration, sensor placement."""
+"""Batch analyses of passes: fits, checks, classification and sensor placement."""

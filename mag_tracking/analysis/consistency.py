@@ -20,21 +20,13 @@ def error_over_bound(network: SensorNetwork, log: TrackLog,
                      rows: IntArray, axes: int) -> float | None:
     """Ratio of the RMS error of a track to the posterior Cramér-Rao bound along the true path.
 
-    The bound applies to a point target with the estimated moment of the track, because the true
-    moment is unknown, and assumes the tracker's motion model, sensor noise and relative field
-    error. The backgrounds are states, and the prior of the first pose is wide. The extent of the
-    vehicle is neglected. None if fewer than two poses have a ground truth, or no evaluated pose has
-    one. T10 Alg. 2, linearised at the truth; [Tichavsky98]_.
-
-    Parameters
-    ----------
-    truth : timestamps [ns], positions [m] and quaternions (xyzw) of the ground truth
-    acceleration : (3,), spectral density of the acceleration, m²/s³
-    moment_walk : random walk of the moment relative to its magnitude, 1/s^0.5
-    field_error : model error relative to the field
-    background_std : prior std of the backgrounds, T
-    rows : indices of the evaluated poses in the log
-    axes : 2 for the horizontal error, 3 for the error in space
+    The bound applies to a point target with the estimated moment, because the true one is unknown,
+    and the tracker's motion model, sensor noise and relative field error; the backgrounds are
+    states. None if fewer than two poses have a ground truth, or none of the evaluated `rows` of the
+    log. T10 Alg. 2, linearised at the truth; [Tichavsky98]_. `truth` is timestamps [ns], positions
+    [m] and quaternions (xyzw); `acceleration` (3,) its spectral density [m²/s³]; `moment_walk` the
+    relative random walk of the moment [1/s^0.5]; `background_std` in T is that of the prior; `axes`
+    is 2 for the horizontal error, 3 for the error in space.
     """
     true_path = interpolate_truth(truth, log.stamp_ns)
     truth_rows = np.flatnonzero(np.isfinite(true_path).all(axis=1))
@@ -45,18 +37,28 @@ def error_over_bound(network: SensorNetwork, log: TrackLog,
     if len(truth_rows) < 2 or not len(rows):
         return None
     t = log.seconds()[truth_rows]
-    H, C = _measurement_model(network, log, true_path[truth_rows], t, truth_rows, field_error)
-    F, Q = _motion_model(t, acceleration, moment_walk, log, truth_rows, H.shape[-1])
-    P = path_bound(F, Q, H, C,
-                   _prior_covariance(network, true_path[truth_rows], t, log, truth_rows,
-                                     background_std))
+    H, C = _measurement_model(network, log, true_path[truth_rows], truth_rows, field_error)
+    n_x, moments = H.shape[-1], np.array(log.moment)[truth_rows]
+    F, Q = np.tile(np.eye(n_x), (len(t), 1, 1)), np.zeros((len(t), n_x, n_x))
+    for k, dt in enumerate(np.diff(t), 1):
+        F[k, :6, :6] = constant_velocity(dt)
+        Q[k, :6, :6] = integrator_noise(dt, acceleration)
+        Q[k, 6:9, 6:9] = moment_walk**2 * dt * np.square(moments[k]).sum() * np.eye(3)
+    # The prior has the extent and speed of the path as standard deviations.
+    steps = np.linalg.norm(np.diff(true_path[truth_rows], axis=0), axis=1)
+    std = np.full(n_x, background_std)
+    std[:3] = max(np.ptp(true_path[truth_rows], axis=0).max(),
+                  np.ptp(network.positions, axis=0).max())
+    std[3:6] = max(steps.max() / np.diff(t).min(), MIN_VELOCITY_STD)
+    std[6:9] = np.linalg.norm(moments[0])
+    P = path_bound(F, Q, H, C, np.diag(std**2))
     is_evaluated = np.isin(truth_rows, rows)
     variance = np.einsum('kii->ki', P[is_evaluated])[:, :axes].sum(axis=1)
     error = np.array(log.position)[truth_rows[is_evaluated]] - true_path[truth_rows[is_evaluated]]
     return float(np.sqrt(np.mean(np.square(error[:, :axes]).sum(axis=1)) / np.mean(variance)))
 
 
-def _measurement_model(network: SensorNetwork, log: TrackLog, true_path: FloatArray, t: FloatArray,
+def _measurement_model(network: SensorNetwork, log: TrackLog, true_path: FloatArray,
                        truth_rows: IntArray, field_error: float) -> tuple[FloatArray, FloatArray]:
     """Jacobians (k, n_sensors, 3, n_x) of the field with respect to [r, v, m, backgrounds], NaN
     without a measurement, and noise covariances (k, n_sensors, 3, 3)."""
@@ -74,28 +76,3 @@ def _measurement_model(network: SensorNetwork, log: TrackLog, true_path: FloatAr
     C = np.array(log.noise)[truth_rows] + field_error**2 * np.square(h).sum(axis=-1)[
         ..., None, None] * np.eye(3)
     return H, C
-
-
-def _motion_model(t: FloatArray, acceleration: FloatArray, moment_walk: float, log: TrackLog,
-                  truth_rows: IntArray, n_x: int) -> tuple[FloatArray, FloatArray]:
-    """F and Q (k, n_x, n_x); F[i] and Q[i] lead from pose i - 1 to pose i, F[0] = I and Q[0]
-    = 0."""
-    F, Q = np.tile(np.eye(n_x), (len(t), 1, 1)), np.zeros((len(t), n_x, n_x))
-    for k, dt in enumerate(np.diff(t), 1):
-        F[k, :6, :6] = constant_velocity(dt)
-        Q[k, :6, :6] = integrator_noise(dt, acceleration)
-        walk = moment_walk**2 * dt * np.square(log.moment[truth_rows[k]]).sum()
-        Q[k, 6:9, 6:9] = walk * np.eye(3)
-    return F, Q
-
-
-def _prior_covariance(network: SensorNetwork, true_path: FloatArray, t: FloatArray, log: TrackLog,
-                      truth_rows: IntArray, background_std: float) -> FloatArray:
-    """Diagonal covariance (n_x, n_x) of the first state, with extent and speed of the path as
-    stds."""
-    extent = max(np.ptp(true_path, axis=0).max(), np.ptp(network.positions, axis=0).max())
-    speed = max(np.linalg.norm(np.diff(true_path, axis=0), axis=1).max()
-                / np.diff(t).min(), MIN_VELOCITY_STD)
-    std = np.full(9 + 3 * len(network), background_std)
-    std[:3], std[3:6], std[6:9] = extent, speed, np.linalg.norm(log.moment[truth_rows[0]])
-    return np.diag(std**2)

@@ -3,10 +3,8 @@
 If a target passes two sensors one after the other at about the same distance, both measure the same
 field with a delay. Distance over delay is the speed; the sign of the delay is the direction. The
 result does not depend on the moment, shape or length of the target and is therefore an independent
-check of tracks and fits. Sensors on opposite sides of a road measure different fields without a
-common delay; the result then contains a reason instead of a speed.
-
-Offsets between the sensors' clocks bias the delay and are not included in its standard deviation.
+check of tracks and fits. Offsets between the sensors' clocks bias the delay and are not included in
+its standard deviation.
 """
 
 from collections.abc import Sequence
@@ -17,6 +15,7 @@ import numpy as np
 
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.geometry import cross_matrix
 from mag_tracking.inference.least_squares import model_error_covariance
 from mag_tracking.network.sensor_network import MIN_DELAY_BASELINE
 from mag_tracking.physics.bounds import ADVICE, MAX_SPEED, TOO_FAST
@@ -27,61 +26,42 @@ MIN_CORRELATION = 0.97
 MIN_PEAK = 0.7
 """Minimum height of a correlation maximum relative to the highest maximum."""
 
-N_COARSE = 512
-"""Number of field samples in the search for correlation maxima."""
+N_COARSE, MAX_PAIRS = 512, 12
+"""Number of samples in the search for correlation maxima, and of compared pairs (the closest)."""
 
 SCALE_STD, GAIN_STD, ROTATION_STD = 0.05, 0.02, np.deg2rad(2.0)
 """Prior standard deviations of the differences between the fields at two sensors: common scale
-(distance to the target), gain of each axis, and rotation [rad] about each axis. The standard
-deviation of the rotation assumes careful mounting."""
+(distance to the target), gain of each axis, and rotation [rad] about each axis."""
 
 MIN_DELAY = 3.0
 """Minimum delay in standard deviations; a smaller delay is not significant."""
 
-RELATIVE_KERNEL_WIDTH = 0.3
-"""Width of the smoothing kernel relative to the RMS duration of the field."""
-
-MAX_DELAY_SHIFT = 4.0
-"""Maximum shift of a delay during the refinement, in widths of the smoothing kernel. A larger shift
-leads to a different correlation maximum."""
+RELATIVE_KERNEL_WIDTH, MAX_DELAY_SHIFT = 0.3, 4.0
+"""Width of the smoothing kernel relative to the RMS duration of the field, and maximum shift of a
+delay during the refinement in these widths."""
 
 MAX_PRIOR_CHI2 = 22.5
-"""Maximum joint chi-square of rotation, scale and gains (probability 0.001). At a larger value, the
-fields are considered different."""
+"""Maximum joint chi-square of rotation, scale and gains of equal fields (probability 0.001)."""
 
 MIN_DIFFERENCE_STDS, MIN_RELATIVE_DIFFERENCE = 3.0, 0.1
-"""Two speeds contradict each other if their difference exceeds both limits: in standard deviations,
-and relative to the speed."""
+"""Minimum difference of contradicting speeds: in standard deviations, and relative to the speed."""
 
 MIN_COSINE = 0.3
-"""Minimum cosine of the angle between the heading and the line through both sensors. At a
-smaller cosine, the target crosses the line, and its speed is not compared."""
+"""Minimum cosine of the angle between the heading and the line through both sensors."""
 
-MAX_READINGS = 1_000_000
-"""Maximum number of resampled readings of a pair. A pair that requires more, due to irregular
-timestamps, is rejected."""
-
-MAX_PAIRS = 12
-"""Maximum number of pairs of sensors; the closest pairs are compared."""
-
-MIN_SAMPLES = 10
-"""Minimum number of readings of each sensor."""
-
-_MAX_GAUSS_NEWTON_STEPS = 20
+MIN_SAMPLES, MAX_READINGS = 10, 1_000_000
+"""Minimum number of readings of each sensor, and maximum number of resampled readings of a pair."""
 
 
 @dataclass(frozen=True)
 class PairDelay:
-    """Delay between two sensors."""
+    """Delay between two sensors, `first` and `second` in the network."""
 
     first: int
-    """Index of the first sensor in the network."""
     second: int
-    """Index of the second sensor in the network."""
     delay: float
     """Delay of the second sensor after the first [s]."""
     delay_std: float
-    """Standard deviation of `delay` [s]."""
     similarity: float
     """Fraction of the energy of the second field that is explained by the delayed first field."""
 
@@ -93,14 +73,12 @@ class CorrelatedMotion:
     reason: str = 'not evaluated'
     """Reason why there is no estimate; empty if there is an estimate."""
     speed: float = np.nan
-    """Speed [m/s]."""
+    """[m/s]"""
     speed_std: float = np.nan
-    """Standard deviation of `speed` [m/s]."""
     heading: float = np.nan
-    """Heading [rad], measured anticlockwise from x."""
+    """[rad], anticlockwise from x."""
     heading_std: float = np.nan
-    """Standard deviation of `heading` [rad]. NaN if the sensors are on one line, because the target
-    is then assumed to move along that line."""
+    """NaN if the sensors are on one line, along which the target is then assumed to move."""
     similarity: float = np.nan
     """Largest `similarity` of the compared pairs."""
     pairs: tuple[PairDelay, ...] = ()
@@ -111,7 +89,11 @@ def correlated_motion(data: PassData) -> CorrelatedMotion:
     """Estimate the velocity of a target from the delays between the sensors that it passed."""
     if len(data.sensors) < 2:
         return CorrelatedMotion('one sensor: a delay requires two sensors')
-    delays = [d for d in (_estimate_delay(data, i, j) for i, j in _nearest_pairs(data))
+    positions = data.network.positions[:, :2]
+    pairs = list(combinations(data.sensors.tolist(), 2))
+    distance = np.array([np.linalg.norm(positions[i] - positions[j]) for i, j in pairs])
+    nearest = [k for k in np.argsort(distance, kind='stable') if distance[k] > MIN_DELAY_BASELINE]
+    delays = [d for d in (_estimate_delay(data, *pairs[k]) for k in nearest[:MAX_PAIRS])
               if d is not None]
     if not delays:
         return CorrelatedMotion('no pair of separate sensors has simultaneous readings of a '
@@ -133,9 +115,8 @@ def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
                        delay: CorrelatedMotion) -> bool:
     """Whether a speed and a heading, each with its std, contradict the delays between the sensors.
 
-    On a path oblique to the line through the sensors, the delay is shorter than along the line; the
-    speeds are compared accordingly. A path almost perpendicular to the line, or an unknown value,
-    never contradicts the delays. A significantly opposite heading always does.
+    On a path oblique to the line through the sensors, the delay is shorter than along the line. A
+    path almost perpendicular to it, or an unknown value, never contradicts the delays.
     """
     if delay.reason or not np.isfinite([*speed, *heading]).all():
         return False
@@ -150,15 +131,6 @@ def contradicts_delays(speed: tuple[float, float], heading: tuple[float, float],
     difference = abs(speed[0] / cosine - delay.speed)
     return bool(difference > MIN_DIFFERENCE_STDS * np.hypot(std, delay.speed_std)
                 and difference > MIN_RELATIVE_DIFFERENCE * delay.speed)
-
-
-def _nearest_pairs(data: PassData) -> list[tuple[int, int]]:
-    """The closest pairs of sensors, at most `MAX_PAIRS`, none closer than `MIN_DELAY_BASELINE`."""
-    positions = data.network.positions[:, :2]
-    pairs = list(combinations(data.sensors.tolist(), 2))
-    distance = np.array([np.linalg.norm(positions[i] - positions[j]) for i, j in pairs])
-    nearest = [k for k in np.argsort(distance, kind='stable') if distance[k] > MIN_DELAY_BASELINE]
-    return [pairs[k] for k in nearest[:MAX_PAIRS]]
 
 
 def _fit_velocity(data: PassData, pairs: Sequence[PairDelay],
@@ -215,26 +187,18 @@ class _SensorReadings:
 
 @dataclass(frozen=True)
 class _SmoothedPair:
-    """Smoothed fields of two sensors at common times. Smoothing does not change the delay."""
+    """Smoothed fields (n, k) [T] of two sensors at common times `t` (n,) [s].
+
+    Smoothing, by a kernel of `width` [s], does not change the delay. `slope` (n, k) [T/s] is the
+    derivative of `first`; `noise` [T] is the std of the difference between two readings.
+    """
 
     t: FloatArray
-    """(n,) [s] Common times."""
     first: FloatArray
-    """(n, k) [T] Field of the first sensor."""
     slope: FloatArray
-    """(n, k) [T/s] Derivative of `first`."""
     second: FloatArray
-    """(n, k) [T] Field of the second sensor."""
     width: float
-    """[s] Width of the smoothing kernel."""
     noise: float
-    """[T] Noise standard deviation of the difference between two readings."""
-
-    def at(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Interpolate the first field and its slope, (n, k) each, at times `t` (n,)."""
-        field, slope = (np.stack([np.interp(t, self.t, v) for v in values.T], axis=1)
-                        for values in (self.first, self.slope))
-        return field, slope
 
 
 def _resampled_pair(data: PassData, i: int, j: int) -> _SmoothedPair | None:
@@ -293,8 +257,7 @@ def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]
     """Refine a delay [s]; return the delay, its std [s] and the similarity.
 
     The second field is modelled by Gauss-Newton as the delayed first field with small rotation,
-    scale and gain errors and another background. An implausible result has infinite std and
-    similarity 0.
+    scale and gain errors and another background. Implausible: infinite std and similarity 0.
     """
     k = pair.second.shape[1]
     theta = np.concatenate([[tau], np.zeros(2 * k + 3)])
@@ -313,7 +276,7 @@ def _refine_delay(pair: _SmoothedPair, tau: float) -> tuple[float, float, float]
         # With such a long delay, the two fields hardly overlap.
         return tau, np.inf, 0.0
     std = norm / np.sqrt(y.size)
-    for _ in range(_MAX_GAUSS_NEWTON_STEPS):
+    for _ in range(20):
         residuals, J = _residuals(pair, t, y, theta)
         # Smoothing reduces noise, but not the quantisation error of a coarse sensor.
         std = max(float(np.linalg.norm(residuals)) / np.sqrt(dof), pair.noise, 1e-6 * norm)
@@ -346,11 +309,9 @@ def _residuals(pair: _SmoothedPair, t: FloatArray, y: FloatArray,
     """Residuals (n k,) [T] of the second field `y`, and derivatives of its model by `theta`."""
     k = y.shape[1]
     tau, background, angles, gain = theta[0], theta[1:1 + k], theta[1 + k:4 + k], theta[4 + k:]
-    field, slope = pair.at(t - tau)
-    by_angle = np.zeros((len(t), k, 3))
-    if k == 3:
-        for a in range(3):
-            by_angle[:, :, a] = np.cross(np.eye(3)[a], field)
+    field, slope = (np.stack([np.interp(t - tau, pair.t, v) for v in values.T], axis=1)
+                    for values in (pair.first, pair.slope))
+    by_angle = -cross_matrix(field) if k == 3 else np.zeros((len(t), k, 3))
     rotated = field + by_angle @ angles
     J = np.concatenate([-slope[:, :, None] * (1.0 + gain)[:, None],
                         np.broadcast_to(np.eye(k), (len(t), k, k)), by_angle,

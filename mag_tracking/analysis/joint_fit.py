@@ -1,4 +1,4 @@
-"""Joint batch fit of several targets whose fields overlap.
+"""Joint batch fit of several targets whose fields overlap, and the choice of their number.
 
 The targets are first modelled as points. One search starts at the tracked positions. A second
 search adds the targets one by one where the residual field is strongest. The number of dipoles of
@@ -12,8 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
-from mag_tracking.analysis.model_order import order_criteria
-from mag_tracking.analysis.pass_covariance import SensorErrors
+from mag_tracking.analysis.fitted_pass import order_criteria
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
 from mag_tracking.analysis.pass_description import PATH_TOLERANCE, assignment, fits_at_minimum
 from mag_tracking.analysis.pass_fit import (
@@ -25,6 +24,7 @@ from mag_tracking.analysis.pass_fit import (
     unusable_reason,
 )
 from mag_tracking.analysis.pass_result import MAX_COST_RATIO, PassFit
+from mag_tracking.analysis.pass_trust import has_plausible_residual
 from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.geometry import overlap, propagated_path
 from mag_tracking.inference.least_squares import refine
@@ -32,40 +32,39 @@ from mag_tracking.inference.separable_fit import coarse_minima, fine_minimum
 from mag_tracking.physics.passes import SuperposedPasses
 from mag_tracking.units import NS
 
-N_REFINED, N_STEPS = 150, 6
-"""Number of starting points that are refined in the coarse search, and number of steps of each."""
-
-N_CONVERGED = 10
-"""Number of coarse solutions that are refined until convergence."""
-
-N_FINE_STARTS = 2
-"""Number of coarse minima from which the fit to all measurements starts."""
+N_REFINED, N_STEPS, N_CONVERGED, N_FINE_STARTS = 150, 6, 10, 2
+"""Number of starting points that are refined in the coarse search, steps of each, number of coarse
+solutions that are refined until convergence, and of those from which the final fit starts."""
 
 INITIAL_LENGTH = 3.0
 """[m] Initial length of a row of dipoles that replaces a point."""
 
 MIN_GAP, VEHICLE_WIDTH = 3.0, 1.5
-"""[m] Minimum distance between the rows of dipoles of two vehicles, along and across their heading.
-A body is longer than its row. Closer rows are parts of one vehicle."""
+"""[m] Minimum distance between the rows of two vehicles, along and across their heading."""
 
 MAX_DETECTION_RANGE = 15.0
 """[m] Maximum distance at which a sensor detects a target."""
 
 MAX_ROUNDS = 3
-"""Maximum number of rounds of the order selection. Each round selects the order of every target in
-turn, given the current orders of the other targets."""
+"""Maximum number of rounds of the order selection, each of all targets in turn."""
 
 MAX_VELOCITY_DIFFERENCE, MAX_TRACK_DISTANCE = 0.5, 5.0
-"""Maximum relative difference of velocity, and maximum distance [m], between two fits of one
-target, or between a fit and its track. Tracks have RMS errors of 0.3 to 0.9 m (`bench.busy`)."""
+"""Maximum relative difference of velocity, and distance [m], of two fits, or of fit and track."""
+
+MAX_TARGETS = 3
+"""Maximum number of targets in a joint fit, each with about twelve unknowns."""
+
+MAX_LENGTH = 18.75
+"""[m] Maximum length of the iron of one vehicle: the limit for road trains (Directive 96/53/EC)."""
+
+MAX_VELOCITY_SPREAD = 0.25
+"""Maximum relative difference of the velocity of a part of a vehicle from the mean of all parts."""
 
 
 @dataclass(frozen=True)
 class GroundPrior:
-    """Prior of the height and vertical speed of vehicles.
-
-    Without the prior, two targets that leave the ground can explain a single target that turns.
-    """
+    """Prior of the height and vertical speed of vehicles, without which two targets that leave the
+    ground can explain a single target that turns."""
 
     height: tuple[float, float]
     """Height of the magnetic centre above z = 0 and its standard deviation [m]."""
@@ -73,19 +72,16 @@ class GroundPrior:
     """Standard deviation of the vertical speed [m/s]; its mean is zero."""
 
     def prior(self, orders: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Prior mean and std (n_theta,) of the paths of rows of dipoles, 0 and inf without a
-        prior."""
-        means, stds = [], []
-        for n_dipoles in orders:
-            mean, std = np.zeros(6 + (n_dipoles > 1)), np.full(6 + (n_dipoles > 1), np.inf)
-            (mean[2], std[2]), std[5] = self.height, self.climb_std
-            means.append(mean)
-            stds.append(std)
-        return np.concatenate(means), np.concatenate(stds)
+        """Prior mean and std (n_theta,) of paths of rows of dipoles, 0 and inf without a prior."""
+        first = np.append(0, np.cumsum([6 + (n > 1) for n in orders]))
+        mean, std = np.zeros(first[-1]), np.full(first[-1], np.inf)
+        mean[first[:-1] + 2], std[first[:-1] + 2] = self.height
+        std[first[:-1] + 5] = self.climb_std
+        return mean, std
 
 
 def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
-              orders: Sequence[int] = (1, 2, 3, 4), errors: SensorErrors = DEFAULT_ERRORS,
+              orders: Sequence[int] = (1, 2, 3, 4),
               stopped: Callable[[], bool] | None = None) -> tuple[tuple[PassFit, ...], ...]:
     """Fit several rows of dipoles, each at constant velocity, to the sum of their fields.
 
@@ -93,14 +89,8 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
     targets then have their selected orders. Targets are sorted by the time at which they pass the
     centre of the sensors; time zero is at the strongest field of each. `reason` is set if the best
     fit of a target differs from its track, or another fit from the best fit. Empty if there are too
-    few measurements or `stopped()` was true.
-
-    Parameters
-    ----------
-    data : readings of at least two sensors
-    paths : (K, 6), approximate positions at time zero of `data` and velocities, m and m/s
-    orders : candidate numbers of dipoles of each target
-    errors : sensor errors included in the robust covariance
+    few measurements or `stopped()` was true. `paths` (K, 6) are approximate positions [m] at time
+    zero of `data` and velocities [m/s].
     """
     n_targets, begin_ns = len(paths), data.stamp_ns
     orders = [n for n in orders if not unusable_reason(data, n_targets * (n,))]
@@ -109,7 +99,7 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
     data, averaged = centred_on_peak(data)
     paths = propagated_path(paths, (data.stamp_ns - begin_ns) / NS)
     initial_paths = np.vstack([paths.ravel(), _initial_paths(averaged, n_targets, ground)])
-    fits = _JointFits(data, averaged, initial_paths, ground, errors)
+    fits = _JointFits(data, averaged, initial_paths, ground)
     selected_orders = [min(orders, key=lambda n: (abs(n - 2), n))] * n_targets
     for _ in range(MAX_ROUNDS):
         previous_orders = list(selected_orders)
@@ -121,11 +111,11 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
                 selected_orders[k] = orders[int(np.argmin(criteria))]
         if selected_orders == previous_orders:
             break
-    shifted = [_shift_to_peak(
-        _check_against_track(fits.of_target(k, selected_orders, orders),
-                             orders.index(selected_orders[k]), paths[k]),
-        orders.index(selected_orders[k])) for k in range(n_targets)]
-    return tuple(target_fits for _, target_fits in sorted(shifted, key=lambda pair: pair[0]))
+    finished = []
+    for k, n in enumerate(selected_orders):
+        target_fits = fits.of_target(k, selected_orders, orders)
+        finished.append(_finished(target_fits, orders.index(n), paths[k]))
+    return tuple(target_fits for _, target_fits in sorted(finished, key=lambda pair: pair[0]))
 
 
 def _initial_paths(averaged: PassData, n_targets: int, ground: GroundPrior) -> FloatArray:
@@ -135,10 +125,9 @@ def _initial_paths(averaged: PassData, n_targets: int, ground: GroundPrior) -> F
     for n in range(1, n_targets + 1):
         orders = n * (1,)
         create_model, prior = partial(SuperposedPasses.from_orders, orders), ground.prior(orders)
-        starts = []
-        for known_path, residual_data in zip(paths, residuals, strict=True):
-            target_starts = starting_paths(residual_data, 1)
-            starts.append(np.hstack([np.tile(known_path, (len(target_starts), 1)), target_starts]))
+        starts = [np.hstack([np.tile(known_path, (len(target_starts), 1)), target_starts])
+                  for known_path, target_starts in zip(
+                      paths, (starting_paths(r, 1) for r in residuals), strict=True)]
         coarse = separable_problem(averaged, create_model, prior=prior)
         paths, _ = coarse_minima(separable_problem(averaged, create_model, COARSE_ERROR, prior),
                                  coarse, np.concatenate(starts), np.tile(PATH_TOLERANCE[:6], n),
@@ -160,8 +149,8 @@ class _JointFits:
     """
 
     def __init__(self, data: PassData, averaged: PassData, initial_paths: FloatArray,
-                 ground: GroundPrior, errors: SensorErrors) -> None:
-        self._data, self._averaged, self._ground, self._errors = data, averaged, ground, errors
+                 ground: GroundPrior) -> None:
+        self._data, self._averaged, self._ground = data, averaged, ground
         # Sort the targets of each solution in the order of the tracks.
         split = [np.split(paths, paths.size // 6) for paths in initial_paths]
         self._initial_paths = [[paths[i] for i in assignment(split[0], paths)] for paths in split]
@@ -170,8 +159,7 @@ class _JointFits:
 
     def of_target(self, k: int, orders: Sequence[int],
                   candidates: Sequence[int]) -> tuple[PassFit, ...]:
-        """Fits of target `k` with each number in `candidates`; the other targets have those in
-        `orders`."""
+        """Fits of target `k` with each of `candidates`, while the others have their `orders`."""
         previous, fits = self._cache.get(tuple(orders)), []
         for n in candidates:
             combination = (*orders[:k], n, *orders[k + 1:])
@@ -183,11 +171,8 @@ class _JointFits:
 
     def _starting_paths(self, orders: tuple[int, ...], k: int,
                         previous: Sequence[PassFit] | None) -> FloatArray:
-        """Starting paths (n, n_theta) for given numbers of dipoles.
-
-        `previous` is a joint fit that may differ in the number of dipoles of target `k`; None if
-        there is no such fit.
-        """
+        """Starting paths (n, n_theta) for given numbers of dipoles; `previous` is a joint fit, if
+        any, that may differ in that of target `k`."""
         starts = [_with_orders(paths, orders) for paths in self._initial_paths]
         if previous is not None and all(len(fit.x) for fit in previous):
             paths = _with_orders([fit.x[:6 + (fit.n_dipoles > 1)] for fit in previous], orders)
@@ -219,7 +204,7 @@ class _JointFits:
             minimum.theta, fine.linear(minimum.theta))
         unexplained = max(minimum.cost - self._noise_dof, 0.0) / (fine.energy - self._noise_dof)
         return fits_at_minimum(data, orders, replace(minimum, theta=theta), p, 1.0 - unexplained,
-                               self._errors, path_std=prior[1])
+                               DEFAULT_ERRORS, path_std=prior[1])
 
 
 def _exclude_solutions(cost: FloatArray, is_allowed: BoolArray, max_ratio: float) -> FloatArray:
@@ -257,18 +242,25 @@ def _with_orders(paths: Sequence[FloatArray], orders: Sequence[int]) -> list[Flo
             if n > 1 else path[:6] for path, n in zip(paths, orders, strict=True)]
 
 
-def _check_against_track(fits: Sequence[PassFit], best: int, path: FloatArray) -> list[PassFit]:
-    """Reject the fits of one target that differ: `best` from the tracked `path` (6,), others from
-    `best`."""
-    out = []
-    for k, fit in enumerate(fits):
-        # The other fits cannot be compared if the best fit has no estimate.
-        agrees = k != best and not len(fits[best].x) or _agrees_with_path(
-            fit, path if k == best else fits[best].x)
-        reason = 'the fit differs from the track in position or velocity' if k == best else \
-            f'the path differs from the selected fit (number of dipoles: {fits[best].n_dipoles})'
-        out.append(fit if agrees or fit.reason else replace(fit, reason=reason, trusted=()))
-    return out
+def _finished(fits: Sequence[PassFit], best: int,
+              path: FloatArray) -> tuple[float, tuple[PassFit, ...]]:
+    """Shift time zero of the fits of one target to the strongest field of the `best` fit, and
+    reject the fits that differ: `best` from the tracked `path` (6,), others from `best`.
+
+    Returns also the time [s since 1970] at which `best` is closest to the centre of the sensors.
+    """
+    fit, checked = fits[best], []
+    if not len(fit.x):
+        return np.inf, tuple(fits)
+    for other in fits:
+        reason = 'the fit differs from the track in position or velocity' if other is fit else \
+            f'the path differs from the selected fit (number of dipoles: {fit.n_dipoles})'
+        agrees = other.reason or _agrees_with_path(other, path if other is fit else fit.x)
+        checked.append(other if agrees else replace(other, reason=reason, trusted=()))
+    centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
+    cpa_time = fit.data.stamp_ns / NS + fit.closest_approach(centre)[0]
+    seconds = _fitted_peak_s(fit)
+    return cpa_time, tuple(f.shifted(seconds) if len(f.x) else f for f in checked)
 
 
 def _agrees_with_path(fit: PassFit, path: FloatArray) -> bool:
@@ -276,28 +268,81 @@ def _agrees_with_path(fit: PassFit, path: FloatArray) -> bool:
     of the same time zero."""
     if not len(fit.x):
         return False
-    seconds = _time_of_peak(fit)
+    seconds = _fitted_peak_s(fit)
     offset = propagated_path(fit.x, seconds)[:2] - propagated_path(path, seconds)[:2]
     return bool(np.linalg.norm(offset) <= MAX_TRACK_DISTANCE and np.linalg.norm(
         fit.velocity - path[3:6]) <= MAX_VELOCITY_DIFFERENCE * np.linalg.norm(path[3:6]))
 
 
-def _time_of_peak(fit: PassFit) -> float:
+def _fitted_peak_s(fit: PassFit) -> float:
     """Time [s] at which the fitted field of a target is strongest."""
-    field = replace(fit.data, field=fit.predicted).field_change
-    return float(fit.data.t[np.argmax(np.einsum('ni,ni->n', field, field))])
+    return replace(fit.data, field=fit.predicted).peak_s
 
 
-def _shift_to_peak(fits: Sequence[PassFit], best: int) -> tuple[float, tuple[PassFit, ...]]:
-    """Shift time zero of the fits of one target to the strongest field of the `best` fit.
+def fit_targets(data: PassData, single_fits: Sequence[PassFit], paths: FloatArray,
+                ground: GroundPrior, orders: Sequence[int],
+                stopped: Callable[[], bool] | None = None) -> tuple[tuple[PassFit, ...], ...]:
+    """Select between a fit of a pass as one target and a joint fit of the tracked targets.
 
-    Returns also the time [s since 1970] at which the best fit is closest to the centre of the
-    sensors.
+    A long row of dipoles can explain two vehicles in a line, and two targets on straight paths a
+    single one that turns. `single_fits`, one for each number of dipoles, are returned if one target
+    explains the field equally well, or if the fitted targets are parts of one vehicle (long
+    vehicles are sometimes tracked as two), and with a reason if the joint fit is impossible or is
+    rejected.
     """
-    fit = fits[best]
-    if not len(fit.x):
-        return np.inf, tuple(fits)
-    seconds = _time_of_peak(fit)
-    centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
-    cpa_time = fit.data.stamp_ns / NS + fit.closest_approach(centre)[0]
-    return cpa_time, tuple(f.shifted(seconds) if len(f.x) else f for f in fits)
+    n_targets = len(paths)
+    if n_targets < 2 or len(data.sensors) < 2:
+        return (tuple(single_fits),)
+    if n_targets > MAX_TARGETS:
+        return (_reject(single_fits, n_targets,
+                        f'but at most {MAX_TARGETS} can be fitted together'),)
+    joint_fits = fit_joint(data, paths, ground, orders, stopped=stopped)
+    if not joint_fits:
+        return (_reject(single_fits, n_targets,
+                        'but there are too few measurements to fit them together'),)
+    best_joint, best_single = [_best_fit(fits) for fits in joint_fits], _best_fit(single_fits)
+    if not best_single.reason and best_single.length[0] <= MAX_LENGTH and all(
+            fit.determined for fit in best_joint) and (
+            _are_parts(data, best_joint) or order_criteria([best_single, best_joint[0]])[0] == 0.0):
+        return (tuple(single_fits),)
+    reason = _rejection_reason(data, best_joint)
+    return (_reject(single_fits, n_targets, reason),) if reason else joint_fits
+
+
+def _best_fit(fits: Sequence[PassFit]) -> PassFit:
+    """Return the fit with the smallest BIC, or the first fit if none is determined."""
+    return fits[int(np.argmin(order_criteria(fits)))]
+
+
+def _are_parts(data: PassData, fits: Sequence[PassFit]) -> bool:
+    """Whether targets are parts of one vehicle: they overlap at almost equal velocities."""
+    velocity = np.array([fit.velocity for fit in fits])
+    mean = velocity.mean(axis=0)
+    return bool((np.linalg.norm(velocity - mean, axis=1)
+                 <= MAX_VELOCITY_SPREAD * np.linalg.norm(mean)).all()
+                and not are_separate(data, [path_from(data, fit) for fit in fits]))
+
+
+def _rejection_reason(data: PassData, fits: Sequence[PassFit]) -> str:
+    """Reason why a joint fit is rejected; empty if it is accepted."""
+    if not all(fit.converged for fit in fits):
+        return 'but the joint fit did not converge'
+    if not all(has_plausible_residual(fit) for fit in fits):
+        return ('but constant velocities leave '
+                f'{1.0 - fits[0].explained:.1%} of the field unexplained; possible causes are a '
+                'turn, braking or another vehicle')
+    if not are_separate(data, [path_from(data, fit) for fit in fits]):
+        return ('but the fitted vehicles overlap; possible causes are a turn, braking or another '
+                'vehicle')
+    for k, fit in enumerate(fits, 1):
+        if fit.reason:
+            return f'but the fit of vehicle {k} is rejected: {fit.reason}'
+        if fit.length[0] > MAX_LENGTH:
+            return f'but the fitted length of vehicle {k}, {fit.length[0]:.0f} m, is too long'
+    return ''
+
+
+def _reject(fits: Sequence[PassFit], n_targets: int, details: str) -> tuple[PassFit, ...]:
+    """Return the fits with a reason for rejection and without trusted quantities."""
+    reason = f'not one target: {n_targets} targets were tracked, {details}'
+    return tuple(replace(fit, reason=reason, trusted=()) for fit in fits)

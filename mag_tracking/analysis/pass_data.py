@@ -31,8 +31,7 @@ class PassData:
     field: FloatArray
     """(n, 3) [T], sensor frame; NaN for axes that were not measured."""
     covariance: FloatArray
-    """(n, 3, 3) [T²] covariance of each sample. If a sample is a mean, this is the mean covariance
-    of the averaged samples, not the covariance of their mean. Ignored for missing axes."""
+    """(n, 3, 3) [T²] covariance of each sample, or mean of those of averaged samples."""
     count: IntArray | None = None
     """(n,) number of averaged samples; None if no samples were averaged."""
     doubt: str = ''
@@ -44,9 +43,8 @@ class PassData:
                     offsets: Sequence[FloatArray] | None = None) -> 'PassData':
         """Create the data of a pass from frames of all sensors.
 
-        `fields` (n_sensors, 3) and `covariances` are in the sensor frame, with NaN for axes that
-        were not measured; `offsets` (n_sensors,) [s] are sampling times relative to the timestamp
-        of the frame.
+        `fields` (n_sensors, 3) and `covariances` are in the sensor frame, NaN if not measured;
+        `offsets` (n_sensors,) [s] are sampling times relative to the timestamp of the frame.
         """
         n, n_sensors = len(stamps_ns), len(network)
         t = np.tile((np.array(stamps_ns, dtype=np.int64) - stamps_ns[0]) / NS, (n_sensors, 1))
@@ -65,9 +63,9 @@ class PassData:
     def n_independent(self) -> float:
         """Number of independent values.
 
-        Repeated readings of a coarse sensor at rest are not independent and have an increased
-        variance (`calibration.resolution`). Such a value counts as the smallest variance of its
-        axis over its own.
+        Repeated readings of a coarse sensor at rest have an increased variance
+        (`calibration/resolution.hpp`); each counts as the smallest variance of its axis over its
+        own.
         """
         total = 0.0
         for j in self.sensors:
@@ -92,8 +90,7 @@ class PassData:
 
     def shifted(self, seconds: float) -> 'PassData':
         """Return the data with time zero shifted; a positive shift makes it later."""
-        return replace(self, stamp_ns=self.stamp_ns + int(round(1e9 * seconds)),
-                       t=self.t - seconds)
+        return replace(self, stamp_ns=self.stamp_ns + int(round(1e9 * seconds)), t=self.t - seconds)
 
     @cached_property
     def whitening(self) -> FloatArray:
@@ -114,31 +111,34 @@ class PassData:
         field_weight = np.sqrt(np.linalg.norm(self.field_change, axis=1))
         columns = []
         for j in np.unique(self.sensor):
-            sensor_rows = np.flatnonzero(self.sensor == j)
-            weight = 1.0 / len(sensor_rows) + field_weight[sensor_rows] / max(
-                field_weight[sensor_rows].sum(), 1e-300)
+            rows = np.flatnonzero(self.sensor == j)
+            weight = 1.0 / len(rows) + field_weight[rows] / max(field_weight[rows].sum(), 1e-300)
             group = np.floor(np.cumsum(weight) / weight.sum()
                              * max_samples * (1.0 - 1e-9)).astype(int)
             begins = np.flatnonzero(np.diff(group, prepend=-1))
-            n = np.diff(begins, append=len(sensor_rows))
+            n = np.diff(begins, append=len(rows))
             # A missing value makes the mean NaN: the other values have a different mean time.
-            columns.append((np.add.reduceat(self.t[sensor_rows], begins) / n, np.full(len(n), j),
-                            np.add.reduceat(self.field[sensor_rows], begins) / n[:, None],
-                            np.add.reduceat(self.covariance[sensor_rows], begins)
-                            / n[:, None, None], n))
+            columns.append((np.add.reduceat(self.t[rows], begins) / n, np.full(len(n), j),
+                            np.add.reduceat(self.field[rows], begins) / n[:, None],
+                            np.add.reduceat(self.covariance[rows], begins) / n[:, None, None], n))
         t, sensor, field, covariance, n = (np.concatenate(c) for c in zip(*columns, strict=True))
         return replace(self, t=t, sensor=sensor, field=field, covariance=covariance, count=n)
+
+    @property
+    def peak_s(self) -> float:
+        """Time [s] of the strongest field."""
+        return float(self.t[np.argmax(np.einsum('ni,ni->n', self.field_change, self.field_change))])
 
     @cached_property
     def field_change(self) -> FloatArray:
         """Field minus its median at each sensor, (n, 3) T: approximately the target's field."""
         out = np.zeros_like(self.field)
         for j in self.sensors:
-            sensor_mask = self.sensor == j
-            is_measured = ~np.isnan(self.field[sensor_mask]).all(axis=0)
+            field = self.field[self.sensor == j]
+            is_measured = ~np.isnan(field).all(axis=0)
             median = np.zeros(3)
-            median[is_measured] = np.nanmedian(self.field[sensor_mask][:, is_measured], axis=0)
-            out[sensor_mask] = np.nan_to_num(self.field[sensor_mask] - median)
+            median[is_measured] = np.nanmedian(field[:, is_measured], axis=0)
+            out[self.sensor == j] = np.nan_to_num(field - median)
         return out
 
 
@@ -147,7 +147,7 @@ def separable_problem(data: PassData, create_model: ModelFactory, relative_error
     """Create the separable least-squares problem of a pass, with unknown backgrounds.
 
     `create_model` gets whitened world-to-sensor rotations. `relative_error` is the model error
-    relative to the field of each sample, added to the noise; `prior` is as for `SeparableProblem`.
+    relative to the field of each sample, added to the noise.
     """
     W = data.whitening
     if relative_error > 0.0:

@@ -6,32 +6,126 @@ from itertools import permutations
 
 import numpy as np
 
-from mag_tracking.analysis.bearing import bearing_of, scaled_to_range
-from mag_tracking.analysis.pass_covariance import (
-    SensorErrors,
-    robust_covariance,
-    shape_covariance,
-    velocity_change,
-)
 from mag_tracking.analysis.pass_data import PassData, background_columns
-from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.analysis.pass_result import PassFit, bearing_of, scaled_to_range
 from mag_tracking.analysis.pass_trust import (
     FittedRow,
+    reach,
     rejection_reason,
     residual_elsewhere,
     trusted_quantities,
 )
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.geometry import cross_matrix
 from mag_tracking.inference.crlb import bound, cpa_information, information
+from mag_tracking.inference.least_squares import model_error_covariance
 from mag_tracking.inference.separable_fit import Minimum
 from mag_tracking.physics.passes import SuperposedPasses
 
+MIDDLE_FRACTION, MIN_MIDDLE_STD, MIDDLE_ACROSS_STD = 0.15, 0.4, 0.1
+"""Standard deviation of the distance from the centre of the row to the middle of the vehicle: along
+the vehicle relative to the length of the row, and at least [m]; across it and vertically [m]."""
+
 PATH_TOLERANCE = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2, 0.3])
-"""Maximum difference between two paths that count as equal: position [m], velocity [m/s] and length
-[m]."""
+"""Maximum difference between equal paths: position [m], velocity [m/s] and length [m]."""
 
 CPA_UNIT_STD = 1e-4
 """[m] Standard deviation of an assumed CPA range. Such a range only defines the unit of length."""
+
+
+@dataclass(frozen=True)
+class SensorErrors:
+    """Sensor errors that cannot be estimated from one pass."""
+
+    rotation_std: float = float(np.deg2rad(2.0))
+    """[rad] about each axis, for sensors without `orientation_std` in the network; the default is
+    for mounting by hand with a spirit level."""
+    gain_std: float = 0.01
+    """Standard deviation of the gain of each axis; 1 to 3 % according to data sheets."""
+
+
+def robust_covariance(data: PassData, whitened: FloatArray, residuals: FloatArray,
+                      target: FloatArray, covariance: FloatArray,
+                      errors: SensorErrors) -> FloatArray:
+    """Covariance (n_x, n_x) due to noise (`covariance`), model error and sensor errors.
+
+    `whitened` (n, 3, n_x) derivatives and `residuals` (n, 3) are of the field, `target` (n, 3) [T,
+    sensor frame] is the field of the target.
+    """
+    model_error = model_error_covariance(*_split_by_sensor(data, whitened, residuals), covariance)
+    sensor_error = np.zeros_like(covariance)
+    R_sw = data.network.R_sw
+    for j in data.sensors:
+        sensor_mask = data.sensor == j
+        configured_std = data.network.orientation_std[j]
+        std = np.full(3, errors.rotation_std) if configured_std is None else configured_std
+        rotation_covariance = R_sw[j] @ np.diag(np.square(std)) @ R_sw[j].T
+        field = target[sensor_mask]
+        G = np.concatenate([-cross_matrix(field), field[:, :, None] * np.eye(3)], axis=2)
+        shift = covariance @ np.einsum('nax,nab->xb', whitened[sensor_mask],
+                                       data.whitening[sensor_mask] @ G)
+        P = np.zeros((6, 6))
+        P[:3, :3], P[3:, 3:] = rotation_covariance, errors.gain_std**2 * np.eye(3)
+        sensor_error += shift @ P @ shift.T
+    robust: FloatArray = covariance + model_error + sensor_error
+    return robust
+
+
+def shape_covariance(data: PassData, whitened: FloatArray, covariance: FloatArray,
+                     position_index: int, row: FittedRow) -> FloatArray:
+    """Covariance (3, 3) [m², world frame] of the middle of a vehicle about the centre of its row.
+
+    The field of iron that extends by `reach` beyond the dipoles resembles that of dipoles at
+    another distance; the relative difference is the square of reach over distance. Sensors on one
+    side of a road measure a wrong range without a residual, whereas the errors of two sides cancel.
+    `position_index` is the index of the unknown x in `whitened` (n, 3, n_x); y and z follow.
+    """
+    xyz, (n_dipoles, theta, _) = slice(position_index, position_index + 3), row
+    length = abs(float(theta[6])) if n_dipoles > 1 else 0.0
+    forward = theta[3:6] / np.linalg.norm(theta[3:6])
+    offset = theta[:3] + data.t[:, None] * theta[3:6] - data.positions
+    # The nearest point of the row.
+    along = np.clip(offset @ forward, -0.5 * length, 0.5 * length)
+    offset = offset - along[:, None] * forward
+    distance = np.linalg.norm(offset, axis=1, keepdims=True)
+    extent = reach(n_dipoles, length)
+    apparent = extent**2 * offset / np.maximum(distance, extent)**2
+    field_error = np.einsum('nai,ni->na', whitened[:, :, xyz], apparent)
+    shift = covariance[xyz] @ np.einsum('nax,na->x', whitened, field_error)
+    along_variance = max(MIN_MIDDLE_STD, MIDDLE_FRACTION * length)**2
+    total: FloatArray = np.outer(shift, shift) + MIDDLE_ACROSS_STD**2 * np.eye(3) \
+        + (along_variance - MIDDLE_ACROSS_STD**2) * np.outer(forward, forward)
+    return total
+
+
+def _split_by_sensor(data: PassData, whitened: FloatArray, residuals: FloatArray) -> tuple[
+        list[FloatArray], list[FloatArray], list[FloatArray]]:
+    """Split times, derivatives and residuals by sensor."""
+    rows = [data.sensor == j for j in data.sensors]
+    return [data.t[r] for r in rows], [whitened[r] for r in rows], [residuals[r] for r in rows]
+
+
+def velocity_change(data: PassData, whitened: FloatArray, residuals: FloatArray, x_index: int,
+                    velocity: FloatArray, duration_s: float) -> tuple[float, float]:
+    """Relative change of the velocity during `duration_s`, and its std including model error.
+
+    A constant horizontal acceleration is estimated by one Gauss-Newton step from the minimum.
+    `x_index` is the index of the unknown x in `whitened` (n, 3, n_x); y follows.
+    """
+    by_acceleration = 0.5 * np.square(data.t)[:, None, None] * whitened[:, :, x_index:x_index + 2]
+    extended = np.concatenate([whitened, by_acceleration], axis=2)
+    flat = extended.reshape(residuals.size, -1)
+    norm = np.linalg.norm(flat, axis=0)
+    # A column of zeros cannot be normalised.
+    norm[norm == 0.0] = 1.0
+    inverse = np.linalg.pinv(flat / norm, rcond=1e-8) / norm[:, None]
+    step, covariance = inverse @ residuals.ravel(), inverse @ inverse.T
+    new_residuals = (residuals.ravel() - flat @ step).reshape(residuals.shape)
+    robust = covariance + model_error_covariance(*_split_by_sensor(data, extended, new_residuals),
+                                                 covariance)
+    scale = duration_s / np.linalg.norm(velocity)
+    return (float(np.linalg.norm(step[-2:]) * scale),
+            float(np.sqrt(np.trace(robust[-2:, -2:])) * scale))
 
 
 def fits_at_minimum(data: PassData, orders: Sequence[int], minimum: Minimum, p: FloatArray,
@@ -40,27 +134,24 @@ def fits_at_minimum(data: PassData, orders: Sequence[int], minimum: Minimum, p: 
                     path_std: FloatArray | None = None) -> tuple[PassFit, ...]:
     """Create the `PassFit` of each target from the minimum of a fit.
 
-    Parameters
-    ----------
-    data : readings of several sensors, or of one sensor and one target
-    minimum : its parameters are the concatenated paths of the targets
-    p : (k,), linear parameters of `SuperposedPasses`
-    explained : fraction of the energy that all targets explain
-    cpa_range : CPA range and its std; see `fit_pass`
-    path_std : (n_theta,), prior stds of the paths; infinite without a prior
+    The parameters of `minimum` are the concatenated paths of the targets, `p` (k,) the linear
+    parameters of `SuperposedPasses`, `explained` the fraction of the energy that all targets
+    explain, and `path_std` (n_theta,) the prior stds of the paths, infinite without a prior. The
+    data of one sensor has one target and may have a `cpa_range`; see `fit_pass`.
     """
     if len(data.sensors) == 1:
         return (_fit_of_one_sensor(data, orders[0], minimum, p, explained, cpa_range, errors),)
-    linear = _LinearisedFit.about(data, orders, minimum.theta, p)
+    linear = _LinearisedFit(data, orders, minimum.theta, p)
     J = information(linear.whitened)
     if path_std is not None:
-        path_indices = np.concatenate([indices[:len(path)] for indices, path in zip(
-            linear.target_indices, linear.theta, strict=True)])
+        path_indices = np.concatenate([indices[:len(row.theta)] for indices, row in zip(
+            linear.target_indices, linear.rows, strict=True)])
         J[path_indices, path_indices] += 1.0 / np.square(path_std)
     fits = _partial_fits(linear, minimum, explained, errors, bound(J))
-    ends = np.cumsum([len(path) for path in linear.theta])[:-1]
-    rivals = [([paths[i] for i in assignment(linear.theta, paths)], cost)
-              for paths, cost in ((np.split(theta, ends), cost) for theta, cost in minimum.rivals)]
+    fitted_paths, rivals = [row.theta for row in linear.rows], []
+    for theta, cost in minimum.rivals:
+        paths = np.split(theta, np.cumsum([len(path) for path in fitted_paths])[:-1])
+        rivals.append(([paths[i] for i in assignment(fitted_paths, paths)], cost))
     fits = [replace(fit, rivals=_select_rivals(fit, [(paths[k], cost) for paths, cost in rivals]))
             for k, fit in enumerate(fits)]
     return tuple(replace(fit, reason=rejection_reason(fit), trusted=trusted_quantities(fit))
@@ -79,7 +170,7 @@ def _fit_of_one_sensor(data: PassData, n_dipoles: int, minimum: Minimum, p: Floa
         return PassFit(n_dipoles, data, 'the path passes through the sensor (r0 parallel to v0): '
                        'the CPA range is zero and does not define a scale')
     theta, p = scaled
-    linear = _LinearisedFit.about(data, (n_dipoles,), theta, p)
+    linear = _LinearisedFit(data, (n_dipoles,), theta, p)
     J = information(linear.whitened)
     J[:6, :6] += cpa_information(theta[:3] - position, theta[3:6],
                                  cpa_range[1] if cpa_range else CPA_UNIT_STD)[:6, :6]
@@ -92,117 +183,91 @@ def _fit_of_one_sensor(data: PassData, n_dipoles: int, minimum: Minimum, p: Floa
     return replace(fit, reason=rejection_reason(fit), trusted=trusted_quantities(fit))
 
 
-@dataclass(frozen=True)
 class _LinearisedFit:
     """Linearisation of a fit at its minimum: path and moments of each target, then the
-    backgrounds."""
+    backgrounds.
 
-    data: PassData
-    orders: tuple[int, ...]
-    """Number of dipoles of each target."""
-    theta: tuple[FloatArray, ...]
-    """Path (6 or 7,) of each target."""
-    whitened: FloatArray
-    """(n, 3, n_x) whitened derivatives with respect to paths, moment combinations, backgrounds."""
-    H: FloatArray
-    """(3 n, n_x) the same derivatives, sensor frame, not whitened, [T] per unit of an unknown."""
-    T: FloatArray
-    """(n_x, n_x) transformation of the parameters of `H` into the unknowns `x`."""
-    x: FloatArray
-    """(n_x,) unknowns."""
-    target_indices: tuple[IntArray, ...]
-    """For each target, the indices of its unknowns, followed by the indices of the backgrounds."""
-    names: tuple[str, ...]
-    """Names of the unknowns."""
-    fields: FloatArray
-    """(K, n, 3) [T] field of each target, sensor frame."""
-    background: FloatArray
-    """(n, 3) [T] fitted background of each sample, sensor frame."""
-    residuals: FloatArray
-    """(n, 3) whitened residuals."""
+    Attributes
+    ----------
+    rows : number of dipoles, path and field of each target
+    H : (3 n, n_x) derivatives by paths, moments and backgrounds, sensor frame, [T] per unit
+    T : (n_x, n_x) transformation of the parameters of `H` into the unknowns `x`
+    x, names : (n_x,) values and names of the unknowns
+    whitened : (n, 3, n_x) whitened derivatives `H`
+    target_indices : for each target, the indices of its unknowns and of the backgrounds
+    background : (n, 3) [T] fitted background of each sample, sensor frame
+    residuals : (n, 3) whitened residuals
+    """
 
-    @classmethod
-    def about(cls, data: PassData, orders: Sequence[int], theta: FloatArray,
-              p: FloatArray) -> '_LinearisedFit':
-        """Linearise a fit at the paths `theta` (n_theta,) and the linear parameters `p` (k,)."""
+    def __init__(self, data: PassData, orders: Sequence[int], theta: FloatArray,
+                 p: FloatArray) -> None:
         model = SuperposedPasses.from_orders(orders, data.t, data.positions,
                                              data.network.R_sw[data.sensor])
+        slices = list(zip(model.path_slices, model.moment_slices, strict=True))
         is_measured = ~np.isnan(data.field)
         columns = background_columns(data, is_measured[:, :, None] * np.eye(3))
         D, A, W = model.derivative(theta[None], p[None])[0], model.basis(theta[None])[0], \
             data.whitening
-        fields = np.stack([(A[:, m] @ p[m]).reshape(-1, 3) for m in model.moment_slices])
+        fields = np.stack([(A[:, m] @ p[m]).reshape(-1, 3) for _, m in slices])
+        self.data, self.rows = data, [FittedRow(*row) for row in zip(
+            orders, model.split(theta), fields, strict=True)]
         y = np.nan_to_num(data.field) - fields.sum(axis=0)
         backgrounds = np.asarray(np.linalg.lstsq(
-            _flatten(W @ columns.reshape(*W.shape[:2], -1)), np.einsum('nij,nj->ni', W, y).ravel(),
-            rcond=None)[0], dtype=np.float64)
-        H = np.hstack([*(part for path, m in zip(model.path_slices, model.moment_slices,
-                                                 strict=True)
-                         for part in (D[:, path], A[:, m])), columns])
-        T, names, target_indices, begin = np.eye(H.shape[1]), [], [], 0
+            (W @ columns.reshape(*W.shape[:2], -1)).reshape(columns.shape),
+            np.einsum('nij,nj->ni', W, y).ravel(), rcond=None)[0], dtype=np.float64)
+        self.background: FloatArray = (columns @ backgrounds).reshape(-1, 3)
+        self.residuals: FloatArray = np.einsum('nij,nj->ni', W, np.nan_to_num(
+            data.field - fields.sum(axis=0) - self.background))
+        H = np.hstack([*(part for path, m in slices for part in (D[:, path], A[:, m])), columns])
+        self.H, self.T, self.whitened = H, np.eye(H.shape[1]), W @ H.reshape(len(W), 3, -1)
+        self.names, self.target_indices, begin = list[str](), list[IntArray](), 0
         background_indices = np.arange(H.shape[1] - len(backgrounds), H.shape[1])
         for row in model.rows:
-            end = begin + len(row.names) + 3 * row.n_dipoles
-            T[begin + len(row.names):end, begin + len(row.names):end] = row.combinations
-            target_indices.append(np.concatenate([np.arange(begin, end), background_indices]))
-            names += [*row.names, *row.moment_names]
+            first, end = begin + len(row.names), begin + len(row.names) + 3 * row.n_dipoles
+            self.T[first:end, first:end] = row.combinations
+            self.target_indices.append(np.append(np.arange(begin, end), background_indices))
+            self.names += [*row.names, *row.moment_names]
             begin = end
-        names += [f'B {data.network.names[j]} {"xyz"[a]}' for j in data.sensors
-                  for a in np.flatnonzero(is_measured[data.sensor == j].any(axis=0))]
-        background = (columns @ backgrounds).reshape(-1, 3)
-        residuals = np.nan_to_num(data.field - fields.sum(axis=0) - background)
-        x = np.concatenate([*(part for path, m in zip(model.path_slices, model.moment_slices,
-                                                      strict=True)
-                              for part in (theta[path], p[m])), backgrounds])
-        return cls(data, tuple(orders), tuple(model.split(theta)),
-                   W @ H.reshape(len(W), 3, -1), H, T, T @ x, tuple(target_indices),
-                   tuple(names), fields, background, np.einsum('nij,nj->ni', W, residuals))
-
-
-def _flatten(A: FloatArray) -> FloatArray:
-    """Reshape (n, 3, q) to (3 n, q)."""
-    return A.reshape(-1, A.shape[-1])
+        self.names += [f'B {data.network.names[j]} {"xyz"[a]}' for j in data.sensors
+                       for a in np.flatnonzero(is_measured[data.sensor == j].any(axis=0))]
+        self.x: FloatArray = self.T @ np.concatenate([
+            *(part for path, m in slices for part in (theta[path], p[m])), backgrounds])
 
 
 def _partial_fits(linear: _LinearisedFit, minimum: Minimum, explained: float, errors: SensorErrors,
                   covariance: FloatArray) -> list[PassFit]:
     """Create the `PassFit` of each target without `rivals`, `reason` and `trusted`; `covariance` is
     that of the noise alone."""
-    data, H, T = linear.data, linear.H, linear.T
-    total_field = linear.fields.sum(axis=0)
+    data, rows, H, T = linear.data, linear.rows, linear.H, linear.T
+    total_field: FloatArray = np.sum([row.field for row in rows], axis=0)
+    targets = list(zip(rows, linear.target_indices, strict=True))
     # The infinite variance of an unobservable state results in NaN.
     with np.errstate(invalid='ignore'):
         robust = robust_covariance(data, linear.whitened, linear.residuals, total_field, covariance,
                                    errors)
-        shapes = [shape_covariance(data, linear.whitened, covariance, int(indices[0]), n, path)
-                  for n, path, indices in zip(linear.orders, linear.theta, linear.target_indices,
-                                              strict=True)]
+        shapes = [shape_covariance(data, linear.whitened, covariance, int(indices[0]), row)
+                  for row, indices in targets]
         predicted_std = np.sqrt(np.einsum('yi,ij,yj->y', H, robust, H)).reshape(-1, 3)
         covariance, robust = (T @ P @ T.T for P in (covariance, robust))
-    unexplained = residual_elsewhere(data, [FittedRow(n, path, field) for n, path, field in zip(
-        linear.orders, linear.theta, linear.fields, strict=True)], linear.residuals)
+    unexplained = residual_elsewhere(data, rows, linear.residuals)
     fits = []
-    for k, (n_dipoles, indices) in enumerate(zip(linear.orders, linear.target_indices,
-                                                 strict=True)):
-        target_data = replace(data, field=data.field - (total_field - linear.fields[k]))
+    for (row, indices), shape in zip(targets, shapes, strict=True):
+        target_data = replace(data, field=data.field - (total_field - row.field))
         duration_s = _duration_s(target_data)
         change = velocity_change(data, linear.whitened, linear.residuals, int(indices[0]),
-                                 linear.theta[k][3:6], duration_s)
+                                 row.theta[3:6], duration_s)
         block = np.ix_(indices, indices)
         fits.append(PassFit(
-            n_dipoles, target_data, '', minimum.converged, tuple(linear.names[i] for i in indices),
-            linear.x[indices], covariance[block], robust[block], minimum.cost, explained,
-            duration_s, *change, unexplained, predicted=linear.fields[k] + linear.background,
-            predicted_std=predicted_std, n_other_unknowns=len(linear.x) - len(indices),
-            shape_covariance=shapes[k]))
+            row.n_dipoles, target_data, '', minimum.converged,
+            tuple(linear.names[i] for i in indices), linear.x[indices], covariance[block],
+            robust[block], minimum.cost, explained, duration_s, *change, unexplained,
+            predicted=row.field + linear.background, predicted_std=predicted_std,
+            n_other_unknowns=len(linear.x) - len(indices), shape_covariance=shape))
     return fits
 
 
 def assignment(paths: Sequence[FloatArray], others: Sequence[FloatArray]) -> tuple[int, ...]:
-    """For each path, the index of its match in `others`, so that the total distance is minimal.
-
-    The order of the targets in a solution of a joint fit is arbitrary.
-    """
+    """For each path, the index of its match in `others`, so that the total distance is minimal."""
     distance = [[float(np.square((other[:6] - path[:6]) / PATH_TOLERANCE[:6]).sum())
                  for other in others] for path in paths]
     return min(permutations(range(len(paths))),

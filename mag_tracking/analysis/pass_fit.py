@@ -6,9 +6,8 @@ from functools import partial
 
 import numpy as np
 
-from mag_tracking.analysis.pass_covariance import SensorErrors
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
-from mag_tracking.analysis.pass_description import PATH_TOLERANCE, fits_at_minimum
+from mag_tracking.analysis.pass_description import PATH_TOLERANCE, SensorErrors, fits_at_minimum
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.detection_theory import energy_threshold
@@ -58,9 +57,8 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
                      PATH_TOLERANCE[:starts.shape[1]], shorter_rows if n_dipoles > 1 else None)
     if not np.isfinite(minimum.cost):
         return PassFit(n_dipoles, data, 'no valid start of the search')
-    theta, p = minimum.theta, problem.linear(minimum.theta)
-    theta, p = create_model(
-        data.t, data.positions, data.whitening).with_nonnegative_length(theta, p)
+    theta, p = create_model(data.t, data.positions, data.whitening).with_nonnegative_length(
+        minimum.theta, problem.linear(minimum.theta))
     unexplained = max(minimum.cost - noise_dof, 0.0) / (problem.energy - noise_dof)
     fit, = fits_at_minimum(data, (n_dipoles,), replace(minimum, theta=theta), p, 1.0 - unexplained,
                            errors, cpa_range)
@@ -68,12 +66,9 @@ def fit_pass(data: PassData, n_dipoles: int = 3,
 
 
 def centred_on_peak(data: PassData) -> tuple[PassData, PassData]:
-    """Shift time zero to the strongest field; return all samples, and means of at most `N_COARSE`
-    per sensor."""
+    """Shift time zero to the strongest field of all samples, and of `N_COARSE` means per sensor."""
     averaged = data.averaged(N_COARSE)
-    field_change = averaged.field_change
-    seconds = averaged.t[np.argmax(np.einsum('ni,ni->n', field_change, field_change))]
-    return data.shifted(seconds), averaged.shifted(seconds)
+    return data.shifted(averaged.peak_s), averaged.shifted(averaged.peak_s)
 
 
 def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
@@ -91,11 +86,8 @@ def unusable_reason(data: PassData, orders: Sequence[int]) -> str:
 
 
 def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
-    """Create starting paths (n, 6 or 7) of the search with various headings, offsets and speeds.
-
-    They pass the sensor with the strongest field. The duration of the field at this sensor
-    determines the ratio of speed to distance.
-    """
+    """Create starting paths (n, 6 or 7) with various headings, offsets and speeds past the sensor
+    with the strongest field, whose duration determines speed over distance."""
     field_change = data.field_change
     energy = np.einsum('ni,ni->n', field_change, field_change)
     strongest = int(np.argmax(energy))
@@ -117,16 +109,10 @@ def starting_paths(data: PassData, n_dipoles: int) -> FloatArray:
 
 
 def shorter_rows(path: FloatArray) -> FloatArray:
-    """Create starting paths of a row (7,): seven shorter rows and one longer row.
-
-    If a dipole at the end of a row has no moment, a shorter row with a different centre fits almost
-    as well.
-    """
-    rows = []
-    for ratio, offset in ((0.7, 0.15), (0.7, 0.0), (0.7, -0.15), (0.4, 0.25), (0.4, 0.0),
-                          (0.4, -0.25), (0.1, 0.0), (1.5, 0.0)):
-        row = path.copy()
-        row[:3] += offset * path[6] * path[3:6] / np.linalg.norm(path[3:6])
-        row[6] *= ratio
-        rows.append(row)
-    return np.array(rows)
+    """Create starting paths of a row (7,): shorter rows, which may fit as well, and longer ones."""
+    ratio, offset = np.array(((0.7, 0.15), (0.7, 0.0), (0.7, -0.15), (0.4, 0.25), (0.4, 0.0),
+                              (0.4, -0.25), (0.1, 0.0), (1.5, 0.0))).T
+    rows = np.tile(path, (len(ratio), 1))
+    rows[:, :3] += (offset * path[6])[:, None] * path[3:6] / np.linalg.norm(path[3:6])
+    rows[:, 6] *= ratio
+    return rows

@@ -13,9 +13,7 @@ RIVAL_CHI2 = 9.2
 """Maximum chi-square difference between a rival and the best fit (probability 0.01)."""
 
 DIFFERENT_PATH_CHI2 = 22.5
-"""Minimum squared normalised distance between two different paths, in six parameters (probability
-0.001)."""
-
+"""Minimum squared normalised distance of different paths in six parameters (probability 0.001)."""
 
 MAX_NORMALISED_COST = 2.0
 """Maximum normalised cost of a joint fit that is not dominated by model errors."""
@@ -24,21 +22,22 @@ MAX_COST_RATIO = 1.25
 """Maximum cost relative to the best cost; fits up to this ratio count as equally good."""
 
 MIN_LENGTH_FRACTION = 1e-2
-"""Minimum length of a row relative to the distance travelled during the pass. A shorter row is
-equivalent to a point. The maximum length is the distance travelled."""
+"""Minimum length of a row, at most one, relative to the distance travelled during the pass."""
+
+MIN_CPA_FRACTION = 1e-3
+"""Minimum CPA range of a path beside the sensor, relative to the distance travelled."""
+
+MAX_DIRECTION_STD = 0.5
+"""[rad] Maximum standard deviation of a direction. Less certain directions are set to NaN."""
 
 
 @dataclass(frozen=True)
 class Bearing:
-    """Observable quantities of a pass at a single sensor, relative to the sensor.
-
-    The distance is not observable, and a path and its reflection through the sensor have equal
-    fields.
-    """
+    """Observable quantities of a pass relative to a single sensor, at which a path and its
+    reflection have equal fields."""
 
     cpa_direction: FloatArray
-    """(3,) unit vector, world, from the sensor to the target at the CPA. The solution above the
-    sensor is used."""
+    """(3,) unit vector, world, from the sensor to the CPA in the solution above the sensor."""
     motion_direction: FloatArray
     """(3,) unit vector, world, of the velocity in the solution above the sensor."""
     moment_direction: FloatArray
@@ -48,23 +47,17 @@ class Bearing:
     cpa_time: float
     """[s] relative to time zero."""
     cpa_time_std: float
-    """[s] standard deviation of `cpa_time`."""
     rate: float
     """[1/s] speed over CPA range."""
     rate_std: float
-    """[1/s] standard deviation of `rate`."""
 
 
 @dataclass(frozen=True)
 class PassFit:
-    """Weighted least-squares fit of a pass at constant velocity.
-
-    If `reason` is not empty, the fit as a whole is rejected; only quantities in `trusted` are
-    valid.
-    """
+    """Weighted least-squares fit of a pass at constant velocity; if `reason` is not empty, only
+    quantities in `trusted` are valid."""
 
     n_dipoles: int
-    """Number of dipoles of the row."""
     data: PassData
     """Fitted readings, without the fields of other targets of a joint fit."""
     reason: str = ''
@@ -76,12 +69,10 @@ class PassFit:
     x: FloatArray = field(default_factory=lambda: np.zeros(0))
     """(n_x,) values of the unknowns: [m], [m/s], [A m²], [T]."""
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    """(n_x, n_x) covariance for a correct model and noise, TSP14 eq. (47). An infinite variance
-    means that the unknown is not observable."""
+    """(n_x, n_x) for a correct model and noise, TSP14 eq. (47); infinite if not observable."""
     robust_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    """(n_x, n_x) covariance including sensor errors and model errors with correlated residuals.
-    All standard deviations are derived from it, and those of positions from
-    `position_covariance`."""
+    """(n_x, n_x) including sensor errors and model errors with correlated residuals, from which all
+    standard deviations are derived, and those of positions from `position_covariance`."""
     cost: float = np.nan
     """Sum of squared whitened residuals, TSP14 eq. (46b)."""
     explained: float = np.nan
@@ -91,25 +82,22 @@ class PassFit:
     velocity_change: float = np.nan
     """Apparent relative change of the velocity during the pass."""
     velocity_change_std: float = np.nan
-    """Standard deviation of `velocity_change` due to noise and model errors."""
+    """Its standard deviation due to noise and model errors."""
     residual_elsewhere: float = np.nan
     """Unexplained fraction of the energy outside the reach of the vehicle; see `pass_trust`."""
     trusted: tuple[str, ...] = ()
-    """Subset of speed, direction and time (of the CPA) that is valid even if the fit is rejected;
-    see `pass_trust`."""
+    """Those of speed, direction and time of the CPA that are valid even if the fit is rejected."""
     bearing: Bearing | None = None
     """Observable quantities of a fit of one sensor; None otherwise."""
     rivals: tuple[tuple[float, FloatArray], ...] = ()
     """(d, path) of each other minimum of the cost, whose likelihood ratio to this fit is exp(-d/2).
-    The covariance does not cover rivals. For example, if a dipole at the end of a row has no
-    moment, a shorter row with a different centre is a rival."""
+    The covariance does not cover rivals."""
     predicted: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """(n, 3) [T] fitted field including the background, sensor frame."""
     predicted_std: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """(n, 3) [T] standard deviation of `predicted` from the robust covariance, without noise."""
     n_other_unknowns: int = 0
-    """Number of unknowns of other targets in the same joint fit; `data` does not contain their
-    fields."""
+    """Number of unknowns of other targets in the same joint fit."""
     shape_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
     """(3, 3) [m²] covariance of the middle of a vehicle about the centre of the row."""
 
@@ -150,18 +138,11 @@ class PassFit:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether a different path is possible at the 1 % level.
-
-        A poor joint fit is ambiguous because the residual cannot be assigned to a target.
-        """
-        if self.is_poor_joint_fit:
-            return True
+        """Whether a different path is possible at the 1 % level, or the fit is a poor joint fit."""
         P = self.robust_covariance[:6, :6]
-        for d, path in self.rivals:
-            e = path[:6] - self.x[:6]
-            if d < RIVAL_CHI2 and e @ np.linalg.pinv(P, hermitian=True) @ e > DIFFERENT_PATH_CHI2:
-                return True
-        return False
+        return self.is_poor_joint_fit or any(
+            (e := path[:6] - self.x[:6]) @ np.linalg.pinv(P, hermitian=True) @ e
+            > DIFFERENT_PATH_CHI2 for d, path in self.rivals if d < RIVAL_CHI2)
 
     @property
     def position(self) -> FloatArray:
@@ -170,11 +151,8 @@ class PassFit:
 
     @property
     def position_covariance(self) -> FloatArray:
-        """Covariance (3, 3) [m², world frame] of the position of the middle of the vehicle.
-
-        For a single sensor without a known range, whose unit of length is the range, it is the
-        covariance of the centre of the row.
-        """
+        """Covariance (3, 3) [m², world frame] of the middle of the vehicle, or of the centre of the
+        row for a single sensor without a known range."""
         P = self.robust_covariance[:3, :3]
         return P if self.bearing is not None else P + self.shape_covariance
 
@@ -214,10 +192,8 @@ class PassFit:
     @property
     def moment(self) -> tuple[FloatArray, FloatArray]:
         """Total moment, (3,) A m², world frame, and its covariance (3, 3); TSP14 eq. (9)."""
-        S = np.zeros((3, len(self.x)))
-        first = 6 + int(self.n_dipoles > 1)
-        for i in range(self.n_dipoles):
-            S[:, first + 3 * i:first + 3 * i + 3] = np.eye(3)
+        S, first = np.zeros((3, len(self.x))), 6 + int(self.n_dipoles > 1)
+        S[:, first:first + 3 * self.n_dipoles] = np.tile(np.eye(3), self.n_dipoles)
         return S @ self.x, S @ self.robust_covariance @ S.T
 
     def closest_approach(self, point: FloatArray) -> tuple[float, float, float, float]:
@@ -232,3 +208,54 @@ class PassFit:
         return (t_cpa, np.float64(np.sqrt(g_time @ P @ g_time)), distance,
                 np.float64(np.sqrt(g_range @ P @ g_range
                                    + u @ (self.position_covariance - P[:3, :3]) @ u)))
+
+
+def scaled_to_range(theta: FloatArray, p: FloatArray, sensor_position: FloatArray,
+                    distance: float, duration: float) -> tuple[FloatArray, FloatArray] | None:
+    """Path and moments scaled to a CPA range `distance`; None if the path meets the sensor.
+
+    At a single sensor, (r, v, m) and (u r, u v, u³ m) have the same field (TSP14 eq. (34)), and so
+    have (r, v) and (-r, -v); the path above the sensor at the CPA is returned. `theta` (6 or 7,) is
+    position, velocity and, for a row, length; `duration` [s] is that of the pass.
+    """
+    r, v = theta[:3] - sensor_position, theta[3:6]
+    t_cpa, cpa_range, _ = closest_approach(r, v)
+    if cpa_range <= MIN_CPA_FRACTION * duration * np.linalg.norm(v):
+        return None
+    u = distance / cpa_range
+    # The path reversed through the sensor has the same field; use the path above the sensor.
+    sign = 1.0 if (r + t_cpa * v)[2] >= 0.0 else -1.0
+    scaled = u * np.concatenate([sign * r, sign * v, theta[6:]])
+    scaled[:3] += sensor_position
+    return scaled, p * u**3
+
+
+def bearing_of(fit: PassFit, sensor_position: FloatArray) -> Bearing:
+    """Compute the quantities of a single-sensor fit that do not depend on the assumed CPA range."""
+    r, v = fit.position - sensor_position, fit.velocity
+    P = fit.robust_covariance
+    t_cpa, distance, r_cpa = closest_approach(r, v)
+    squared_speed = v @ v
+    g_time = -np.concatenate([v, r + 2.0 * t_cpa * v]) / squared_speed
+    dr_cpa = np.hstack([np.eye(3), t_cpa * np.eye(3)]) + np.outer(v, g_time)
+    g_rate = np.concatenate([np.zeros(3), v / np.sqrt(squared_speed)]) / distance
+    m, P_m = fit.moment
+    sign = 1.0 if r_cpa[2] >= 0.0 else -1.0
+    stds = np.array([_direction_std(r_cpa, dr_cpa @ P[:6, :6] @ dr_cpa.T),
+                     _direction_std(v, P[3:6, 3:6]), _direction_std(m, P_m)])
+    cpa_direction, motion_direction, moment_direction = (
+        x / np.linalg.norm(x) if std < MAX_DIRECTION_STD else np.full(3, np.nan)
+        for x, std in zip((sign * r_cpa, sign * v, m), stds, strict=True))
+    return Bearing(cpa_direction, motion_direction, moment_direction, stds, t_cpa,
+                   float(np.sqrt(g_time @ P[:6, :6] @ g_time)),
+                   float(np.sqrt(squared_speed) / distance),
+                   float(np.sqrt(g_rate @ P[:6, :6] @ g_rate)))
+
+
+def _direction_std(x: FloatArray, P: FloatArray) -> float:
+    """Largest std [rad] of the direction of x (3,) with covariance P; inf if P is not finite."""
+    if not np.isfinite(P).all():
+        return np.inf
+    u = x / np.linalg.norm(x)
+    normal_projection = (np.eye(3) - np.outer(u, u)) / np.linalg.norm(x)
+    return float(np.sqrt(np.linalg.eigvalsh(normal_projection @ P @ normal_projection)[-1]))

@@ -101,8 +101,7 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
 
     `points` (n, 2) are in the world frame. Each item is a slice of `points` with n_p points, the
     fields (n_p, 7, k, n_sensors, 3) [T] at the k times of `sampling`, and their derivatives with
-    respect to [r, v, m]. The target is at the point at time zero; `heading` is anticlockwise from
-    x.
+    respect to [r, v, m] at time zero, when the target is at the point.
     """
     t, _ = sampling.times()
     v = target.speed * np.array([np.cos(heading), np.sin(heading), 0.0])
@@ -119,14 +118,10 @@ def pass_fields(positions: FloatArray, R_sw: FloatArray, target: PlannedTarget,
         chunk = points[first:first + step]
         n = len(chunk)
         r0 = np.column_stack([chunk, np.full(n, target.height)])
-        r = np.broadcast_to(r0[:, None, None] + t[:, None] * v, (n, *shape, 3))
-
-        def repeated(a: FloatArray, n: int = n) -> FloatArray:
-            """Repeat the array `a` for each of the `n` points."""
-            return np.tile(a.reshape(n_hypotheses, 1, *a.shape[2:]), (n, *[1] * (a.ndim - 1)))
-
-        h, H, _ = sensor_fields(positions, R_sw, r.reshape(n * n_hypotheses, 1, 3).copy(),
-                                repeated(m), repeated(dr_dx), repeated(dm_dx))
+        states = (np.broadcast_to(a, (n, *shape, *a.shape[-tail:])) for a, tail in (
+            (r0[:, None, None] + t[:, None] * v, 1), (m, 1), (dr_dx, 2), (dm_dx, 2)))
+        h, H, _ = sensor_fields(positions, R_sw, *(
+            a.reshape(n * n_hypotheses, 1, *a.shape[3:]).copy() for a in states))
         # At the position of a sensor, the field is singular. The sensor is not used in this frame.
         is_at_sensor = ~(np.isfinite(h).all(axis=-1) & np.isfinite(H).all(axis=(-2, -1)))
         h[is_at_sensor], H[is_at_sensor] = 0.0, 0.0
@@ -175,8 +170,7 @@ def detection_probabilities(positions: FloatArray, R_sw: FloatArray, target: Pla
                             background_std: float = 0.0) -> FloatArray:
     """Detection probability (n, 7) in one frame at each point (n, 2), for each moment direction.
 
-    `background_std` [T] of the background errors is added to the noise. T10 eq. (5.14)-(5.19),
-    applied to all sensors at once.
+    `background_std` [T] of the background errors is added to the noise. T10 eq. (5.14)-(5.19).
     """
     single_frame = Sampling(sampling.period, sampling.noise_std, half_window=0.0)
     energy_ratio = np.empty((len(points), len(DIRECTIONS)))

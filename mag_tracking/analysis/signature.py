@@ -6,14 +6,11 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 
-N_SAMPLES = 64
-"""Number of samples of a resampled signature."""
+N_SAMPLES, MIN_SAMPLES = 64, 8
+"""Number of samples of a resampled signature, and minimum number of a recorded one."""
 
-BASELINE_FRACTION = 0.1
-"""Fraction of a signature, at each end, to which the baseline is fitted."""
-
-TAIL_FRACTION = 0.005
-"""Fraction of the energy that is cut off at each end of a signature."""
+BASELINE_FRACTION, TAIL_FRACTION = 0.1, 0.005
+"""Fraction of a signature, at each end, for the baseline, and of its energy that is cut off."""
 
 MIN_PROMINENCE = 0.1
 """Minimum prominence of an extremum relative to the range of its axis."""
@@ -23,9 +20,6 @@ AUTOCORRELATION_LAGS = (2, 4, 8, 16)
 
 N_DCT_COEFFICIENTS = 8
 """Number of coefficients of the discrete cosine transform of the field magnitude."""
-
-MIN_SAMPLES = 8
-"""Minimum number of samples of a signature."""
 
 
 @dataclass(frozen=True)
@@ -49,16 +43,16 @@ class Signature:
 
 
 def features(signature: Signature) -> FloatArray:
-    """Compute features (n_features,) of the shape and magnitude of a signature.
+    """Compute features (n_features,) of the shape and magnitude of a signature, not of its
+    duration.
 
     For each axis: logarithm of the range, fraction of the energy, numbers of maxima and minima,
     positions of the largest and the smallest value, fraction of the power in the upper third of the
     spectrum. For the field magnitude: logarithm of its maximum, number of maxima, autocorrelation,
-    DCT coefficients. The duration is not a feature, because the speed is unknown. Raises ValueError
-    if there are too few samples, a value is not finite, times do not increase, or the field is
-    constant.
+    DCT coefficients. Raises ValueError if there are too few samples, a value is not finite, times
+    do not increase, or the field is constant.
     """
-    t, field = np.asarray(signature.t, dtype=float), np.asarray(signature.field, dtype=float)
+    t, field = (np.asarray(a, dtype=float) for a in (signature.t, signature.field))
     if len(t) < MIN_SAMPLES:
         raise ValueError(f'too few samples for a signature: {len(t)}; at least {MIN_SAMPLES} are '
                          'required')
@@ -69,7 +63,7 @@ def features(signature: Signature) -> FloatArray:
     largest = np.abs(field).max()
     if not largest > 0.0 or not np.ptp(field / largest, axis=0).max() > 1e-12:
         raise ValueError('the field is constant')
-    shape = _resample(t, _subtract_baseline(t, field / largest))
+    shape = _resample(t, field / largest)
     magnitude = np.linalg.norm(shape, axis=1)
     energy = np.square(shape).sum(axis=0)
     axis_features = [v for axis, fraction in zip(shape.T, energy / energy.sum(), strict=True)
@@ -78,18 +72,13 @@ def features(signature: Signature) -> FloatArray:
                      *_magnitude_features(magnitude / magnitude.max())])
 
 
-def _subtract_baseline(t: FloatArray, field: FloatArray) -> FloatArray:
-    """Subtract the least-squares line through both ends of a signature."""
+def _resample(t: FloatArray, field: FloatArray) -> FloatArray:
+    """Subtract the line through both ends of a signature, cut off its tails and resample the rest
+    to (N_SAMPLES, n_axes)."""
     n = max(2, round(BASELINE_FRACTION * len(t)))
     ends = np.r_[:n, len(t) - n:len(t)]
     A = np.stack([np.ones_like(t), (t - t[0]) / (t[-1] - t[0])], axis=1)
-    line = np.linalg.lstsq(A[ends], field[ends], rcond=None)[0]
-    corrected_field: FloatArray = field - A @ line
-    return corrected_field
-
-
-def _resample(t: FloatArray, field: FloatArray) -> FloatArray:
-    """Cut off both tails of a signature and resample the rest to (N_SAMPLES, n_axes)."""
+    field = field - A @ np.linalg.lstsq(A[ends], field[ends], rcond=None)[0]
     even_times = np.linspace(t[0], t[-1], max(4 * N_SAMPLES, len(t)))
     fine_field = np.stack([np.interp(even_times, t, axis) for axis in field.T], axis=1)
     energy = np.square(fine_field).sum(axis=1)

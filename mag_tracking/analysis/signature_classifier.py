@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,7 @@ PENALTIES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Candidate values of C, the inverse regularisation strength of the logistic regression."""
 
 KNOWN_QUANTILE = 0.99
-"""Quantile of the distances of held-out training examples to their own class. A signature with a
-larger distance to every class is assigned to the class `unknown`."""
+"""Quantile of the distances of held-out examples to their class, beyond which it is `unknown`."""
 
 TEMPERATURES = np.geomspace(0.3, 10.0, 40)
 """Candidate temperatures of the logits."""
@@ -36,7 +36,6 @@ class SignatureModel:
     """Linear classifier that rejects signatures far from all classes as unknown."""
 
     classes: tuple[str, ...]
-    """Names of the classes."""
     axes: tuple[str, ...]
     """Names of the axes of the signatures."""
     unit: str
@@ -46,7 +45,7 @@ class SignatureModel:
     mean: FloatArray
     """(n_features,) mean features of the training set."""
     scale: FloatArray
-    """(n_features,) standard deviations of the features of the training set."""
+    """(n_features,) standard deviations of these features."""
     weights: FloatArray
     """(n_classes, n_features) weights of the scaled features."""
     offsets: FloatArray
@@ -64,11 +63,12 @@ class SignatureModel:
 
     def posterior(self, x: FloatArray) -> FloatArray:
         """Posterior probabilities (n, n_classes) for features `x` (n, n_features)."""
-        return _softmax((self._standardise(x) @ self.weights.T + self.offsets) / self.temperature)
+        z = (x - self.mean) / self.scale
+        return _softmax((z @ self.weights.T + self.offsets) / self.temperature)
 
     def is_known(self, x: FloatArray) -> FloatArray:
         """Whether each signature is within `limit` of the nearest class centre."""
-        known: FloatArray = _squared_distances(self._standardise(x), self.centres,
+        known: FloatArray = _squared_distances((x - self.mean) / self.scale, self.centres,
                                                self.precision).min(axis=1) <= self.limit
         return known
 
@@ -78,18 +78,12 @@ class SignatureModel:
         return [self.classes[k] if known else UNKNOWN
                 for k, known in zip(best.tolist(), self.is_known(x).tolist(), strict=True)]
 
-    def _standardise(self, x: FloatArray) -> FloatArray:
-        """Standardise features by the mean and scale of the training set."""
-        scaled: FloatArray = (x - self.mean) / self.scale
-        return scaled
-
 
 @dataclass(frozen=True)
 class Evaluation:
     """Accuracy of classifiers on one or several test sets."""
 
     classes: tuple[str, ...]
-    """Names of the classes."""
     n: int
     """Number of signatures in the first test set."""
     majority: float
@@ -103,15 +97,12 @@ class Evaluation:
     unknown: FloatArray
     """(n_sets,) fraction of `unknown` predictions."""
     expected_calibration_error: float
-    """Expected calibration error: mean absolute difference between predicted probability and
-    accuracy over bins of the probability, weighted by the number of predictions."""
+    """Mean absolute difference of probability and accuracy over bins of the probability."""
 
 
 def feature_table(signatures: Sequence[Signature]) -> tuple[FloatArray, IntArray, list[str]]:
-    """Features, indices of the signatures that have features, and reasons for the others.
-
-    Raises LabelsError if the signatures have different axes or units.
-    """
+    """Features, indices of the signatures that have features, and reasons for the others; raises
+    LabelsError if the signatures have different axes or units."""
     axes = Counter((' '.join(s.axes), s.unit) for s in signatures)
     if len(axes) > 1:
         raise LabelsError('the signatures have different axes or units: ' + ', '.join(
@@ -131,9 +122,8 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
           unit: str, seed: int = 0) -> SignatureModel:
     """Train a classifier; select its method and penalty by cross-validation.
 
-    A fold never splits the signatures of one target, which have the same group. Raises LabelsError
-    for fewer than two classes or too few examples of one, MissingDependencyError without
-    scikit-learn.
+    A fold never splits a group. Raises LabelsError for fewer than two classes or too few examples
+    of one, MissingDependencyError without scikit-learn.
     """
     counts = check_labels(labels, groups)
     classes = tuple(sorted(counts))
@@ -146,20 +136,24 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
     for name, create_estimator in _candidates():
         held_out_logits = np.zeros((len(y), len(classes)))
         for train_rows, test_rows in folds:
-            held_out_logits[test_rows] = _logits(
-                create_estimator().fit(z[train_rows], y[train_rows]), z[test_rows])
-        losses = [_log_loss(held_out_logits / t, y) for t in TEMPERATURES]
+            weights, offsets = _weights_and_offsets(
+                create_estimator().fit(z[train_rows], y[train_rows]), len(classes))
+            held_out_logits[test_rows] = z[test_rows] @ weights.T + offsets
+        losses = [float(-np.mean(np.log(np.maximum(
+            _softmax(held_out_logits / t)[np.arange(len(y)), y], 1e-300)))) for t in TEMPERATURES]
         k = int(np.argmin(losses))
         candidates.append((losses[k], name, create_estimator, float(TEMPERATURES[k])))
     _, name, create_estimator, temperature = min(candidates, key=lambda s: s[0])
     fitted = create_estimator().fit(z, y)
-    centres, precision = _class_statistics(z, y)
-    held_out = np.concatenate([_held_out_distances(z, y, train_rows, test_rows)
-                               for train_rows, test_rows in folds])
-    return SignatureModel(classes, axes, unit, name, mean, scale,
-                          *_weights_and_offsets(fitted, len(classes)), temperature,
-                          centres, precision,
-                          float(np.quantile(held_out, KNOWN_QUANTILE)), dict(counts))
+    held_out = []
+    for train_rows, test_rows in folds:
+        distances = _squared_distances(
+            z[test_rows], *_class_statistics(z[train_rows], y[train_rows]))
+        held_out.append(distances[np.arange(len(test_rows)), y[test_rows]])
+    return SignatureModel(
+        classes, axes, unit, name, mean, scale, *_weights_and_offsets(fitted, len(classes)),
+        temperature, *_class_statistics(z, y),
+        float(np.quantile(np.concatenate(held_out), KNOWN_QUANTILE)), dict(counts))
 
 
 def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]':
@@ -186,9 +180,8 @@ def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
                     test_fraction: float = 0.3, progress: Any = iter) -> Evaluation:
     """Train and test on stratified random splits.
 
-    Method, penalty and temperature are selected within the training part of each split. `progress`
-    wraps the range of splits. Raises the errors of `train`, and LabelsError if no class has enough
-    examples for a test part of `test_fraction`.
+    `progress` wraps the range of splits. Raises the errors of `train`, and LabelsError if no class
+    has enough examples for a test part of `test_fraction`.
     """
     check_labels(labels, groups)
     y, g = np.array(labels), np.array(groups)
@@ -232,8 +225,7 @@ def _evaluate_parts(parts: Sequence[tuple[SignatureModel, FloatArray, Any]]) -> 
 
 def expected_calibration_error(probability: FloatArray, correct: FloatArray, n_bins: int = 10
                                ) -> float:
-    """Expected calibration error of predictions, over `n_bins` equal-width bins of the
-    probability."""
+    """Expected calibration error over `n_bins` equal-width bins of the probability."""
     bins = np.minimum((probability * n_bins).astype(int), n_bins - 1)
     return float(sum(abs(probability[bins == b].mean() - correct[bins == b].mean())
                      * np.mean(bins == b) for b in np.unique(bins)))
@@ -241,18 +233,13 @@ def expected_calibration_error(probability: FloatArray, correct: FloatArray, n_b
 
 def _candidates() -> list[tuple[str, Any]]:
     """List the candidate classifiers as (name, function that creates an estimator)."""
-    try:
-        from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
-        from sklearn.linear_model import LogisticRegression
-    except ImportError as error:
-        raise MissingDependencyError('the classifier requires scikit-learn: pip install '
-                                     '"mag_tracking[classes]"') from error
-    out: list[tuple[str, Any]] = [('linear discriminant analysis', lambda: (
-        LinearDiscriminantAnalysis(solver='lsqr', shrinkage='auto')))]
-    for penalty in PENALTIES:
-        out.append((f'logistic regression, C = {penalty:g}', lambda c=penalty: (
-            LogisticRegression(C=c, max_iter=5000))))
-    return out
+    from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+    from sklearn.linear_model import LogisticRegression
+
+    return [('linear discriminant analysis',
+             partial(LinearDiscriminantAnalysis, solver='lsqr', shrinkage='auto')),
+            *((f'logistic regression, C = {c:g}', partial(LogisticRegression, C=c, max_iter=5000))
+              for c in PENALTIES)]
 
 
 def _weights_and_offsets(fitted: Any, n_classes: int) -> tuple[FloatArray, FloatArray]:
@@ -264,13 +251,6 @@ def _weights_and_offsets(fitted: Any, n_classes: int) -> tuple[FloatArray, Float
     return weights, offsets
 
 
-def _logits(fitted: Any, z: FloatArray) -> FloatArray:
-    """Logits (n, n_classes) of a fitted estimator."""
-    weights, offsets = _weights_and_offsets(fitted, len(fitted.classes_))
-    logits: FloatArray = z @ weights.T + offsets
-    return logits
-
-
 def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
     """Stratified folds without splitting groups, as pairs of training and test indices."""
     try:
@@ -278,8 +258,8 @@ def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
     except ImportError as error:
         raise MissingDependencyError('the classifier requires scikit-learn: pip install '
                                      '"mag_tracking[classes]"') from error
-    folds = StratifiedGroupKFold(n, shuffle=True, random_state=seed)
-    return folds.split(np.zeros(len(y)), y, np.array(groups))
+    return StratifiedGroupKFold(n, shuffle=True, random_state=seed).split(
+        np.zeros(len(y)), y, np.array(groups))
 
 
 def _random_split(y: Any, groups: Any, test_fraction: float, seed: int
@@ -308,15 +288,6 @@ def _class_statistics(z: FloatArray, y: IntArray) -> tuple[FloatArray, FloatArra
     return centres, np.linalg.inv(covariance + 1e-6 * np.eye(z.shape[1]))
 
 
-def _held_out_distances(z: FloatArray, y: IntArray, train_rows: IntArray,
-                        test_rows: IntArray) -> FloatArray:
-    """Squared distances (n_test,) of held-out examples to the centres of their own classes."""
-    centres, precision = _class_statistics(z[train_rows], y[train_rows])
-    own_distances: FloatArray = _squared_distances(z[test_rows], centres, precision)[
-        np.arange(len(test_rows)), y[test_rows]]
-    return own_distances
-
-
 def _squared_distances(z: FloatArray, centres: FloatArray, precision: FloatArray) -> FloatArray:
     """Squared Mahalanobis distances (n, n_classes) to the class centres."""
     e = z[:, None] - centres
@@ -329,8 +300,3 @@ def _softmax(logits: FloatArray) -> FloatArray:
     p = np.exp(logits - logits.max(axis=1, keepdims=True))
     out: FloatArray = p / p.sum(axis=1, keepdims=True)
     return out
-
-
-def _log_loss(logits: FloatArray, y: IntArray) -> float:
-    """Mean negative log-probability of the correct class."""
-    return float(-np.mean(np.log(np.maximum(_softmax(logits)[np.arange(len(y)), y], 1e-300))))

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.analysis.network_blind import calibrate_geometry_blind
-from mag_tracking.analysis.network_geometry import (
-    GeometrySettings,
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration.network_fit import GeometrySettings
+from mag_tracking.calibration.network_geometry import (
     NetworkGeometry,
     calibrate_geometry,
+    calibrate_geometry_blind,
 )
-from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.errors import NetworkError, RecordingError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.quantities import quantity

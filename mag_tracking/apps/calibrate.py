@@ -5,8 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mag_tracking.analysis.pass_mounting import MountingEvidence, fuse_mounting, with_pass_mounting
 from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration.orientation import (
+    MountingEvidence,
+    fuse_mounting,
+    with_pass_mounting,
+)
+from mag_tracking.calibration.survey import NetworkSurvey, Survey, with_measured_noise
 from mag_tracking.errors import RecordingError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings
@@ -19,7 +24,6 @@ from mag_tracking.records import AccelerationSample, Track
 from mag_tracking.run import RecordingSource, run
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.stage import rejected
-from mag_tracking.stages.survey.stage import NetworkSurvey, Survey, with_measured_noise
 
 MIN_POSES = 8
 """Minimum number of unambiguous poses of a track; shorter tracks are not used."""
@@ -59,7 +63,7 @@ def calibrate(recording: Recording, network: SensorNetwork, settings: Settings, 
         recording, network, settings, date, progress, stopped)
     if not stage.counts.total():
         raise RecordingError(f'{recording.path}: no samples from the sensors of the network')
-    calibrated_network = with_measured_noise(survey.network, stage)
+    calibrated_network = with_measured_noise(survey.network, stage.backgrounds())
     evidence = None
     # A faulty sensor would bias the orientations of the other sensors.
     if passes and not interrupted and settings.track.mounting_std_deg \

@@ -7,6 +7,7 @@ import numpy as np
 
 from mag_tracking.apps.host_stalls import HostStalls
 from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration.survey import SurveySettings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings
 from mag_tracking.record_receiver import Step
@@ -29,7 +30,6 @@ from mag_tracking.stages.health.input_findings import (
 )
 from mag_tracking.stages.health.rejections import driver_findings, rejection_findings
 from mag_tracking.stages.health.sensor_health import SensorHealth
-from mag_tracking.stages.survey.settings import SurveySettings
 
 MIN_MISSED_TARGETS = 3
 """Number of consecutive missed targets at which a sensor is reported."""

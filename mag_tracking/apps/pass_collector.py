@@ -7,7 +7,7 @@ import numpy as np
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.doubtful_times import DOUBTFUL_BACKGROUND, are_doubtful
-from mag_tracking.calibration.saturation import saturated_readings, with_margin
+from mag_tracking.calibration.reading_faults import saturated_readings, with_margin
 from mag_tracking.pipeline import Pipeline
 from mag_tracking.record_receiver import Step
 from mag_tracking.records import Detection, FieldFrame, Readings

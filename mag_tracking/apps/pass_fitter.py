@@ -3,13 +3,11 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from mag_tracking.analysis.correlated_motion import CorrelatedMotion, correlated_motion
-from mag_tracking.analysis.fitted_pass import FittedPass
-from mag_tracking.analysis.joint_fit import GroundPrior, are_separate, path_from
-from mag_tracking.analysis.model_order import choose_order
+from mag_tracking.analysis.fitted_pass import FittedPass, choose_order
+from mag_tracking.analysis.joint_fit import GroundPrior, are_separate, fit_targets, path_from
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
-from mag_tracking.analysis.pass_targets import fit_targets
 from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.arrays import FloatArray

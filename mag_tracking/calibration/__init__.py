@@ -1,1 +1,1 @@
-"""Calibration of sensors from their own readings: background, noise, iron, orientation, clocks."""
+"""Calibration of sensors and networks: background, noise, iron, orientation, clocks, geometry."""

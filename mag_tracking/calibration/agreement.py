@@ -23,8 +23,7 @@ OFFSET_PROBABILITY = 1e-3
 """Probability that a sensor with a constant offset is regarded as misleading."""
 
 EXPLAINED_PROBABILITY = 0.05
-"""Probability that the difference that remains after the correction of a fault is larger. A fault
-that explains the field this well is more probable than an offset that resembles it."""
+"""Probability of a larger remaining difference above which a fault is preferred to an offset."""
 
 GAIN_STDS = 2.0
 """Half of the stated interval of a gain, in standard deviations."""
@@ -36,33 +35,18 @@ is below the second value for one axis, and below the third for all axes."""
 UNIT_TOLERANCE = 0.1
 """A gain that differs from a power of ten by less than this may be due to a wrong unit."""
 
-MAX_HEADING_STDS = 5.0
-"""Maximum tested heading error, in standard deviations."""
+MAX_HEADING_STDS, YAW_STEP = 5.0, np.deg2rad(0.25)
+"""Maximum tested heading error in standard deviations, and step of the tested headings [rad]."""
 
-YAW_STEP = np.deg2rad(0.25)
-"""[rad] Step of the tested headings; one step rotates a horizontal field of 20 uT by 0.1 uT."""
-
-MAX_REMAINING_FRACTION = 0.3
-"""Maximum difference that remains after a partial explanation, as a fraction of the original
-difference."""
-
-MAX_RATIO_TO_NEXT = 0.5
-"""Maximum difference that remains after a partial explanation, relative to the difference that
-remains after the next best change of axes of the same complexity."""
+MAX_REMAINING_FRACTION, MAX_RATIO_TO_NEXT = 0.3, 0.5
+"""Maximum difference that remains after a partial explanation, relative to the original one, and to
+that after the next best, equally complex change of axes."""
 
 UNITS = (('gauss', 1e4), ('millitesla', 1e3), ('microtesla', 1e6), ('nanotesla', 1e9))
 _AXES = 'xyz'
 
 _AxisChange: TypeAlias = tuple[str, tuple[int, ...], FloatArray]
 """Description, order and signs (3,) of a signed permutation of the axes."""
-
-
-ADVICE = 'fix the sensor, its orientation in the network file, or earth_field'
-"""Remedy for a misleading sensor."""
-
-OFFSET_ADVICE = 'measure the offset with mag-tracking calibrate tumble if the orientations are '\
-                'calibrated'
-"""Remedy for a sensor with a constant offset."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +59,14 @@ class FieldInconsistency:
     explanations: tuple[str, ...]
     """The simplest possible explanations; empty if no known fault explains the difference."""
     misleads: bool
-    """Whether the field of a target is probably distorted, too, so that tracks are wrong. False if
-    the difference may be a constant offset."""
+    """Whether the field of a target is probably distorted, too; not by a constant offset."""
 
     @property
     def advice(self) -> str:
         """Remedy."""
-        return ADVICE if self.misleads else OFFSET_ADVICE
+        return 'fix the sensor, its orientation in the network file, or earth_field' \
+            if self.misleads else 'measure the offset with mag-tracking calibrate tumble if the ' \
+            'orientations are calibrated'
 
     def __str__(self) -> str:
         cause = ' or '.join(self.explanations) or (
@@ -92,11 +77,9 @@ class FieldInconsistency:
 
 
 def consensus(fields: FloatArray, R_ws: FloatArray) -> FloatArray:
-    """Median per world axis, T, of fields (n, 3) in the sensor frames; NaN for an unreported axis.
-
-    Raises ValueError if fewer than three sensors report all axes: with two, the faulty sensor
-    cannot be identified.
-    """
+    """Median per world axis, T, of the complete fields (n, 3) in the sensor frames; raises
+    ValueError if these are fewer than three, because with two, the faulty sensor cannot be
+    identified."""
     is_complete = ~np.isnan(fields).any(axis=1)
     if np.count_nonzero(is_complete) < 3:
         raise ValueError('if earth_field is unknown, at least three sensors must report all axes, '
@@ -111,14 +94,13 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
                   bias_std: float, offset_std: float) -> list[FieldInconsistency]:
     """Find the sensors whose fields (n, 3) in T without a target differ from the Earth's field.
 
-    `fields` is in the sensor frames, NaN for an unreported axis. `orientation_std` (n, 3) in rad is
-    about the world axes. `bias_std` and `offset_std` in T are per axis: that of the bias including
-    nearby iron, and that of the offset of an uncalibrated sensor. A difference within the offset is
-    not misleading; an `offset_std` of 0 makes no difference misleading.
+    `fields` is in the sensor frames, NaN for an unreported axis; `orientation_std` (n, 3) in rad is
+    about the world axes. `bias_std`, which includes nearby iron, and `offset_std`, that of an
+    uncalibrated sensor, are in T per axis. A difference within the offset is not misleading.
     """
     B0 = np.asarray(earth_field, dtype=float)
-    sensors = [_Sensor(names[j], fields[j], R_ws[j], orientation_std[j], B0, bias_std)
-               for j in range(len(names))]
+    sensors = [_Sensor(*sensor, B0, bias_std)
+               for sensor in zip(names, fields, R_ws, orientation_std, strict=True)]
     suspects = [s for s in sensors if not s.fits(s.field)]
     inconsistencies = []
     for s in suspects:
@@ -129,8 +111,7 @@ def disagreements(names: Sequence[str], fields: FloatArray, R_ws: FloatArray,
         gains = _gain_explanations(s)
         explanations = tuple(text for text, _ in exact) or (
             ('a constant offset of the sensor or of iron nearby', *gains) if is_offset else
-            gains or _partial_explanation(s.field, s.R_ws, s.std, B0)
-            or _orientation_explanation(s))
+            gains or _partial_explanation(s))
         magnitude = float(np.sqrt(np.nansum((s.field - s.R_ws.T @ B0)**2)))
         inconsistencies.append(FieldInconsistency(
             s.name, magnitude, explanations, offset_std > 0.0 and not is_offset))
@@ -153,22 +134,17 @@ class _Sensor:
 
     def probability(self, y: FloatArray, bias_std: float | None = None) -> float:
         """Probability that a field differs more from the Earth's field than `y` does."""
-        return _probability(*map(_cache_key, (y, self.R_ws, self.std, self.B0)),
-                            self.bias_std if bias_std is None else bias_std)
+        key = (tuple(np.ravel(a).tolist()) for a in (y, self.R_ws, self.std, self.B0))
+        return _probability(*key, self.bias_std if bias_std is None else bias_std)
 
     def fits(self, y: FloatArray) -> bool:
         """Whether a field is consistent with the Earth's field."""
         return self.probability(y) >= FALSE_ALARM_PROBABILITY
 
-    def nominal_field(self) -> FloatArray:
-        """Earth's field (3,) [T] in the sensor frame, NaN for an unreported axis."""
-        field: FloatArray = np.where(np.isnan(self.field), np.nan, self.R_ws.T @ self.B0)
-        return field
-
-
-def _cache_key(a: FloatArray) -> tuple[float, ...]:
-    """Elements of an array as a hashable cache key."""
-    return tuple(np.ravel(a).tolist())
+    def remaining_difference(self, y: FloatArray) -> float:
+        """Magnitude [T] of a field minus the Earth's field, at the best heading."""
+        _, B = _headings(self.std, self.B0)
+        return float(np.linalg.norm((y - B @ self.R_ws)[:, ~np.isnan(y)], axis=1).min())
 
 
 @functools.lru_cache(maxsize=4096)
@@ -208,7 +184,7 @@ def _exact_explanations(s: _Sensor, suspects: Sequence[_Sensor]) -> list[tuple[s
 
 def _gain_explanations(s: _Sensor) -> tuple[str, ...]:
     """Gains of all axes, or of one axis, that explain the field."""
-    y, B = s.field, s.nominal_field()
+    y, B = s.field, np.where(np.isnan(s.field), np.nan, s.R_ws.T @ s.B0)
     found = []
     gain = np.sqrt(np.nansum(y**2) / np.nansum(B**2))
     relative_std = s.bias_std / np.sqrt(np.nansum(B**2))
@@ -228,13 +204,6 @@ def _gain_explanations(s: _Sensor) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _orientation_explanation(s: _Sensor) -> tuple[str, ...]:
-    """A wrong orientation, if the magnitude of the field agrees."""
-    difference = abs(np.linalg.norm(s.field) - np.linalg.norm(s.B0))
-    return ('another orientation (the magnitude agrees)',) \
-        if difference < MAX_HEADING_STDS * s.bias_std else ()
-
-
 def _is_wrong_gain(gain: float, max_gain: float = MAX_GAIN) -> bool:
     """Whether a gain differs from 1, and is possible."""
     return abs(gain - 1.0) > MIN_GAIN_ERROR and 1.0 / max_gain < gain < max_gain
@@ -246,28 +215,21 @@ def _gain_text(gain: float, relative_std: float) -> str:
     return f'gain {low}' if low == high else f'gain {low} to {high}'
 
 
-def _partial_explanation(y: FloatArray, R_ws: FloatArray, std: FloatArray,
-                         B0: FloatArray) -> tuple[str, ...]:
-    """Simplest change of axes that explains most of the difference from `B0`, unless ambiguous."""
-    original_difference = _remaining_difference(y, R_ws, std, B0)
+def _partial_explanation(s: _Sensor) -> tuple[str, ...]:
+    """Simplest change of axes that explains most of the difference, unless ambiguous, or a wrong
+    orientation if the magnitude agrees."""
+    original_difference = s.remaining_difference(s.field)
     for changes in _axis_changes():
-        remainders = sorted(
-            (_remaining_difference(signs * y[list(order)], R_ws, std, B0), description)
-            for description, order, signs in changes)
+        remainders = sorted((s.remaining_difference(signs * s.field[list(order)]), description)
+                            for description, order, signs in changes)
         # If two changes explain the difference equally well, neither is reported.
         if remainders[0][0] < MAX_REMAINING_FRACTION * original_difference and not (
                 len(remainders) > 1 and remainders[1][0] < remainders[0][0] / MAX_RATIO_TO_NEXT):
             return (f'{remainders[0][1]}, and {remainders[0][0] * 1e6:.2g} uT remain (due to '
                     'nearby iron or the bias of the sensor)',)
-    return ()
-
-
-def _remaining_difference(y: FloatArray, R_ws: FloatArray, std: FloatArray,
-                          B0: FloatArray) -> float:
-    """Magnitude [T] of a measured field minus the Earth's field, at the best heading."""
-    is_reported = ~np.isnan(y)
-    _, B = _headings(std, B0)
-    return float(np.linalg.norm((y - B @ R_ws)[:, is_reported], axis=1).min())
+    difference = abs(np.linalg.norm(s.field) - np.linalg.norm(s.B0))
+    return ('another orientation (the magnitude agrees)',) \
+        if difference < MAX_HEADING_STDS * s.bias_std else ()
 
 
 def _headings(std: FloatArray, B0: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -9,6 +9,7 @@ covariance of a target-free interval; the line and the freezing are additions of
 """
 
 from collections import deque
+from collections.abc import Sequence
 from functools import partial
 from math import inf
 from typing import NamedTuple
@@ -16,17 +17,32 @@ from typing import NamedTuple
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, StructArray
-from mag_tracking.calibration.background_level import BackgroundLevel
-from mag_tracking.calibration.blocks import Block, Blocks, block_of, pooled_covariance, stacked
+from mag_tracking.calibration import core
+from mag_tracking.calibration.background_level import (
+    SHORTENED_FRACTION,
+    BackgroundLevel,
+    FormerLevel,
+    LevelDeparture,
+)
+from mag_tracking.calibration.blocks import (
+    Block,
+    Blocks,
+    LearningWindow,
+    QuietInterval,
+    block_of,
+    line_through,
+    pooled_covariance,
+    stacked,
+)
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, doubtful_since, updated
-from mag_tracking.calibration.drift import FormerLevel, is_steep
-from mag_tracking.calibration.frequent_level import MIN_DURATION_RATIO
-from mag_tracking.calibration.learning_window import LearningWindow
+from mag_tracking.calibration.frequent_level import (
+    MIN_DURATION_RATIO,
+    MIN_OBSERVED_S,
+    MostFrequentLevel,
+    ProvisionalLevel,
+)
 from mag_tracking.calibration.level_change import ChangeEvaluator, SharedChanges
-from mag_tracking.calibration.level_departure import SHORTENED_FRACTION, LevelDeparture
-from mag_tracking.calibration.provisional import MIN_OBSERVED_S, FrequentLevel, ProvisionalLevel
-from mag_tracking.calibration.quiet_interval import QuietInterval, line_of
-from mag_tracking.calibration.resolution import MIN_STD, corrected_steps
+from mag_tracking.calibration.sensor_state import corrected_steps
 from mag_tracking.units import NS
 
 MAX_CHANGES = 16
@@ -39,29 +55,25 @@ class RelearntBackground(NamedTuple):
     stamp_ns: int
     """Timestamp of the first reading to which the new background applies."""
     has_departed: bool
-    """Whether the background contained the field of a target, which has departed. Otherwise,
-    another level lasted, or a former level returned."""
+    """Whether a target in the background has departed, or else another level lasted or returned."""
     before: FloatArray
     """Previous background, (3,) T, sensor frame. NaN for a missing axis."""
     after: FloatArray
     """New background, (3,) T, sensor frame. NaN for a missing axis."""
 
 
-class RunningBackground:
+class RunningBackground(BackgroundLevel):
     """Running estimate of a sensor's background; times are in s since the first reading.
 
     Parameters
     ----------
-    learn : s, quiet time required before the background is ready
-    memory : s, length of the interval that the line is fitted to
-    guard : s, delay after which a quiet block enters that interval, to exclude a target's onset
-    block : s, length of a block
+    learn, memory, guard, block : s, quiet time required before the background is ready, length of
+        the fitted interval, delay after which a quiet block enters it, length of a block
     freeze_std : number of noise std by which the mean of a departing block differs
     relearn : s, duration of another steady level after which it becomes the background
         Shorter if the background was observed briefly or contains the field of a departed target.
         0 disables the replacement, except of a background set by `resume`.
-    background, noise_std : (3,) arrays, T, known in advance
-        If both are given, the background is ready immediately.
+    background, noise_std : (3,) T, known in advance
     phase : extra length of the first block, as a fraction of `block`
         It staggers the blocks of sensors that started together. If it is given, each complete block
         is evaluated by a later call of `evaluate_block`, at the latest before the next reading;
@@ -73,8 +85,7 @@ class RunningBackground:
     ----------
     frozen : whether the field departs from the background, e.g. because of a target
     stuck : whether the readings do not change
-    n_relearnt : number of times another steady level became the background
-    relearnt : the latest of these changes
+    n_relearnt, relearnt : number of times another steady level became the background, latest ones
     doubtful_times : intervals in which the background was doubtful
     """
 
@@ -83,7 +94,7 @@ class RunningBackground:
                  noise_std: FloatArray | None = None, phase: float | None = None, *,
                  sensors: StructArray, evaluate_change: ChangeEvaluator | None = None) -> None:
         self._learn, self._block_length, self._relearn = learn, block, relearn
-        self._sensors, self._state = sensors, sensors[0]
+        super().__init__(sensors, freeze_std)
         self._state['length'], self._state['phase'] = block, np.nan if phase is None else phase
         self._max_blocks = max(3, int(round(memory / block)))
         self._quiet = QuietInterval(guard, self._max_blocks)
@@ -91,7 +102,6 @@ class RunningBackground:
         self._known_background = None if background is None else np.asarray(background, dtype=float)
         self._known_noise: FloatArray | None = \
             None if noise_std is None else np.diag(np.asarray(noise_std, float) ** 2)
-        self._level = BackgroundLevel(sensors, freeze_std)
         self.n_relearnt = 0
         self.relearnt: tuple[RelearntBackground, ...] = ()
         # Background and level (3,) [T] of the latest departure.
@@ -100,7 +110,7 @@ class RunningBackground:
         self.doubtful_times: DoubtfulTimes = ()
         self._provisional = ProvisionalLevel(learn)
         self._departure = LevelDeparture(
-            learn, relearn, self._state, self._level,
+            learn, relearn, sensors, self,
             evaluate_change or partial(SharedChanges().evaluate_change, 0))
         self.forget()
 
@@ -118,22 +128,24 @@ class RunningBackground:
         # Duration for which the level was observed, its end, and the start of the background.
         self._observed_s = 0.0 if self._known_background is None else inf
         self._observed_until = self._start_time = np.nan
-        self._level.set_uncertainty()
-        self._level.set(None if self._known_background is None
-                        else (0.0, self._known_background, np.zeros(3), 0.0), self._known_noise)
+        self.set_uncertainty()
+        self.set_trend(None if self._known_background is None
+                       else (0.0, self._known_background, np.zeros(3), 0.0), self._known_noise)
+
+    def _set_constant(self, level: FloatArray, noise: FloatArray) -> None:
+        """Set a constant level (3,) T, and its noise (3, 3) T² unless that is known."""
+        self.set_trend((0.0, level, np.zeros(3), 0.0),
+                       noise if self._known_noise is None else self._known_noise)
 
     def resume(self, background: FloatArray, covariance: FloatArray) -> None:
-        """Resume with a recently stored background (3,) T and noise (3, 3) T² of a reading; NaN
-        marks an unreported axis.
+        """Resume with a recently stored background (3,) T and noise (3, 3) T² of a reading.
 
-        The level remains constant until the new quiet interval is as long as `learn`.
+        NaN marks an unreported axis. The level remains constant until a quiet interval of `learn`.
         """
-        noise = np.asarray(covariance, dtype=float)
-        self._level.set((0.0, np.asarray(background, dtype=float), np.zeros(3), 0.0),
-                        noise if self._known_noise is None else self._known_noise)
+        self._set_constant(np.asarray(background, dtype=float), np.asarray(covariance, dtype=float))
         self._is_resumed = self._relearns_soon = True
         self._observed_s, self._is_steep = inf, False
-        self._level.set_uncertainty()
+        self.set_uncertainty()
 
     def start_from(self, level: FloatArray, covariance: FloatArray) -> None:
         """Start with a level (3,) T and noise (3, 3) T² determined from other readings.
@@ -141,20 +153,15 @@ class RunningBackground:
         Unlike after `resume`, another level must last for the full `relearn` time to replace it. No
         effect if the noise of all axes is unknown.
         """
-        covariance = self._level.without_unknown_noise(covariance)
+        covariance = self.without_unknown_noise(covariance)
         if not np.isnan(covariance).all():
             self.resume(level, covariance)
             self._relearns_soon = False
 
     @property
-    def ready(self) -> bool:
-        """Whether background and noise are known, possibly provisionally."""
-        return self._level.is_ready
-
-    @property
     def doubtful(self) -> bool:
         """Whether the background is provisional or may contain the field of a target."""
-        return self._level.is_provisional or self._is_ambiguous or self._is_steep
+        return self.is_provisional or self._is_ambiguous or self._is_steep
 
     @property
     def departed_at(self) -> float | None:
@@ -165,20 +172,6 @@ class RunningBackground:
     def certain(self) -> bool:
         """Whether the background is ready and not doubtful."""
         return self.ready and not self.doubtful
-
-    @property
-    def covariance(self) -> FloatArray | None:
-        """Noise (3, 3) T² of one sample with quantisation; None if unknown, NaN if unreported."""
-        return self._level.covariance
-
-    @property
-    def drift(self) -> FloatArray:
-        """Drift, (3,) T/s; NaN before the background is ready, and for unreported axes."""
-        return self._level.drift
-
-    def level(self, time: float) -> FloatArray:
-        """Background (3,) T at a time in s; raises ValueError if it is not ready."""
-        return self._level.at(time)
 
     @property
     def scatter_std(self) -> FloatArray:
@@ -197,9 +190,9 @@ class RunningBackground:
             return
         block = block_of(self._sensors)
         self._state['is_full'] = False
-        is_constant = (block.n > 1) & (block.scatter.diagonal() < MIN_STD**2 * (block.n - 1))
-        if self.ready and not self._level.is_provisional:
-            self._level.apply_steps()
+        is_constant = (block.n > 1) & (block.scatter.diagonal() < core.MIN_STD**2 * (block.n - 1))
+        if self.ready and not self.is_provisional:
+            self.apply_steps()
             # A constant axis is at rest if its steps are coarse, and stuck if they are fine.
             self.stuck = bool((is_constant & (self._state['step_variance'] == 0.0)
                                & ~np.isnan(self._state['noise_std'])).any())
@@ -208,35 +201,32 @@ class RunningBackground:
         else:
             self.stuck = bool(is_constant[block.n > 1].all())
             self._collect_until_quiet(block)
-        last_ns = int(self._state['last_ns'])
-        self.doubtful_times = updated(self.doubtful_times, last_ns, self.doubtful)
+        self.doubtful_times = updated(self.doubtful_times, int(self._state['last_ns']),
+                                      self.doubtful)
 
     def _collect_until_quiet(self, block: Block) -> None:
-        """Add a block; adopt the latest quiet interval as the background if it is long enough."""
+        """Add a block; adopt the latest quiet interval as the background if it is long enough, or
+        else the given background or a frequent level, provisional if uncertain."""
         self._start_time = block.time if np.isnan(self._start_time) else self._start_time
         segments = self._learning_window.segments(block, self.stuck)
-        if not any(self._adopt_if_steady(s) for s in segments) and not self.stuck:
-            self._start_provisionally(block)
-
-    def _start_provisionally(self, block: Block) -> None:
-        """Add a block; adopt the given background or a frequent level, provisional if uncertain."""
+        if any(self._adopt_if_steady(s) for s in segments) or self.stuck:
+            return
         self._provisional.collect(block)
         frequent = self._provisional.frequent_level(corrected_steps(self._sensors))
-        if frequent is not None and self._known_background is not None:
-            self.start_from(self._known_background, frequent.level.covariance)
+        if frequent is None:
+            return
+        if self._known_background is not None:
+            self.start_from(self._known_background, frequent.covariance)
             self._learning_window.clear()
-        elif frequent is not None and frequent.is_certain:
+        elif frequent.is_certain:
             self._start_with_frequent(frequent)
-        elif frequent is not None:
-            level, noise = frequent.level, self._level.without_dead_axes(frequent.level.covariance)
-            if not np.isnan(noise).all():
-                self._level.set((0.0, level.level, np.zeros(3), 0.0),
-                                noise if self._known_noise is None else self._known_noise)
-                self._level.set_uncertainty(frequent.std, is_provisional=True)
+        elif not np.isnan(noise := self.without_dead_axes(frequent.covariance)).all():
+            self._set_constant(frequent.level, noise)
+            self.set_uncertainty(self._provisional.std(frequent), is_provisional=True)
 
-    def _start_with_frequent(self, frequent: FrequentLevel) -> None:
+    def _start_with_frequent(self, frequent: MostFrequentLevel) -> None:
         """Adopt a frequent level as the background; another level may still replace it."""
-        self.start_from(frequent.level.level, frequent.level.covariance)
+        self.start_from(frequent.level, frequent.covariance)
         self._quiet.clear()  # Its blocks are those of the previous level.
         self._observed_s, self.frozen, self._is_ambiguous = frequent.observed_s, False, False
         self._learning_window.clear()
@@ -244,9 +234,9 @@ class RunningBackground:
 
     def _update(self, block: Block) -> None:
         """Extend the quiet interval by a block, or freeze the background."""
-        difference = np.abs(self._level.departure(block.time, block.mean))
+        difference = np.abs(self.difference(block.time, block.mean))
         # A comparison with NaN is false: an axis that is not reported freezes nothing.
-        self.frozen = bool((difference > self._level.limits).any())
+        self.frozen = bool((difference > self.limits).any())
         self._provisional.collect(block)
         if self.frozen:
             self._departure.add(block, self._quiet.pending)
@@ -266,7 +256,7 @@ class RunningBackground:
     def _change_if_steady(self, block: Block) -> None:
         """While frozen, adopt another level that persists or that was the background earlier."""
         self._observed_until = np.nan
-        self._previous_level, self._departure_level = self._level.at(block.time), block.mean
+        self._previous_level, self._departure_level = self.level(block.time), block.mean
         departure = self._departure
         duration = block.time - departure.blocks[0].time
         relearn_time = departure.relearn_time(
@@ -274,7 +264,7 @@ class RunningBackground:
         if not relearn_time:
             return departure.end()
         other_level = self._provisional.frequent_level(corrected_steps(self._sensors))
-        if other_level is not None and other_level.level.is_at(self._level.at(block.time)):
+        if other_level is not None and other_level.is_at(self.level(block.time)):
             other_level = None
         new_blocks = departure.steady_end(SHORTENED_FRACTION)
         if new_blocks is not None and self._relearn and self._adopt_if_background(new_blocks):
@@ -305,7 +295,7 @@ class RunningBackground:
                                     self._previous_level, self._departure_level)
         self.relearnt = (*self.relearnt, change)[-MAX_CHANGES:]
 
-    def _adopt_if_background(self, new_blocks: deque[Block]) -> bool:
+    def _adopt_if_background(self, new_blocks: Sequence[Block]) -> bool:
         """Adopt a former level, or a level after a vehicle departed; return whether adopted."""
         former_observed_s = self._departure.former_observed_s()
         if former_observed_s:
@@ -320,12 +310,13 @@ class RunningBackground:
         self.doubtful_times = doubtful_since(self.doubtful_times, since_ns)
         return True
 
-    def _change_to(self, new_blocks: deque[Block], observed_s: float, has_departed: bool) -> None:
+    def _change_to(self, new_blocks: Sequence[Block], observed_s: float,
+                   has_departed: bool) -> None:
         """Change the background to the level of `new_blocks`, observed for `observed_s` [s]."""
         # The first half may contain the tail of the departing vehicle's field.
         second_half = list(new_blocks)[len(new_blocks) // 2:]
         self._store_former_level(second_half[0].time)
-        self._level.set_constant(stacked(second_half))
+        self.set_trend((0.0, line_through(stacked(second_half))[1], np.zeros(3), 0.0), self.noise)
         self._is_resumed, self._relearns_soon, self._observed_s = True, False, observed_s
         self._quiet.begin(second_half)
         self._count_relearnt(has_departed)
@@ -334,33 +325,33 @@ class RunningBackground:
     def _store_former_level(self, begin: float) -> None:
         """Store the present level as the former level, which ended at `begin` [s]."""
         self._start_time = begin
-        self._departure.former = FormerLevel(begin, self._level.at(begin), self._observed_s)
+        self._departure.former = FormerLevel(begin, self.level(begin), self._observed_s)
         self._departure.end()
 
     def _adopt_if_steady(self, collected: deque[Block]) -> bool:
         """Adopt blocks that all lie on one line as the background; return whether adopted."""
         blocks = stacked(collected)
         noise = pooled_covariance(blocks) if self._known_noise is None else self._known_noise
-        noise = None if noise is None else self._level.without_dead_axes(noise)
+        noise = None if noise is None else self.without_dead_axes(noise)
         if noise is None or np.isnan(noise).all():
             return False
-        previous_noise = self._level.noise
-        self._level.set(self._level.line, noise)
-        if not self._level.are_steady(blocks):
-            self._level.set(self._level.line, previous_noise)
+        previous_noise = self.noise
+        self.set_trend(self.line, noise)
+        if not self.are_steady(blocks):
+            self.set_trend(self.line, previous_noise)
             return False
-        if self._known_background is not None and self._level.line is not None \
+        if self._known_background is not None and self.line is not None \
                 and not self.n_relearnt and not self.frozen:
             # The background was given and only the noise had to be learnt.
             self._learning_window.clear()
             return True
-        if self.frozen and self._level.line is not None:
+        if self.frozen and self.line is not None:
             self._store_former_level(float(blocks.time[0]))
         # The required length was checked by the caller; the initial length does not apply.
         self._is_resumed = False
         self._observed_s = float(blocks.time[-1] - blocks.time[0]) + self._block_length
         self._observed_until = float(blocks.time[-1])
-        self._level.set_uncertainty()
+        self.set_uncertainty()
         self._quiet.begin(collected)
         self._learning_window.clear()
         self._fit(self._quiet.blocks())
@@ -372,12 +363,11 @@ class RunningBackground:
                 and np.ptp(blocks.time) < self._learn:
             return
         self._is_resumed = False
-        line = line_of(blocks)
-        assert self._level.noise is not None
+        # The drift is extrapolated for at most twice the duration of the blocks.
+        first, last = float(blocks.time.min()), float(blocks.time.max())
+        line = *line_through(blocks), last + 2.0 * (last - first)
         is_briefly_observed = MIN_DURATION_RATIO * self._observed_s < self._relearn
-        self._is_steep = is_briefly_observed and is_steep(
-            blocks, line[2], self._level.noise.diagonal() + self._state['step_variance'])
-        self._level.set_uncertainty(np.abs(line[2]) * self._learn if self._is_steep else 0.0)
+        self._is_steep = is_briefly_observed and self.is_steep(blocks, line[2])
+        self.set_uncertainty(np.abs(line[2]) * self._learn if self._is_steep else 0.0)
         noise = pooled_covariance(blocks) if self._known_noise is None else None
-        self._level.set(line, self._level.noise if noise is None
-                        else self._level.without_dead_axes(noise))
+        self.set_trend(line, self.noise if noise is None else self.without_dead_axes(noise))

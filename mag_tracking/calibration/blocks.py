@@ -1,7 +1,7 @@
-"""Summaries of short intervals of readings (blocks), to which the background line is fitted."""
+"""Summaries of short intervals of readings (blocks), windows of them, and lines through them."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -11,13 +11,10 @@ from mag_tracking.calibration import core
 from mag_tracking.records import plain
 
 MAX_VARIANCE_RATIO = 100.0
-"""Maximum ratio of the variance of a block to the variance of the quietest block. A target that
-passes within a block, as in the long blocks of a slow sensor, causes a higher ratio. Noise and
-coarse steps cause much lower ratios."""
+"""Maximum variance of a block relative to the quietest one; a target within it causes more."""
 
 
-@dataclass(frozen=True)
-class Block:
+class Block(NamedTuple):
     """Time, mean and scatter of the readings in a short interval."""
 
     time: float
@@ -44,39 +41,8 @@ class Blocks(NamedTuple):
     n: FloatArray
 
 
-class BlockWindow:
-    """Ring buffer of the latest blocks, stored as arrays to speed up line fits."""
-
-    def __init__(self, max_blocks: int) -> None:
-        self._time, self._n = np.zeros(max_blocks), np.zeros((max_blocks, 3))
-        self._mean, self._scatter = np.zeros((max_blocks, 3)), np.zeros((max_blocks, 3, 3))
-        self.clear()
-
-    def __len__(self) -> int:
-        return min(self._count, len(self._time))
-
-    def clear(self) -> None:
-        """Remove all blocks."""
-        self._count = 0
-
-    def append(self, block: Block) -> None:
-        """Append a block; if the window is full, it replaces the oldest block."""
-        i = self._count % len(self._time)
-        self._time[i], self._mean[i], self._scatter[i] = block.time, block.mean, block.scatter
-        self._n[i] = block.n
-        self._count += 1
-
-    def blocks(self) -> Blocks:
-        """Stored blocks, in no particular order."""
-        k = len(self)
-        return Blocks(self._time[:k], self._mean[:k], self._scatter[:k], self._n[:k])
-
-
 def line_through(blocks: Blocks) -> tuple[float, FloatArray, FloatArray]:
-    """Weighted least-squares line through block means: mean time [s], value there, slope [T/s].
-
-    The value is NaN for an axis that no block reports.
-    """
+    """Weighted least-squares line through block means: mean time [s], value there, slope [T/s]."""
     centre = float(blocks.time.mean())
     return centre, *core.line_through(
         plain(blocks.time), plain(blocks.n), plain(blocks.mean), centre)
@@ -84,15 +50,11 @@ def line_through(blocks: Blocks) -> tuple[float, FloatArray, FloatArray]:
 
 def stacked(blocks: Iterable[Block]) -> Blocks:
     """Convert blocks to arrays."""
-    return Blocks(*(np.array(values, dtype=float) for values in zip(*(
-        (b.time, b.mean, b.scatter, b.n) for b in blocks), strict=True)))
+    return Blocks(*(np.array(values, dtype=float) for values in zip(*blocks, strict=True)))
 
 
 def has_noisy_block(blocks: Blocks, step_variance: FloatArray) -> bool:
-    """Whether the variance of a block far exceeds that of the quietest block, on any axis.
-
-    `step_variance` (3,) in T² is the quantisation variance, the least variance compared.
-    """
+    """Whether the variance of a block, at least `step_variance` (3,) T², far exceeds others."""
     n = blocks.n
     variance = np.where(n > 1, np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1, 1), np.nan)
     variance = np.maximum(variance, step_variance)
@@ -102,8 +64,89 @@ def has_noisy_block(blocks: Blocks, step_variance: FloatArray) -> bool:
 
 
 def pooled_covariance(blocks: Blocks) -> FloatArray | None:
-    """Noise covariance (3, 3) T² from the scatter within blocks, pooled over all blocks.
-
-    NaN for an axis with too few samples; None if all axes have too few.
-    """
+    """Noise covariance (3, 3) T² from the scatter within all blocks; NaN for an axis with too few
+    samples, None if all axes have too few."""
     return core.pooled_covariance(plain(blocks.scatter), plain(blocks.n))
+
+
+class QuietInterval:
+    """Ring buffer of the latest quiet blocks, as arrays, to which a background is fitted; a block
+    is `pending` for the guard time in s, to exclude the gradual onset of a target."""
+
+    def __init__(self, guard: float, max_blocks: int) -> None:
+        self._guard = guard
+        self._window = Blocks(np.zeros(max_blocks), np.zeros((max_blocks, 3)),
+                              np.zeros((max_blocks, 3, 3)), np.zeros((max_blocks, 3)))
+        self.pending: deque[Block] = deque()
+        self._count = 0
+
+    def __len__(self) -> int:
+        return min(self._count, len(self._window.time))
+
+    def clear(self) -> None:
+        """Discard all blocks."""
+        self.begin(())
+        self.pending.clear()
+
+    def begin(self, blocks: Iterable[Block]) -> None:
+        """Restart the interval with the given blocks."""
+        self._count = 0
+        for block in blocks:
+            self._append(block)
+
+    def _append(self, block: Block) -> None:
+        """Append a block; if the interval is full, it replaces the oldest block."""
+        i = self._count % len(self._window.time)
+        for values, value in zip(self._window, block, strict=True):
+            values[i] = value
+        self._count += 1
+
+    def extend(self, block: Block) -> Iterator[Blocks]:
+        """Queue the next quiet block, and yield the interval after each block that enters it."""
+        self.pending.append(block)
+        while self.pending and self.pending[0].time <= block.time - self._guard:
+            self._append(self.pending.popleft())
+            yield self.blocks()
+
+    def blocks(self) -> Blocks:
+        """Blocks of the interval, in no particular order."""
+        return Blocks(*(values[:len(self)] for values in self._window))
+
+    def scatter(self) -> FloatArray:
+        """Pooled variance (3,) T² of the readings within the blocks; NaN if unknown."""
+        covariance = pooled_covariance(self.blocks()) if self else None
+        return np.full(3, np.nan) if covariance is None else covariance.diagonal()
+
+
+class LearningWindow:
+    """Window of the latest blocks, which provides candidates for the first quiet interval.
+
+    `learn` [s] is the required duration, `length` [s] that of a block; at most `max_blocks` blocks
+    of equal readings are stored.
+    """
+
+    def __init__(self, learn: float, length: float, max_blocks: int) -> None:
+        # Measured between block centres; the blocks of a slow sensor may be longer than `length`.
+        self._min_duration = learn - 1.5 * length
+        self._constant_blocks: deque[Block] = deque(maxlen=max_blocks)
+        self._recent: deque[Block] = deque()
+
+    def clear(self) -> None:
+        """Discard all blocks."""
+        self._constant_blocks.clear()
+        self._recent.clear()
+
+    def segments(self, block: Block, is_stuck: bool) -> Iterator[deque[Block]]:
+        """Add a block; yield the candidate intervals that are long enough, best first."""
+        self._recent.append(block)
+        if is_stuck:
+            # The steps are unknown until the first change, which may be due to a target.
+            self._constant_blocks.append(block)
+        elif self._constant_blocks \
+                and self._constant_blocks[-1].time - self._constant_blocks[0].time \
+                >= self._min_duration:
+            yield self._constant_blocks
+        while len(self._recent) > 3 and block.time - self._recent[1].time >= self._min_duration:
+            self._recent.popleft()
+        if len(self._recent) >= 3 and block.time - self._recent[0].time >= self._min_duration:
+            yield self._recent

@@ -17,15 +17,10 @@ MIN_CORRELATION = 0.7
 """Minimum correlation of two sensors that measured the same knocks."""
 
 MAX_RIVAL_RATIO = 0.9
-"""Correlation at a second lag, relative to that at the best lag, above which the lag is
-ambiguous."""
+"""Maximum correlation at a second lag, relative to the best one, of an unambiguous lag."""
 
-CONTEXT_S = 5.0
-"""[s] Interval before the first and after the last knock that is compared in a long recording, so
-that the signal at rest is included."""
-
-MARGIN_S = 0.1
-"""[s] Interval before and after a knock that is compared."""
+CONTEXT_S, MARGIN_S = 5.0, 0.1
+"""[s] Interval beside the first and last knock that is compared, and beside a knock."""
 
 _Series: TypeAlias = tuple[FloatArray, FloatArray]
 """Times (n,) [s] and values (n,)."""
@@ -51,10 +46,7 @@ def _no_lag(reason: str, correlation: float = float('nan')) -> Lag:
 
 
 def shock(acceleration: FloatArray) -> FloatArray:
-    """Magnitude (n,) of shocks in an acceleration (n, 3), m/s², in any orientation of the sensor.
-
-    It is the distance from the median acceleration, minus the median of all distances.
-    """
+    """Magnitude (n,) above rest of the distance of accelerations (n, 3), m/s², from the median."""
     a = np.asarray(acceleration, dtype=float)
     magnitude = np.linalg.norm(a - np.nanmedian(a, axis=0), axis=1)
     above_rest: FloatArray = magnitude - np.nanmedian(magnitude)
@@ -68,8 +60,7 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
     `reference` and `signal` are shocks (see `shock`) at increasing times in s since the same zero;
     `max_lag` bounds the absolute offset, which is positive if the sensor's clock is ahead. The lag
     of the largest correlation ([T10]_ section 6.3) is refined below the sampling interval by least
-    squares, which also yields the std. Raises ValueError for differing shapes, or times that do not
-    increase.
+    squares. Raises ValueError for differing shapes, or times that do not increase.
     """
     a, b = (_validated_series(t_reference, reference, 'reference'),
             _validated_series(t, signal, 'sensor'))
@@ -79,7 +70,7 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
         return _no_lag(f'the knocks are {separation:.3g} s apart, maximum {max_lag:g} s')
     a, b = _around_knocks(a, b, max_lag), _around_knocks(b, a, max_lag)
     for name, (_, s) in (('reference', a), ('sensor', b)):
-        if len(s) < 8 or not _is_knock(s).any():
+        if not _has_knock(s):
             return _no_lag(f'the {name} measured no knock')
     lag, correlation, reason = _coarse_lag(a, b, max_lag)
     if reason:
@@ -126,7 +117,7 @@ def _without_cut_knocks(t: FloatArray, s: FloatArray) -> _Series:
 
 def _knock_separation(a: _Series, b: _Series, max_lag: float) -> float | None:
     """Smallest interval [s] between knocks of two series; None if none, or within `max_lag`."""
-    if not (len(a[1]) > 7 and len(b[1]) > 7 and _is_knock(a[1]).any() and _is_knock(b[1]).any()):
+    if not (_has_knock(a[1]) and _has_knock(b[1])):
         return None
     s, t = a[0][_is_knock(a[1])], b[0][_is_knock(b[1])]
     next_index = np.clip(np.searchsorted(t, s), 0, len(t) - 1)
@@ -137,7 +128,7 @@ def _knock_separation(a: _Series, b: _Series, max_lag: float) -> float | None:
 
 def _around_knocks(a: _Series, b: _Series, max_lag: float) -> _Series:
     """Part of series `a` around the knocks of `b`; all of `a` if `b` has no knock."""
-    if len(b[1]) < 8 or not _is_knock(b[1]).any():
+    if not _has_knock(b[1]):
         return a
     first, last = _knock_times(*b)
     is_near = (a[0] >= first - max_lag - CONTEXT_S) & (a[0] <= last + max_lag + CONTEXT_S)
@@ -149,6 +140,11 @@ def _is_knock(s: FloatArray) -> BoolArray:
     rest_level = 1.4826 * np.median(np.abs(s - np.median(s)))
     is_loud: BoolArray = s > KNOCK_THRESHOLD * max(rest_level, 1e-3)
     return is_loud
+
+
+def _has_knock(s: FloatArray) -> bool:
+    """Whether a signal is long enough and contains a knock."""
+    return len(s) > 7 and bool(_is_knock(s).any())
 
 
 def _knock_times(t: FloatArray, s: FloatArray) -> tuple[float, float]:

@@ -1,7 +1,7 @@
 """Calibration of readings one by one, compiled; the rules are in `readings.hpp`.
 
 `sensors` is an array of `SENSOR`. Functions without an argument `row` or `rows` require an array
-with a single element.
+with a single element. Structured arrays are updated.
 """
 
 from typing import Any
@@ -62,237 +62,64 @@ def calibrate_readings(
         out_covariances: FloatArray) -> int:
     """Calibrate the readings of a batch from index `next` on, until Python must handle a case.
 
-    Parameters
-    ----------
-    sensors : (n_sensors,) SENSOR array
-        Updated.
-    limits : (1,) LIMITS array
-    rows : (n,) int array
-        Index of the sensor of each reading; negative if unknown.
-    stamps : (n,) int array, ns
-    fields : (n, 3) array, T
-        Raw fields.
-    own : (n,) int array
-        State of the covariance in the message: NONE, VALID or INVALID.
-    covariances : (n, 3, 3) array, T²
-        Ignored where `own` is NONE.
-    batches : (1,) BATCH array
-        Updated.
-    out_rows : (m,) int array
-        Output: index of the sensor of each calibrated reading.
-    out_stamps : (m,) int array, ns
-        Output: timestamps.
-    out_fields : (m, 3) array, T
-        Output: fields minus the background.
-    out_covariances : (m, 3, 3) array, T²
-        Output: noise covariances. All outputs are appended from `n_out` on.
-
-    Returns
-    -------
-    int
-        DONE, or the reason for stopping; `row` and `stamp_ns` of the batch identify the reading.
-
-    Raises
-    ------
-    IndexError
-        If an output array is full, or the index of a sensor is out of range.
+    `rows` (n,) are the indices of the sensors, negative if unknown, `stamps` (n,) in ns, `fields`
+    (n, 3) in T raw, `own` (n,) the states of the covariances (n, 3, 3) in T² of the messages: NONE
+    (ignored), VALID or INVALID. Calibrated readings (m, ...) are appended to the outputs from
+    `n_out` on: indices of sensors, timestamps, fields minus the background, noise covariances.
+    `limits` and `batches` have one element. Returns DONE, or the reason for stopping; `row` and
+    `stamp_ns` of the batch identify the reading. Raises IndexError if an output array is full, or
+    the index of a sensor is out of range.
     """
 
 def use_reading(
         sensors: StructArray, limits: StructArray, batches: StructArray, row: int, stamp: int,
         field: FloatArray, own: int, covariance: FloatArray, out_rows: IntArray,
         out_stamps: IntArray, out_fields: FloatArray, out_covariances: FloatArray) -> bool:
-    """Calibrate a reading that has passed the screening.
+    """Calibrate a reading (3,) T, after the iron correction, that has passed the screening.
 
-    Parameters
-    ----------
-    sensors : (n_sensors,) SENSOR array
-        Updated.
-    limits : (1,) LIMITS array
-    batches : (1,) BATCH array
-        Updated.
-    row : int
-        Index of the sensor.
-    stamp : int, ns
-    field : (3,) array, T
-        Field after the iron correction.
-    own : int
-        State of the covariance in the message: NONE, VALID or INVALID.
-    covariance : (3, 3) array, T²
-        Covariance in the message; ignored if `own` is NONE.
-    out_rows : (m,) int array
-        As for `calibrate_readings`.
-    out_stamps : (m,) int array, ns
-        As for `calibrate_readings`.
-    out_fields : (m, 3) array, T
-        As for `calibrate_readings`.
-    out_covariances : (m, 3, 3) array, T²
-        As for `calibrate_readings`.
-
-    Returns
-    -------
-    bool
-        False if a complete block must be evaluated first; the reading has not been used then.
+    The other arguments are those of `calibrate_readings`. False if a complete block must be
+    evaluated first; the reading has not been used then.
     """
 
 def subtract(sensors: StructArray, time: float, field: FloatArray, out: FloatArray) -> None:
-    """Subtract the background from a field.
-
-    Parameters
-    ----------
-    sensors : (1,) SENSOR array
-    time : float, s
-    field : (3,) array, T
-    out : (3,) array, T
-        Overwritten.
-    """
+    """Subtract the background at `time` in s from a field (3,) T, into `out` (3,)."""
 
 def steps_of(sensors: StructArray, are_corrected: bool) -> FloatArray:
-    """Quantisation steps of the axes of a sensor.
-
-    Parameters
-    ----------
-    sensors : (1,) SENSOR array
-    are_corrected : bool
-        Whether to apply the soft-iron correction to the steps.
-
-    Returns
-    -------
-    (3,) array, T
-        0 if the steps are too fine to be observed, inf if the axis has never changed.
-    """
+    """Quantisation steps (3,) T of a sensor, after soft-iron correction if `are_corrected`; 0 if
+    too fine to be observed, inf if the axis has never changed."""
 
 def complete_steps(variance: FloatArray, steps: FloatArray) -> None:
-    """Complete unknown steps in place; see `resolution.completed_steps`.
-
-    Parameters
-    ----------
-    variance : (3,) array, T²
-        Noise variance of each axis; NaN for a missing axis.
-    steps : (3,) array, T
-        Updated.
-    """
+    """Complete unknown `steps` (3,) T in place; see `sensor_state.completed_steps`."""
 
 def apply_steps(sensors: StructArray, freeze_std: float, limits: FloatArray) -> None:
-    """Add the quantisation variance of a sensor to its noise.
-
-    Reads `noise`; writes `step_variance` and `noise_std`.
-
-    Parameters
-    ----------
-    sensors : (1,) SENSOR array
-        Updated.
-    freeze_std : float
-        Number of standard deviations of the noise in `limits`.
-    limits : (3,) array, T
-        Overwritten: maximum difference between the mean of a block and the background.
-    """
+    """Add the quantisation variance of a sensor to its noise: reads `noise`; writes
+    `step_variance`, `noise_std` and `limits` (3,) T, the maximum difference between the mean of a
+    block and the background, of `freeze_std` standard deviations of the noise."""
 
 def block_moments(sensors: StructArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-    """Attributes of `blocks.Block` for the latest complete block.
-
-    Parameters
-    ----------
-    sensors : (1,) SENSOR array
-
-    Returns
-    -------
-    time : float, s
-    mean : (3,) array, T
-    scatter : (3, 3) array, T²
-    n : (3,) array
-    """
+    """Attributes of `blocks.Block` for the latest complete block."""
 
 def line_through(time: FloatArray, n: FloatArray, y: FloatArray, centre: float
                  ) -> tuple[FloatArray, FloatArray]:
-    """Weighted least-squares line of each axis; see `blocks.line_through`.
-
-    Parameters
-    ----------
-    time : (k,) array, s
-        Mean time of each block.
-    n : (k, 3) array
-        Number of readings of each block, per axis.
-    y : (k, 3) array, T
-        Mean of each block.
-    centre : float, s
-        Time at which the mean is evaluated.
-
-    Returns
-    -------
-    mean : (3,) array, T
-    slope : (3,) array, T/s
-    """
+    """Weighted least-squares line of each axis through the means `y` (k, 3) T of blocks of `n`
+    (k, 3) readings at `time` (k,) s: mean (3,) T at `centre` in s, and slope (3,) T/s."""
 
 def pooled_covariance(scatter: FloatArray, n: FloatArray) -> FloatArray | None:
-    """Noise covariance from the scatter within blocks; see `blocks.pooled_covariance`.
-
-    Parameters
-    ----------
-    scatter : (k, 3, 3) array, T²
-        Sum of squared deviations of each block.
-    n : (k, 3) array
-        Number of readings of each block, per axis.
-
-    Returns
-    -------
-    (3, 3) array or None, T²
-    """
+    """Noise covariance (3, 3) T² from the scatter (k, 3, 3) T² within blocks of `n` (k, 3)
+    readings; see `blocks.pooled_covariance`."""
 
 def note_step(sensors: StructArray, stamp: int, raw: FloatArray) -> None:
-    """Update the quantisation steps and the time of the latest change of each axis.
-
-    Parameters
-    ----------
-    sensors : (1,) SENSOR array
-        Updated.
-    stamp : int, ns
-    raw : (3,) array, T
-        Raw reading; NaN for a missing axis.
-    """
+    """Update the quantisation steps and the time of the latest change of each axis with a raw
+    reading (3,) T at `stamp` in ns."""
 
 def is_stuck(sensors: StructArray, field: FloatArray) -> bool:
-    """Record a reading, and return whether its repetitions are too many to be due to chance.
-
-    Parameters
-    ----------
-    sensors : (1,) SENSOR array
-        Updated.
-    field : (3,) array, T
-        Reading; NaN for a missing axis.
-
-    Returns
-    -------
-    bool
-    """
+    """Record a reading (3,) T, and return whether its repetitions are too many to be due to
+    chance."""
 
 def screen_spike(sensors: StructArray, threshold: float, stamp: int, field: FloatArray) -> int:
-    """Classify a reading without its own covariance.
-
-    Parameters
-    ----------
-    sensors : (1,) SENSOR array
-        Updated.
-    threshold : float
-        Minimum magnitude of a spike in standard deviations of the noise.
-    stamp : int, ns
-    field : (3,) array, T
-        Reading; NaN for a missing axis.
-
-    Returns
-    -------
-    int
-        PASSES, HELD, SPIKE or RELEASED.
-    """
+    """Classify a reading (3,) T without its own covariance as PASSES, HELD, SPIKE or RELEASED;
+    `threshold` is the minimum magnitude of a spike in standard deviations of the noise."""
 
 def collect(sensors: StructArray, time: float, field: FloatArray) -> None:
-    """Add a reading to the current block; if that block has ended, start the next block first.
-
-    Parameters
-    ----------
-    sensors : (1,) SENSOR array
-        Updated.
-    time : float, s
-    field : (3,) array, T
-        Reading; NaN for a missing axis.
-    """
+    """Add a reading (3,) T to the current block; if that block has ended, start the next block
+    first."""

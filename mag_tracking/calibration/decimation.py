@@ -9,9 +9,8 @@ from mag_tracking.arrays import FloatArray
 ATTENUATION_DB = 60.0
 """Attenuation of the frequencies that alias into the pass band."""
 PASS_FRACTION = 0.5
-"""Pass band as a fraction of half the output rate. The transition band ends at the edge of
-the pass band mirrored about half the output rate, so that only frequencies above the pass band
-alias. A wider pass band would increase the delay, which is about four output intervals."""
+"""Pass band as a fraction of half the output rate; only frequencies above the pass band alias. The
+delay is about four output intervals, and more for a wider pass band."""
 GAP_TOLERANCE = 0.5
 """Relative difference from the median interval beyond which an interval is a gap."""
 RATE_SAMPLES = 32
@@ -23,8 +22,7 @@ def lowpass(factor: int) -> FloatArray:
     # The import takes 0.3 s, and most sensors need no filter.
     from scipy.signal import firwin, kaiserord
 
-    width = 2.0 * (1.0 - PASS_FRACTION) / factor
-    n, beta = kaiserord(ATTENUATION_DB, width)
+    n, beta = kaiserord(ATTENUATION_DB, 2.0 * (1.0 - PASS_FRACTION) / factor)
     taps: FloatArray = firwin(n | 1, 1.0 / factor, window=('kaiser', beta))
     return taps
 
@@ -32,10 +30,10 @@ def lowpass(factor: int) -> FloatArray:
 class Decimator:
     """Decimator of one sensor to about `rate` Hz, an integer fraction of the sensor's rate.
 
-    The filter has linear phase (`scipy.signal.firwin`), and its delay is subtracted from the
-    timestamps ([T10]_ section 6.3 reduces 100 Hz to 12.5 Hz likewise). The rate is measured from
-    the first samples; `factor`, the ratio of input to output rate, is None until then. After a gap
-    or a clock step the filter restarts, because filtering across it would produce an invalid field.
+    The filter has linear phase, and its delay is subtracted from the timestamps ([T10]_ section 6.3
+    reduces 100 Hz to 12.5 Hz likewise). The rate is measured from the first samples; `factor`, the
+    ratio of input to output rate, is None until then. The filter restarts after a gap or clock
+    step.
     """
 
     def __init__(self, rate: float) -> None:
@@ -51,12 +49,11 @@ class Decimator:
         self._n_until_output = 0
 
     def feed(self, stamp_ns: int, field: FloatArray) -> list[tuple[int, FloatArray]]:
-        """Add a sample (3,) T; return the outputs that become available, usually none.
-
-        An output is the timestamp [ns] of the filter's centre and a field; NaN for an axis that any
-        sample of the filter lacks.
-        """
-        if self._window and self._is_gap(stamp_ns):
+        """Add a sample (3,) T; return the outputs that become available: timestamp [ns] of the
+        filter's centre and field, NaN for incomplete axes."""
+        interval = stamp_ns - self._window[-1][0] if self._window else 1
+        if interval <= 0 or self._window and self.factor is not None and abs(
+                interval - self._interval) > GAP_TOLERANCE * self._interval:
             self.reset()
         self._window.append((stamp_ns, field))
         if self.factor is None:
@@ -64,7 +61,15 @@ class Decimator:
         if self._taps is None:
             self._window = deque(list(self._window)[-2:])
             return [(stamp_ns, field)]
-        return self._filter(self.factor, self._taps)
+        if len(self._window) < len(self._taps):
+            return []
+        if self._n_until_output:
+            self._n_until_output -= 1
+            return []
+        self._n_until_output = self.factor - 1
+        # The filter is symmetric, so its output belongs to the centre sample.
+        return [(self._window[len(self._taps) // 2][0],
+                 self._taps @ np.array([f for _, f in self._window]))]
 
     @property
     def n_waiting(self) -> int:
@@ -77,12 +82,6 @@ class Decimator:
             raise ValueError('the sampling rate of the sensor is not known yet')
         return 1.0 if self._taps is None else float(self._taps @ self._taps)
 
-    def _is_gap(self, stamp_ns: int) -> bool:
-        """Whether the interval between the previous sample and this sample is a gap."""
-        interval = stamp_ns - self._window[-1][0]
-        return interval <= 0 or (self.factor is not None and abs(
-            interval - self._interval) > GAP_TOLERANCE * self._interval)
-
     def _measure_rate(self) -> list[tuple[int, FloatArray]]:
         """Measure the rate if enough samples are stored; return the outputs of these samples."""
         if len(self._window) < RATE_SAMPLES:
@@ -94,15 +93,3 @@ class Decimator:
         stored_samples = list(self._window)
         self.reset()
         return [out for stamp, field in stored_samples for out in self.feed(stamp, field)]
-
-    def _filter(self, factor: int, taps: FloatArray) -> list[tuple[int, FloatArray]]:
-        """Return the output of the filter as a list; empty if no output is due."""
-        if len(self._window) < len(taps):
-            return []
-        if self._n_until_output:
-            self._n_until_output -= 1
-            return []
-        self._n_until_output = factor - 1
-        # The filter is symmetric, so its output belongs to the centre sample.
-        middle = self._window[len(taps) // 2][0]
-        return [(middle, taps @ np.array([f for _, f in self._window]))]

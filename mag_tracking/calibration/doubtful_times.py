@@ -1,8 +1,5 @@
-"""Intervals in which the input of a sensor was doubtful, as timestamps of its readings.
-
-The stages and programs that diagnose the input report the intervals by reason and sensor. The
-tracker marks the tracks that use such readings as ambiguous, for the same reason.
-"""
+"""Intervals, as timestamps of readings, in which the input of a sensor was doubtful; the tracker
+marks tracks that use it as ambiguous."""
 
 from collections.abc import Mapping
 from typing import TypeAlias
@@ -24,10 +21,7 @@ MAX_INTERVALS = 16
 
 def updated(times: DoubtfulTimes, stamp_ns: int, is_doubtful: bool,
             max_intervals: int = MAX_INTERVALS) -> DoubtfulTimes:
-    """Return the intervals, updated with the state of the background from a timestamp on.
-
-    Beyond `max_intervals`, the oldest intervals are removed.
-    """
+    """Return at most `max_intervals`, updated with the state from a timestamp on."""
     is_open = bool(times) and times[-1][1] is None
     if is_doubtful and not is_open:
         return (*times, (stamp_ns, None))[-max_intervals:]
@@ -49,8 +43,8 @@ def merged(earlier: Mapping[str, DoubtfulTimes], latest: Mapping[str, DoubtfulTi
     """Merge earlier and latest doubtful intervals of sensors.
 
     A latest interval replaces an earlier one that begins at the same time or within it. An earlier
-    interval without an end ends where the next one begins. If a sensor has no latest intervals, its
-    background was replaced, and its open interval is removed.
+    open interval ends where the next one begins, or is removed if the sensor has no latest
+    intervals.
     """
     out = dict(earlier)
     for name, times in latest.items():

@@ -1,75 +1,62 @@
 """Hard and soft iron of a three-axis magnetometer that is tumbled in a uniform field.
 
-In a uniform field, the readings y of a rotating sensor lie on an ellipsoid; B = C (y - o) maps them
-to a sphere. A rotation of B does not change its magnitude, so C is chosen symmetric: the
-orientation of the sensor's axes relative to its case is not observable from field magnitudes.
+The readings y lie on an ellipsoid; B = C (y - o) maps them to a sphere. A rotation of B does not
+change its magnitude, so C is chosen symmetric: the orientation of the axes is not observable.
 """
 
-from dataclasses import dataclass
-from typing import TypedDict
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray
-from mag_tracking.calibration.ellipsoid_refinement import BASIS, Quality, refine_ellipsoid
-from mag_tracking.calibration.missing_marks import are_marked, missing_marks
-from mag_tracking.calibration.quadric import POSSIBLE_CAUSES, fit_quadric
-from mag_tracking.calibration.saturation import saturated_readings, with_margin
+from mag_tracking.calibration.ellipsoid import (
+    BASIS,
+    POSSIBLE_CAUSES,
+    Quality,
+    fit_quadric,
+    refine_ellipsoid,
+)
+from mag_tracking.calibration.reading_faults import (
+    are_marked,
+    missing_marks,
+    saturated_readings,
+    with_margin,
+)
 
-MIN_READINGS = 50
-"""Minimum number of readings."""
+MIN_READINGS, MIN_DIRECTIONS = 50, 18
+"""Minimum number of readings, and of cells with readings: two for each of the nine parameters."""
 
-MIN_DIRECTIONS = 18
-"""Minimum number of cells with readings: two for each of the nine parameters."""
-
-MIN_COVERAGE = 0.01
-"""Minimum coverage; at this value, an error shared by adjacent directions is amplified ten
-times."""
-
-GOOD_COVERAGE = 0.1
-"""Coverage below which a warning is issued; at this value, errors are amplified three times."""
+MIN_COVERAGE, GOOD_COVERAGE = 0.01, 0.1
+"""Coverage at which errors of adjacent directions are amplified ten times (rejected), and three
+times (warning)."""
 
 MIN_THICKNESS = 0.05
-"""Minimum ratio of smallest to largest spread of the readings about their mean; a flatter set is
-due to a rotation about a single axis."""
+"""Minimum ratio of smallest to largest spread of the readings; one axis of rotation has less."""
 
 MAX_AXIS_RATIO = 5.0
-"""Maximum ratio of longest to shortest axis; soft iron on a sensor's board causes a ratio of two or
-slightly more."""
+"""Maximum ratio of longest to shortest axis; soft iron on a sensor's board causes about two."""
 
 MAX_SCATTER = 0.1
-"""Maximum scatter about the ellipsoid relative to its radius, without outliers; 0.01 to 0.03 is
-typical. The noise of a sensor at rest fills a ball, with a scatter of 0.3 to 0.4 about any
-ellipsoid."""
+"""Maximum scatter about the ellipsoid relative to its radius, without outliers: 0.01 to 0.03 is
+typical, the noise of a sensor at rest 0.3 to 0.4."""
 
 MAX_OFFSET_STD = 0.1
 """Maximum standard deviation of the offset relative to the radius, in the worst direction."""
 
 GOOD_RESIDUAL = 0.05
-"""Coefficient of variation (std/mean) of the corrected magnitudes above which a warning is issued:
-the field was not uniform."""
+"""Coefficient of variation (std/mean) of corrected magnitudes above which a warning is issued."""
 
-GOOD_OUTLIER_FRACTION = 0.01
-"""Fraction of outliers above which a warning is issued."""
+GOOD_OUTLIER_FRACTION, MAX_OUTLIER_FRACTION = 0.01, 0.2
+"""Fraction of outliers above which a warning is issued, or the scatter is not meaningful."""
 
-MAX_OUTLIER_FRACTION = 0.2
-"""Maximum fraction of outliers; beyond it, the robust scatter is not meaningful."""
-
-MIN_GLITCH_DISTANCE = 5.0
-"""Minimum distance of a glitch (a data transfer error) from the median reading, in multiples of
-the median distance."""
-
-MAX_GLITCH_FRACTION = 0.02
-"""Maximum fraction of readings beyond `MIN_GLITCH_DISTANCE`; if it is exceeded, none of them is a
-glitch. If the sensor was at rest most of the time, all other readings are far from the median."""
+MIN_GLITCH_DISTANCE, MAX_GLITCH_FRACTION = 5.0, 0.02
+"""Minimum distance of glitches (data transfer errors) from the median, in median distances, and
+their maximum fraction; more are due to a sensor that was mostly at rest."""
 
 
 @dataclass(frozen=True)
 class EllipsoidFit:
-    """Calibration B = correction (y - offset), its accuracy, and its warnings.
-
-    Results that were not computed because the fit was rejected are NaN.
-    """
+    """Calibration B = correction (y - offset), its accuracy and warnings; NaN if not computed."""
 
     offset: FloatArray
     """(3,), unit of the readings, sensor frame: hard iron and bias."""
@@ -77,11 +64,9 @@ class EllipsoidFit:
     """(3, 3) symmetric positive definite, field unit per reading unit: soft iron, scale factors and
     non-orthogonality, up to a rotation."""
     field_magnitude: float
-    """Magnitude of B after correction: the given value, or the mean radius for det(correction) = 1,
-    in the unit of the readings."""
+    """Magnitude of B: as given, or the mean radius for det(correction) = 1, in reading units."""
     residual: float
-    """Coefficient of variation (std/mean) of ‖B‖ over all readings after correction, including
-    outliers and saturated readings."""
+    """Coefficient of variation (std/mean) of ‖B‖ over all readings, including excluded ones."""
     residual_before: float
     """Coefficient of variation (std/mean) of ‖y‖, the magnitudes before correction."""
     offset_std: FloatArray
@@ -93,9 +78,8 @@ class EllipsoidFit:
     coverage: float
     """0 to 1: smallest eigenvalue of the weighted mean of f fᵀ over the directions, with the nine
     spherical harmonics f to degree two, which are the effects of the nine parameters on ‖B‖. One
-    for even coverage, 0.008 for a hemisphere or a band of +-21 degrees, zero for a ring. Errors
-    shared by adjacent directions are amplified by up to 1/sqrt(coverage) relative to even
-    coverage."""
+    for even coverage, 0.008 for a hemisphere, zero for a ring. Errors shared by adjacent directions
+    are amplified by up to 1/sqrt(coverage)."""
     empty_octants: tuple[str, ...]
     """Octants of the sensor frame with few or no corrected readings, e.g. '+x-y+z'."""
     n_readings: int
@@ -105,14 +89,16 @@ class EllipsoidFit:
     n_saturated: int
     """Number of readings excluded because of saturation."""
     n_outliers: int
-    """Number of excluded glitches, plus the number of readings further than OUTLIER_STDS robust
-    standard deviations from the ellipsoid. The robust loss limits the influence of the latter."""
-    converged: bool
-    """Whether the calibration is valid."""
+    """Number of excluded glitches, plus that of readings beyond OUTLIER_STDS from the ellipsoid."""
     reason: str
     """Reason for the rejection of the fit; empty if the fit is accepted."""
     warnings: tuple[str, ...]
     """Warnings about readings and accuracy."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether the calibration is valid."""
+        return not self.reason
 
     def correct(self, readings: FloatArray) -> FloatArray:
         """Field (n, 3), in the unit of `field_magnitude`, of readings in the unit of `offset`."""
@@ -120,41 +106,17 @@ class EllipsoidFit:
         return field
 
 
-class _Counts(TypedDict):
-    """Counts and residual that follow from the readings alone; see `EllipsoidFit`."""
-
-    n_readings: int
-    n_missing: int
-    n_saturated: int
-    n_outliers: int
-    residual_before: float
-
-
-class _Parameters(TypedDict):
-    """Parameters and standard deviations in the units of `EllipsoidFit`."""
-
-    offset: FloatArray
-    correction: FloatArray
-    field_magnitude: float
-    offset_std: FloatArray
-    correction_std: FloatArray
-    field_magnitude_std: float
-
-
 def fit_ellipsoid(readings: FloatArray, field_magnitude: float | None = None) -> EllipsoidFit:
     """Fit the offset and the symmetric correction that map all readings to the same magnitude.
 
-    `readings` (n, 3) are chronological, in any unit, from a sensor rotated in a uniform field;
-    those with a NaN are excluded. `field_magnitude` is in the unit requested for the corrected
-    field. The result is not converged, with a reason, if the readings do not determine the nine
-    parameters. Raises ValueError for a wrong shape, an infinite reading, or a magnitude that is not
-    positive and finite.
+    `readings` (n, 3) are chronological, in any unit, from a sensor rotated in a uniform field.
+    `field_magnitude` is in the unit requested for the corrected field. Raises ValueError for a
+    wrong shape, an infinite reading, or a magnitude that is not positive and finite.
 
-    A linear quadric fit initialises a robust geometric least-squares fit of ‖C (y - o)‖, with
-    smaller weights for crowded directions, e.g. of a sensor at rest. Noise of relative std s
-    increases the radius by s², which is not corrected. The stds are from a block jackknife in time.
-    [Renaudin10]_ and [KokSchon16]_ section V.A convert the quadric into offset and correction; the
-    measure of coverage and the rejection criteria are additions of this package.
+    A quadric initialises a robust geometric fit, with smaller weights for crowded directions. Noise
+    of relative std s increases the radius by s², which is not corrected. [Renaudin10]_ and
+    [KokSchon16]_ section V.A convert the quadric into offset and correction; the measure of
+    coverage and the rejection criteria are additions of this package.
     """
     readings = _validated(readings, field_magnitude)
     marks = missing_marks(readings)
@@ -164,34 +126,34 @@ def fit_ellipsoid(readings: FloatArray, field_magnitude: float | None = None) ->
     valid = readings[present & ~is_saturated.any(axis=1)]
     glitches = _glitches(valid)
     valid = valid[~glitches]
-    counts: _Counts = {
-        'n_readings': len(valid), 'n_missing': int((~present).sum()),
-        'n_saturated': int(is_saturated.any(axis=1).sum()), 'n_outliers': int(glitches.sum()),
-        'residual_before': _relative_spread(np.linalg.norm(readings[present], axis=1))}
-    notes = _notes_on_input(counts, is_saturated, marks)
-    reason = _insufficient_data(valid)
-    if reason:
-        return _rejected_fit(reason, counts, notes)
+    nan = float('nan')
+    fit = EllipsoidFit(
+        offset=np.full(3, nan), correction=np.full((3, 3), nan), field_magnitude=nan, residual=nan,
+        residual_before=_relative_spread(np.linalg.norm(readings[present], axis=1)),
+        offset_std=np.full(3, nan), correction_std=np.full((3, 3), nan), field_magnitude_std=nan,
+        coverage=nan, empty_octants=(), n_readings=len(valid), n_missing=int((~present).sum()),
+        n_saturated=int(is_saturated.any(axis=1).sum()), n_outliers=int(glitches.sum()),
+        reason=_insufficient_data(valid), warnings=_notes_on_input(present, is_saturated, marks))
+    if fit.reason:
+        return fit
     centre, scale = valid.mean(axis=0), float(np.sqrt(valid.var(axis=0).sum()))
     z = (valid - centre) / scale
     o, C, reason = fit_quadric(z)
     if reason:
-        return _rejected_fit(reason, counts, notes)
+        return replace(fit, reason=reason)
     o, C, P, quality = refine_ellipsoid(z, o, C)
     axes = np.linalg.eigvalsh(C)
     if not axes[0] * MAX_AXIS_RATIO >= axes[2]:
-        return _rejected_fit(f'the axes of the ellipsoid have a ratio of {axes[0]:.2g} to '
-                             f'{axes[2]:.2g}, maximum 1 to {MAX_AXIS_RATIO:g}; {POSSIBLE_CAUSES}',
-                             counts, notes)
-    counts['n_outliers'] += quality['n_outliers']
-    parameters = _in_units(o, C, P, centre, scale, field_magnitude)
-    residual = _relative_spread(np.linalg.norm(
-        (readings[present] - parameters['offset']) @ parameters['correction'], axis=1))
-    outlier_fraction = counts['n_outliers'] / (len(valid) + glitches.sum())
-    reason = _rejection_reason(C, P, quality, outlier_fraction)
-    return EllipsoidFit(**parameters, **counts, residual=residual, coverage=quality['coverage'],
-                        empty_octants=quality['empty'], converged=not reason, reason=reason,
-                        warnings=notes + _notes_on_fit(residual, quality, outlier_fraction))
+        return replace(fit, reason=f'the axes of the ellipsoid have a ratio of {axes[0]:.2g} to '
+                       f'{axes[2]:.2g}, maximum 1 to {MAX_AXIS_RATIO:g}; {POSSIBLE_CAUSES}')
+    fit = _in_units(fit, o, C, P, centre, scale, field_magnitude)
+    residual = _relative_spread(np.linalg.norm(fit.correct(readings[present]), axis=1))
+    n_outliers = fit.n_outliers + quality.n_outliers
+    outlier_fraction = n_outliers / (len(valid) + glitches.sum())
+    return replace(fit, residual=residual, n_outliers=n_outliers, coverage=quality.coverage,
+                   empty_octants=quality.empty,
+                   reason=_rejection_reason(C, P, quality, outlier_fraction),
+                   warnings=fit.warnings + _notes_on_fit(residual, quality, outlier_fraction))
 
 
 def _validated(readings: FloatArray, field_magnitude: float | None) -> FloatArray:
@@ -213,26 +175,27 @@ def _relative_spread(magnitudes: FloatArray) -> float:
     return float(magnitudes.std() / magnitudes.mean()) if magnitudes.any() else float('nan')
 
 
-def _notes_on_input(counts: _Counts, is_saturated: BoolArray,
+def _notes_on_input(present: BoolArray, is_saturated: BoolArray,
                     marks: FloatArray) -> tuple[str, ...]:
     """Warnings about missing and saturated readings."""
     notes: tuple[str, ...] = ()
-    if counts['n_missing']:
+    if not present.all():
         values = ', '.join(f'{v:.6g}' for v in np.unique(marks[~np.isnan(marks)]))
-        notes += (f'readings excluded because of a missing axis: {counts["n_missing"]}'
+        notes += (f'readings excluded because of a missing axis: {np.count_nonzero(~present)}'
                   + (f' (marked by the value {values})' if values else ''),)
-    if counts['n_saturated']:
+    if n_saturated := int(is_saturated.any(axis=1).sum()):
         axes = ', '.join(name for name, is_cut in zip('xyz', np.any(is_saturated, axis=0),
                                                       strict=True) if is_cut)
-        notes += (f'readings excluded because of saturation of {axes}: {counts["n_saturated"]}',)
+        notes += (f'readings excluded because of saturation of {axes}: {n_saturated}',)
     return notes
 
 
 def _glitches(y: FloatArray) -> BoolArray:
     """Flags (n,) of readings far from the median, unless these are too many to be glitches."""
-    distance = np.linalg.norm(y - np.median(y, axis=0), axis=1) if len(y) else np.zeros(0)
-    is_far = distance > MIN_GLITCH_DISTANCE * np.median(distance) if len(y) \
-        else np.zeros(0, dtype=bool)
+    if not len(y):
+        return np.zeros(0, dtype=bool)
+    distance = np.linalg.norm(y - np.median(y, axis=0), axis=1)
+    is_far = distance > MIN_GLITCH_DISTANCE * np.median(distance)
     is_glitch: BoolArray = is_far & (is_far.sum() <= MAX_GLITCH_FRACTION * len(y))
     return is_glitch
 
@@ -252,9 +215,9 @@ def _insufficient_data(y: FloatArray) -> str:
     return ''
 
 
-def _in_units(o: FloatArray, C: FloatArray, P: FloatArray, centre: FloatArray, scale: float,
-              field_magnitude: float | None) -> _Parameters:
-    """Convert normalised parameters and their covariance `P` to the units of the result."""
+def _in_units(fit: EllipsoidFit, o: FloatArray, C: FloatArray, P: FloatArray, centre: FloatArray,
+              scale: float, field_magnitude: float | None) -> EllipsoidFit:
+    """Add normalised parameters with their covariance `P` to the result, in its units."""
     volume = np.linalg.det(C)**(-1.0 / 3.0)
     t = np.einsum('ij,kji->k', np.linalg.inv(C), BASIS)
     if field_magnitude is None:
@@ -264,52 +227,42 @@ def _in_units(o: FloatArray, C: FloatArray, P: FloatArray, centre: FloatArray, s
     else:
         k, magnitude, magnitude_std = field_magnitude / scale, float(field_magnitude), 0.0
         D = k * BASIS
-    return {'offset': centre + scale * o, 'correction': k * C, 'field_magnitude': float(magnitude),
-            'offset_std': scale * np.sqrt(np.diagonal(P)[:3]),
-            'correction_std': np.sqrt(np.einsum('kij,kl,lij->ij', D, P[3:, 3:], D)),
-            'field_magnitude_std': float(magnitude_std)}
+    return replace(
+        fit, offset=centre + scale * o, correction=k * C, field_magnitude=float(magnitude),
+        offset_std=scale * np.sqrt(np.diagonal(P)[:3]),
+        correction_std=np.sqrt(np.einsum('kij,kl,lij->ij', D, P[3:, 3:], D)),
+        field_magnitude_std=float(magnitude_std))
 
 
 def _rejection_reason(C: FloatArray, P: FloatArray, quality: Quality,
                       outlier_fraction: float) -> str:
     """Reason for the rejection of a fit; empty if the fit is accepted."""
-    if quality['scatter'] > MAX_SCATTER:
-        return (f'the scatter about the ellipsoid is {quality["scatter"]:.2g} of the radius, '
+    if quality.scatter > MAX_SCATTER:
+        return (f'the scatter about the ellipsoid is {quality.scatter:.2g} of the radius, '
                 f'maximum {MAX_SCATTER}; {POSSIBLE_CAUSES}')
     if outlier_fraction > MAX_OUTLIER_FRACTION:
         return (f'the fraction of outliers is {outlier_fraction:.2g}, maximum '
                 f'{MAX_OUTLIER_FRACTION}')
-    if quality['directions'] < MIN_DIRECTIONS:
-        return f'readings in {quality["directions"]} directions, minimum {MIN_DIRECTIONS}'
-    if quality['coverage'] < MIN_COVERAGE:
-        return (f'the coverage is {quality["coverage"]:.2g}, minimum {MIN_COVERAGE}; octants with '
-                f'few or no readings: {", ".join(quality["empty"]) or "none"}')
+    if quality.directions < MIN_DIRECTIONS:
+        return f'readings in {quality.directions} directions, minimum {MIN_DIRECTIONS}'
+    if quality.coverage < MIN_COVERAGE:
+        return (f'the coverage is {quality.coverage:.2g}, minimum {MIN_COVERAGE}; octants with '
+                f'few or no readings: {", ".join(quality.empty) or "none"}')
     offset_std = np.sqrt(np.linalg.eigvalsh(C @ P[:3, :3] @ C)[-1])
     if not offset_std <= MAX_OFFSET_STD:
         return (f'the standard deviation of the offset is {offset_std:.2g} of the radius, maximum '
                 f'{MAX_OFFSET_STD}')
-    return '' if quality['solved'] else 'least squares did not converge in 100 evaluations'
+    return '' if quality.solved else 'least squares did not converge in 100 evaluations'
 
 
-def _notes_on_fit(residual: float, quality: Quality,
-                  outlier_fraction: float) -> tuple[str, ...]:
+def _notes_on_fit(residual: float, quality: Quality, outlier_fraction: float) -> tuple[str, ...]:
     """Warnings about coverage, residual and outliers."""
     checks = {
-        f'the coverage is {quality["coverage"]:.2g}, recommended at least {GOOD_COVERAGE}':
-            quality['coverage'] < GOOD_COVERAGE,
-        f'octants with few or no readings: {", ".join(quality["empty"])}': quality['empty'],
+        f'the coverage is {quality.coverage:.2g}, recommended at least {GOOD_COVERAGE}':
+            quality.coverage < GOOD_COVERAGE,
+        f'octants with few or no readings: {", ".join(quality.empty)}': quality.empty,
         f'the residual after correction is {residual:.2g}, recommended at most {GOOD_RESIDUAL}':
             residual > GOOD_RESIDUAL,
         f'the fraction of outliers is {outlier_fraction:.2g}':
             outlier_fraction > GOOD_OUTLIER_FRACTION}
     return tuple(note for note, holds in checks.items() if holds)
-
-
-def _rejected_fit(reason: str, counts: _Counts, notes: tuple[str, ...]) -> EllipsoidFit:
-    """Create the result of a rejected fit: the reason, the counts, and NaN for all estimates."""
-    nan = float('nan')
-    return EllipsoidFit(
-        offset=np.full(3, nan), correction=np.full((3, 3), nan), field_magnitude=nan, residual=nan,
-        offset_std=np.full(3, nan), correction_std=np.full((3, 3), nan), field_magnitude_std=nan,
-        coverage=nan, empty_octants=(), converged=False, reason=reason,
-        warnings=notes, **counts)

@@ -1,23 +1,24 @@
-"""Most frequent level of a sensor, which serves as its background if targets are often nearby."""
+"""Most frequent level of a sensor, its background if targets are often nearby.
 
+In dense traffic no interval is quiet for several seconds, and a sensor without a background cannot
+contribute to tracking. The level is provisional until a quiet interval is long enough.
+"""
+
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.calibration.blocks import Blocks, line_through, pooled_covariance
-from mag_tracking.calibration.resolution import TOGGLE_TOLERANCE
+from mag_tracking.calibration import core
+from mag_tracking.calibration.blocks import Block, Blocks, line_through, pooled_covariance, stacked
 
 MAX_CALM_RATIO = 3.0
-"""Maximum standard deviation within a block, relative to the 20 % quantile of all blocks. Blocks
-above this limit are excluded, because a passing target changes the field within a block."""
+"""Maximum std within a block, relative to the 20 % quantile of all blocks; a target exceeds it."""
 
-LEVEL_WIDTH = 4.0
-"""Maximum difference between the mean of a block and its level, in standard deviations of a mean,
-per axis."""
-
-MIN_WIDTH = 5e-9
-"""[T] Minimum tolerance of a level, which allows for drift."""
+LEVEL_WIDTH, MIN_WIDTH = 4.0, 5e-9
+"""Maximum difference between a block and its level per axis, in standard deviations of a mean, and
+at least [T], which allows for drift."""
 
 MIN_REPORTED_FRACTION = 0.5
 """An axis is evaluated if more than this fraction of the blocks contain it."""
@@ -29,11 +30,20 @@ MIN_LEVEL_DISTANCE = 3.0
 """Minimum distance of another level, in widths. A distant target may change a level by less."""
 
 MIN_DURATION_RATIO = 4.0
-"""Minimum duration of a level that replaces the initial level, relative to the duration of the
-initial level. Such a level indicates that a target present at the start has left."""
+"""Minimum duration of a level that replaces the initial level, relative to that of the latter."""
 
 BATCH_SIZE = 64
 """Number of blocks that are compared with all other blocks in one operation, to limit memory."""
+
+WAIT_RATIO = 2.0
+"""Waiting time for a quiet interval, relative to its required length."""
+
+MIN_SEARCHED_BLOCKS, MAX_BLOCKS, SEARCH_GROWTH = 12, 240, 1.1
+"""Minimum and maximum number of searched blocks (a minute of the usual length), and factor by which
+their number must grow between searches."""
+
+MIN_OBSERVED_S = 10.0
+"""[s] Minimum total duration of a level that is considered certain."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +67,17 @@ class MostFrequentLevel:
     width: FloatArray
     """(3,) [T] Maximum difference between the mean of a block and the level."""
 
+    @property
+    def observed_s(self) -> float:
+        """Total duration for which the level was observed [s]."""
+        return self.n_blocks * self.block_s
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the level was observed long enough, and longer than any other level."""
+        return self.observed_s >= MIN_OBSERVED_S \
+            and self.n_blocks >= MIN_DURATION_RATIO * self.n_rival
+
     def is_at(self, level: FloatArray) -> bool:
         """Whether a level (3,) T is the same within `MIN_LEVEL_DISTANCE` widths."""
         return not bool((np.abs(self.level - level) > MIN_LEVEL_DISTANCE * self.width).any())
@@ -66,14 +87,13 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int
                         ) -> MostFrequentLevel | None:
     """Find the most frequent level of chronological blocks, from the earliest `max_blocks` at it.
 
-    `steps` (3,) in T are the quantisation steps, 0 if unknown. None if no level has `MIN_BLOCKS`
+    `steps` (3,) in T are the quantisation steps, inf if unknown. None if no level has `MIN_BLOCKS`
     blocks, or the noise is unknown on all axes.
     """
+    steps = np.where(np.isfinite(steps), steps, 0.0)
     n = np.maximum(blocks.n, 1.0)
     variance = np.einsum('kii->ki', blocks.scatter) / np.maximum(n - 1.0, 1.0)
     variance = np.where(blocks.n > 1, np.maximum(variance, steps**2 / 12.0), np.nan)
-    if np.isnan(variance).all():
-        return None
     # An axis that is rarely reported would exclude the blocks without it.
     is_used = (~np.isnan(variance)).mean(axis=0) > MIN_REPORTED_FRACTION
     if not is_used.any():
@@ -82,7 +102,7 @@ def most_frequent_level(blocks: Blocks, steps: FloatArray, max_blocks: int
     is_calm = (variance[:, is_used] <= MAX_CALM_RATIO**2 * quietest).all(axis=1)
     width = np.full(3, np.nan)
     width[is_used] = np.maximum(LEVEL_WIDTH * np.sqrt(quietest / np.median(n[:, is_used], axis=0)),
-                                np.maximum(TOGGLE_TOLERANCE * steps[is_used], MIN_WIDTH))
+                                np.maximum(core.TOGGLE_TOLERANCE * steps[is_used], MIN_WIDTH))
     calm_rows = np.flatnonzero(is_calm)
     if len(calm_rows) < MIN_BLOCKS:
         return None
@@ -117,3 +137,37 @@ def _densest(means: FloatArray, width: FloatArray) -> IntArray:
         best = densest if np.count_nonzero(densest) > np.count_nonzero(best) else best
     centre = np.median(means[best], axis=0)
     return np.flatnonzero((np.abs(means - centre) <= width).all(axis=1))
+
+
+class ProvisionalLevel:
+    """Collects the blocks of a sensor and periodically determines their most frequent level."""
+
+    def __init__(self, learn_s: float) -> None:
+        self._min_duration_s = WAIT_RATIO * learn_s
+        self.clear()
+
+    def clear(self) -> None:
+        """Discard all blocks."""
+        self._blocks: deque[Block] = deque(maxlen=MAX_BLOCKS)
+        self._n_new, self._n_required = 0, MIN_SEARCHED_BLOCKS
+
+    def collect(self, block: Block) -> None:
+        """Add the next block."""
+        self._blocks.append(block)
+        self._n_new += 1
+
+    def frequent_level(self, steps: FloatArray) -> MostFrequentLevel | None:
+        """Most frequent level; None if none is frequent enough, or too few blocks are new."""
+        blocks = self._blocks
+        if self._n_new < self._n_required \
+                or blocks[-1].time - blocks[0].time < self._min_duration_s:
+            return None
+        self._n_new, self._n_required = 0, max(1, int((SEARCH_GROWTH - 1.0) * len(blocks)))
+        return most_frequent_level(stacked(blocks), steps, MAX_BLOCKS)
+
+    def std(self, frequent: MostFrequentLevel) -> FloatArray:
+        """Uncertainty (3,) T of a frequent level: median distance of all blocks, as a std."""
+        distance, is_known = np.full(3, np.nan), ~np.isnan(frequent.level)
+        means = np.array([block.mean for block in self._blocks])[:, is_known]
+        distance[is_known] = np.nanmedian(np.abs(means - frequent.level[is_known]), axis=0)
+        return 1.4826 * distance

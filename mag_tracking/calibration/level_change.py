@@ -1,21 +1,24 @@
 """Classification of a lasting level change as the arrival or departure of a vehicle.
 
-An approaching vehicle's field grows with the inverse cube of its distance, and the vehicle brakes
-to a stop; a departing vehicle starts slowly, and its field decays with the inverse cube. The far
-end of a change (distant vehicle) therefore lasts longer than the near end (vehicle at the sensor):
-growth accelerates at the far end and decelerates at the near end. The test is an addition of this
+The field of a vehicle that approaches at constant speed grows with the inverse cube of its
+distance: its relative growth accelerates. The change due to a vehicle that starts or stops grows
+with the square of time: its relative growth decelerates. The far end of a change (distant vehicle)
+therefore lasts longer than the near end (vehicle at the sensor). The test is an addition of this
 package.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.blocks import Blocks
-from mag_tracking.calibration.growth import growth_of
+
+MAX_GAP = 2.5
+"""Maximum interval between blocks, in median intervals."""
 
 MAX_SMALL_FRACTION = 0.3
 """Maximum magnitude of the evaluated ends of a change, as a fraction of the total magnitude."""
@@ -30,9 +33,8 @@ MIN_GROWTH = 3.5
 """Minimum ratio of the largest evaluated magnitude to the detection limit."""
 
 MAX_QUARTER_FRACTION = 0.5
-"""Maximum duration of a quarter, less one block, as a fraction of the total growth time; a longer
-quarter is a stall. The theoretical fraction is 0.3 to 0.54 for growth by a factor of 4 to 300. Half
-of that growth takes only a few blocks."""
+"""Maximum duration of a quarter, less one block, relative to the growth time; longer is a stall.
+The theoretical fraction is 0.3 to 0.54 for growth by a factor of 4 to 300."""
 
 MAX_START_RATIO = 0.9
 """Maximum ratio of the first to the second half of the growth time at the near end. The theoretical
@@ -42,11 +44,57 @@ MIN_BLOCKS = 2.0
 """Minimum duration of the longer end in blocks; a step is neither an arrival nor a departure."""
 
 CLEAR_SIZE = 60.0
-"""Minimum magnitude of a clear change in standard deviations of one reading. A clear change is
-classified alone; a smaller change may be classified by a larger change at another sensor."""
+"""Minimum magnitude, in std of one reading, of a change that is classified alone."""
 
 MAX_TIME_DIFFERENCE_S = 3.0
 """[s] Maximum time between the starts of the new levels at sensors near the same target."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Durations of the four quarters in which the magnitude of a change grows by a factor q.
+
+    If it grows with the inverse cube of a distance, each quarter takes q**(1/12) times as long as
+    the next; if with the square of time, q**(1/8) times as long as the previous one.
+    """
+
+    quarters: tuple[float, ...]
+    """(4,) [s] Duration of each quarter of the growth, on a logarithmic scale of the magnitude."""
+
+    @property
+    def early(self) -> float:
+        """Duration of the first two quarters [s]."""
+        return self.quarters[0] + self.quarters[1]
+
+    @property
+    def late(self) -> float:
+        """Duration of the last two quarters [s]."""
+        return self.quarters[2] + self.quarters[3]
+
+    @property
+    def duration(self) -> float:
+        """Total duration [s]."""
+        return self.early + self.late
+
+
+def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> Growth | None:
+    """Measure the growth of `size` (k,) at increasing times (k,) in s, between `low` and `high`.
+
+    It ends where `size` first exceeds `high` and starts where it was last below `low` before. None
+    if it never exceeds `high`, was never below `low` before, or has a gap in between.
+    """
+    times, end, begin = [], int(np.flatnonzero(size > high).min(initial=len(size))), 0
+    for level in np.geomspace(low, high, 5):
+        i = int(np.flatnonzero(size[:end] <= level).max(initial=-1)) + 1
+        if i == 0 or end == len(size):
+            return None
+        # Interpolate on a logarithmic scale; growth from zero is instantaneous.
+        rate = np.log(size[i] / size[i - 1]) if size[i - 1] > 0.0 else np.inf
+        times.append(float(time[i] - np.log(size[i] / level) / rate * (time[i] - time[i - 1])))
+        begin = begin or i
+    if np.diff(time[begin - 1:end + 1]).max() > MAX_GAP * np.median(np.diff(time)):
+        return None
+    return Growth(tuple(b - a for a, b in pairwise(times)))
 
 
 @dataclass(frozen=True)
@@ -58,13 +106,12 @@ class LevelChange:
     size: float
     """Magnitude of the change in standard deviations of one reading."""
     has_departed: bool | None
-    """True: a vehicle that caused the earlier level has departed. False: a vehicle that causes the
-    later level has arrived. None: unknown."""
+    """True: a vehicle that caused the earlier level has departed. False: one that causes the later
+    level has arrived. None: unknown."""
 
 
 ChangeEvaluator: TypeAlias = Callable[[LevelChange], bool | None]
-"""Function of the `LevelChange` of a sensor that returns whether a vehicle has departed, as
-`LevelChange.has_departed`."""
+"""Function that classifies the `LevelChange` of a sensor like `LevelChange.has_departed`."""
 
 
 def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: FloatArray,
@@ -72,9 +119,8 @@ def level_change(blocks: Blocks, n_steady: int, before: FloatArray, noise_std: F
     """Evaluate a change to a steady level from chronological blocks that begin at the old level.
 
     The last `n_steady` blocks are at the later level. `before` (k, 3) in T is the earlier level at
-    the times of the blocks; `noise_std` (3,) in T is that of one reading. NaN marks an
-    unreported axis. `origin` in s is the zero
-    of the block times in the time common to all sensors.
+    the times of the blocks; `noise_std` (3,) in T is that of one reading. NaN marks an unreported
+    axis. `origin` in s is the zero of the block times in the time common to all sensors.
     """
     after = np.average(blocks.mean[-n_steady:], axis=0)
     distance_before, distance_after = (
@@ -101,9 +147,9 @@ def _asymmetry(time: FloatArray, distance_before: FloatArray, distance_after: Fl
                detection_limit: float, largest: float) -> float:
     """Binary logarithm of the asymmetry between the ends of a change; positive for a departure.
 
-    Zero if the growth stalls at one end, e.g. because a second vehicle stops behind the first, or
-    if neither end matches a starting or stopping vehicle. The distances (k,) from the two levels
-    are in std of a reading; the ends are evaluated from `detection_limit` to `largest`.
+    Zero if the growth stalls at one end, or neither end matches a starting or stopping vehicle. The
+    distances (k,) from the two levels are in std of a reading; the ends are evaluated from
+    `detection_limit` to `largest`.
     """
     block_length = float(np.median(np.diff(time)))
     first = growth_of(time, distance_before, detection_limit, largest)
@@ -132,10 +178,8 @@ class SharedChanges:
         self._latest_changes: dict[int, LevelChange] = {}
 
     def evaluate_change(self, sensor: int, change: LevelChange) -> bool | None:
-        """Store a sensor's change; return whether a vehicle has departed (None: unknown).
-
-        A change that is not clear is classified by the largest simultaneous change at any sensor.
-        """
+        """Store a sensor's change; return whether a vehicle has departed (None: unknown), for a
+        change that is not clear from the largest simultaneous change."""
         self._latest_changes[sensor] = change
         if change.size >= CLEAR_SIZE and change.has_departed is not None:
             return change.has_departed

@@ -3,9 +3,10 @@
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration import core
 from mag_tracking.calibration.background import RunningBackground
+from mag_tracking.calibration.background_level import TYPICAL_DRIFT
 from mag_tracking.calibration.blocks import Block, block_of, stacked
-from mag_tracking.calibration.drift import TYPICAL_DRIFT
 from mag_tracking.calibration.frequent_level import (
     LEVEL_WIDTH,
     MIN_BLOCKS,
@@ -13,11 +14,10 @@ from mag_tracking.calibration.frequent_level import (
     MostFrequentLevel,
     most_frequent_level,
 )
-from mag_tracking.calibration.resolution import corrected_steps, raw_steps
+from mag_tracking.calibration.sensor_state import corrected_steps
 
 NEAR_STDS = 8.0
-"""Maximum difference between the initial and the most frequent level that an approaching target may
-cause, in standard deviations of a reading."""
+"""Maximum change of the initial level by an approaching target, in std of a reading."""
 NEAR_DURATION_RATIO = 1.5
 """Value that replaces `MIN_DURATION_RATIO` for levels that differ by at most `NEAR_STDS`."""
 
@@ -43,24 +43,16 @@ class BlockRecorder(RunningBackground):
         super().forget()
 
     def quiet_level(self, since: float = 0.0) -> MostFrequentLevel | None:
-        """Most frequent level from `since` s on; None if no level has `MIN_BLOCKS` blocks.
-
-        None also if the noise is unknown.
-        """
+        """Most frequent level from `since` s on; None if unknown."""
         blocks = [block for block in self._blocks if block.time >= since]
         if len(blocks) < MIN_BLOCKS:
             return None
-        stride = 1 + len(blocks) // MAX_BLOCKS
-        steps = corrected_steps(self._sensors)
-        return most_frequent_level(stacked(blocks[::stride]),
-                                   np.where(np.isfinite(steps), steps, 0.0), self._max_blocks)
+        return most_frequent_level(stacked(blocks[::1 + len(blocks) // MAX_BLOCKS]),
+                                   corrected_steps(self._sensors), self._max_blocks)
 
     def is_known_level(self, initial: FloatArray, found: MostFrequentLevel) -> bool:
-        """Whether the initial level (3,) T of a recording is the level of the background.
-
-        True if the field drifts from it to the most frequent level, or is at the latter for not
-        much longer than at the former.
-        """
+        """Whether the field drifts from the initial level (3,) T of a recording to the most
+        frequent level, or is there for not much longer."""
         level, previous_time, n = initial, 0.0, 0
         for block in self._blocks:
             width = found.width + TYPICAL_DRIFT * (block.time - previous_time)
@@ -86,5 +78,5 @@ class BlockRecorder(RunningBackground):
     @property
     def steps(self) -> FloatArray:
         """Quantisation steps of the raw axes, (3,) T; inf if unknown."""
-        steps = raw_steps(self._sensors)
+        steps = core.steps_of(self._sensors, False)
         return np.where(steps > 0.0, steps, np.inf)

@@ -1,4 +1,4 @@
-// Steps of a sensor's readings, updated for each reading; see resolution.py.
+// Steps of a sensor's readings, updated for each reading; see sensor_state.py.
 
 #pragma once
 

@@ -17,15 +17,13 @@ N_INTERVALS = 8
 MAX_ERROR_S = 0.02
 """[s] Error of the timestamps above which tracks are ambiguous. A car at 20 m/s moves 0.4 m."""
 MAX_REGULAR_RATIO = 1.4
-"""Ratio of the longest to the shortest interval below which timestamps have none of the errors. The
-intervals of a coarse clock are different numbers of steps, at least two and three."""
+"""Ratio of the longest to the shortest interval below which timestamps have none of the errors."""
 MIN_SHARED = 0.1
 """Minimum fraction of readings that share the timestamp of a different reading."""
 MIN_IN_BURSTS = 0.45
 """Minimum fraction of short intervals; it is 0.5 if readings arrive in pairs."""
 MAX_BURST_INTERVAL_NS = 4_000_000
-"""[ns] Maximum interval between readings that arrive together: a line of text takes 3 ms at 115,200
-baud. Readings of a magnetometer that is read in blocks with pauses are further apart."""
+"""[ns] Maximum interval within a burst: a line of text takes 3 ms at 115,200 baud."""
 SHORT_RATIO = 0.35
 """Maximum ratio of a short interval to the mean interval."""
 MAX_INTERVAL_STEPS = 3
@@ -33,20 +31,9 @@ MAX_INTERVAL_STEPS = 3
 ROUND_STEPS_NS = np.array([m * 10**k for k in range(5, 10) for m in (1, 2, 4, 5)] + [16_666_667])
 """[ns] Steps of coarse clocks; other steps are those of packets."""
 
-
-class TimestampError(enum.Enum):
-    """Kind of a regular error of timestamps."""
-
-    ZERO = enum.auto()
-    """All timestamps are zero."""
-    COARSE = enum.auto()
-    """The clock has steps."""
-    PACKET = enum.auto()
-    """Several readings have the timestamp of their packet."""
-    BURST = enum.auto()
-    """Several readings have timestamps of their common arrival."""
-    UNIT = enum.auto()
-    """The nanoseconds are written in another unit."""
+TimestampError = enum.Enum('TimestampError', 'ZERO COARSE PACKET BURST UNIT')
+"""Kind of a regular error of timestamps: all are zero, the clock has steps, several readings have
+the timestamp of their packet or of their common arrival, nanoseconds are in another unit."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +54,8 @@ class TimestampFault:
 
 
 def timestamp_fault(stamps: IntArray, fields: FloatArray) -> TimestampFault | None:
-    """Find a regular error in the timestamps of consecutive readings of one sensor.
-
-    `stamps` (n,) in ns are in order of arrival. A reading that repeats timestamp and field was
-    published twice, which is another fault. None if the timestamps are regular, or the readings are
-    too few.
-    """
+    """Find a regular error in the timestamps (n,) [ns] of consecutive readings of one sensor,
+    except of those that were published twice."""
     if len(stamps) < MIN_READINGS:
         return None
     intervals = np.diff(stamps)
@@ -132,11 +115,8 @@ def _burst_fault(stamps: IntArray, intervals: IntArray) -> TimestampFault | None
 
 
 def _coarse_fault(stamps: IntArray, intervals: IntArray) -> TimestampFault | None:
-    """Fault of timestamps (n,) [ns] of which none are equal, although the clock is coarse.
-
-    The intervals are then different multiples of the step. Lost readings look alike, but move all
-    later timestamps away from a line.
-    """
+    """Fault of timestamps (n,) [ns] that are different multiples of the step of a coarse clock,
+    without a lost reading that moves the later ones."""
     step_ns = int(np.gcd.reduce(intervals))
     if step_ns < 2.0 * MAX_ERROR_S * NS or not _is_coarse_step(stamps, step_ns) \
             or np.median(intervals) > MAX_INTERVAL_STEPS * step_ns:
@@ -161,8 +141,7 @@ def _groups(is_joined: BoolArray, stamps: IntArray) -> tuple[int, float, float]:
     """Median size and period [s] of groups of readings, and mean interval [s] between readings.
 
     `is_joined` (n - 1,) marks the readings that belong to the group of the previous one. The first
-    and last group may be incomplete and are not used; with fewer than two others, the size is that
-    of the largest group.
+    and last group may be incomplete and are not used if there are others.
     """
     first = np.flatnonzero(np.append(True, ~is_joined))
     sizes = np.diff(np.append(first, len(stamps)))

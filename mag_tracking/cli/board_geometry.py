@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.analysis.network_geometry import GeometrySettings, NetworkGeometry
 from mag_tracking.apps.board_geometry import (
     ASSUMED_NOISE,
     GeometrySurvey,
@@ -19,6 +18,8 @@ from mag_tracking.apps.board_geometry import (
     survey_geometry,
 )
 from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration.network_fit import GeometrySettings
+from mag_tracking.calibration.network_geometry import NetworkGeometry
 from mag_tracking.cli.options import (
     Commands,
     add_command,

@@ -15,6 +15,7 @@ from mag_tracking_msgs.srv import Calibrate as CalibrateService
 from mag_tracking_msgs.srv import Survey as SurveyMessage
 from sensor_msgs.msg import Imu, MagneticField
 
+from mag_tracking.calibration.survey import Survey
 from mag_tracking.errors import NetworkError, SettingsError
 from mag_tracking.files import checked_path
 from mag_tracking.messages.schema import (
@@ -54,7 +55,6 @@ from mag_tracking.recording.background_file import (
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.stage import Stage
-from mag_tracking.stages.survey.stage import Survey
 
 MIN_STEP_S = 0.01
 """[s] Minimum interval between the steps of a round over the sensors. A round takes one second, or

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from mag_tracking_msgs.srv import Survey as SurveyMessage
 
+from mag_tracking.calibration.survey import Survey, with_measured_noise
 from mag_tracking.errors import OutputError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import write_network
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.survey.stage import Survey, with_measured_noise
 
 MIN_INTERVAL_S = 0.5
 """[s] Minimum interval between surveys, each of which delays the readings."""
@@ -57,7 +57,7 @@ class SurveyService:
             return None
         date = datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds')
         solution = self._survey.solve(fields, date)
-        surveyed = with_measured_noise(solution.network, self._stage)
+        surveyed = with_measured_noise(solution.network, self._stage.backgrounds())
         if save:
             try:
                 write_network(self._save_as, surveyed, 'Written by calibration_node.')

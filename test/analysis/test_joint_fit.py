@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from mag_tracking.analysis.fitted_pass import choose_order, order_criteria
 from mag_tracking.analysis.joint_fit import (
     GroundPrior,
     are_separate,
     fit_joint,
+    fit_targets,
     path_from,
 )
-from mag_tracking.analysis.model_order import choose_order, order_criteria
-from mag_tracking.analysis.pass_covariance import SensorErrors
-from mag_tracking.analysis.pass_description import assignment, fits_at_minimum
+from mag_tracking.analysis.pass_description import SensorErrors, assignment, fits_at_minimum
 from mag_tracking.analysis.pass_fit import fit_pass
-from mag_tracking.analysis.pass_targets import fit_targets
 from mag_tracking.analysis.pass_trust import FittedRow, residual_elsewhere
 from mag_tracking.inference.separable_fit import Minimum
 from mag_tracking.physics.passes import RowPass, SuperposedPasses

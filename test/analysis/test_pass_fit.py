@@ -7,12 +7,11 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from mag_tracking.analysis.bearing import MIN_CPA_FRACTION, scaled_to_range
-from mag_tracking.analysis.model_order import choose_order, order_criteria
-from mag_tracking.analysis.pass_covariance import SensorErrors
+from mag_tracking.analysis.fitted_pass import choose_order, order_criteria
 from mag_tracking.analysis.pass_data import separable_problem
+from mag_tracking.analysis.pass_description import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
-from mag_tracking.analysis.pass_result import PassFit
+from mag_tracking.analysis.pass_result import MIN_CPA_FRACTION, PassFit, scaled_to_range
 from mag_tracking.apps.fit import fit
 from mag_tracking.inference.iron import hard_and_soft_iron
 from mag_tracking.inference.least_squares import refine, score_sum_covariance

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mag_tracking.analysis.pass_covariance import SensorErrors
+from mag_tracking.analysis.pass_description import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.analysis.pass_trust import (

@@ -5,13 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
-from mag_tracking.analysis.network_readings import TrackedMagnet, rotation, tool_rotations
 from mag_tracking.apps.board_geometry import survey_geometry
+from mag_tracking.calibration.network_fit import (
+    GeometrySettings,
+    TrackedMagnet,
+    rotation,
+    tool_rotations,
+)
+from mag_tracking.calibration.network_geometry import calibrate_geometry
 from mag_tracking.network import CalibrationRecord
 from mag_tracking.network.file import read_network, write_network
 from support.geometry_command import calibrated_readings, command, write_table
-from support.magnet_boards import HIGH, LOW, MOMENT, simulated
+from support.magnet_boards import HIGH, LOW, MOMENT, signal_of, simulated
 
 
 def with_earlier_calibration(network):
@@ -40,7 +45,7 @@ def test_an_earlier_calibration_is_preserved(tmp_path):
     assert command(table, '--network', tmp_path / 'nominal.yaml', out=tmp_path / 'out.yaml') == 0
     network = read_network(tmp_path / 'out.yaml')
     B = calibrated_readings(network, raw_readings(calibrated, field))
-    np.testing.assert_allclose(B, geometry.signal(field), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(B, signal_of(geometry, field), rtol=0, atol=1e-11)
     np.testing.assert_allclose(network.positions, geometry.network.positions, atol=1e-8)
     np.testing.assert_allclose(network.R_ws, geometry.network.R_ws, atol=1e-6)
     assert all(c.clock_offset_std == 1e-3 and c.by == 'magnet, 40 tracked poses'

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.stats import binom, special_ortho_group, t
 
-from mag_tracking.calibration import ellipsoid_refinement
+from mag_tracking.calibration import ellipsoid
+from mag_tracking.calibration.ellipsoid import N_BLOCKS
 from mag_tracking.calibration.ellipsoid_fit import fit_ellipsoid
-from mag_tracking.calibration.ellipsoid_refinement import N_BLOCKS
 from support.bundled import DATA
 from support.marks import studied
 
@@ -340,8 +340,8 @@ def test_an_uncertain_offset_is_rejected():
 
 
 def test_least_squares_without_convergence_are_rejected(monkeypatch):
-    solve = ellipsoid_refinement.least_squares
-    monkeypatch.setattr(ellipsoid_refinement, 'least_squares',
+    solve = ellipsoid.least_squares
+    monkeypatch.setattr(ellipsoid, 'least_squares',
                         lambda *a, **k: solve(*a, **(k | {'max_nfev': 1})))
     fit = fit_ellipsoid(readings(EVEN))
     assert not fit.converged and 'converge' in fit.reason

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from mag_tracking.calibration.blocks import Blocks
-from mag_tracking.calibration.growth import growth_of
 from mag_tracking.calibration.level_change import (
     CLEAR_SIZE,
     LevelChange,
     SharedChanges,
+    growth_of,
     level_change,
 )
 from mag_tracking.physics.dipole import dipole_field

@@ -5,12 +5,11 @@ import pytest
 
 from mag_tracking.calibration import core
 from mag_tracking.calibration.core import DITHERED, MAX_REST_NS
-from mag_tracking.calibration.resolution import (
+from mag_tracking.calibration.sensor_state import (
     completed_steps,
-    raw_steps,
+    new_sensors,
     smallest_steps,
 )
-from mag_tracking.calibration.sensor_state import new_sensors
 from support.fed_background import FedBackground
 
 MS = 1_000_000
@@ -51,9 +50,9 @@ def test_missing_axes_and_spikes_do_not_change_the_step():
 def test_a_field_that_changes_with_every_reading_has_no_observable_steps():
     y = np.cumsum(np.random.default_rng(0).uniform(1e-6, 3e-6, (60, 3)), axis=0)
     state = sensor_after(y)
-    assert (state[0]['step'] > 1e-6).all() and (raw_steps(state) == 0.0).all()
-    assert (raw_steps(sensor_after(coarse(1e-8, 1e-7, offset=0.45))) > 0.0).all()
-    assert np.isinf(raw_steps(sensor_after(np.ones((5, 3))))).all()
+    assert (state[0]['step'] > 1e-6).all() and (core.steps_of(state, False) == 0.0).all()
+    assert (core.steps_of(sensor_after(coarse(1e-8, 1e-7, offset=0.45)), False) > 0.0).all()
+    assert np.isinf(core.steps_of(sensor_after(np.ones((5, 3))), False)).all()
 
 
 def test_the_compiled_rule_agrees_with_a_plain_implementation():

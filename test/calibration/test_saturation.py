@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mag_tracking.calibration.saturation import N_MARGIN, saturated_readings, with_margin
+from mag_tracking.calibration.reading_faults import N_MARGIN, saturated_readings, with_margin
 from support.live_runs import passes_of
 from support.passes import ROAD, measured, random_path, unknowns_at
 from support.samples import MagSample, one

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mag_tracking.calibration import core
-from mag_tracking.calibration.screening import HELD, PASSES, RELEASED, SPIKE
-from mag_tracking.calibration.sensor_state import MAX_HELD, new_sensors
+from mag_tracking.calibration.core import HELD, MAX_HELD, PASSES, RELEASED, SPIKE
+from mag_tracking.calibration.sensor_state import new_sensors
 from mag_tracking.simulation.scenario import Path, point_body, random_vehicle
 from support.networks import line_network
 from support.samples import simulate

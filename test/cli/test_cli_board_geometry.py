@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from mag_tracking.analysis.magnet_pose import PoseSettings, locate_magnet
-from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
+from mag_tracking.calibration.magnet_pose import PoseSettings, locate_magnet
+from mag_tracking.calibration.network_fit import GeometrySettings
+from mag_tracking.calibration.network_geometry import calibrate_geometry
 from mag_tracking.network.file import read_network, write_network
 from support.geometry_command import calibrated_readings, command, write_table
-from support.magnet_boards import MOMENT, board, simulated
+from support.magnet_boards import MOMENT, board, magnet_poses, signal_of, simulated
 from support.real_board import BOX, FOLDER, assert_within_limits, board_of_41, print_errors
 
 POSITIONS_FILE = FOLDER / 'sensor_positions_m.csv'
@@ -40,10 +41,10 @@ def test_the_written_network_locates_the_magnet(calibrated):
                            GeometrySettings())
     B = calibrated_readings(network, field[1::2])
     # The fields are equal within the digits of the file, because the background does not drift.
-    np.testing.assert_allclose(B, g.signal(field[1::2]), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(B, signal_of(g, field[1::2]), rtol=0, atol=1e-12)
     poses = [locate_magnet(network, b, MOMENT, *BOX, PoseSettings()) for b in B]
     assert all(p.converged for p in poses)
-    r, u = g.magnet_poses(positions[1::2], axes[1::2])
+    r, u = magnet_poses(g, positions[1::2], axes[1::2])
     position_error = np.linalg.norm([p.position for p in poses] - r, axis=1)
     angle_error = np.rad2deg([np.arccos(np.clip(p.axis @ a, -1.0, 1.0))
                               for p, a in zip(poses, u, strict=True)])

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 
 from mag_tracking.analysis.correlated_motion import CorrelatedMotion, correlated_motion
-from mag_tracking.analysis.model_order import choose_order
+from mag_tracking.analysis.fitted_pass import choose_order
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track

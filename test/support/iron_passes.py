@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.analysis.pass_covariance import SensorErrors
+from mag_tracking.analysis.pass_description import SensorErrors
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.writer import RecordingWriter

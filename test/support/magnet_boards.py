@@ -1,16 +1,18 @@
 """Simulated sensor boards below a magnet."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
-from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
-from mag_tracking.analysis.network_readings import (
+from mag_tracking.calibration.network_fit import (
+    GeometrySettings,
     TrackedMagnet,
     predicted_readings,
     rotation,
     tool_rotations,
 )
+from mag_tracking.calibration.network_geometry import calibrate_geometry
 from mag_tracking.network import SensorNetwork
 
 MOMENT = 0.264
@@ -32,6 +34,18 @@ def tracked(n_poses, rng):
     positions = rng.uniform([0.0, 0.0, 0.05], [0.12, 0.12, 0.13], (n_poses, 3))
     axes = np.array([0.0, 0.0, 1.0]) + 0.6 * rng.uniform(-1.0, 1.0, (n_poses, 3))
     return positions, axes / np.linalg.norm(axes, axis=1)[:, None]
+
+
+def signal_of(geometry, field):
+    """Remove the biases and gains of a calibrated network from readings (..., n, 3) [T]."""
+    return (np.asarray(field, dtype=float) - geometry.bias) / geometry.gain[:, None]
+
+
+def magnet_poses(geometry, positions, axes):
+    """Convert tracked positions and axes (K, 3), tracker frame, to those of the magnet, world
+    frame."""
+    magnet = replace(geometry.magnet, tool=positions, R_tool=tool_rotations(axes))
+    return magnet.positions_and_axes(geometry.shared, np.zeros((len(positions), 8)))
 
 
 def truth(network, n_poses, rng, settings=SETTINGS):

@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from mag_tracking.analysis.magnet_pose import PoseSettings, locate_magnet
+from mag_tracking.calibration.magnet_pose import PoseSettings, locate_magnet
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.pose_table import read_pose_table, read_sensor_positions
 from support.bundled import DATA
+from support.magnet_boards import signal_of
 
 MOMENT = 0.264
 FOLDER = DATA / 'magnet_41_sensors'
@@ -29,7 +30,7 @@ def errors(geometry, field, positions, axes, to_world):
     """
     r, u = to_world(positions, axes)
     estimates = [locate_magnet(geometry.network, B, geometry.moment[0], *BOX, PoseSettings())
-                 for B in geometry.signal(field)]
+                 for B in signal_of(geometry, field)]
     assert all(p.converged for p in estimates)
     angle = [np.rad2deg(np.arccos(np.clip(p.axis @ a, -1.0, 1.0)))
              for p, a in zip(estimates, u, strict=True)]

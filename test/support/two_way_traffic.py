@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mag_tracking.analysis.direction_likelihood import (
-    LaneHypothesis,
-    direction_likelihood_ratio,
-)
 from mag_tracking.inference.driving_direction import (
     FieldRotation,
     fused_log_odds,
     rotation_of_pass,
+)
+from support.direction_likelihood import (
+    LaneHypothesis,
+    direction_likelihood_ratio,
 )
 from support.passes import EARTH
 from support.situation_worlds import car, truck

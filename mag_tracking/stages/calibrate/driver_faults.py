@@ -7,14 +7,15 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.calibration import core
-from mag_tracking.calibration.missing_marks import (
+from mag_tracking.calibration.reading_faults import (
     MIN_JUMP,
+    ReadingFaults,
     are_marked,
     describe_marks,
+    reading_faults,
     typical_change,
+    with_lost_readings,
 )
-from mag_tracking.calibration.reading_faults import ReadingFaults, reading_faults
-from mag_tracking.calibration.repetition import with_lost_readings
 from mag_tracking.calibration.sensor_state import FIRST_WINDOW, N_WINDOW
 from mag_tracking.stages.health.diagnosis import Cause
 from mag_tracking.units import NS

@@ -7,9 +7,9 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.agreement import FieldInconsistency, consensus, disagreements
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted, updated
+from mag_tracking.calibration.survey import COMPASS_BIAS_STD, SurveySettings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.stages.health.diagnosis import Cause, Finding
-from mag_tracking.stages.survey.settings import COMPASS_BIAS_STD, SurveySettings
 
 MIN_CHANGE = 1e-7
 """[T] Change of a background after which it is compared again; the smallest fault that distorts

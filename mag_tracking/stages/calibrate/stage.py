@@ -21,8 +21,8 @@ from mag_tracking.calibration.doubtful_times import (
 from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.level_change import SharedChanges
 from mag_tracking.calibration.reading_faults import ReadingFaults
-from mag_tracking.calibration.screening import clear_spikes
-from mag_tracking.calibration.sensor_state import new_sensors
+from mag_tracking.calibration.sensor_state import clear_spikes, new_sensors
+from mag_tracking.calibration.survey import SurveySettings
 from mag_tracking.errors import NetworkError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
@@ -45,7 +45,6 @@ from mag_tracking.stages.health.clocks import ClockSpan, corrected
 from mag_tracking.stages.health.diagnosis import Cause
 from mag_tracking.stages.health.timestamps import TimestampMonitor
 from mag_tracking.stages.stage import MAX_BACKWARD_JUMP_S
-from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NEVER, NS
 
 MEMORY_S = 20.0

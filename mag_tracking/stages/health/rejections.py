@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from mag_tracking.calibration.missing_marks import describe_marks
+from mag_tracking.calibration.reading_faults import describe_marks
 from mag_tracking.quantities import quantity
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.diagnosis import Cause, Finding

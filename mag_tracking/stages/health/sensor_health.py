@@ -10,10 +10,13 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration import timestamps
-from mag_tracking.calibration.reading_faults import NO_FAULTS, ReadingFaults
-from mag_tracking.calibration.resolution import smallest_steps
-from mag_tracking.calibration.saturation import isolated_readings, saturated_readings
-from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
+from mag_tracking.calibration.reading_faults import (
+    NO_FAULTS,
+    ReadingFaults,
+    isolated_readings,
+    saturated_readings,
+)
+from mag_tracking.calibration.sensor_state import COARSE_FRACTION, MIN_CHANGES, smallest_steps
 from mag_tracking.quantities import occurrences
 from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.stages.health.diagnosis import Cause, Finding

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.calibration.resolution import smallest_steps
+from mag_tracking.calibration.sensor_state import smallest_steps
 
 
 def quantiles(values: Sequence[float] | FloatArray | IntArray,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mag_tracking.analysis.magnet_pose import PoseSettings, locate_magnet
-from mag_tracking.analysis.network_blind import calibrate_geometry_blind
-from mag_tracking.analysis.network_readings import TrackedMagnet, tool_rotations
+from mag_tracking.calibration.magnet_pose import PoseSettings, locate_magnet
+from mag_tracking.calibration.network_fit import TrackedMagnet, tool_rotations
+from mag_tracking.calibration.network_geometry import calibrate_geometry_blind
 from mag_tracking.physics.dipole import dipole_field
 from support.magnet_boards import HIGH, LOW, MOMENT, SETTINGS, board, estimated, simulated
 

@@ -6,9 +6,22 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
-from mag_tracking.analysis.network_readings import TrackedMagnet, rotation, tool_rotations
-from support.magnet_boards import MOMENT, SETTINGS, board, calibrated_boards, estimated, simulated
+from mag_tracking.calibration.network_fit import (
+    GeometrySettings,
+    TrackedMagnet,
+    rotation,
+    tool_rotations,
+)
+from mag_tracking.calibration.network_geometry import calibrate_geometry
+from support.magnet_boards import (
+    MOMENT,
+    SETTINGS,
+    board,
+    calibrated_boards,
+    estimated,
+    magnet_poses,
+    simulated,
+)
 
 
 @pytest.fixture(scope='module')
@@ -63,7 +76,7 @@ def test_estimated_poses_are_closer_to_the_truth_than_tracked_ones(boards):
     estimated_error, tracked_error, z2 = [], [], []
     for (_, _, positions, axes, x), g in boards:
         magnet = TrackedMagnet(positions, tool_rotations(axes), positions.mean(axis=0), MOMENT)
-        r, u = g.magnet_poses(positions, axes)
+        r, u = magnet_poses(g, positions, axes)
         as_tracked, m, *_ = magnet.poses(x[1], np.zeros((40, 8)))
         assert np.linalg.norm(r - as_tracked, axis=1).max() < 2.5e-3
         assert (np.einsum('ki,ki->k', u, m) / np.linalg.norm(m, axis=1)).min() > np.cos(0.025)

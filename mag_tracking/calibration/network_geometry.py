@@ -8,93 +8,54 @@ poses of the magnet. PHD15 Paper A suggests such a calibration as future work.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from mag_tracking.analysis.network_fit import (
-    GeometryProblem,
-    NormalEquations,
-    Unknowns,
-    median_ratio,
-    solve,
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.calibration.magnet_pose import (
+    PoseSettings,
+    check_moment_and_noise,
+    locate_magnet,
 )
-from mag_tracking.analysis.network_readings import (
+from mag_tracking.calibration.network_fit import (
     N_POSE,
     N_SENSOR,
     N_SHARED,
+    GeometryProblem,
+    GeometrySettings,
+    NormalEquations,
     Prediction,
     TrackedMagnet,
+    Unknowns,
+    median_ratio,
     rotation,
-    tool_rotations,
+    solve,
 )
-from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
-from mag_tracking.settings import param
 
+COARSE_ERROR = 0.1
+"""Assumed error relative to the field in the first stage, while the poses are inaccurate."""
 
-@dataclass(frozen=True)
-class GeometrySettings:
-    """Prior standard deviations, where zero means exactly known, and limits of the fit."""
-
-    gain_std: float = param(0.03, 'Standard deviation of the gain of a sensor.', '',
-                            (0.0, 1.0))
-    rotation_std_deg: float = param(
-        2.0, 'Standard deviation of the orientation of a sensor, per axis.', 'deg', (0.0, 45.0))
-    position_std: float = param(
-        1e-3, 'Standard deviation of the position of a sensor, per axis.', 'm', (0.0, 100.0))
-    moment_std: float = param(
-        0.0, 'Standard deviation of the moment of the magnet, relative to its magnitude.', '',
-        (0.0, 1.0))
-    board_shift_std: float = param(
-        0.01, 'Standard deviation of the position of the network relative to the tracker, per '
-        'axis.', 'm', (0.0, 100.0))
-    board_rotation_std_deg: float = param(
-        2.0, 'Standard deviation of the orientation of the network relative to the tracker, per '
-        'axis.', 'deg', (0.0, 45.0))
-    tool_offset_std: float = param(
-        0.01, 'Standard deviation of the offset of the magnet from the tracked point, per axis.',
-        'm', (0.0, 100.0))
-    tool_tilt_std_deg: float = param(
-        3.0, 'Standard deviation of the tilt of the magnet from the tracked axis, per axis.',
-        'deg', (0.0, 45.0))
-    tracker_position_std: float = param(
-        3e-4, 'Standard deviation of the tracked position of one pose, per axis.', 'm',
-        (0.0, 100.0))
-    tracker_tilt_std_deg: float = param(
-        0.2, 'Standard deviation of the tracked tilt of one pose, per axis.', 'deg', (0.0, 45.0))
-    start_position_std: float = param(
-        0.1, 'Standard deviation of the starting position of an untracked magnet, per axis.', 'm',
-        (0.0, 100.0))
-    start_tilt_std_deg: float = param(
-        30.0, 'Standard deviation of the starting tilt of an untracked magnet, per axis.', 'deg',
-        (0.0, 60.0))
-    ambient_std: float = param(
-        1e-7, 'Standard deviation of the change of the ambient field from pose to pose, per axis; '
-        'the change is the same at all sensors.', 'T', (0.0, 1e-3))
-    field_error: float = param(
-        0.01, 'Error of the dipole model relative to the field.', '', (0.0, 1.0))
-    iterations: int = param(60, 'Maximum number of steps.', '', (1, 10000))
+INITIAL_POSE_SETTINGS = PoseSettings(field_error=COARSE_ERROR, ambient_std=1e-6)
+"""Settings of the search for the initial poses, while the biases are inaccurate."""
 
 
 @dataclass(frozen=True)
 class NetworkGeometry:
-    """Result of a geometry calibration; valid only if `reason` is empty.
-
-    Standard deviations are posterior; noise is scaled up if residuals exceed the configured noise.
-    """
+    """Result of a geometry calibration, with posterior stds; valid only if `reason` is empty."""
 
     network: SensorNetwork
     """Network with corrected positions and orientations, and with the biases as background."""
     position_std: FloatArray
-    """(n, 3) [m] standard deviations of the sensor positions, world frame."""
+    """(n, 3) [m], world frame."""
     rotation_std: FloatArray
-    """(n, 3) [rad] standard deviations of the rotations about the axes of the sensor."""
+    """(n, 3) [rad], about the axes of the sensor."""
     gain: FloatArray
     """(n,) gain; one is nominal."""
     gain_std: FloatArray
-    """(n,) standard deviations of `gain`."""
     bias: FloatArray
     """(n, 3) [T] biases, sensor frame; NaN for an axis without readings."""
     bias_std: FloatArray
-    """(n, 3) [T] standard deviations of `bias`; infinite for an axis without readings."""
+    """(n, 3) [T]; infinite for an axis without readings."""
     magnet: TrackedMagnet
     """Tracked poses of the magnet, and its nominal moment."""
     rows: IntArray
@@ -102,14 +63,12 @@ class NetworkGeometry:
     shared: FloatArray
     """(12,) shared unknowns; see `TrackedMagnet.poses`."""
     shared_std: FloatArray
-    """(12,) standard deviations of `shared`."""
     pose: FloatArray
     """(K, 8) unknowns of each pose; see `TrackedMagnet.poses`."""
     pose_covariance: FloatArray
-    """(K, 8, 8) covariance of `pose`."""
+    """(K, 8, 8)."""
     covariance: FloatArray
-    """(10 n + 12, 10 n + 12) covariance of the sensor unknowns (bias, gain, rotation, position),
-    followed by the shared unknowns."""
+    """(10 n + 12, 10 n + 12) of sensor unknowns (bias, gain, rotation, position) and `shared`."""
     normalised_cost: float
     """Cost per degree of freedom; about one if model, noise and field error are correct."""
     sensor_residual: FloatArray
@@ -117,27 +76,16 @@ class NetworkGeometry:
     pose_residual: FloatArray
     """(K,) median of the sensor residuals of each pose, relative to the median for pure noise."""
     suspect_sensors: tuple[str, ...]
-    """Names of the sensors with large residuals, or with corrections beyond `MAX_CORRECTION` prior
-    standard deviations."""
+    """Names of the sensors with large residuals or corrections."""
     suspect_poses: tuple[int, ...]
     """Indices of the poses with large residuals or corrections."""
-    converged: bool
-    """Whether the calibration is valid."""
     reason: str
     """Reason why the calibration is not valid; empty if it is valid."""
 
-    def signal(self, field: FloatArray) -> FloatArray:
-        """Remove biases and gains from readings (..., n, 3) [T, sensor frame]."""
-        signal: FloatArray = (np.asarray(field, dtype=float) - self.bias) / self.gain[:, None]
-        return signal
-
-    def magnet_poses(self, positions: FloatArray,
-                     axes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Convert tracked positions and axes (K, 3), tracker frame, to those of the magnet, world
-        frame."""
-        magnet = replace(self.magnet, tool=np.asarray(positions, dtype=float),
-                         R_tool=tool_rotations(np.asarray(axes, dtype=float)))
-        return _positions_and_axes(magnet, self.shared, np.zeros((len(magnet.tool), N_POSE)))
+    @property
+    def converged(self) -> bool:
+        """Whether the calibration is valid."""
+        return not self.reason
 
     @property
     def moment(self) -> tuple[float, float]:
@@ -158,28 +106,19 @@ class NetworkGeometry:
     @property
     def poses(self) -> tuple[FloatArray, FloatArray]:
         """Estimated poses of the magnet: positions (K, 3) m and unit axes (K, 3), world frame."""
-        return _positions_and_axes(self.magnet, self.shared, self.pose)
-
-
-def _positions_and_axes(magnet: TrackedMagnet, shared: FloatArray,
-                        pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Positions and unit axes of the magnet, each (K, 3), world frame."""
-    r, m, *_ = magnet.poses(shared, pose)
-    return r, m / np.linalg.norm(m, axis=1)[:, None]
+        return self.magnet.positions_and_axes(self.shared, self.pose)
 
 
 MIN_POSES = 3
 """Minimum number of poses that separates the bias of a sensor from the field of the magnet."""
 
 MIN_POSE_VARIATION = 0.1
-"""Minimum variation of the axis [rad], and of the position relative to the distance of the nearest
-sensor. If both variations are smaller, the poses do not determine the geometry."""
+"""Minimum variation of the axis [rad], or of the position relative to the distance of the nearest
+sensor, of poses that determine the geometry."""
 
-MAX_CORRECTION = 4.0
-"""Maximum correction of a sensor or pose that is not suspect, in prior standard deviations."""
-
-MAX_RESIDUAL_RATIO = 3.0
-"""Maximum residual of a sensor or pose that is not suspect, relative to the median residual."""
+MAX_CORRECTION, MAX_RESIDUAL_RATIO = 4.0, 3.0
+"""Maximum correction in prior standard deviations, and residual relative to the median, of a sensor
+or pose that is not suspect."""
 
 MAX_COST = 100.0
 """Maximum normalised cost; a larger cost means that the readings do not fit the model."""
@@ -196,13 +135,10 @@ def calibrate_geometry(network: SensorNetwork, field: FloatArray, positions: Flo
     no readings or is at a sensor, a reading is infinite, a sensor has no `noise_std`, or the moment
     is not positive.
 
-    Parameters
-    ----------
-    field : (K, n, 3), T, sensor frame, with the constant background; NaN if not measured
-    positions : (K, 3), tracked points, m; the tracker frame differs from the world frame only by a
-        shift and a rotation within the priors
-    axes : (K, 3) unit vectors, directions of the moment if the magnet is not tilted in the tool
-    moment : nominal moment of the magnet, A m²
+    `field` (K, n, 3) [T, sensor frame] contains the constant background; NaN if not measured.
+    `positions` (K, 3) [m] are tracked points in a frame that differs from the world frame only by a
+    shift and a rotation within the priors, `axes` (K, 3) the directions of the moment if the magnet
+    is not tilted in the tool; `moment` [A m²] is nominal.
     """
     s, deg = settings, np.pi / 180.0
     shared_unit = np.concatenate([
@@ -217,12 +153,8 @@ def calibrate_geometry(network: SensorNetwork, field: FloatArray, positions: Flo
 def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatArray,
                     axes: FloatArray, moment: float, settings: GeometrySettings,
                     shared_unit: FloatArray, pose_unit: FloatArray) -> NetworkGeometry:
-    """`calibrate_geometry` with given priors.
-
-    `shared_unit` (12,) are the prior stds of the unknowns common to all poses (board pose, magnet
-    alignment, moment), in the units of `TrackedMagnet.poses`; `pose_unit` (8,) those of each pose.
-    Zero fixes an unknown.
-    """
+    """`calibrate_geometry` with the prior stds `shared_unit` (12,) and `pose_unit` (8,), in the
+    order of `TrackedMagnet.poses`; zero fixes an unknown."""
     field, positions, axes = (np.asarray(a, dtype=float) for a in (field, positions, axes))
     _check_input(network, field, positions, axes, moment)
     problem = GeometryProblem(network, field, positions, axes, moment, settings, shared_unit,
@@ -241,8 +173,7 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
     sensor, shared, pose = problem.in_si(x)
     corrections = rotation(sensor[:, 4:7])
     sensor_residual, pose_residual = _sensor_and_pose_residuals(problem, predicted)
-    outlier_sensors, outlier_poses = _suspects(problem, x, sensor_residual, pose_residual)
-    reason = _failure_reason(problem, x, converged, cost)
+    suspect_sensors, suspect_poses = _suspects(problem, x, sensor_residual, pose_residual)
     return NetworkGeometry(
         network=replace(network, positions=network.positions + sensor[:, 7:],
                         R_ws=network.R_ws @ corrections, background=tuple(
@@ -256,8 +187,8 @@ def fitted_geometry(network: SensorNetwork, field: FloatArray, positions: FloatA
         shared_std=shared_std, pose=pose,
         pose_covariance=P_pose * np.outer(problem.pose_unit, problem.pose_unit),
         covariance=covariance, normalised_cost=cost, sensor_residual=sensor_residual,
-        pose_residual=pose_residual, suspect_sensors=outlier_sensors, suspect_poses=outlier_poses,
-        converged=not reason, reason=reason)
+        pose_residual=pose_residual, suspect_sensors=suspect_sensors, suspect_poses=suspect_poses,
+        reason=_failure_reason(problem, x, converged, cost))
 
 
 def _normalised_cost(problem: GeometryProblem, x: Unknowns, predicted: Prediction, W: FloatArray,
@@ -298,32 +229,24 @@ def _suspects(problem: GeometryProblem, x: Unknowns, sensor_residual: FloatArray
             tuple(int(k) for k in np.flatnonzero(is_suspect_pose)))
 
 
-def _is_magnet_at_rest(problem: GeometryProblem, x: Unknowns) -> bool:
-    """Whether position and axis of the magnet vary by less than `MIN_POSE_VARIATION`."""
-    r, u = _positions_and_axes(problem.magnet, *problem.in_si(x)[1:])
-    nearest_distance = np.linalg.norm(problem.network.positions - r.mean(axis=0), axis=1).min()
-    return bool((np.ptp(r, axis=0) < MIN_POSE_VARIATION * nearest_distance).all()
-                and (np.ptp(u, axis=0) < MIN_POSE_VARIATION).all())
-
-
 def _failure_reason(problem: GeometryProblem, x: Unknowns, converged: bool, cost: float) -> str:
     """Reason why the fit is not valid; empty if it is valid."""
-    K, max_steps = len(problem.magnet.tool), problem.settings.iterations
+    K = len(problem.magnet.tool)
     if K < MIN_POSES:
-        reason = (f'number of poses is {K}; at least {MIN_POSES} are required to separate the '
-                  'biases from the field of the magnet')
-    elif _is_magnet_at_rest(problem, x):
-        reason = 'the poses are almost equal: the geometry is not observable; move the magnet'
-    elif not converged:
-        reason = f'no minimum found (maximum number of steps: {max_steps})'
-    elif np.isnan(cost):
-        reason = 'too few readings for the number of unknowns'
-    elif cost > MAX_COST:
-        reason = (f'the readings do not fit the model: the normalised cost is {cost:.0f}; check '
-                  'the poses, the moment, the network and noise_std')
-    else:
-        reason = ''
-    return reason
+        return (f'number of poses is {K}; at least {MIN_POSES} are required to separate the '
+                'biases from the field of the magnet')
+    r, u = problem.magnet.positions_and_axes(*problem.in_si(x)[1:])
+    nearest_distance = np.linalg.norm(problem.network.positions - r.mean(axis=0), axis=1).min()
+    if (np.ptp(r, axis=0) < MIN_POSE_VARIATION * nearest_distance).all() \
+            and (np.ptp(u, axis=0) < MIN_POSE_VARIATION).all():
+        return 'the poses are almost equal: the geometry is not observable; move the magnet'
+    if not converged:
+        return f'no minimum found (maximum number of steps: {problem.settings.iterations})'
+    if np.isnan(cost):
+        return 'too few readings for the number of unknowns'
+    return '' if not cost > MAX_COST else (
+        f'the readings do not fit the model: the normalised cost is {cost:.0f}; check the poses, '
+        'the moment, the network and noise_std')
 
 
 def _check_input(network: SensorNetwork, field: FloatArray, positions: FloatArray,
@@ -335,19 +258,61 @@ def _check_input(network: SensorNetwork, field: FloatArray, positions: FloatArra
                          f'{field.shape}, {positions.shape}, {axes.shape}')
     if K == 0:
         raise ValueError('there are no poses; at least one pose is required')
-    for name, std in zip(network.names, network.noise_std, strict=True):
-        if std is None or not (np.asarray(std) > 0.0).all():
-            raise ValueError(f'sensor {name}: noise_std is {std}; it must be above 0 T')
+    check_moment_and_noise(network, field, moment)
     for k in range(K):
-        if not (np.isfinite(positions[k]).all()
-                and abs(np.linalg.norm(axes[k]) - 1.0) <= 1e-3):
+        if not (np.isfinite(positions[k]).all() and abs(np.linalg.norm(axes[k]) - 1.0) <= 1e-3):
             raise ValueError(f'pose {k}: expected a finite position and a unit axis, got '
                              f'{positions[k].tolist()} and {axes[k].tolist()}')
         if (network.positions == positions[k]).all(axis=1).any():
             raise ValueError(f'pose {k}: {positions[k].tolist()} m is the position of a sensor')
         if np.isnan(field[k]).all():
             raise ValueError(f'pose {k}: no sensor has a reading')
-    if np.isinf(field).any():
-        raise ValueError('field contains an infinite reading')
-    if not (np.isfinite(moment) and moment > 0.0):
-        raise ValueError(f'moment is {moment} A m^2; it must be finite and above 0')
+
+
+def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: float,
+                             low: ArrayLike, high: ArrayLike,
+                             settings: GeometrySettings) -> NetworkGeometry:
+    """Estimate the geometry of a network from readings of a magnet at unknown poses.
+
+    The initial poses are found with the median reading of each sensor as its bias. Biases, poses
+    and moment are then fitted with a field error of at least 10 %; finally, all unknowns are fitted
+    with the configured one. `low` and `high` [m, world frame] are corners of the box that contains
+    the magnet; poses located outside are excluded from `rows`. The world frame is defined only by
+    the priors of the sensors. Raises ValueError as `calibrate_geometry`, or if fewer than
+    `MIN_POSES` poses are inside the box.
+    """
+    field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
+    s = settings
+    shared_unit = np.append(np.zeros(N_SHARED - 1), s.moment_std)
+    pose_unit = np.repeat([s.start_position_std, np.deg2rad(s.start_tilt_std_deg), s.ambient_std],
+                          [3, 2, 3])
+    rows, r, u = _initial_poses(network, field, moment, low, high)
+    coarse = replace(s, gain_std=0.0, rotation_std_deg=0.0, position_std=0.0,
+                     field_error=max(COARSE_ERROR, s.field_error))
+    for stage in (coarse, s):
+        if len(rows) < MIN_POSES:
+            raise ValueError(f'found {len(rows)} of {len(field)} poses in the box; at least '
+                             f'{MIN_POSES} are required; check the moment and the box')
+        geometry = fitted_geometry(network, field[rows], r, u, moment, stage, shared_unit,
+                                   pose_unit)
+        fitted_rows, (r, u) = rows, geometry.poses
+        is_inside = ((low <= r) & (r <= high)).all(axis=1)
+        rows, r, u = rows[is_inside], r[is_inside], u[is_inside]
+    return replace(geometry, rows=fitted_rows,
+                   suspect_poses=tuple(int(fitted_rows[k]) for k in geometry.suspect_poses))
+
+
+def _initial_poses(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
+                   high: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Locate the magnet in each reading; return rows, positions and axes of the valid poses."""
+    if field.ndim != 3 or field.shape[1:] != (len(network), 3):
+        raise ValueError(f'expected field (K, {len(network)}, 3), got {field.shape}')
+    median = np.zeros(field.shape[1:])
+    for j, a in zip(*np.nonzero((~np.isnan(field)).any(axis=0)), strict=True):
+        median[j, a] = np.nanmedian(field[:, j, a])
+    poses = [locate_magnet(network, B - median, moment, low, high, INITIAL_POSE_SETTINGS)
+             for B in field]
+    rows = np.flatnonzero([pose.converged for pose in poses])
+    positions, axes = (np.array([getattr(poses[k], name) for k in rows]).reshape(-1, 3)
+                       for name in ('position', 'axis'))
+    return rows, positions, axes

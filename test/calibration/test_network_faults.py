@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mag_tracking.analysis.network_geometry import calibrate_geometry, fitted_geometry
-from mag_tracking.analysis.network_readings import rotation
+from mag_tracking.calibration.network_fit import rotation
+from mag_tracking.calibration.network_geometry import calibrate_geometry, fitted_geometry
 from mag_tracking.physics.dipole import dipole_field
 from support.magnet_boards import MOMENT, SETTINGS, board, calibrated_boards, estimated, simulated
 

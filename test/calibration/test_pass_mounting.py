@@ -8,7 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from mag_tracking.analysis.pass_mounting import MountingEvidence, fuse_mounting, with_pass_mounting
+from mag_tracking.calibration.orientation import (
+    MountingEvidence,
+    fuse_mounting,
+    with_pass_mounting,
+)
 from mag_tracking.geometry import rotation_about_z
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from mag_tracking.analysis.direction_likelihood import (
+from mag_tracking.physics.dipole import dipole_field
+from support.direction_likelihood import (
     LaneHypothesis,
     direction_likelihood_ratio,
 )
-from mag_tracking.physics.dipole import dipole_field
 from support.two_way_traffic import far_sensor_error, passings, shares
 
 RIGHT, LEFT = LaneHypothesis(25.0, 3.5), LaneHypothesis(-25.0, 6.5)

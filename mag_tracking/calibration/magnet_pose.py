@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,14 +11,16 @@ from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.inference.least_squares import project_out_linear, refine
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import dipole_jacobians, sensor_fields
-from mag_tracking.settings import param
 
 N_UNKNOWNS = 5
 """Number of unknowns of a pose; the roll of a dipole is not observable."""
 
+N_GRID, N_STARTS, MAX_STEPS = 7, 8, 60
+"""Number of grid points per axis of the search box, number of the best ones that are refined, and
+maximum number of steps."""
+
 EXACT_COST = 1e-9
-"""Maximum sum of squared residuals of readings without noise. Rounding prevents a further
-reduction, so the fit counts as converged."""
+"""Maximum sum of squared residuals of exact readings, which rounding keeps above zero."""
 
 MAX_COST = 100.0
 """Maximum normalised cost; a larger cost means that the readings do not fit the dipole."""
@@ -27,19 +29,14 @@ _Problem: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Function that maps states (n, 9) to residuals (n, n_y) and Jacobians (n, n_y, 9)."""
 
 
-@dataclass(frozen=True)
-class PoseSettings:
-    """Settings of the search for a magnet pose, and error model of the readings."""
+class PoseSettings(NamedTuple):
+    """Error model of the readings of a magnet."""
 
-    field_error: float = param(
-        0.01, 'Error of sensors and dipole model relative to the field.', '', (0.0, 1.0))
-    ambient_std: float = param(
-        1e-7, 'Standard deviation of the change of the ambient field since the biases were '
-        'estimated, per axis; the change is the same at all sensors.', 'T', (1e-15, 1e-3))
-    grid_points: int = param(
-        343, 'Number of points of the coarse grid in the search box.', '', (8, 1_000_000))
-    starts: int = param(8, 'Number of grid points that are refined.', '', (1, 1000))
-    iterations: int = param(60, 'Maximum number of steps.', '', (1, 10000))
+    field_error: float = 0.01
+    """Error of sensors and dipole model relative to the field."""
+    ambient_std: float = 1e-7
+    """[T] Standard deviation of the change of the ambient field since the biases were estimated,
+    per axis; the change is the same at all sensors."""
 
 
 @dataclass(frozen=True)
@@ -51,16 +48,16 @@ class MagnetPose:
     axis: FloatArray
     """(3,) unit vector, world: direction of the moment."""
     covariance: FloatArray
-    """(6, 6) covariance of position and axis, singular along the axis. Scaled by the normalised
-    cost if this cost exceeds one."""
-    ambient: FloatArray
-    """(3,) [T], world: change of the ambient field since the biases were estimated."""
+    """(6, 6) of position and axis, singular along the axis; scaled by a cost above one."""
     normalised_cost: float
     """Cost per degree of freedom; about one if moment, noise and field error are correct."""
-    converged: bool
-    """Whether the pose is valid."""
     reason: str
     """Reason why the pose is not valid; empty if it is valid."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether the pose is valid."""
+        return not self.reason
 
 
 def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low: ArrayLike,
@@ -68,10 +65,9 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     """Estimate the pose of a dipole of known moment from one reading of all sensors.
 
     The best points of a grid in the box between the corners `low` and `high` (3,) [m, world frame]
-    are refined; the solution with the smallest cost is returned. `field` (n, 3) [T, sensor frame]
-    is corrected for bias and gain (`NetworkGeometry.signal`); NaN if not measured. All values are
-    NaN if too few axes were measured. Raises ValueError for an invalid reading, moment or box, or a
-    sensor without `noise_std`. PHD15 Paper A eq. (3).
+    are refined. `field` (n, 3) [T, sensor frame] is corrected for bias and gain; NaN if not
+    measured. Raises ValueError for an invalid reading,
+    moment or box, or a sensor without `noise_std`. PHD15 Paper A eq. (3).
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
     _check_input(network, field, moment, low, high)
@@ -79,17 +75,17 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     n_values = int(np.count_nonzero(is_measured))
     if n_values <= N_UNKNOWNS:
         nan_vector = np.full(3, np.nan)
-        return MagnetPose(nan_vector, nan_vector, np.full((6, 6), np.nan), nan_vector, np.nan,
-                          False, f'number of measured axes is {n_values}; more than '
-                          f'{N_UNKNOWNS} are required')
+        return MagnetPose(nan_vector, nan_vector, np.full((6, 6), np.nan), np.nan,
+                          f'number of measured axes is {n_values}; more than {N_UNKNOWNS} are '
+                          'required')
     squared_norm = np.nansum(np.square(field), axis=1)[:, None]
     std = np.sqrt(np.square(np.array(network.noise_std)) + settings.field_error**2 * squared_norm)
     problem = _residual_function(network, field, std, is_measured, moment, settings.ambient_std)
-    starts = _starting_states(network, field, std, is_measured, low, high, settings)
-    x, cost, covariance, converged = refine(problem, starts, settings.iterations, 1e-9)
+    starts = _starting_states(network, field, std, is_measured, low, high)
+    x, cost, covariance, converged = refine(problem, starts, MAX_STEPS, 1e-9)
     best = int(np.argmin(cost))
     return _pose_of_minimum(x[best], covariance[best], cost[best] / (n_values - N_UNKNOWNS),
-                            converged[best] or cost[best] < EXACT_COST, low, high, settings)
+                            converged[best] or cost[best] < EXACT_COST, low, high)
 
 
 def _residual_function(network: SensorNetwork, field: FloatArray, std: FloatArray,
@@ -120,24 +116,22 @@ def _residual_function(network: SensorNetwork, field: FloatArray, std: FloatArra
 
 
 def _starting_states(network: SensorNetwork, field: FloatArray, std: FloatArray,
-                     is_measured: BoolArray, low: FloatArray, high: FloatArray,
-                     settings: PoseSettings) -> FloatArray:
+                     is_measured: BoolArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Best states (k, 9) on a grid of positions, each with its best-fitting moment direction."""
-    points_per_axis = max(2, int(round(settings.grid_points ** (1.0 / 3.0))))
-    axes = [np.linspace(a, b, points_per_axis + 2)[1:-1] for a, b in zip(low, high, strict=True)]
+    axes = [np.linspace(a, b, N_GRID + 2)[1:-1] for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
     # The Jacobian with respect to the moment does not depend on the moment.
     dB_dm = dipole_jacobians(network.positions - grid[:, None], np.zeros(3))[1]
     A = (network.R_sw @ dB_dm / std[:, :, None])[:, is_measured]
     is_finite = np.isfinite(A).all(axis=(1, 2))
     m, residual, _ = project_out_linear(A[is_finite], (field / std)[is_measured])
-    best = np.argsort(np.einsum('gy,gy->g', residual, residual), kind='stable')[:settings.starts]
+    best = np.argsort(np.einsum('gy,gy->g', residual, residual), kind='stable')[:N_STARTS]
     m = m[best] / np.linalg.norm(m[best], axis=1)[:, None]
     return np.hstack([grid[is_finite][best], m, np.zeros((len(m), 3))])
 
 
 def _pose_of_minimum(x: FloatArray, covariance: FloatArray, cost: float, converged: bool,
-                     low: FloatArray, high: FloatArray, settings: PoseSettings) -> MagnetPose:
+                     low: FloatArray, high: FloatArray) -> MagnetPose:
     """Convert a minimum `x` (9,) to a `MagnetPose`, with a reason if it is not valid."""
     length = np.linalg.norm(x[3:6])
     u = x[3:6] / length
@@ -145,7 +139,7 @@ def _pose_of_minimum(x: FloatArray, covariance: FloatArray, cost: float, converg
     T[:3, :3] = np.eye(3)
     T[3:, 3:6] = (np.eye(3) - np.outer(u, u)) / length
     if not (np.isfinite(cost) and converged):
-        reason = f'no minimum found (maximum number of steps: {settings.iterations})'
+        reason = f'no minimum found (maximum number of steps: {MAX_STEPS})'
     elif not cost <= MAX_COST:
         reason = ('the readings do not fit one dipole of this moment: the normalised cost is '
                   f'{cost:.0f}')
@@ -153,8 +147,7 @@ def _pose_of_minimum(x: FloatArray, covariance: FloatArray, cost: float, converg
         reason = f'the magnet is outside the box: {x[:3].tolist()} m'
     else:
         reason = ''
-    return MagnetPose(x[:3], u, max(1.0, cost) * T @ covariance @ T.T,
-                      settings.ambient_std * x[6:], float(cost), not reason, reason)
+    return MagnetPose(x[:3], u, max(1.0, cost) * T @ covariance @ T.T, float(cost), reason)
 
 
 def _check_input(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
@@ -163,10 +156,15 @@ def _check_input(network: SensorNetwork, field: FloatArray, moment: float, low: 
     if field.shape != (len(network), 3) or low.shape != (3,) or high.shape != (3,):
         raise ValueError(f'expected field ({len(network)}, 3) and corners (3,), got '
                          f'{field.shape}, {low.shape}, {high.shape}')
-    if not (np.isfinite(moment) and moment > 0.0):
-        raise ValueError(f'moment is {moment} A m^2; it must be finite and above 0')
     if not (np.isfinite(high - low).all() and (high > low).all()):
         raise ValueError(f'the box from {low.tolist()} to {high.tolist()} m has no volume')
+    check_moment_and_noise(network, field, moment)
+
+
+def check_moment_and_noise(network: SensorNetwork, field: FloatArray, moment: float) -> None:
+    """Raise ValueError for an invalid moment, an infinite reading or a sensor without noise."""
+    if not (np.isfinite(moment) and moment > 0.0):
+        raise ValueError(f'moment is {moment} A m^2; it must be finite and above 0')
     if np.isinf(field).any():
         raise ValueError('field contains an infinite reading')
     for name, std in zip(network.names, network.noise_std, strict=True):

@@ -1,12 +1,17 @@
 """Calibration of a board of 41 sensors from recorded readings, validated with held-out readings."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mag_tracking.analysis.network_blind import calibrate_geometry_blind
-from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
-from mag_tracking.analysis.network_readings import rotation, tool_rotations
+from mag_tracking.calibration.network_fit import GeometrySettings, rotation, tool_rotations
+from mag_tracking.calibration.network_geometry import (
+    calibrate_geometry,
+    calibrate_geometry_blind,
+)
+from support.magnet_boards import magnet_poses
 from support.marks import studied
 from support.real_board import BOX, MOMENT, assert_within_limits, board_of_41, errors, print_errors
 
@@ -29,7 +34,7 @@ def test_calibration_with_half_of_the_readings_is_accurate_for_the_other_half(re
     assert g.tool_offset[1][2] < 3e-4 and (g.tool_tilt[1] < 2e-3).all()
     test_rows = slice(1 - first, None, 2)
     position_error, axis_error = errors(g, field[test_rows], positions[test_rows],
-                                        axes[test_rows], g.magnet_poses)
+                                        axes[test_rows], partial(magnet_poses, g))
     is_low = positions[test_rows, 2] < 0.1
     print_errors(f'known poses, rows {first}::2', position_error, axis_error, is_low)
     assert_within_limits(position_error, axis_error, is_low)
@@ -42,7 +47,7 @@ def test_calibration_with_half_of_the_readings_is_accurate_for_the_other_half(re
                                      bias_only)
         sixth_rows = slice(1, None, 6)
         nominal_error, axis_error = errors(nominal, field[sixth_rows], positions[sixth_rows],
-                                           axes[sixth_rows], nominal.magnet_poses)
+                                           axes[sixth_rows], partial(magnet_poses, nominal))
         print_errors('nominal', nominal_error, axis_error, positions[sixth_rows, 2] < 0.1)
         assert np.median(nominal_error) > 3.0 * np.median(position_error)
 

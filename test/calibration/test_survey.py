@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mag_tracking.calibration import survey as survey_stage
+from mag_tracking.calibration.survey import Survey, SurveySettings
 from mag_tracking.geometry import rotation_about_z
 from mag_tracking.network import CalibrationRecord, SensorNetwork
 from mag_tracking.network.file import read_network, write_network
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import AccelerationSample, Readings
-from mag_tracking.stages.survey import stage as survey_stage
-from mag_tracking.stages.survey.settings import SurveySettings
-from mag_tracking.stages.survey.stage import Survey
 from support.bundled import vehicle_path
 from support.counters import assert_counts
 from support.samples import recorded, samples_of

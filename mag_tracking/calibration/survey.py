@@ -7,7 +7,6 @@ and the field of the Earth give the orientations.
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -27,25 +26,41 @@ from mag_tracking.calibration.orientation import (
 from mag_tracking.geometry import yaw_between
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import AccelerationSample
-from mag_tracking.stages.survey.settings import COMPASS_BIAS_STD, SurveySettings
+from mag_tracking.settings import param
 from mag_tracking.units import NS
 
 MAX_GAP_S = 3600.0
-"""[s] Maximum gap between accelerations. After a longer gap or a backward jump, earlier readings
-belong to another recording and are discarded."""
+"""[s] Maximum gap between accelerations of one recording; earlier readings are discarded."""
+
+COMPASS_BIAS_STD = 6e-7
+"""[T] Prior standard deviation, per axis, of the field of a sensor and of nearby iron."""
 
 ACCELEROMETER_BIAS = 0.05
 """[m/s²] Bias of an accelerometer, per axis; it tilts the estimated vertical by 0.3 degrees."""
 
 MAX_CLOCK_OFFSET_S = 0.5
-"""[s] Maximum offset between two clocks. The knocks must be further apart, at irregular
-intervals."""
+"""[s] Maximum offset between two clocks, and minimum interval between knocks."""
 
 MAX_ACCELERATIONS = 60_000
 """Maximum number of stored readings per accelerometer, which bounds the memory."""
 
 MIN_NOMINAL_STD = 1e-3
 """[rad] Minimum standard deviation of an orientation in the network file."""
+
+
+@dataclass(frozen=True)
+class SurveySettings:
+    """Settings of the survey of orientations and clock offsets."""
+
+    offset_std: float = param(
+        5e-6, 'Standard deviation, per axis, of the constant offset of an uncalibrated sensor, '
+        'including iron nearby. An offset does not affect tracks. If the background of a sensor '
+        'contradicts the field of the Earth by more than this offset and the uncertainty of its '
+        'orientation explain, its gain, its axes or its orientation are wrong, and its tracks are '
+        'ambiguous. 0 disables this flag.', 'T', (0.0, 1e-3))
+    nominal_std_deg: float = param(
+        5.0, 'Standard deviation, about each axis, of the orientations in the network file, for '
+        'sensors without orientation_std_deg.', 'deg', (0.06, 180.0))
 
 
 @dataclass(frozen=True)
@@ -58,8 +73,7 @@ class SensorSurvey:
     by: str
     """Source of the orientation."""
     lag: Lag | None
-    """Offset of the sensor clock. None for the sensor with the reference clock, and for sensors
-    without accelerations."""
+    """Offset of the sensor clock; None for the reference clock and without accelerations."""
     warnings: tuple[str, ...]
 
 
@@ -71,16 +85,14 @@ class NetworkSurvey:
     """Network with the surveyed orientations and clock offsets."""
     sensors: tuple[SensorSurvey, ...]
     disagreements: tuple[FieldInconsistency, ...]
-    """Sensors whose field differs from the field of the Earth. Their headings remain as in the
-    network file."""
+    """Sensors whose field differs from the field of the Earth; their headings are nominal."""
     bias_std: float
     """[T] Standard deviation of the compass biases."""
     reference: str
-    """Name of the sensor with the reference clock; empty if no two sensors measured the same
-    knock."""
+    """Name of the sensor with the reference clock; empty if no two measured the same knock."""
     shocks: dict[str, tuple[FloatArray, FloatArray]]
-    """{sensor: (t (n,) [s], shock (n,) [m/s²])} for sensors with accelerations. Times are by the
-    clock of each sensor, relative to the first reading of any sensor."""
+    """{sensor: (t (n,) [s], shock (n,) [m/s²])} with times by the clock of each sensor, relative to
+    the first reading of any sensor."""
 
     def warnings(self) -> list[str]:
         """Warnings about the fields, orientations and clocks of the sensors."""
@@ -134,9 +146,8 @@ class Survey:
     def solve(self, fields: Mapping[str, FloatArray], date: str) -> NetworkSurvey:
         """Compute orientations and clock offsets from fields and the accelerations added so far.
 
-        `fields` (3,) [T] are measured in the sensor frame while no target is present; an axis that
-        is not reported is NaN, and sensors may be missing. `date` is entered in the calibration
-        records.
+        `fields` (3,) [T, sensor frame] are measured without a target, NaN for an unreported axis;
+        sensors may be missing. `date` is entered in the calibration records.
         """
         network, names = self._network, self._network.names
         field = np.array([fields.get(name, np.full(3, np.nan)) for name in names])
@@ -152,17 +163,19 @@ class Survey:
             if surveyed is not None:
                 warnings[name] += _tilt_warning(before, surveyed.R_ws, std, surveyed.std)
         inconsistent = self._disagreements(field, orientations, nominal_std, warnings)
+        faulty = {d.sensor for d in inconsistent}
         bias_std, oriented = self._compass(
-            {j: u for j, u in enumerate(up_directions) if u is not None and names[j] not in
-             {d.sensor for d in inconsistent}}, field, nominal_std, warnings)
+            {j: up for j, up in enumerate(up_directions) if up is not None
+             and names[j] not in faulty}, field, nominal_std, warnings)
         shocks = self._shocks()
         reference, lags = self._lags(shocks)
         sensors = []
         for j, name in enumerate(names):
-            orientation, by = oriented.get(j, (orientations[j], 'accelerometer, nominal heading'))
-            sensors.append(SensorSurvey(
-                name, orientation, 'nominal orientation' if orientation is None else by,
-                lags.get(name), tuple(warnings[name])))
+            orientation = oriented.get(j, orientations[j])
+            by = 'nominal orientation' if orientation is None else \
+                f'accelerometer, {"compass and " if j in oriented else ""}nominal heading'
+            sensors.append(SensorSurvey(name, orientation, by, lags.get(name),
+                                        tuple(warnings[name])))
         return NetworkSurvey(self._updated_network(sensors, reference, date), tuple(sensors),
                              tuple(inconsistent), bias_std, reference, shocks)
 
@@ -181,10 +194,7 @@ class Survey:
     def _disagreements(self, field: FloatArray, orientations: Sequence[Orientation | None],
                        nominal_std: FloatArray, warnings: Mapping[str, list[str]]
                        ) -> list[FieldInconsistency]:
-        """Find the sensors whose field contradicts the Earth's field.
-
-        If the Earth's field is unknown, add a warning and return an empty list.
-        """
+        """Find the sensors whose field contradicts that of the Earth; warn if that is unknown."""
         network = self._network
         R = np.array([R if o is None else o.R_ws
                       for o, R in zip(orientations, network.R_ws, strict=True)])
@@ -199,13 +209,8 @@ class Survey:
                              self._settings.offset_std)
 
     def _compass(self, ups: Mapping[int, UpDirection], field: FloatArray, nominal_std: FloatArray,
-                 warnings: Mapping[str, list[str]]
-                 ) -> tuple[float, dict[int, tuple[Orientation, str]]]:
-        """Estimate the orientations of the sensors with a compass.
-
-        Return the std of the compass biases [T], and the orientation and its source by sensor
-        index.
-        """
+                 warnings: Mapping[str, list[str]]) -> tuple[float, dict[int, Orientation]]:
+        """Std of the compass biases [T], and {sensor index: orientation from the compass}."""
         network, bias_std = self._network, COMPASS_BIAS_STD
         usable = {j: up for j, up in ups.items() if not np.isnan(field[j]).all()}
         if network.earth_field is None or not usable:
@@ -227,16 +232,17 @@ class Survey:
         out = {}
         for j, orientation in estimates.items():
             fused = with_nominal_heading(orientation, network.R_ws[j], nominal_std[j][2])
-            name = network.names[j]
             if fused is None:
                 difference = np.degrees(yaw_between(network.R_ws[j], orientation.R_ws))
-                warnings[name].append(f'the compass heading differs by {difference:+.0f} degrees '
-                                      'from the network file, whose heading is retained')
-            elif not np.isnan(orientation.rival):
-                warnings[name].append('the compass allows another heading, which differs by '
-                                      f'{np.degrees(orientation.rival):+.0f} degrees')
-            if fused is not None:
-                out[j] = fused, 'accelerometer, compass and nominal heading'
+                warnings[network.names[j]].append(
+                    f'the compass heading differs by {difference:+.0f} degrees from the network '
+                    'file, whose heading is retained')
+                continue
+            out[j] = fused
+            if not np.isnan(orientation.rival):
+                warnings[network.names[j]].append(
+                    'the compass allows another heading, which differs by '
+                    f'{np.degrees(orientation.rival):+.0f} degrees')
         return bias_std, out
 
     def _shocks(self) -> dict[str, tuple[FloatArray, FloatArray]]:
@@ -251,14 +257,10 @@ class Survey:
 
     def _lags(self, signals: Mapping[str, tuple[FloatArray, FloatArray]]
               ) -> tuple[str, dict[str, Lag]]:
-        """Find the reference sensor, and estimate the lags of the other sensors from knocks.
-
-        The name of the reference is empty if no two sensors measured the same knock.
-        """
-        max_offset = MAX_CLOCK_OFFSET_S
+        """Find the reference sensor, '' if none, and estimate the lags of others from knocks."""
         first_lags: dict[str, Lag] = {}
         for reference, (t, s) in signals.items():
-            lags = {name: knock_lag(t, s, *signals[name], max_offset)
+            lags = {name: knock_lag(t, s, *signals[name], MAX_CLOCK_OFFSET_S)
                     for name in signals if name != reference}
             if any(not lag.reason for lag in lags.values()):
                 return reference, lags
@@ -287,25 +289,11 @@ class Survey:
                        calibrated=tuple(calibrated))
 
 
-class NoiseSource(Protocol):
-    """Part of the interface of `Calibrate` that `with_measured_noise` uses."""
-
-    def backgrounds(self) -> Mapping[str, RunningBackground]:
-        """Background estimator of each sensor, in the order of the network.
-
-        Returns
-        -------
-        mapping of str to RunningBackground
-        """
-
-
-def with_measured_noise(network: SensorNetwork, calibrate: NoiseSource) -> SensorNetwork:
-    """Network with the noise that a `Calibrate` stage has measured.
-
-    A sensor retains its previous noise if the measured noise of any axis is unknown.
-    """
+def with_measured_noise(network: SensorNetwork,
+                        backgrounds: Mapping[str, RunningBackground]) -> SensorNetwork:
+    """Network with the noise of the backgrounds of its sensors, if known for all axes."""
     noise = list(network.noise_std)
-    for j, background in enumerate(calibrate.backgrounds().values()):
+    for j, background in enumerate(backgrounds.values()):
         std = None if background.covariance is None else np.sqrt(np.diagonal(background.covariance))
         # The network file requires all three axes, but an axis that is not reported has no noise.
         if std is not None and not np.isnan(std).any():
@@ -315,10 +303,7 @@ def with_measured_noise(network: SensorNetwork, calibrate: NoiseSource) -> Senso
 
 def _tilt_warning(R: FloatArray, surveyed: FloatArray, std: FloatArray,
                   surveyed_std: FloatArray) -> list[str]:
-    """List with a warning if the tilt of a sensor differs significantly from the network file.
-
-    `R` and `std` [rad] are from the network file, the others from the survey.
-    """
+    """List with a warning if a surveyed tilt differs significantly from the network file."""
     tilt = np.arccos(np.clip((R.T @ [0.0, 0.0, 1.0]) @ (surveyed.T @ [0.0, 0.0, 1.0]), -1.0, 1.0))
     limit = 3.0 * np.hypot(std[:2].max(), surveyed_std[:2].max())
     return [f'the tilt differs by {np.degrees(tilt):.0f} degrees from the network file'] \

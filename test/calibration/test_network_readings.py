@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.analysis.network_readings import (
+from mag_tracking.calibration.network_fit import (
     TrackedMagnet,
     predicted_readings,
     rotation,

@@ -1,1 +1,0 @@
-"""Survey: estimate the orientations and clock offsets of the sensors of a network."""
