@@ -32,7 +32,7 @@ from mag_tracking.report.metrics import (
 )
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.results.result_folder import ResultFolder, figure_name
-from mag_tracking.results.tum_file import write_tum
+from mag_tracking.results.track_files import write_tum
 from mag_tracking.run import (
     Failure,
     RecordingSource,

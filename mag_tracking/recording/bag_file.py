@@ -13,13 +13,15 @@ from typing import TYPE_CHECKING, Any
 import lz4.frame
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.ros1 import cdr_of_ros1
+from mag_tracking.messages.encodings import cdr_of_ros1
 from mag_tracking.messages.types import schema_of
-from mag_tracking.recording.decode_errors import DECODE_ERRORS
-from mag_tracking.recording.expansion import RefusedDataError, expanded, largest_chunk
-from mag_tracking.recording.interruptible import Progress
-from mag_tracking.recording.message_block import MessageBlock
-from mag_tracking.recording.raw_message import RawMessage
+from mag_tracking.recording.expansion import (
+    DECODE_ERRORS,
+    RefusedDataError,
+    expanded,
+    largest_chunk,
+)
+from mag_tracking.recording.message_block import MessageBlock, Progress, RawMessage
 from mag_tracking.units import LATEST_NS
 
 if TYPE_CHECKING:

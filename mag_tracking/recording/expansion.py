@@ -2,15 +2,22 @@
 
 import bz2
 import os
+import struct
+import zlib
 from collections.abc import Callable, Iterator
 from io import BytesIO
 
 import lz4.frame
 import zstandard
+from mcap.exceptions import McapError
+from mcap.stream_reader import CRCValidationError
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.recording.decode_errors import DECODE_ERRORS
 
+DECODE_ERRORS: tuple[type[Exception], ...] = (
+    McapError, CRCValidationError, ValueError, KeyError, EOFError, struct.error, zlib.error,
+    zstandard.ZstdError, RuntimeError, UnicodeDecodeError, MemoryError, OverflowError)
+"""Exceptions that the MCAP library and its decompressors raise for damaged bytes."""
 LARGEST_CHUNK_MB = 256.0
 """Largest size of a decompressed chunk, message or record that is read [MB]."""
 LARGEST_CHUNK_VARIABLE = 'MAG_TRACKING_LARGEST_CHUNK_MB'

@@ -19,9 +19,15 @@ from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.table_columns import IGNORED, Columns, find_columns, sensor_name
 from mag_tracking.recording.table_layout import Table, read_table
-from mag_tracking.recording.table_order import MAX_STEPS, check_resolution, order_times
 from mag_tracking.recording.table_text import find_decimal, parse_number
-from mag_tracking.recording.table_times import check_range, read_times, span_text
+from mag_tracking.recording.table_times import (
+    MAX_STEPS,
+    check_range,
+    check_resolution,
+    order_times,
+    read_times,
+    span_text,
+)
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Readings
 from mag_tracking.time_text import DAY_NS

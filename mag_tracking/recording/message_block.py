@@ -1,8 +1,8 @@
-"""Blocks of messages: their bytes, and arrays of their channels, log times and byte positions."""
+"""Messages of a recording in blocks, and reading that can be stopped."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from mcap.records import Schema
@@ -11,7 +11,52 @@ from mag_tracking.arrays import IntArray
 from mag_tracking.messages.encodings import CDR, cdr_of, type_of
 from mag_tracking.messages.types import ROS_SCHEMA, schema_of
 from mag_tracking.recording.expansion import expanded_message
-from mag_tracking.recording.raw_message import RawMessage
+
+Progress: TypeAlias = Callable[[int], object]
+"""Function that is called with the number of bytes read since the last call."""
+_Item = TypeVar('_Item')
+
+
+class ReadingStopped(Exception):
+    """Raised when the caller stops the reading."""
+
+
+def until_stopped(read: Callable[[Progress], Iterator[_Item]], progress: Progress | None = None,
+                  stopped: Callable[[], bool] | None = None) -> Iterator[_Item]:
+    """Iterate over the items of `read`, which calls its `Progress` argument while it reads.
+
+    `stopped` is called after every item and every progress report; ReadingStopped is raised when it
+    returns true.
+    """
+    def advance(n: int) -> None:
+        if progress is not None:
+            progress(n)
+        check()
+
+    def check() -> None:
+        if stopped is not None and stopped():
+            raise ReadingStopped
+
+    for item in read(advance):
+        yield item
+        check()
+
+
+class RawMessage(NamedTuple):
+    """Message of a recording, converted to CDR if it is stored in another encoding."""
+
+    topic: str
+    """Name of the topic."""
+    type: str
+    """Message type."""
+    log_time_ns: int
+    """Log time, ns since 1970."""
+    data: bytes
+    """Serialised message, CDR. Empty if the stored message cannot be converted."""
+    schema: Schema
+    """Schema of the message type."""
+    fault: str = ''
+    """Why the stored message cannot be converted. Empty if it can."""
 
 
 class ChannelKind(NamedTuple):

@@ -13,11 +13,9 @@ from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path
 from mag_tracking.recording.bag_file import ROS1_MAGIC, SQLITE_MAGIC, BagFile
 from mag_tracking.recording.file_kind import HEAD_SIZE, describe_file
-from mag_tracking.recording.interruptible import Progress
+from mag_tracking.recording.mcap_file import MAGIC as MCAP_MAGIC
 from mag_tracking.recording.mcap_file import McapFile
-from mag_tracking.recording.mcap_records import MAGIC as MCAP_MAGIC
-from mag_tracking.recording.message_block import MessageBlock
-from mag_tracking.recording.raw_message import RawMessage
+from mag_tracking.recording.message_block import MessageBlock, Progress, RawMessage
 from mag_tracking.yaml_file import read_yaml
 
 SUFFIXES = ('.mcap', '.db3', '.bag')

@@ -18,17 +18,17 @@ from typing import TypeAlias
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path
-from mag_tracking.recording.mcap_file_writer import McapFileWriter
 from mag_tracking.recording.repair import finish_file
-from mag_tracking.recording.rosbag2_folder import (
+from mag_tracking.recording.writer import (
     FileSummary,
+    McapFileWriter,
     Opener,
     Topic,
     check_no_recording,
+    offered_qos,
     open_new,
     write_metadata,
 )
-from mag_tracking.recording.writer import offered_qos
 
 FLUSH_INTERVAL_NS = 400_000_000
 """Interval between flushes [ns]. A crash loses the messages of at most one flush interval plus one

@@ -32,14 +32,13 @@ from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path, new_binary_file
 from mag_tracking.recording import core
 from mag_tracking.recording.bag_file import ROS1_MAGIC, SQLITE_MAGIC
-from mag_tracking.recording.decode_errors import DECODE_ERRORS
-from mag_tracking.recording.expansion import largest_chunk
+from mag_tracking.recording.expansion import DECODE_ERRORS, largest_chunk
 from mag_tracking.recording.file_kind import HEAD_SIZE, describe_file
-from mag_tracking.recording.mcap_file import McapFile
-from mag_tracking.recording.mcap_records import (
+from mag_tracking.recording.mcap_file import (
     MAGIC,
     MIN_BYTES_PER_MESSAGE,
     RECORD_HEADER,
+    McapFile,
     Record,
     chunk_content,
     chunk_header,
@@ -47,7 +46,7 @@ from mag_tracking.recording.mcap_records import (
     read_summary,
     records,
 )
-from mag_tracking.recording.rosbag2_folder import (
+from mag_tracking.recording.writer import (
     FileSummary,
     Topic,
     UnbufferedWriter,

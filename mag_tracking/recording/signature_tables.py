@@ -18,7 +18,7 @@ from mag_tracking.analysis.signature_classifier import VERSION, SignatureModel
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import LabelsError, RecordingError
 from mag_tracking.files import checked_path, replace_text
-from mag_tracking.recording.csv_file import Lines, number, read_csv
+from mag_tracking.recording.table_text import Lines, number, read_csv
 from mag_tracking.units import NS
 
 LABEL, TIME, PASS = 'label', 'time_s', 'pass'

@@ -14,8 +14,8 @@ from mag_tracking.geometry import quaternion_between
 from mag_tracking.messages.message_arrays import poses
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.messages.types import ODOMETRY, POSE, POSE_WITH_COVARIANCE
-from mag_tracking.recording.csv_file import Lines, number, read_csv
 from mag_tracking.recording.message_block import MessageBlock
+from mag_tracking.recording.table_text import Lines, number, read_csv
 from mag_tracking.report.metrics import Truth
 from mag_tracking.units import LATEST_NS, NS
 

@@ -1,17 +1,268 @@
-"""Writer of MCAP recordings that rosbag2 can play."""
+"""Writers of MCAP recordings that rosbag2 can play."""
 
+import errno
+import fcntl
+import io
+import os
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
+from typing import IO, NamedTuple, TypeAlias, cast
 
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from mag_tracking.errors import OutputError
+from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path, new_binary_file, new_text_file
-from mag_tracking.messages.shapes import MessageDict
-from mag_tracking.messages.types import definition, encoder
+from mag_tracking.messages.types import MessageDict, definition, encoder
+from mag_tracking.yaml_file import parse_yaml
+
+Opener: TypeAlias = Callable[[Path], io.FileIO]
+"""Creates a file at a path and returns an unbuffered stream."""
+
+
+OFFERED_QOS = '''- history: keep_last
+  depth: 10
+  reliability: reliable
+  durability: volatile
+  deadline: {sec: 9223372036, nsec: 854775807}
+  lifespan: {sec: 9223372036, nsec: 854775807}
+  liveliness: automatic
+  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
+  avoid_ros_namespace_conventions: false
+'''
+"""Default QoS profile of a topic: reliable and volatile, depth 10."""
+
+
+def offered_qos(reliable: bool = True, latched: bool = False) -> str:
+    """QoS profile of a topic as rosbag2 writes it in `offered_qos_profiles`, YAML.
+
+    Without `reliable` it is best-effort, without `latched` volatile.
+    """
+    text = OFFERED_QOS if reliable else OFFERED_QOS.replace('reliability: reliable',
+                                                            'reliability: best_effort')
+    return text.replace('durability: volatile', 'durability: transient_local') if latched else text
+
+
+class Topic(NamedTuple):
+    """Description of a topic in a recording."""
+
+    type: str
+    """Message type."""
+    definition: str = ''
+    """Definition of the type as a `ros2msg` schema. Empty if unknown."""
+    qos: str = OFFERED_QOS
+    """Offered QoS profiles, as YAML."""
+
+
+class FileSummary(NamedTuple):
+    """Entry of one file in `metadata.yaml`."""
+
+    name: str
+    """Name of the file."""
+    counts: Counter[str]
+    """Number of messages by topic."""
+    first_ns: int | None = None
+    """Log time of the first message, ns. None if the file has no messages."""
+    last_ns: int | None = None
+    """Log time of the last message, ns. None if the file has no messages."""
+
+
+def open_new(path: Path) -> io.FileIO:
+    """Create a file that must not exist, unbuffered, so that a crash loses no written data.
+
+    It is locked if the file system supports locks.
+    """
+    stream = open(path, 'xb', buffering=0)
+    # The lock prevents a repair of a file that is still being written. Some file systems do not
+    # support locks.
+    with suppress(OSError):
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return stream
+
+
+class UnbufferedWriter:
+    """Stream that writes all bytes or raises OSError.
+
+    On a full disk, an unbuffered write may write only part of its data without raising an error.
+    """
+
+    def __init__(self, raw: io.FileIO) -> None:
+        self.raw, self.offset = raw, 0
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Append data to the file."""
+        remaining = memoryview(data)
+        while remaining:
+            n = self.raw.write(remaining)
+            self.offset += n
+            remaining = remaining[n:]
+
+    def tell(self) -> int:
+        """Number of bytes written."""
+        return self.offset
+
+    def flush(self) -> None:
+        """Do nothing: there is no buffer."""
+
+
+def check_no_recording(folder: Path) -> None:
+    """Raise OutputError if a path is not a folder or contains a recording."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f'{folder} is not a folder')
+    existing = sorted(p.name for pattern in ('metadata.yaml', '*.mcap', '*.db3')
+                      for p in folder.glob(pattern))
+    if existing:
+        raise OutputError(f'{folder} already contains a recording ({existing[0]}): choose another '
+                          f'folder, or run mag-tracking repair to complete a truncated recording')
+
+
+def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[str, Topic],
+                   opener: Opener = open_new) -> None:
+    """Write the `metadata.yaml` of rosbag2 atomically, with the topics by name.
+
+    Raises OSError, or RecordingError if the QoS profiles of a topic are not valid YAML.
+    """
+    no_counts: Counter[str] = Counter()
+    counts = sum((f.counts for f in files), no_counts)
+    first_times = [f.first_ns for f in files if f.first_ns is not None]
+    last_times = [f.last_ns for f in files if f.last_ns is not None]
+    content = {'rosbag2_bagfile_information': {
+        'version': 9, 'storage_identifier': 'mcap', **_span(first_times, last_times),
+        'message_count': counts.total(),
+        'topics_with_message_count': [
+            {'topic_metadata': {'name': name, 'type': topics[name].type,
+                                'serialization_format': 'cdr',
+                                'offered_qos_profiles': _qos_profiles(name, topics[name]),
+                                'type_description_hash': ''},
+             'message_count': n} for name, n in counts.items()],
+        'compression_format': '', 'compression_mode': '',
+        'relative_file_paths': [f.name for f in files],
+        'files': [{'path': f.name, 'message_count': f.counts.total(),
+                   **_span([f.first_ns or 0], [f.last_ns or 0])} for f in files],
+        'custom_data': None, 'ros_distro': 'jazzy'}}
+    new_file = folder / '.metadata.yaml.new'
+    new_file.unlink(missing_ok=True)
+    stream = UnbufferedWriter(opener(new_file))
+    try:
+        stream.write(yaml.safe_dump(content, sort_keys=False).encode())
+        os.replace(new_file, folder / 'metadata.yaml')
+    finally:
+        stream.raw.close()
+        new_file.unlink(missing_ok=True)
+
+
+def _qos_profiles(name: str, topic: Topic) -> object:
+    """Parse the QoS profiles of a topic, stored as YAML; raises RecordingError if invalid."""
+    return parse_yaml(topic.qos, f'offered_qos_profiles of {name}', RecordingError)
+
+
+def _span(first_times: Sequence[int], last_times: Sequence[int]) -> dict[str, dict[str, int]]:
+    """Metadata entries of start time and duration from first and last log times [ns] of files; 0 if
+    there are none."""
+    first, last = min(first_times, default=0), max(last_times, default=0)
+    return {'starting_time': {'nanoseconds_since_epoch': first},
+            'duration': {'nanoseconds': last - first}}
+
+
+class McapFileWriter:
+    """Writer of one MCAP file of a recording; raises OSError if a write fails.
+
+    `opener` creates the file and returns an unbuffered stream.
+
+    Attributes
+    ----------
+    counts : number of messages by topic, including pending ones
+    pending : number of messages by topic that are not yet in a complete chunk
+    """
+
+    def __init__(self, path: Path, opener: Opener) -> None:
+        self.path = path
+        self._stream = UnbufferedWriter(opener(path))
+        self.counts: Counter[str] = Counter()
+        self.pending: Counter[str] = Counter()
+        self._times: list[int] = []
+        self._span: tuple[int | None, int | None] = (None, None)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._intact_size = self._buffered_size = 0
+        # The writer calls only stream methods that `UnbufferedWriter` has.
+        self._writer = Writer(cast(IO[bytes], self._stream), chunk_size=1 << 20,
+                              compression=CompressionType.ZSTD)
+
+    def start(self) -> None:
+        """Write the header of the file."""
+        self._writer.start(profile='ros2', library='mag_tracking')
+        self._mark_intact()
+
+    @property
+    def size(self) -> int:
+        """Upper bound of the file size after the next flush, bytes."""
+        return self._stream.offset + self._buffered_size
+
+    def add(self, name: str, topic: Topic, sequence: int, data: bytes, log_ns: int,
+            publish_ns: int) -> None:
+        """Append a CDR message with the times at which it was received and published."""
+        self.counts[name] += 1
+        self.pending[name] += 1
+        if name not in self._channels:
+            self._open_channel(name, topic)
+        # A message record has 31 bytes besides its data.
+        self._buffered_size += len(data) + 31
+        previous_offset = self._stream.offset
+        self._writer.add_message(self._channels[name], log_ns, data, publish_ns,
+                                 sequence & 0xFFFFFFFF)
+        self._times.append(log_ns)
+        if self._stream.offset != previous_offset:
+            self._mark_intact()
+
+    def _open_channel(self, name: str, topic: Topic) -> None:
+        """Register the schema and the channel of a topic."""
+        if topic.type not in self._schemas:
+            encoding = 'ros2msg' if topic.definition else ''
+            self._schemas[topic.type] = self._writer.register_schema(
+                topic.type, encoding, topic.definition.encode())
+        self._channels[name] = self._writer.register_channel(
+            name, 'cdr', self._schemas[topic.type], {'offered_qos_profiles': topic.qos})
+
+    def flush(self) -> None:
+        """Complete the current chunk, so that a crash cannot lose its messages; raises OSError also
+        if the file was removed."""
+        if self.pending:
+            self._writer.flush()
+            self._mark_intact()
+        if os.fstat(self._stream.raw.fileno()).st_nlink == 0:
+            raise OSError(errno.ENOENT, 'the file was removed')
+
+    def _mark_intact(self) -> None:
+        """Mark all bytes written so far as complete chunks, which `abandon` keeps."""
+        self._intact_size, self._buffered_size = self._stream.offset, 0
+        self.pending.clear()
+        if self._times:
+            self._span = min(self._times), max(self._times)
+            self._times = [*self._span]
+
+    def finish(self) -> None:
+        """Write the index and close the file."""
+        self.flush()
+        self._writer.finish()
+        os.fsync(self._stream.raw.fileno())
+        self._stream.raw.close()
+
+    def abandon(self) -> None:
+        """Truncate the file to its complete chunks after a failure; close it without an index."""
+        self.counts -= self.pending
+        with suppress(OSError):
+            self._stream.raw.truncate(self._intact_size)
+        with suppress(OSError):
+            self._stream.raw.close()
+
+    def summary(self) -> FileSummary:
+        """Entry of the file in `metadata.yaml`."""
+        return FileSummary(self.path.name, Counter(self.counts), *self._span)
+
 
 MAX_TOPICS = 2000
 """Maximum number of topics; twice the maximum number of sensors. The time to write and to read
@@ -121,26 +372,3 @@ class RecordingWriter:
             'custom_data': None, 'ros_distro': 'jazzy'}}
         with new_text_file(self.path.parent / 'metadata.yaml') as stream:
             yaml.safe_dump(metadata, stream, sort_keys=False)
-
-
-OFFERED_QOS = '''- history: keep_last
-  depth: 10
-  reliability: reliable
-  durability: volatile
-  deadline: {sec: 9223372036, nsec: 854775807}
-  lifespan: {sec: 9223372036, nsec: 854775807}
-  liveliness: automatic
-  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
-  avoid_ros_namespace_conventions: false
-'''
-"""Default QoS profile of a topic: reliable and volatile, depth 10."""
-
-
-def offered_qos(reliable: bool = True, latched: bool = False) -> str:
-    """QoS profile of a topic as rosbag2 writes it in `offered_qos_profiles`, YAML.
-
-    Without `reliable` it is best-effort, without `latched` volatile.
-    """
-    text = OFFERED_QOS if reliable else OFFERED_QOS.replace('reliability: reliable',
-                                                            'reliability: best_effort')
-    return text.replace('durability: volatile', 'durability: transient_local') if latched else text

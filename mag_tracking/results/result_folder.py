@@ -21,8 +21,7 @@ from mag_tracking.records import Detection, FieldFrame, Hypotheses, SmoothedPose
 from mag_tracking.report.json_text import without_nan
 from mag_tracking.report.page import REPORT
 from mag_tracking.results.columns import RESULT_TABLES, names_of, row_of
-from mag_tracking.results.rerun_file import RERUN_FILE
-from mag_tracking.results.track_recording import TrackRecording
+from mag_tracking.results.track_files import RERUN_FILE, TrackRecording
 
 _QUOTE, _SPECIAL = '"', {'"', ',', '\r', '\n'}
 _SUMMARY, _RECORDING = 'summary.json', 'tracks.mcap'

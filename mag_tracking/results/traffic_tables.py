@@ -1,18 +1,111 @@
-"""Passages and traffic summaries as tables: CSV, and Parquet if pyarrow is installed."""
+"""Passages, traffic summaries, pass events and enrolled vehicles as tables."""
 
 import csv
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from importlib.util import find_spec
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mag_tracking.errors import OutputError
-from mag_tracking.event_records import TrafficSummary, VehiclePassage
-from mag_tracking.files import new_text_file, output_folder
-from mag_tracking.results.columns import INTERVALS, Column, row_of, traffic_tables
+from mag_tracking.arrays import FloatArray
+from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.event_records import SIGNATURE_SPAN, PassEvent, TrafficSummary, VehiclePassage
+from mag_tracking.files import checked_path, new_text_file, output_folder, replace_text
+from mag_tracking.results.columns import (
+    EVENTS,
+    INTERVALS,
+    SIGNATURES,
+    Column,
+    names_of,
+    row_of,
+    traffic_tables,
+)
 from mag_tracking.results.parquet_table import TableWriter
+from mag_tracking.units import NS
+
+
+def event_row(event: PassEvent) -> list[object]:
+    """Cells of an event by column; numbers with a unit have six significant digits."""
+    row = row_of(EVENTS, event)
+    return [_number(row[c.name]) if c.kind == 'f' and c.unit else row[c.name] for c in EVENTS]
+
+
+def _number(value: float) -> str:
+    """Format a number with six significant digits; return '' for NaN and infinity."""
+    return f'{value:.6g}' if np.isfinite(value) else ''
+
+
+def write_events(folder: str | PathLike[str], events: Iterable[PassEvent]) -> None:
+    """Write `events.csv` and `signatures.csv` to a folder."""
+    folder, events = output_folder(folder), list(events)
+    try:
+        with new_text_file(folder / 'events.csv', newline='') as stream:
+            writer = csv.writer(stream)
+            writer.writerow(names_of(EVENTS))
+            writer.writerows(map(event_row, events))
+        with new_text_file(folder / 'signatures.csv', newline='') as stream:
+            writer = csv.writer(stream)
+            writer.writerow(names_of(SIGNATURES))
+            for event in events:
+                offsets_s = event.time_scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN,
+                                                           len(event.signature))
+                closest_s = (event.closest_ns - event.onset_ns) / NS
+                writer.writerows([event.sensor, event.number, _number(closest_s + t),
+                                  *(_number(1e9 * v) for v in field)]
+                                 for t, field in zip(offsets_s, event.signature, strict=True))
+    except OSError as error:
+        raise OutputError(f'cannot write to {folder}: {error.strerror}') from error
+
+
+VERSION = 1
+"""Version of the file format."""
+
+
+@dataclass(frozen=True)
+class FleetPass:
+    """One pass of an enrolled vehicle."""
+
+    moment: FloatArray
+    """Magnetic moment, (3,) A m², world frame."""
+    covariance: FloatArray
+    """Covariance of `moment`, (3, 3) (A m²)², world frame."""
+    heading: float
+    """Heading, rad, anticlockwise from x."""
+    source: str
+    """Name of the recording, and index of the passage in it."""
+
+
+def read_fleet(path: str | PathLike[str]) -> dict[str, list[FleetPass]]:
+    """Passes of enrolled vehicles by name; raises RecordingError for a file of another version."""
+    path = checked_path(path, RecordingError)
+    try:
+        with open(path, encoding='utf-8') as stream:
+            content = json.load(stream)
+        if content['mag_tracking.fleet'] != VERSION:
+            raise RecordingError(f'{path}: fleet version {content["mag_tracking.fleet"]} is not '
+                                 f'supported; expected {VERSION}')
+        return {str(name): [FleetPass(
+            np.array(p['moment'], dtype=float).reshape(3),
+            np.array(p['covariance'], dtype=float).reshape(3, 3), float(p['heading']),
+            str(p['source'])) for p in passes] for name, passes in content['vehicles'].items()}
+    except OSError as error:
+        raise RecordingError(f'cannot read {path}: {error.strerror}') from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise RecordingError(
+            f'{path} is not a valid fleet file (missing or invalid: {error})') from error
+
+
+def write_fleet(path: Path, fleet: dict[str, list[FleetPass]]) -> None:
+    """Write the passes of enrolled vehicles atomically."""
+    vehicles = {name: [{k: v.tolist() if isinstance(v, np.ndarray) else v
+                        for k, v in asdict(p).items()} for p in passes]
+                for name, passes in fleet.items()}
+    replace_text(path, json.dumps({'mag_tracking.fleet': VERSION, 'vehicles': vehicles},
+                                  indent=1) + '\n')
 
 
 def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[str],

@@ -23,7 +23,7 @@ from bench.figures import Figures
 from mag_tracking.apps.replay import replay
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.recording.importers import import_pose_table
+from mag_tracking.recording.pose_table import import_pose_table
 from mag_tracking.recording.reader import Recording
 from mag_tracking.records import Track
 from mag_tracking.report.metrics import interpolate_truth

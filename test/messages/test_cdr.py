@@ -8,9 +8,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.writer import Writer
 
-from mag_tracking.messages.definitions import DEFINITIONS
-from mag_tracking.messages.types import decode, definition, encoder, schema_of
-from mag_tracking.recording.raw_message import RawMessage
+from mag_tracking.messages.types import DEFINITIONS, decode, definition, encoder, schema_of
+from mag_tracking.recording.message_block import RawMessage
 
 MARKER = 'visualization_msgs/msg/Marker'
 HEADER = 'std_msgs/msg/Header'
