@@ -26,7 +26,7 @@ from mag_tracking.recording.writer import (
     Topic,
     check_no_recording,
     offered_qos,
-    open_new,
+    open_locked,
     write_metadata,
 )
 
@@ -64,7 +64,7 @@ class Recorder:
 
     def __init__(self, folder: str | PathLike[str], split_bytes: int = 10**9,
                  split_ns: int = 3600 * 10**9, retry_ns: int = 2 * 10**9,
-                 report: Callable[[str], object] = print, opener: Opener = open_new) -> None:
+                 report: Callable[[str], object] = print, opener: Opener = open_locked) -> None:
         self.folder = checked_path(folder, OutputError)
         self._split_bytes, self._split_ns, self._retry_ns = split_bytes, split_ns, retry_ns
         self._report, self._opener = report, opener
@@ -170,7 +170,7 @@ class Recorder:
 
     def _finish(self, file: McapFileWriter) -> None:
         """Complete and close the open file."""
-        if self._attempt(file, file.finish):
+        if self._attempt(file, file.flush) and self._attempt(file, file.finish):
             self._report_recovery()
             self._add_finished(file)
             self._file = None

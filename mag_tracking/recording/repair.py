@@ -17,15 +17,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import (
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Schema,
-    Statistics,
-)
+from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Schema, Statistics
 
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import OutputError, RecordingError
@@ -47,14 +39,12 @@ from mag_tracking.recording.mcap_file import (
     records,
 )
 from mag_tracking.recording.writer import (
+    MESSAGE_HEADER,
     FileSummary,
     Topic,
     UnbufferedWriter,
     write_metadata,
 )
-
-MESSAGE_PREFIX = 31
-"""Number of bytes of a message record before its data."""
 
 
 class _Scan:
@@ -174,7 +164,7 @@ class _Scan:
         for channel in dict.fromkeys(self._rows[:, 0].tolist()):
             chunk.message_index_offsets[channel] = end + len(indexes)
             rows = self._rows[self._rows[:, 0] == channel]
-            entries = np.stack((rows[:, 1], rows[:, 2] - MESSAGE_PREFIX), axis=1).astype('<u8')
+            entries = np.stack((rows[:, 1], rows[:, 2] - MESSAGE_HEADER), axis=1).astype('<u8')
             indexes += RECORD_HEADER.pack(Opcode.MESSAGE_INDEX, 6 + entries.nbytes) + struct.pack(
                 '<HI', channel, entries.nbytes) + entries.tobytes()
         chunk.message_index_length = len(indexes)

@@ -15,14 +15,15 @@ import yaml
 from mcap.writer import CompressionType, Writer
 
 from mag_tracking.errors import OutputError, RecordingError
-from mag_tracking.files import checked_path, new_binary_file, new_text_file
+from mag_tracking.files import checked_path
 from mag_tracking.messages.types import MessageDict, definition, encoder
 from mag_tracking.yaml_file import parse_yaml
 
-Opener: TypeAlias = Callable[[Path], io.FileIO]
-"""Creates a file at a path and returns an unbuffered stream."""
-
-
+MAX_TOPICS = 2000
+"""Maximum number of topics; twice the maximum number of sensors. The time to write and to read
+`metadata.yaml` grows with their number."""
+MESSAGE_HEADER = 31
+"""Number of bytes of a message record before its data."""
 OFFERED_QOS = '''- history: keep_last
   depth: 10
   reliability: reliable
@@ -34,6 +35,8 @@ OFFERED_QOS = '''- history: keep_last
   avoid_ros_namespace_conventions: false
 '''
 """Default QoS profile of a topic: reliable and volatile, depth 10."""
+Opener: TypeAlias = Callable[[Path], io.FileIO]
+"""Creates a file at a path and returns an unbuffered stream."""
 
 
 def offered_qos(reliable: bool = True, latched: bool = False) -> str:
@@ -50,10 +53,9 @@ class Topic(NamedTuple):
     """Description of a topic in a recording."""
 
     type: str
-    """Message type."""
-    definition: str = ''
+    definition: str
     """Definition of the type as a `ros2msg` schema. Empty if unknown."""
-    qos: str = OFFERED_QOS
+    qos: str
     """Offered QoS profiles, as YAML."""
 
 
@@ -61,7 +63,6 @@ class FileSummary(NamedTuple):
     """Entry of one file in `metadata.yaml`."""
 
     name: str
-    """Name of the file."""
     counts: Counter[str]
     """Number of messages by topic."""
     first_ns: int | None = None
@@ -70,14 +71,17 @@ class FileSummary(NamedTuple):
     """Log time of the last message, ns. None if the file has no messages."""
 
 
-def open_new(path: Path) -> io.FileIO:
-    """Create a file that must not exist, unbuffered, so that a crash loses no written data.
+def open_unbuffered(path: Path) -> io.FileIO:
+    """Create a file that must not exist, unbuffered, so that a crash loses no written data."""
+    return open(path, 'xb', buffering=0)
 
-    It is locked if the file system supports locks.
+
+def open_locked(path: Path) -> io.FileIO:
+    """Create a file as `open_unbuffered`, and lock it if the file system supports locks.
+
+    The lock prevents a repair of a file that is still being written.
     """
-    stream = open(path, 'xb', buffering=0)
-    # The lock prevents a repair of a file that is still being written. Some file systems do not
-    # support locks.
+    stream = open_unbuffered(path)
     with suppress(OSError):
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
     return stream
@@ -119,29 +123,45 @@ def check_no_recording(folder: Path) -> None:
                           f'folder, or run mag-tracking repair to complete a truncated recording')
 
 
+def check_no_other_recording(path: Path) -> None:
+    """Raise OutputError if the folder of a new MCAP file has a `metadata.yaml` that does not list
+    it."""
+    metadata = path.parent / 'metadata.yaml'
+    try:
+        # Only a regular file is read: a pipe or a device could block.
+        if metadata.is_file() and f'- {path.name}\n' not in metadata.read_text(
+                encoding='utf-8', errors='replace'):
+            raise OutputError(f'{path.parent} contains another recording (its metadata.yaml does '
+                              f'not list {path.name}): choose another folder')
+    except OSError as error:
+        raise OutputError(f'cannot read {metadata}: {error.strerror}') from error
+
+
 def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[str, Topic],
-                   opener: Opener = open_new) -> None:
+                   opener: Opener = open_locked) -> None:
     """Write the `metadata.yaml` of rosbag2 atomically, with the topics by name.
 
     Raises OSError, or RecordingError if the QoS profiles of a topic are not valid YAML.
     """
     no_counts: Counter[str] = Counter()
     counts = sum((f.counts for f in files), no_counts)
-    first_times = [f.first_ns for f in files if f.first_ns is not None]
-    last_times = [f.last_ns for f in files if f.last_ns is not None]
+    start, duration = _span([t for f in files for t in (f.first_ns, f.last_ns) if t is not None])
     content = {'rosbag2_bagfile_information': {
-        'version': 9, 'storage_identifier': 'mcap', **_span(first_times, last_times),
-        'message_count': counts.total(),
+        'version': 9, 'storage_identifier': 'mcap',
+        'duration': duration, 'starting_time': start, 'message_count': counts.total(),
         'topics_with_message_count': [
             {'topic_metadata': {'name': name, 'type': topics[name].type,
                                 'serialization_format': 'cdr',
-                                'offered_qos_profiles': _qos_profiles(name, topics[name]),
+                                'offered_qos_profiles': parse_yaml(
+                                    topics[name].qos, f'offered_qos_profiles of {name}',
+                                    RecordingError),
                                 'type_description_hash': ''},
              'message_count': n} for name, n in counts.items()],
         'compression_format': '', 'compression_mode': '',
         'relative_file_paths': [f.name for f in files],
-        'files': [{'path': f.name, 'message_count': f.counts.total(),
-                   **_span([f.first_ns or 0], [f.last_ns or 0])} for f in files],
+        'files': [{'path': f.name, **dict(zip(('starting_time', 'duration'), _span(
+            [f.first_ns or 0, f.last_ns or 0]), strict=True)), 'message_count': f.counts.total()}
+            for f in files],
         'custom_data': None, 'ros_distro': 'jazzy'}}
     new_file = folder / '.metadata.yaml.new'
     new_file.unlink(missing_ok=True)
@@ -154,23 +174,16 @@ def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[s
         new_file.unlink(missing_ok=True)
 
 
-def _qos_profiles(name: str, topic: Topic) -> object:
-    """Parse the QoS profiles of a topic, stored as YAML; raises RecordingError if invalid."""
-    return parse_yaml(topic.qos, f'offered_qos_profiles of {name}', RecordingError)
-
-
-def _span(first_times: Sequence[int], last_times: Sequence[int]) -> dict[str, dict[str, int]]:
-    """Metadata entries of start time and duration from first and last log times [ns] of files; 0 if
-    there are none."""
-    first, last = min(first_times, default=0), max(last_times, default=0)
-    return {'starting_time': {'nanoseconds_since_epoch': first},
-            'duration': {'nanoseconds': last - first}}
+def _span(times: Sequence[int]) -> tuple[dict[str, int], dict[str, int]]:
+    """Metadata entries of start time and duration from log times [ns]; 0 without times."""
+    first, last = min(times, default=0), max(times, default=0)
+    return {'nanoseconds_since_epoch': first}, {'nanoseconds': last - first}
 
 
 class McapFileWriter:
-    """Writer of one MCAP file of a recording; raises OSError if a write fails.
+    """Writer of one MCAP file, which can be truncated to its complete chunks after a failure.
 
-    `opener` creates the file and returns an unbuffered stream.
+    `opener` creates the file. Raises OSError if a write fails.
 
     Attributes
     ----------
@@ -202,6 +215,11 @@ class McapFileWriter:
         """Upper bound of the file size after the next flush, bytes."""
         return self._stream.offset + self._buffered_size
 
+    @property
+    def is_closed(self) -> bool:
+        """Whether the file is complete or was abandoned."""
+        return self._stream.raw.closed
+
     def add(self, name: str, topic: Topic, sequence: int, data: bytes, log_ns: int,
             publish_ns: int) -> None:
         """Append a CDR message with the times at which it was received and published."""
@@ -209,8 +227,7 @@ class McapFileWriter:
         self.pending[name] += 1
         if name not in self._channels:
             self._open_channel(name, topic)
-        # A message record has 31 bytes besides its data.
-        self._buffered_size += len(data) + 31
+        self._buffered_size += MESSAGE_HEADER + len(data)
         previous_offset = self._stream.offset
         self._writer.add_message(self._channels[name], log_ns, data, publish_ns,
                                  sequence & 0xFFFFFFFF)
@@ -230,11 +247,15 @@ class McapFileWriter:
     def flush(self) -> None:
         """Complete the current chunk, so that a crash cannot lose its messages; raises OSError also
         if the file was removed."""
+        self._complete_chunk()
+        if os.fstat(self._stream.raw.fileno()).st_nlink == 0:
+            raise OSError(errno.ENOENT, 'the file was removed')
+
+    def _complete_chunk(self) -> None:
+        """Write the pending messages."""
         if self.pending:
             self._writer.flush()
             self._mark_intact()
-        if os.fstat(self._stream.raw.fileno()).st_nlink == 0:
-            raise OSError(errno.ENOENT, 'the file was removed')
 
     def _mark_intact(self) -> None:
         """Mark all bytes written so far as complete chunks, which `abandon` keeps."""
@@ -246,7 +267,7 @@ class McapFileWriter:
 
     def finish(self) -> None:
         """Write the index and close the file."""
-        self.flush()
+        self._complete_chunk()
         self._writer.finish()
         os.fsync(self._stream.raw.fileno())
         self._stream.raw.close()
@@ -264,25 +285,6 @@ class McapFileWriter:
         return FileSummary(self.path.name, Counter(self.counts), *self._span)
 
 
-MAX_TOPICS = 2000
-"""Maximum number of topics; twice the maximum number of sensors. The time to write and to read
-`metadata.yaml` grows with their number."""
-
-
-def check_no_other_recording(path: Path) -> None:
-    """Raise OutputError if the folder of a new MCAP file has a `metadata.yaml` that does not list
-    it."""
-    metadata = path.parent / 'metadata.yaml'
-    try:
-        # Only a regular file is read: a pipe or a device could block.
-        if metadata.is_file() and f'- {path.name}\n' not in metadata.read_text(
-                encoding='utf-8', errors='replace'):
-            raise OutputError(f'{path.parent} contains another recording (its metadata.yaml does '
-                              f'not list {path.name}): choose another folder')
-    except OSError as error:
-        raise OutputError(f'cannot read {metadata}: {error.strerror}') from error
-
-
 class RecordingWriter:
     """Writes messages to an MCAP file that rosbag2 can play; a context manager.
 
@@ -293,21 +295,16 @@ class RecordingWriter:
 
     def __init__(self, path: str | PathLike[str], latched: Collection[str] = ()) -> None:
         self._latched = frozenset(latched)
+        self._topics: dict[str, Topic] = {}
         self.path = checked_path(path, OutputError)
         check_no_other_recording(self.path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream = new_binary_file(self.path)
+            self.path.unlink(missing_ok=True)
+            self._file = McapFileWriter(self.path, open_unbuffered)
         except OSError as error:
             raise OutputError(f'cannot write {self.path}: {error.strerror}') from error
-        self._writer = Writer(self._stream, chunk_size=1 << 20, compression=CompressionType.ZSTD)
-        self._writer.start(profile='ros2', library='mag_tracking')
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, tuple[int, str]] = {}
-        self._counts: Counter[str] = Counter()
-        self._sequence: Counter[str] = Counter()
-        self._first: int | None = None
-        self._last: int | None = None
+        self._file.start()
 
     def __enter__(self) -> 'RecordingWriter':
         return self
@@ -321,54 +318,17 @@ class RecordingWriter:
         Raises RecordingError if the definition of the type is unknown, OutputError beyond
         `MAX_TOPICS`.
         """
-        if topic not in self._channels:
-            self._open_channel(topic, type_name)
-        self._writer.add_message(
-            self._channels[topic][0], log_time=time_ns, publish_time=time_ns,
-            sequence=self._sequence[topic], data=encoder(type_name)(message))
-        self._sequence[topic] += 1
-        self._counts[topic] += 1
-        self._first = time_ns if self._first is None else min(self._first, time_ns)
-        self._last = time_ns if self._last is None else max(self._last, time_ns)
-
-    def _open_channel(self, topic: str, type_name: str) -> None:
-        """Register the schema and the channel of a topic; raises OutputError."""
-        if len(self._channels) == MAX_TOPICS:
-            raise OutputError(f'{self.path}: the recording would have more than {MAX_TOPICS} '
-                              f'topics; the next one is {topic}')
-        if type_name not in self._schemas:
-            self._schemas[type_name] = self._writer.register_schema(
-                type_name, 'ros2msg', definition(type_name).encode())
-        channel = self._writer.register_channel(
-            topic, 'cdr', self._schemas[type_name],
-            {'offered_qos_profiles': offered_qos(latched=topic in self._latched)})
-        self._channels[topic] = channel, type_name
+        if topic not in self._topics:
+            if len(self._topics) == MAX_TOPICS:
+                raise OutputError(f'{self.path}: the recording would have more than {MAX_TOPICS} '
+                                  f'topics; the next one is {topic}')
+            self._topics[topic] = Topic(type_name, definition(type_name),
+                                        offered_qos(latched=topic in self._latched))
+        self._file.add(topic, self._topics[topic], self._file.counts[topic],
+                       encoder(type_name)(message), time_ns, time_ns)
 
     def close(self) -> None:
         """Complete the file and write `metadata.yaml`."""
-        if self._stream.closed:
-            return
-        self._writer.finish()
-        self._stream.close()
-        first, last = self._first or 0, self._last or 0
-        metadata = {'rosbag2_bagfile_information': {
-            'version': 9, 'storage_identifier': 'mcap',
-            'duration': {'nanoseconds': last - first},
-            'starting_time': {'nanoseconds_since_epoch': first},
-            'message_count': sum(self._counts.values()),
-            'topics_with_message_count': [
-                {'topic_metadata': {'name': t, 'type': type_name, 'serialization_format': 'cdr',
-                                    'offered_qos_profiles': yaml.safe_load(offered_qos(
-                                        latched=t in self._latched)),
-                                    'type_description_hash': ''},
-                 'message_count': self._counts[t]}
-                for t, (_, type_name) in self._channels.items()],
-            'compression_format': '', 'compression_mode': '',
-            'relative_file_paths': [self.path.name],
-            'files': [{'path': self.path.name,
-                       'starting_time': {'nanoseconds_since_epoch': first},
-                       'duration': {'nanoseconds': last - first},
-                       'message_count': sum(self._counts.values())}],
-            'custom_data': None, 'ros_distro': 'jazzy'}}
-        with new_text_file(self.path.parent / 'metadata.yaml') as stream:
-            yaml.safe_dump(metadata, stream, sort_keys=False)
+        if not self._file.is_closed:
+            self._file.finish()
+            write_metadata(self.path.parent, [self._file.summary()], self._topics)
