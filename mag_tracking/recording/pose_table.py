@@ -1,8 +1,6 @@
 """Tables of the poses of a magnet: above a board of sensors, and as imported recordings."""
 
-from os import PathLike
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
@@ -13,20 +11,23 @@ from mag_tracking.messages.schema import magnetic_field_dicts, pose_dict
 from mag_tracking.messages.types import MAGNETIC_FIELD, POSE
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import write_network
-from mag_tracking.recording.table_text import CsvPath, Lines, number, read_csv, read_numbers
+from mag_tracking.recording.table_text import FilePath, Lines, read_csv
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Readings
 
+_COLUMNS = ('id', 'timestamp', 'Bx', 'By', 'Bz', 'sensor_x', 'sensor_y', 'sensor_z',
+            'sensor_ox', 'sensor_oy', 'sensor_oz', 'm_x', 'm_y', 'm_z', 'm_ox', 'm_oy', 'm_oz')
+MAX_ID, MAX_TIME_S = 1e6, 9e9
+"""Limits of `id` and `timestamp`; nanoseconds since 1970 are 64-bit integers."""
 _POSE_COLUMNS = ('mag_x0', 'mag_y0', 'mag_z0', 'mag_mx0', 'mag_my0', 'mag_mz0')
 
 
-def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Read fields and the poses of a magnet from an external tracker.
+def read_pose_table(path: FilePath) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Read fields (K, n, 3), NaN if not measured, and the positions (K, 3) and normalised axes
+    (K, 3) of a magnet from an external tracker.
 
     Columns: `x0,y0,z0,x1...` [T, sensor frame; empty or nan if not measured], `mag_x0..z0` [m,
-    tracker frame] and `mag_mx0..mz0` (unit vector, tracker frame). Results: fields (K, n, 3), NaN
-    if not measured; positions (K, 3); normalised axes (K, 3). Raises RecordingError also if the
-    length of an axis differs from 1 by more than 1e-3.
+    tracker frame] and `mag_mx0..mz0` (unit vector within 1e-3, tracker frame).
     """
     rows, values = _values(path, _POSE_COLUMNS)
     axes = values[:, -3:]
@@ -38,45 +39,34 @@ def read_pose_table(path: CsvPath) -> tuple[FloatArray, FloatArray, FloatArray]:
     return (values[:, :-6].reshape(len(rows), -1, 3), values[:, -6:-3], axes / lengths[:, None])
 
 
-def read_readings(path: CsvPath) -> FloatArray:
+def read_readings(path: FilePath) -> FloatArray:
     """Fields (K, n, 3), T, sensor frames, of a pose table, which may lack pose columns; NaN if not
     measured."""
     rows, values = _values(path, ())
     return values.reshape(len(rows), -1, 3)
 
 
-def read_sensor_positions(path: CsvPath) -> FloatArray:
+def read_sensor_positions(path: FilePath) -> FloatArray:
     """Sensor positions (n, 3), m, from a CSV file x, y, z without header; # begins a comment
     line."""
-    return read_numbers(path, ('x', 'y', 'z'))
+    return read_csv(path, 'xyz').numbers('xyz')
 
 
-def _values(path: CsvPath, pose: tuple[str, ...]) -> tuple[Lines, FloatArray]:
+def _values(path: FilePath, pose: tuple[str, ...]) -> tuple[Lines, FloatArray]:
     """Read a table; return [(line, cells)], and an array of the field and `pose` columns."""
-    header, rows = read_csv(path)
-    n = sum(name[:1] == 'x' and name[1:].isdigit() for name in header)
+    table = read_csv(path)
+    n = sum(name[:1] == 'x' and name[1:].isdigit() for name in table.header)
     fields = [f'{a}{j}' for j in range(n) for a in 'xyz']
     if not n:
         raise RecordingError(f'{path}: column x0 is missing')
     for name in (*fields, *pose):
-        if header.count(name) != 1:
-            problem = 'missing' if name not in header else 'given twice'
-            raise RecordingError(f'{path}: column {name} is {problem}')
-    indices = [header.index(name) for name in (*fields, *pose)]
-    values = np.array([[number(path, line, name, row[i], name in pose)
-                        for name, i in zip((*fields, *pose), indices, strict=True)]
-                       for line, row in rows])
-    return rows, values
+        if table.header.count(name) != 1:
+            raise RecordingError(f'{path}: column {name} is '
+                                 f'{"given twice" if name in table.header else "missing"}')
+    return table.rows, table.numbers((*fields, *pose), fields)
 
 
-_Path: TypeAlias = str | PathLike[str]
-_COLUMNS = ('id', 'timestamp', 'Bx', 'By', 'Bz', 'sensor_x', 'sensor_y', 'sensor_z',
-            'sensor_ox', 'sensor_oy', 'sensor_oz', 'm_x', 'm_y', 'm_z', 'm_ox', 'm_oy', 'm_oz')
-MAX_ID, MAX_TIME_S = 1e6, 9e9
-"""Limits of `id` and `timestamp`; nanoseconds since 1970 are 64-bit integers."""
-
-
-def import_pose_table(table: _Path, background: _Path, out: _Path,
+def import_pose_table(table: FilePath, background: FilePath, out: FilePath,
                       noise_std: float) -> tuple[Path, Path, int]:
     """Import a table of magnet poses and sensor fields; return recording, network file and row
     count.
@@ -89,7 +79,7 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
     order of the ids. `noise_std` [T] is that of one reading, which the table does not contain.
     """
     rows = _read_table(table)
-    backgrounds = read_numbers(background, ('Bx', 'By', 'Bz'))
+    backgrounds = read_csv(background, _COLUMNS[2:5]).numbers(_COLUMNS[2:5])
     ids = np.unique(rows['id']).astype(int)
     if len(backgrounds) != len(ids):
         raise RecordingError(f'the tables have different numbers of sensors: {background} has '
@@ -122,14 +112,9 @@ def import_pose_table(table: _Path, background: _Path, out: _Path,
     return recording, out / 'network.yaml', len(order)
 
 
-def _read_table(path: _Path) -> dict[str, FloatArray]:
+def _read_table(path: FilePath) -> dict[str, FloatArray]:
     """Read a table of poses as arrays, in the units of the table; raises RecordingError."""
-    header, rows = read_csv(path)
-    missing_columns = [c for c in _COLUMNS if c not in header]
-    if missing_columns:
-        raise RecordingError(f'{path}: column {missing_columns[0]} is missing')
-    a = np.array([[number(path, line, c, row[header.index(c)], True) for c in _COLUMNS]
-                  for line, row in rows])
+    a = read_csv(path).numbers(_COLUMNS)
     if ((a[:, 0] != np.round(a[:, 0])) | (np.abs(a[:, 0]) > MAX_ID)).any():
         raise RecordingError(f'{path}: column id contains values that are not integers up to '
                              f'{MAX_ID:g}')

@@ -5,9 +5,10 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 from os import PathLike
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.files import checked_path
 from mag_tracking.recording.file_kind import binary_kind
 
+FilePath: TypeAlias = str | PathLike[str]
+Lines: TypeAlias = list[tuple[int, list[str]]]
+"""Line number and cells of each line that is not empty."""
 SEPARATORS = {'\t': 'tab', ';': 'semicolon', '|': 'bar', ',': 'comma', ' ': 'spaces'}
 """Names of the separators that are recognised. White space of any length is one separator."""
 COMMENTS = ('#', '%', '//')
@@ -40,12 +44,9 @@ _POINT_DECIMALS = re.compile(
     r'[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?[0-9]{1,3}(?:,[0-9]{3}){2,}').fullmatch
 
 
-def read_text(path: str | PathLike[str], encoding: str = '') -> tuple[list[str], str]:
-    """Lines (without ends and NUL characters) and encoding of a text file.
-
-    The encoding is found: a byte order mark, UTF-16 by its zero bytes, UTF-8, or else Windows-1252.
-    Raises RecordingError if the file is not text.
-    """
+def read_text(path: FilePath, encoding: str = '') -> tuple[list[str], str]:
+    """Lines (without ends and NUL characters) and encoding of a text file; raises RecordingError
+    if the file is not text."""
     path = checked_path(path, RecordingError)
     try:
         data, kind = path.read_bytes(), binary_kind(path)
@@ -69,7 +70,7 @@ def read_text(path: str | PathLike[str], encoding: str = '') -> tuple[list[str],
 
 
 def _encoding_of(data: bytes) -> str:
-    """Find the encoding of a text."""
+    """Encoding by a byte order mark, UTF-16 by its zero bytes, UTF-8, or else Windows-1252."""
     for mark, name in _MARKS:
         if data.startswith(mark):
             return name
@@ -80,11 +81,9 @@ def _encoding_of(data: bytes) -> str:
                 and begin[1 - first::2].count(0) < 0.1 * len(begin):
             return name
     for name in ('utf-8', 'cp1252'):
-        try:
+        with suppress(UnicodeDecodeError):
             data.decode(name)
-        except UnicodeDecodeError:
-            continue
-        return name
+            return name
     return 'latin-1'
 
 
@@ -139,8 +138,7 @@ def find_decimal(cells: Iterable[str], separator: str) -> str:
     """Decimal mark of numbers, '.' or ','; empty if they fit both or contradict each other."""
     marked = {cell for cell in cells if (',' in cell or '.' in cell) and _NUMBER(cell)
               and not _DATE(cell)}
-    with_comma = any(',' in cell for cell in marked)
-    if not with_comma:
+    if not any(',' in cell for cell in marked):
         return '.'
     comma = any(map(_COMMA_DECIMALS, marked))
     point = any(map(_POINT_DECIMALS, marked))
@@ -176,26 +174,51 @@ def plain_number(cell: str, decimal: str) -> str:
         else cell.translate(_GROUPING)
 
 
-CsvPath: TypeAlias = str | PathLike[str]
-Lines: TypeAlias = list[tuple[int, list[str]]]
-"""Line number and cells of each line that is not empty."""
+class CsvTable(NamedTuple):
+    """Cells of a CSV file."""
+
+    path: FilePath
+    header: Sequence[str]
+    rows: Lines
+
+    def by_name(self) -> list[tuple[int, dict[str, str]]]:
+        """Line number, and cells by column, of each row."""
+        return [(line, dict(zip(self.header, row, strict=True))) for line, row in self.rows]
+
+    def numbers(self, names: Sequence[str], optional: Collection[str] = ()) -> FloatArray:
+        """Values (n, len(names)) of columns; NaN if empty in the columns `optional`.
+
+        Raises RecordingError if a column is missing or a cell is not a number.
+        """
+        for name in names:
+            if name not in self.header:
+                raise RecordingError(f'{self.path}: column {name} is missing')
+        indices = [self.header.index(name) for name in names]
+        return np.array([[number(self.path, line, name, row[j], name not in optional)
+                          for name, j in zip(names, indices, strict=True)]
+                         for line, row in self.rows])
 
 
-def read_csv(path: CsvPath) -> tuple[list[str], Lines]:
-    """Header and numbered rows of a CSV file; raises RecordingError if a row is too long or
-    short."""
-    lines = csv_lines(path)
-    if len(lines) < 2:
+def read_csv(path: FilePath, header: Sequence[str] = ()) -> CsvTable:
+    """Read a CSV file; raises RecordingError if a row is too long or short.
+
+    If `header` names the columns, the file has no header, and # begins a comment line.
+    """
+    lines = _csv_lines(path)
+    if header:
+        lines = [(line, row) for line, row in lines if not row[0].startswith('#')]
+    elif lines:
+        header, lines = [name.strip() for name in lines[0][1]], lines[1:]
+    if not lines:
         raise RecordingError(f'{path} has no rows')
-    header = [name.strip() for name in lines[0][1]]
-    for line, row in lines[1:]:
+    for line, row in lines:
         if len(row) != len(header):
             raise RecordingError(f'{path}: row {line}: expected {len(header)} columns, '
                                  f'got {len(row)}')
-    return header, lines[1:]
+    return CsvTable(path, header, lines)
 
 
-def csv_lines(path: CsvPath) -> Lines:
+def _csv_lines(path: FilePath) -> Lines:
     """Non-empty lines of a CSV file as (line number, cells).
 
     Tabs, semicolons, bars and white space also separate cells. Decimal commas, which need one of
@@ -211,21 +234,7 @@ def csv_lines(path: CsvPath) -> Lines:
             for line, row in rows]
 
 
-def read_numbers(path: CsvPath, columns: Sequence[str]) -> FloatArray:
-    """Read a CSV file of numbers without a header as an (n, len(columns)) array; # begins a
-    comment."""
-    rows = [(line, row) for line, row in csv_lines(path) if not row[0].startswith('#')]
-    if not rows:
-        raise RecordingError(f'{path} has no rows')
-    for line, row in rows:
-        if len(row) != len(columns):
-            raise RecordingError(f'{path}: row {line}: expected {len(columns)} columns, got '
-                                 f'{len(row)}')
-    return np.array([[number(path, line, name, text, True)
-                      for name, text in zip(columns, row, strict=True)] for line, row in rows])
-
-
-def number(path: CsvPath, line: int, column: str, text: str, finite: bool) -> float:
+def number(path: FilePath, line: int, column: str, text: str, finite: bool) -> float:
     """Convert a cell to a number, NaN if it is empty; raises RecordingError for NaN if `finite`,
     and for infinity."""
     try:

@@ -2,10 +2,11 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from decimal import Context, Decimal, InvalidOperation
 from fractions import Fraction
+from typing import NamedTuple
 
 from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.quantities import occurrences
@@ -30,10 +31,20 @@ _COUNTER_LIMITS = (2**15, 2**16, 2**20, 2**24, 2**31, 2**32)
 _CLOCK_LIMITS_S = (60, 3600, 86400, 7 * 86400)
 _TIME_OF_DAY = re.compile('[0-2][0-9][0-5][0-9][0-5][0-9](?:[.][0-9]+)?').fullmatch
 """hhmmss and decimals, as in NMEA 0183."""
+JUMPS = ('split', 'sort')
+"""Meanings of a time that runs backwards: the clock restarted, or the rows are out of order."""
+MAX_GAP_NS = 5 * 365 * DAY_NS
+"""Maximum interval between two readings [ns]. A clock that is set after its start jumps farther."""
+MAX_STEPS = 5
+"""Maximum interval, in median intervals, that counts as uninterrupted."""
+MAX_EQUAL_FRACTION = 0.5
+"""Maximum fraction of times that equal the previous time of the sensor."""
+_REMEDY = ('. If the clock restarted or was set, give --jumps split (each part becomes a '
+           'recording); if the counter returns to 0 after N, --wrap N; if the rows are out of '
+           'order, --jumps sort')
 
 
-@dataclass
-class Times:
+class Times(NamedTuple):
     """Times of the rows of a table, exact integers."""
 
     values: list[int | None]
@@ -55,26 +66,28 @@ class Times:
         return [(v * numerator + half) // denominator - self.offset_ns for v in values]
 
 
-def step_of(values: Sequence[int | None], keys: Sequence[int]) -> int:
-    """Median interval between successive times of the same series (`keys`); 0 if no time
-    increases."""
+def _successive(values: Iterable[int | None], keys: Iterable[int]) -> Iterator[tuple[int, int]]:
+    """Iterate over the pairs of successive times of the same series (`keys`)."""
     last: dict[int, int] = {}
-    steps = []
     for value, key in zip(values, keys, strict=True):
         if value is not None:
-            if key in last and value != last[key]:
-                steps.append(abs(value - last[key]))
+            if key in last:
+                yield last[key], value
             last[key] = value
-    return sorted(steps)[len(steps) // 2] if steps else 0
+
+
+def _step_of(values: Sequence[int | None], keys: Sequence[int]) -> int:
+    """Median interval between successive times of a series; 0 if no time increases."""
+    steps = sorted(abs(b - a) for a, b in _successive(values, keys) if a != b)
+    return steps[len(steps) // 2] if steps else 0
 
 
 def read_times(where: str, texts: Sequence[str], keys: Sequence[int], decimal: str, unit: str,
                header_unit: str, order: str) -> Times:
-    """Convert the times of a table.
+    """Convert the times of a table, whose series (sensors) are `keys`.
 
-    `keys` are the series (sensors) of the times. An empty `unit` is that of the header, or else
-    found from the values; an empty `order` of day, month and year is found. Raises RecordingError,
-    with the option that states it, if form or unit is ambiguous.
+    An empty `unit` or `order` of a date is found; if it is ambiguous, RecordingError names the
+    option that states it.
     """
     if order and order not in DATE_ORDERS:
         raise SettingsError(f'--date-order: expected one of {", ".join(DATE_ORDERS)}, got '
@@ -91,7 +104,7 @@ def read_times(where: str, texts: Sequence[str], keys: Sequence[int], decimal: s
         return _read_dates(where, texts, order)
     values = [_exact(t, decimal) for t in texts]
     # Several readings may share a coarse time.
-    step = round(step_of(values, keys) * min(1.0, len(set(values)) * len(set(keys)) / len(values)))
+    step = round(_step_of(values, keys) * min(1.0, len(set(values)) * len(set(keys)) / len(values)))
     scale, offset, notes = _unit_of(where, values, step, unit, header_unit)
     limits = (*(n * _SUB for n in _COUNTER_LIMITS),
               *(round(s * NS / scale) for s in _CLOCK_LIMITS_S))
@@ -201,21 +214,6 @@ def check_range(where: str, line: int, stamp_ns: int) -> None:
                              'since 1970; check --time-unit')
 
 
-JUMPS = ('split', 'sort')
-"""Meanings of a time that runs backwards: the clock restarted, or the rows are out of order."""
-MAX_GAP_NS = 5 * 365 * DAY_NS
-"""Maximum interval between two readings [ns]. A clock that is set after its start jumps farther."""
-MAX_STEPS = 5
-"""Maximum interval, in median intervals, that counts as uninterrupted."""
-MAX_EQUAL_FRACTION = 0.5
-"""Maximum fraction of times that equal the previous time of the sensor."""
-
-
-_REMEDY = ('. If the clock restarted or was set, give --jumps split (each part becomes a '
-           'recording); if the counter returns to 0 after N, --wrap N; if the rows are out of '
-           'order, --jumps sort')
-
-
 @dataclass
 class OrderedTimes:
     """Times that do not run backwards within a session."""
@@ -234,15 +232,14 @@ def order_times(where: str, times: Times, texts: Sequence[str], keys: Sequence[i
                 lines: Sequence[int], wrap: int = 0, jumps: str = '') -> OrderedTimes:
     """Unwrap times that run backwards, or divide them into sessions; sort them only on request.
 
-    Rows without a time are left out. `keys` are the series (sensors) of the rows. `wrap` is the
-    number at which the time returns to 0; by default, usual numbers are recognised. `jumps` is one
-    of `JUMPS`. Raises RecordingError, with row and options, if a time runs backwards for an unknown
-    reason or jumps ahead by years.
+    Rows without a time are left out. `wrap` is the number at which the time returns to 0; by
+    default, usual numbers are recognised. Raises RecordingError if a time runs backwards for an
+    unknown reason or jumps ahead by years.
     """
     if jumps and jumps not in JUMPS:
         raise SettingsError(f'--jumps: expected {" or ".join(JUMPS)}, got {jumps!r}')
     raw = {k: value for k, value in enumerate(times.values) if value is not None}
-    tolerance = MAX_STEPS * step_of(times.values, keys)
+    tolerance = MAX_STEPS * _step_of(times.values, keys)
     out = _usable_rows(raw, keys, -1 if jumps or wrap else tolerance)
     last: dict[int, int] = {}
     offset: Counter[int] = Counter()
@@ -292,14 +289,11 @@ def _usable_rows(raw: dict[int, int], keys: Sequence[int], tolerance: int) -> Or
 
 def _is_reversed(raw: dict[int, int], rows: Sequence[int], keys: Sequence[int]) -> bool:
     """Whether all times decrease, as in an export with the newest row first."""
-    last: dict[int, int] = {}
     n_earlier = 0
-    for k in rows:
-        if keys[k] in last:
-            if raw[k] > last[keys[k]]:
-                return False
-            n_earlier += raw[k] < last[keys[k]]
-        last[keys[k]] = raw[k]
+    for before, value in _successive((raw[k] for k in rows), (keys[k] for k in rows)):
+        if value > before:
+            return False
+        n_earlier += value < before
     return n_earlier > 1
 
 
@@ -314,32 +308,19 @@ def _outliers(raw: dict[int, int], rows: Sequence[int], keys: Sequence[int], tol
             raw[before] - tolerance <= raw[k] <= raw[after] + tolerance]
 
 
-def equal_fraction(values: Sequence[int], keys: Sequence[int]) -> float:
-    """Fraction of times that equal the previous time of the same series (`keys`)."""
-    last: dict[int, int] = {}
-    n_equal = n = 0
-    for value, key in zip(values, keys, strict=True):
-        if key in last:
-            n_equal += value == last[key]
-            n += 1
-        last[key] = value
-    return n_equal / n if n else 0.0
-
-
 def check_resolution(where: str, texts: Sequence[str], values: Sequence[int], keys: Sequence[int]
                      ) -> None:
     """Raise RecordingError, with cause and remedy, if more than `MAX_EQUAL_FRACTION` of the times
     equal the previous one of the series (`keys`)."""
-    equal = equal_fraction(values, keys)
+    is_equal = [a == b for a, b in _successive(values, keys)]
+    equal = sum(is_equal) / len(is_equal) if is_equal else 0.0
     if equal <= MAX_EQUAL_FRACTION:
         return
-    n_distinct = len(set(values))
+    coarse = 'all times are equal' if len(set(values)) == 1 else \
+        'their resolution is too coarse, or rows are repeated'
     cause = next((f'a spreadsheet rounded them to {text}; write the column with all digits '
                   '(as a number, not in scientific notation)' for text in texts
-                  if 'e+' in text.lower()), '')
-    coarse = 'all times are equal' if n_distinct == 1 else \
-        'their resolution is too coarse, or rows are repeated'
-    cause = cause or f'{coarse}; write more digits of the time'
+                  if 'e+' in text.lower()), f'{coarse}; write more digits of the time')
     raise RecordingError(
         f'{where}: {100.0 * equal:.0f} % of the times equal the previous time of the sensor, such '
         f'as {texts[0]}: {cause}, or give the rate of the readings with --rate HZ, which spaces '
