@@ -21,7 +21,7 @@ from mag_tracking.recording.expansion import (
     expanded,
     largest_chunk,
 )
-from mag_tracking.recording.message_block import MessageBlock, Progress, RawMessage
+from mag_tracking.recording.message_block import MessageBlock, Progress, RawMessage, RecordingFile
 from mag_tracking.units import LATEST_NS
 
 if TYPE_CHECKING:
@@ -41,30 +41,17 @@ _ROS1_COMPRESSIONS: dict[object, str] = {bz2.decompress: 'bz2', lz4.frame.decomp
 """Compression of a chunk by the decompressor that the library uses."""
 
 
-class BagFile:
-    """Reader of one bag of a recording; raises RecordingError if the file is not a bag.
-
-    Attributes
-    ----------
-    types : message type by topic
-    message_counts : number of messages by topic
-    start_ns, end_ns : log times of the first and last message; None without messages
-    losses : number of unreadable parts by description, updated in place
-    """
+class BagFile(RecordingFile):
+    """Reader of one bag of a recording; raises RecordingError if the file is not a bag."""
 
     def __init__(self, path: Path, losses: 'Counter[str]') -> None:
-        self._path, self._losses = path, losses
+        super().__init__(path, losses)
         with open(path, 'rb') as stream:
             self._is_ros1 = stream.read(len(ROS1_MAGIC)) == ROS1_MAGIC
-        self._lost_offsets: set[int] = set()
         log = path.with_name(f'{path.name}-wal')
         if not self._is_ros1 and log.is_file() and log.stat().st_size:
             losses[f'write-ahead logs that are not read ({log.name}: run `sqlite3 {path.name} '
                    '"PRAGMA wal_checkpoint(TRUNCATE)"`)'] = 1
-        self.types: dict[str, str] = {}
-        self.message_counts: Counter[str] = Counter()
-        self.start_ns: int | None = None
-        self.end_ns: int | None = None
         with self._open_reader() as reader:
             for connection in reader.connections:
                 if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
@@ -79,30 +66,20 @@ class BagFile:
 
     def _open_reader(self) -> AbstractContextManager[Any]:
         """Open the bag with the reader of `rosbags`; raises RecordingError."""
+        # Imported here because most recordings are MCAP and do not need the library.
+        from rosbags.rosbag1 import Reader
+        from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
         try:
-            reader = self._new_reader()
+            reader = (Reader if self._is_ros1 else Sqlite3Reader)(self._path)
             reader.open()
         except bag_errors() as error:
             raise RecordingError(f'{self._path} cannot be read as a bag: {error}') from error
         return closing(reader)
 
-    def _new_reader(self) -> 'Ros1Reader | Sqlite3Reader':
-        """Create the reader of `rosbags` for this type of bag."""
-        # Imported here because most recordings are MCAP and do not need the library.
-        if self._is_ros1:
-            from rosbags.rosbag1 import Reader
-
-            return Reader(self._path)
-        from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
-
-        return Sqlite3Reader(self._path)
-
     def blocks(self, start_ns: int | None = None,
                progress: Progress | None = None) -> Iterator[MessageBlock]:
-        """Iterate over blocks of CDR messages from `start_ns` on, in order of log time.
-
-        `progress` is called with the number of bytes read since the last call.
-        """
+        """Iterate over blocks of CDR messages from `start_ns` on, in order of log time."""
         size, total = self._path.stat().st_size, max(self.message_counts.total(), 1)
         reported = n = 0
         messages: list[RawMessage] = []
@@ -184,12 +161,6 @@ class BagFile:
                 reader.indexes[number].append(entry)
             # The library has closed the chunk before the damaged one.
             reader.current_chunk = (-1, BytesIO())
-
-    def _count_loss(self, offset: int, description: str) -> None:
-        """Count the damaged chunk at byte `offset`, unless it has already been counted."""
-        if offset not in self._lost_offsets:
-            self._lost_offsets.add(offset)
-            self._losses[description] += 1
 
 
 @functools.cache

@@ -7,7 +7,7 @@ import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -29,7 +29,7 @@ from mag_tracking.recording.expansion import (
     expanded,
     largest_chunk,
 )
-from mag_tracking.recording.message_block import ChannelKind, MessageBlock, Progress
+from mag_tracking.recording.message_block import ChannelKind, MessageBlock, Progress, RecordingFile
 from mag_tracking.units import LATEST_NS
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -47,6 +47,13 @@ _CHUNK_HEADER = struct.Struct('<QQQII')
 _MAX_NAME = 64
 """Largest accepted length of the name of a compression."""
 _CRC_STEP = 1 << 20
+CONTENT = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+"""Operation codes of the records in a chunk, which may also be outside of chunks."""
+MAX_MERGED_SIZE = 64 << 20
+"""Size of a chunk above which its messages are not sorted among those of other chunks, because
+that takes several times the memory [bytes]."""
+UNCHUNKED_SIZE = 1 << 20
+"""Number of bytes of consecutive records outside of chunks that are read at once."""
 
 
 class Record(NamedTuple):
@@ -84,8 +91,6 @@ class ChunkHeader(NamedTuple):
     """Log time of the first message [ns]."""
     end_ns: int
     """Log time of the last message [ns]."""
-    uncompressed_size: int
-    """Declared size of the content, bytes."""
     crc: int
     """CRC of the content; 0 if unknown."""
     compression: str
@@ -94,16 +99,13 @@ class ChunkHeader(NamedTuple):
 
 
 def chunk_header(stream: BinaryIO, chunk: Record) -> ChunkHeader:
-    """Read the header of a chunk, up to the beginning of its content.
-
-    Raises ValueError if there is no intact header, EOFError if the content is longer than the
-    chunk.
-    """
+    """Read the header of a chunk, up to the beginning of its content; raises ValueError or EOFError
+    if it is damaged."""
     stream.seek(chunk.begin)
     opcode, length = RECORD_HEADER.unpack(stream.read(RECORD_HEADER.size))
     if opcode != Opcode.CHUNK or chunk.begin + RECORD_HEADER.size + length != chunk.end:
         raise ValueError('no chunk at the indexed offset')
-    start_ns, end_ns, uncompressed, crc, name_length = _CHUNK_HEADER.unpack(
+    start_ns, end_ns, _, crc, name_length = _CHUNK_HEADER.unpack(
         stream.read(_CHUNK_HEADER.size))
     if name_length > _MAX_NAME:
         raise ValueError('the name of the compression is too long')
@@ -111,15 +113,14 @@ def chunk_header(stream: BinaryIO, chunk: Record) -> ChunkHeader:
     (size,) = struct.unpack('<Q', stream.read(8))
     if stream.tell() + size > chunk.end:
         raise EOFError('the content exceeds its chunk')
-    return ChunkHeader(start_ns, end_ns, uncompressed, crc, compression, size)
+    return ChunkHeader(start_ns, end_ns, crc, compression, size)
 
 
 def chunk_content(stream: BinaryIO, chunk: Record, limit: int) -> bytes:
     """Read and decompress the records in a chunk, at most `limit` bytes.
 
     Of a chunk beyond the end of the file, the part that was written is read without checking the
-    CRC, which covers the whole. Raises one of DECODE_ERRORS if the chunk is damaged,
-    RefusedDataError if it is too large or has an unsupported compression.
+    CRC, which covers the whole. Raises one of DECODE_ERRORS, also RefusedDataError.
     """
     is_cut = chunk.end > file_size(stream)
     header = chunk_header(stream, chunk)
@@ -128,6 +129,14 @@ def chunk_content(stream: BinaryIO, chunk: Record, limit: int) -> bytes:
     if header.crc and not is_cut and zlib.crc32(data) != header.crc:
         raise ValueError('the CRC of the chunk is wrong')
     return data
+
+
+def definitions_of(data: bytes, places: Iterable[tuple[int, int, int]]
+                   ) -> Iterator[Schema | Channel]:
+    """Schemas and channels at the `places` (opcode, begin, end) in the records of a chunk."""
+    for opcode, begin, end in places:
+        kind: type[Schema] | type[Channel] = Schema if opcode == Opcode.SCHEMA else Channel
+        yield kind.read(ReadDataStream(BytesIO(data[begin:end])))
 
 
 def _footer(stream: BinaryIO) -> tuple[int, int] | None:
@@ -168,46 +177,25 @@ def _check_crc(stream: BinaryIO, start: int, crc: int) -> None:
         raise ValueError('the CRC of the summary is wrong')
 
 
-MAX_MERGED_SIZE = 64 << 20
-"""Size of a chunk above which its messages are not sorted among those of other chunks, because
-that takes several times the memory [bytes]."""
-UNCHUNKED_SIZE = 1 << 20
-"""Number of bytes of consecutive records outside of chunks that are read at once."""
-_DEFINITION_TYPES: dict[int, type[Schema] | type[Channel]] = {
-    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
-
-
 class _Part(NamedTuple):
     """Part of a file that is read at once: a chunk, or consecutive records outside of chunks."""
 
     record: Record
     """Position. The operation code is that of the first record."""
     start_ns: int
-    """Log time of the first message [ns]."""
     end_ns: int
-    """Log time of the last message [ns]."""
 
 
-class McapFile:
+class McapFile(RecordingFile):
     """Reader of one MCAP file of a recording; raises RecordingError for another kind of file.
 
     Schemas and channels are those of the summary and of the parts that were read. A file without a
     summary is read once when it is opened, to find its topics and chunks.
-
-    Attributes
-    ----------
-    types : message type by topic
-    message_counts : number of messages by topic; empty if unknown
-    start_ns, end_ns : log times of the first and last message; None without messages
-    losses : number of unreadable parts by description, updated in place
     """
 
     def __init__(self, path: Path, losses: 'Counter[str]') -> None:
-        self.message_counts: Counter[str] = Counter()
-        self.start_ns: int | None = None
-        self.end_ns: int | None = None
-        self._path, self._losses, self._limit = path, losses, largest_chunk()
-        self._lost_offsets: set[int] = set()
+        super().__init__(path, losses)
+        self._limit = largest_chunk()
         self._channels, self._counts = _Channels(), Counter[int]()
         self._parts: list[_Part] = []
         with open(path, 'rb') as stream:
@@ -218,11 +206,7 @@ class McapFile:
                 self._losses[f'files without a valid index ({path.name}, possibly truncated)'] = 1
             self._inspect(stream, summary or Summary())
         self._parts.sort(key=lambda part: part.start_ns)
-
-    @property
-    def types(self) -> dict[str, str]:
-        """Message type by topic."""
-        return {kind.topic: kind.type for kind in self._channels.kinds.values()}
+        self.types = {kind.topic: kind.type for kind in self._channels.kinds.values()}
 
     def _inspect(self, stream: BinaryIO, summary: Summary) -> None:
         """Find the parts of the file, the topics, the message counts and the times."""
@@ -268,7 +252,7 @@ class McapFile:
         for record in records(stream, begin, end):
             begin = record.begin
             is_valid = record.end <= end and record.opcode != 0
-            in_run = is_valid and record.opcode in (*_DEFINITION_TYPES, Opcode.MESSAGE)
+            in_run = is_valid and record.opcode in CONTENT
             if run and (not in_run or record.end - run.begin > UNCHUNKED_SIZE):
                 self._add_scanned(stream, run)
                 run = None
@@ -298,8 +282,7 @@ class McapFile:
             return
         if len(rows):
             self._parts.append(_Part(record, int(rows[:, 1].min()), int(rows[:, 1].max())))
-            self._counts.update(dict(zip(
-                *(a.tolist() for a in np.unique(rows[:, 0], return_counts=True)), strict=True)))
+            self._counts.update(sorted(rows[:, 0].tolist()))
 
     def _read(self, stream: BinaryIO, record: Record) -> tuple[bytes, IntArray]:
         """Read the records of a part: their bytes and the rows of its messages; raises one of
@@ -314,18 +297,14 @@ class McapFile:
                                                  self._limit // MIN_BYTES_PER_MESSAGE)
         if end < len(data) and record.end <= file_size(stream):
             raise EOFError('the chunk ends within a record')
-        for kind, first, last in definitions:
-            self._channels.add(_DEFINITION_TYPES[kind].read(
-                ReadDataStream(BytesIO(data[first:last]))))
+        for definition in definitions_of(data, definitions):
+            self._channels.add(definition)
         return data, rows
 
     def blocks(self, start_ns: int | None = None,
                progress: Progress | None = None) -> Iterator[MessageBlock]:
         """Iterate over the messages chunk by chunk, in order of log time, without chunks that end
-        before `start_ns`.
-
-        `progress` is called with the number of bytes read since the last call.
-        """
+        before `start_ns`."""
         pending = MessageBlock.of_messages([])
         parts = [p for p in self._parts if start_ns is None or p.end_ns >= start_ns]
         starts = [p.start_ns for p in parts[1:]]
@@ -367,12 +346,6 @@ class McapFile:
         self._count_loss(part.record.begin, f'damaged segments ({self._path.name}, '
                          f'{duration_s:.1f} s long, {start_s:.1f} s after the start'
                          f'{_reason(error)})')
-
-    def _count_loss(self, offset: int, description: str, n: int = 1) -> None:
-        """Count the unreadable part at byte `offset`, unless it has already been counted."""
-        if offset not in self._lost_offsets:
-            self._lost_offsets.add(offset)
-            self._losses[description] += n
 
 
 def _is_valid(index: Sequence[ChunkIndex], size: int) -> bool:

@@ -1,7 +1,9 @@
 """Messages of a recording in blocks, and reading that can be stopped."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -46,15 +48,11 @@ class RawMessage(NamedTuple):
     """Message of a recording, converted to CDR if it is stored in another encoding."""
 
     topic: str
-    """Name of the topic."""
     type: str
-    """Message type."""
     log_time_ns: int
-    """Log time, ns since 1970."""
     data: bytes
     """Serialised message, CDR. Empty if the stored message cannot be converted."""
     schema: Schema
-    """Schema of the message type."""
     fault: str = ''
     """Why the stored message cannot be converted. Empty if it can."""
 
@@ -63,15 +61,11 @@ class ChannelKind(NamedTuple):
     """Topic and type of the messages of a channel."""
 
     topic: str
-    """Name of the topic."""
     type: str
-    """Message type. A magnetic field in a supported encoding has the type
-    sensor_msgs/msg/MagneticField. The type of other messages that are not CDR ends with their
-    encoding, such as 'std_msgs/msg/String (json)'."""
+    """Message type, as from `type_of`."""
     schema: Schema
     """Schema in the file."""
     encoding: str = CDR
-    """Encoding of the messages. Encodings other than CDR must be converted."""
 
     @property
     def is_cdr(self) -> bool:
@@ -82,6 +76,32 @@ class ChannelKind(NamedTuple):
     def of(cls, topic: str, encoding: str, schema: Schema) -> 'ChannelKind':
         """Describe a channel by the schema in its file."""
         return cls(topic, type_of(encoding, schema), schema, encoding)
+
+
+class RecordingFile:
+    """One file of a recording.
+
+    Attributes
+    ----------
+    types : message type by topic
+    message_counts : number of messages by topic; empty if unknown
+    start_ns, end_ns : log times of the first and last message; None without messages
+    losses : number of unreadable parts by description, updated in place
+    """
+
+    def __init__(self, path: Path, losses: Counter[str]) -> None:
+        self._path, self._losses = path, losses
+        self._lost_offsets: set[int] = set()
+        self.types: dict[str, str] = {}
+        self.message_counts: Counter[str] = Counter()
+        self.start_ns: int | None = None
+        self.end_ns: int | None = None
+
+    def _count_loss(self, offset: int, description: str, n: int = 1) -> None:
+        """Count the unreadable part at byte `offset`, unless it has already been counted."""
+        if offset not in self._lost_offsets:
+            self._lost_offsets.add(offset)
+            self._losses[description] += n
 
 
 @dataclass(frozen=True)
@@ -95,7 +115,6 @@ class MessageBlock:
     channel: IntArray
     """Channel number of each message, (n,)."""
     log_time_ns: IntArray
-    """Log time of each message, (n,) ns."""
     begin: IntArray
     """Index in `data` of the first byte of each message, (n,)."""
     end: IntArray

@@ -14,7 +14,7 @@ from typing import BinaryIO
 
 import numpy as np
 import zstandard
-from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Schema, Statistics
@@ -27,6 +27,7 @@ from mag_tracking.recording.bag_file import ROS1_MAGIC, SQLITE_MAGIC
 from mag_tracking.recording.expansion import DECODE_ERRORS, largest_chunk
 from mag_tracking.recording.file_kind import HEAD_SIZE, describe_file
 from mag_tracking.recording.mcap_file import (
+    CONTENT,
     MAGIC,
     MIN_BYTES_PER_MESSAGE,
     RECORD_HEADER,
@@ -34,6 +35,7 @@ from mag_tracking.recording.mcap_file import (
     Record,
     chunk_content,
     chunk_header,
+    definitions_of,
     file_size,
     read_summary,
     records,
@@ -87,7 +89,7 @@ class _Scan:
             self._is_damaged = True
             self._add_chunk(record)
             self._is_damaged = False
-        elif record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+        elif record.opcode in CONTENT:
             self._stream.seek(record.begin)
             self._add_content(self._stream.read(record.end - record.begin))
         elif record.opcode == Opcode.MESSAGE_INDEX and self.chunks and not self._is_damaged:
@@ -101,16 +103,12 @@ class _Scan:
         complete records."""
         rows, definitions, end = core.records_of(
             data, 2**63 - 1, self._limit // MIN_BYTES_PER_MESSAGE)
-        for opcode, first, last in definitions:
-            content = ReadDataStream(io.BytesIO(data[first:last]))
-            if opcode == Opcode.SCHEMA:
-                schema = Schema.read(content)
-                self.schemas[schema.id] = schema
+        for definition in definitions_of(data, definitions):
+            if isinstance(definition, Schema):
+                self.schemas[definition.id] = definition
             else:
-                channel = Channel.read(content)
-                self.channels[channel.id] = channel
-        numbers, counts = np.unique(rows[:, 0], return_counts=True)
-        self.counts.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
+                self.channels[definition.id] = definition
+        self.counts.update(sorted(rows[:, 0].tolist()))
         if len(rows):
             times = (*self.times, int(rows[:, 1].min()), int(rows[:, 1].max()))
             self.times = [min(times), max(times)]
@@ -241,8 +239,8 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
     """Repair a truncated MCAP file or folder, including `metadata.yaml`; return the number of
     files.
 
-    Raises RecordingError if no message can be recovered (none is complete, or the files have an
-    index and damaged chunks), OutputError if the recording is still being recorded.
+    Raises RecordingError if no message can be recovered, OutputError if the recording is still
+    being recorded.
     """
     path = checked_path(path, RecordingError)
     files = [path] if path.is_file() else sorted(path.glob('*.mcap'), key=_number)
@@ -257,7 +255,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
         raise RecordingError(f'{path} cannot be repaired: all .mcap files are empty')
     for file in empty_files:
         report(f'{file} is empty and was skipped')
-    for file in [file for file in files if file not in empty_files]:
+    for file in (file for file in files if file not in empty_files):
         try:
             lines = finish_file(file)
             if not lines:

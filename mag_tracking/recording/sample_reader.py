@@ -249,7 +249,7 @@ class SampleReader:
                                       np.append(rows, self._truth.add_block(block)))
         parts, n_added = [], 0
         for k in other_messages:
-            for record, _ in self._records_of([block.message(k)], {}):
+            for record, _ in self._records([block.message(k)], {}):
                 if isinstance(record, Readings):
                     n = int(np.searchsorted(rows, k))
                     parts += [batch.part(slice(n_added, n)), record]
@@ -268,25 +268,20 @@ class SampleReader:
     def readings_as_received(self, progress: Progress | None = None
                              ) -> Iterator[tuple[Readings, int]]:
         """Iterate over (readings, log time [ns]) of each message, in order of log time."""
-        for record, log_time_ns in self._records({}, progress):
+        for record, log_time_ns in self._records(self._recording.messages(progress=progress), {}):
             if isinstance(record, Readings):
                 yield record, log_time_ns
 
     def readings_and_accelerations(self, progress: Progress | None = None
                                    ) -> Iterator[Readings | AccelerationSample]:
         """Iterate over readings and accelerations message by message, in order of log time."""
-        return (record for record, _ in self._records(self._imus, progress))
+        messages = self._recording.messages(progress=progress)
+        return (record for record, _ in self._records(messages, self._imus))
 
-    def _records(self, imus: Mapping[str, Sequence[str]], progress: Progress | None
+    def _records(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
                  ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """Iterate over (batch of readings or acceleration, log time [ns]); `imus` maps topics of
-        accelerations to sensors."""
-        return self._records_of(self._recording.messages(progress=progress), imus)
-
-    def _records_of(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
-                    ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
         """Decode messages to (record, log time [ns]), collect the true poses, and count the
-        messages that cannot be decoded."""
+        messages that cannot be decoded; `imus` maps topics of accelerations to sensors."""
         for message in messages:
             sensor = self._sensors.get(message.topic)
             is_truth = self._truth.accepts(message.topic, message.type)
