@@ -175,6 +175,11 @@ def xyz(v: Sequence[float] | FloatArray) -> dict[str, float]:
     return {'x': float(v[0]), 'y': float(v[1]), 'z': float(v[2])}
 
 
+def quaternion_dict(q: FloatArray) -> dict[str, float]:
+    """Convert a quaternion xyzw to a geometry_msgs/Quaternion."""
+    return dict(zip('xyzw', map(float, q), strict=True))
+
+
 def header_dict(ns: int, frame: str) -> MessageDict:
     """Build a std_msgs/Header."""
     return {'stamp': stamp_dict(ns), 'frame_id': frame}
@@ -259,8 +264,7 @@ def pose_dict(ns: int, frame: str, position: FloatArray, quaternion: FloatArray)
 
 def _pose(position: FloatArray, quaternion: FloatArray) -> MessageDict:
     """Build a geometry_msgs/Pose as a dict."""
-    return {'position': xyz(position),
-            'orientation': {**xyz(quaternion), 'w': float(quaternion[3])}}
+    return {'position': xyz(position), 'orientation': quaternion_dict(quaternion)}
 
 
 def pose_covariance(uncertainty: Track | SmoothedPose | PoseUncertainty) -> FloatArray:

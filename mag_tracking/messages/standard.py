@@ -10,7 +10,12 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import quaternion_from_rotation
-from mag_tracking.messages.schema import header_dict, pose_with_covariance_dict, xyz
+from mag_tracking.messages.schema import (
+    header_dict,
+    pose_with_covariance_dict,
+    quaternion_dict,
+    xyz,
+)
 from mag_tracking.messages.types import MessageDict
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import PoseUncertainty, Track
@@ -25,18 +30,16 @@ def track_transform_dict(track: Track, frame: str, child_frame: str) -> MessageD
         return None
     return {'transforms': [{
         'header': header_dict(track.stamp_ns, frame), 'child_frame_id': child_frame,
-        'transform': {'translation': xyz(track.position), 'rotation': {
-            **xyz(track.orientation), 'w': float(track.orientation[3])}}}]}
+        'transform': {'translation': xyz(track.position),
+                      'rotation': quaternion_dict(track.orientation)}}]}
 
 
 def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[MessageDict]:
     """geometry_msgs/TransformStamped from the world frame to each sensor, named after it."""
-    quaternions = map(quaternion_from_rotation, network.R_ws)
-    return [{'header': header_dict(stamp_ns, network.frame),
-             'child_frame_id': name,
-             'transform': {'translation': xyz(position), 'rotation': {
-                 **xyz(q), 'w': float(q[3])}}}
-            for name, position, q in zip(network.names, network.positions, quaternions,
+    return [{'header': header_dict(stamp_ns, network.frame), 'child_frame_id': name,
+             'transform': {'translation': xyz(position), 'rotation': quaternion_dict(
+                 quaternion_from_rotation(R))}}
+            for name, position, R in zip(network.names, network.positions, network.R_ws,
                                          strict=True)]
 
 
@@ -103,8 +106,9 @@ def sensor_markers(network: SensorNetwork) -> dict[str, Any]:
         common = {'header': header_dict(0, network.frame), 'id': j, 'action': _ADD}
         markers.append({
             **common, 'ns': SENSOR_NAMESPACES[0], 'type': _CUBE, 'color': _GREY,
-            'pose': {'position': xyz(network.positions[j]), 'orientation': _quaternion(
-                network.R_ws[j])}, 'scale': xyz(np.array([1.0, 0.6, 0.2]) * size)})
+            'pose': {'position': xyz(network.positions[j]), 'orientation': quaternion_dict(
+                quaternion_from_rotation(network.R_ws[j]))},
+            'scale': xyz(np.array([1.0, 0.6, 0.2]) * size)})
         above = network.positions[j] + [0.0, 0.0, size]
         markers.append({
             **common, 'ns': SENSOR_NAMESPACES[1], 'type': _TEXT, 'color': _GREY, 'text': name,
@@ -127,23 +131,24 @@ def _marker(track: Track, frame: str, namespace: str, shape: int,
             'type': shape, **message_fields}
 
 
-def _quaternion(R: FloatArray) -> dict[str, float]:
-    """Convert a rotation matrix to a geometry_msgs/Quaternion as a dict."""
-    return dict(zip('xyzw', quaternion_from_rotation(R).tolist(), strict=True))
+def ellipsoid_axes(C: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Standard deviations (3,) along the axes of a covariance (3, 3), and the quaternion xyzw that
+    rotates to them."""
+    variances, R = np.linalg.eigh(C)
+    if np.linalg.det(R) < 0.0:
+        R = -R
+    return np.sqrt(np.maximum(variances, 0.0)), quaternion_from_rotation(R)
 
 
 def _ellipsoid(track: Track, frame: str) -> dict[str, Any]:
     """Ellipsoid marker of the 90 % region of the position."""
     uncertainty: Track | PoseUncertainty = track.topic_uncertainty or track
-    variances, R = np.linalg.eigh(uncertainty.covariance[:3, :3])
-    if np.linalg.det(R) < 0.0:
-        R = -R
-    diameters = 2.0 * _REGION_RADIUS * np.sqrt(np.maximum(variances, 0.0))
+    std, q = ellipsoid_axes(uncertainty.covariance[:3, :3])
     return _marker(
         track, frame, 'ellipsoid', _SPHERE, action=_ADD, lifetime={'sec': LIFETIME_S},
-        pose={'position': xyz(track.position), 'orientation': _quaternion(R)},
+        pose={'position': xyz(track.position), 'orientation': quaternion_dict(q)},
         # RViz rejects spheres with zero thickness.
-        scale=xyz(np.maximum(diameters, 1e-6)),
+        scale=xyz(np.maximum(2.0 * _REGION_RADIUS * std, 1e-6)),
         color={**_BLUE, 'a': 0.15 if track.ambiguous else 0.35})
 
 

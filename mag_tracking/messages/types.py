@@ -10,7 +10,7 @@ import struct
 from ast import literal_eval
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, Protocol, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from mcap.exceptions import McapError
 from mcap.records import Schema
@@ -143,6 +143,19 @@ _FIELD = re.compile(r'\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?P<array>(?:<=)
                     r'\s+(?P<name>[A-Za-z]\w*)\s*(?P<is_constant>=?)(?P<default>[^#]*)')
 
 
+class RawMessage(NamedTuple):
+    """Message of a recording, converted to CDR if it is stored in another encoding."""
+
+    topic: str
+    type: str
+    log_time_ns: int
+    data: bytes
+    """Serialised message, CDR. Empty if the stored message cannot be converted."""
+    schema: Schema
+    fault: str = ''
+    """Why the stored message cannot be converted. Empty if it can."""
+
+
 def _full_name(kind: str, package: str) -> str:
     """Full name of the type that is called `kind` in a definition of `package`."""
     owner, _, leaf = kind.rpartition('/')
@@ -151,36 +164,31 @@ def _full_name(kind: str, package: str) -> str:
 
 def referenced_types(message_definition: str, package: str) -> list[str]:
     """Full names of the types that a definition references directly, in order of appearance."""
-    out: list[str] = []
-    for line in message_definition.splitlines():
-        field = _FIELD.match(line.partition('#')[0])
-        if field and not field['is_constant'] and field['type'] not in _BUILT_IN:
-            name = _full_name(field['type'], package)
-            if name not in out:
-                out.append(name)
-    return out
+    fields = (_FIELD.match(line.partition('#')[0]) for line in message_definition.splitlines())
+    return list(dict.fromkeys(
+        _full_name(field['type'], package) for field in fields
+        if field and not field['is_constant'] and field['type'] not in _BUILT_IN))
 
 
 def _dependencies(type_name: str) -> list[str]:
     """Types contained in `type_name` at any depth, without duplicates, in breadth-first order."""
-    visited: list[str] = []
-    queue = [type_name]
-    while queue:
-        name = queue.pop(0)
-        if name not in visited:
-            visited.append(name)
-            queue += referenced_types(DEFINITIONS[name], name.partition('/')[0])
-    return visited[1:]
+    found = [type_name]
+    for name in found:
+        found += [n for n in referenced_types(DEFINITIONS[name], name.partition('/')[0])
+                  if n not in found]
+    return found[1:]
+
+
+def _own_definition(type_name: str) -> str:
+    """Definition of a type; raises RecordingError if it is unknown."""
+    if type_name not in DEFINITIONS:
+        raise RecordingError(f'cannot encode {type_name}: no definition of this type is available')
+    return DEFINITIONS[type_name]
 
 
 def definition(type_name: str) -> str:
-    """Definition of a type and of all types it contains, in the format of a `ros2msg` schema.
-
-    Raises RecordingError if `definitions` does not contain the type.
-    """
-    if type_name not in DEFINITIONS:
-        raise RecordingError(f'cannot encode {type_name}: no definition of this type is available')
-    message_definition = DEFINITIONS[type_name]
+    """Definition of a type and of all types it contains, in the format of a `ros2msg` schema."""
+    message_definition = _own_definition(type_name)
     for name in _dependencies(type_name):
         package, _, leaf = name.split('/')
         message_definition += f'{"=" * 80}\nMSG: {package}/{leaf}\n{DEFINITIONS[name]}'
@@ -189,7 +197,7 @@ def definition(type_name: str) -> str:
 
 @functools.cache
 def schema_of(type_name: str) -> Schema:
-    """MCAP schema of a message type; empty if `definitions` does not contain it."""
+    """MCAP schema of a message type; empty if its definition is unknown."""
     is_defined = type_name in DEFINITIONS
     return Schema(1, definition(type_name).encode() if is_defined else b'',
                   ROS_SCHEMA if is_defined else '', type_name)
@@ -197,11 +205,9 @@ def schema_of(type_name: str) -> Schema:
 
 @functools.cache
 def encoder(type_name: str) -> core.Encoder:
-    """Encoder from nested dicts to CDR; raises RecordingError if `definitions` lacks the type."""
-    if type_name not in DEFINITIONS:
-        raise RecordingError(f'cannot encode {type_name}: no definition of this type is available')
+    """Encoder from nested dicts to CDR; raises RecordingError if the type is unknown."""
     package, fields = type_name.partition('/')[0], []
-    for line in DEFINITIONS[type_name].splitlines():
+    for line in _own_definition(type_name).splitlines():
         field = _FIELD.match(line)
         if field is None or field['is_constant']:
             continue
@@ -214,25 +220,12 @@ def encoder(type_name: str) -> core.Encoder:
     return core.Encoder(fields)
 
 
-class _RawMessage(Protocol):
-    """Interface of `RawMessage`."""
-
-    @property
-    def topic(self) -> str: ...
-    @property
-    def type(self) -> str: ...
-    @property
-    def data(self) -> bytes: ...
-    @property
-    def schema(self) -> Schema: ...
-
-
 _decoders: dict[tuple[str, bytes], Callable[[bytes], SimpleNamespace] | None] = {}
 _DECODE_ERRORS = (ValueError, TypeError, IndexError, KeyError, OverflowError, struct.error,
                   McapError)
 
 
-def decode(message: _RawMessage) -> SimpleNamespace:
+def decode(message: RawMessage) -> SimpleNamespace:
     """Decode the CDR bytes of a message to the fields of its type.
 
     Raises RecordingError if the bytes do not match the type, or the schema is not supported.

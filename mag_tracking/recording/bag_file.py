@@ -14,14 +14,14 @@ import lz4.frame
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.encodings import cdr_of_ros1
-from mag_tracking.messages.types import schema_of
+from mag_tracking.messages.types import RawMessage, schema_of
 from mag_tracking.recording.expansion import (
     DECODE_ERRORS,
     RefusedDataError,
     expanded,
     largest_chunk,
 )
-from mag_tracking.recording.message_block import MessageBlock, Progress, RawMessage, RecordingFile
+from mag_tracking.recording.message_block import MessageBlock, Progress, RecordingFile
 from mag_tracking.units import LATEST_NS
 
 if TYPE_CHECKING:

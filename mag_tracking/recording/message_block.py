@@ -11,7 +11,7 @@ from mcap.records import Schema
 
 from mag_tracking.arrays import IntArray
 from mag_tracking.messages.encodings import CDR, cdr_of, type_of
-from mag_tracking.messages.types import ROS_SCHEMA, schema_of
+from mag_tracking.messages.types import ROS_SCHEMA, RawMessage, schema_of
 from mag_tracking.recording.expansion import expanded_message
 
 Progress: TypeAlias = Callable[[int], object]
@@ -42,19 +42,6 @@ def until_stopped(read: Callable[[Progress], Iterator[_Item]], progress: Progres
     for item in read(advance):
         yield item
         check()
-
-
-class RawMessage(NamedTuple):
-    """Message of a recording, converted to CDR if it is stored in another encoding."""
-
-    topic: str
-    type: str
-    log_time_ns: int
-    data: bytes
-    """Serialised message, CDR. Empty if the stored message cannot be converted."""
-    schema: Schema
-    fault: str = ''
-    """Why the stored message cannot be converted. Empty if it can."""
 
 
 class ChannelKind(NamedTuple):

@@ -25,11 +25,12 @@ from mag_tracking.messages.types import (
     IMU,
     MAGNETIC_FIELD,
     RAW_READINGS,
+    RawMessage,
     decode,
 )
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute, namespaces_of
-from mag_tracking.recording.message_block import MessageBlock, Progress, RawMessage
+from mag_tracking.recording.message_block import MessageBlock, Progress
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings

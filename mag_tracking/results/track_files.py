@@ -17,7 +17,6 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import MissingDependencyError, OutputError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.files import new_binary_file, replace_text
-from mag_tracking.geometry import quaternion_from_rotation
 from mag_tracking.messages.schema import (
     disturbance_dict,
     header_dict,
@@ -30,6 +29,7 @@ from mag_tracking.messages.schema import (
 )
 from mag_tracking.messages.standard import (
     delete_markers,
+    ellipsoid_axes,
     sensor_markers,
     sensor_transform_dicts,
     track_markers,
@@ -117,9 +117,9 @@ def _write_track(rerun: Any, stream: Any, network: Sensors, log: TrackLog) -> No
     root = f'{network.frame}/track_{log.id}'
     for k, ns in enumerate(log.stamp_ns):
         stream.set_time(TIME, timestamp=np.datetime64(ns, 'ns'))
-        half_axes, orientation = _ellipsoid(log.covariance[k][:3, :3])
+        std, orientation = ellipsoid_axes(log.covariance[k][:3, :3])
         stream.log(f'{root}/region', rerun.Ellipsoids3D(
-            centers=[log.position[k]], half_sizes=[half_axes],
+            centers=[log.position[k]], half_sizes=[SCALE_3D * std],
             quaternions=[rerun.Quaternion(xyzw=orientation)]))
         stream.log(f'{root}/pose', rerun.Points3D([log.position[k]], labels=[
             f'{log.id} {log.kind[k]}{"?" if log.ambiguous[k] else ""}']))
@@ -134,15 +134,6 @@ def _write_track(rerun: Any, stream: Any, network: Sensors, log: TrackLog) -> No
     period = log.stamp_ns[-1] - log.stamp_ns[-2] if len(log.stamp_ns) > 1 else NS
     stream.set_time(TIME, timestamp=np.datetime64(log.stamp_ns[-1] + period, 'ns'))
     stream.log(root, rerun.Clear(recursive=True))
-
-
-def _ellipsoid(C: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Semi-axes (3,) [m] and quaternion xyzw of the 90 % ellipsoid of a covariance."""
-    values, R = np.linalg.eigh(C)
-    if np.linalg.det(R) < 0.0:
-        R = -R
-    half: FloatArray = SCALE_3D * np.sqrt(np.maximum(values, 0.0))
-    return half, quaternion_from_rotation(R)
 
 
 LATCHED = ('/tf_static', '/tracker_node/sensor_markers')

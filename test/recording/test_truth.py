@@ -13,11 +13,12 @@ from mag_tracking.messages.types import (
     MAGNETIC_FIELD,
     POSE,
     POSE_WITH_COVARIANCE,
+    RawMessage,
     encoder,
     schema_of,
 )
 from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.message_block import MessageBlock, RawMessage
+from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.truth import TruthTopics, read_truth_table
