@@ -24,10 +24,8 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 def cdr_of_ros1(data: bytes, type_name: str) -> bytes:
-    """Convert a serialised ROS 1 message to CDR; empty if damaged or of an unsupported type.
-
-    `type_name` is the name of the type in ROS 2.
-    """
+    """Convert a serialised ROS 1 message to CDR; empty if damaged or of an unsupported type (name
+    in ROS 2)."""
     if type_name not in DEFINITIONS:
         return b''
     try:
@@ -78,10 +76,8 @@ class MissingPartError(ValueError):
 
 
 def cdr_of_self_described(encoding: str, schema: Schema, data: bytes) -> tuple[bytes, str]:
-    """Convert a message to the CDR of sensor_msgs/MagneticField, or return the reason why not.
-
-    Of the two results, data and fault, one is empty. The encoding is one of `SELF_DESCRIBED`.
-    """
+    """Convert a message in an encoding of `SELF_DESCRIBED` to the CDR of sensor_msgs/MagneticField,
+    or return the reason why not; of the two results, data and fault, one is empty."""
     try:
         return encoder(MAGNETIC_FIELD)(
             field_decoder(encoding, schema.name, schema.data)(data)), ''
@@ -103,12 +99,8 @@ def decode_errors() -> tuple[type[Exception], ...]:
 
 @functools.cache
 def field_decoder(encoding: str, name: str, content: bytes) -> Callable[[bytes], MessageDict]:
-    """Create a decoder of magnetic fields for one schema, in an encoding of `SELF_DESCRIBED`.
-
-    `content` is the protobuf descriptor, not needed for JSON. The decoder returns
-    sensor_msgs/MagneticField as nested dicts, and raises ValueError for messages that are no
-    magnetic field. Raises ValueError if a protobuf schema cannot be read.
-    """
+    """Create a decoder of magnetic fields, to nested dicts, for one schema, whose `content` is the
+    protobuf descriptor; both raise ValueError if they cannot read it."""
     if encoding == 'json':
         return lambda data: _field(json.loads(data, object_hook=lambda d: SimpleNamespace(**d)))
     from mcap_protobuf.decoder import DecoderFactory
@@ -232,10 +224,8 @@ def _ros2_name(name: str) -> str:
 
 
 def cdr_of(encoding: str, kind: str, schema: Schema, data: bytes) -> tuple[bytes, str]:
-    """Convert a message of a `kind` from `type_of` to plain CDR, or return the reason why not.
-
-    Of the two results, data and fault, one is empty.
-    """
+    """Convert a message of a `kind` from `type_of` to plain CDR, or return the reason why not; of
+    the two results, data and fault, one is empty."""
     if encoding in SELF_DESCRIBED and kind == MAGNETIC_FIELD:
         return cdr_of_self_described(encoding, schema, data)
     if encoding == ROS1:

@@ -73,10 +73,8 @@ def poses(content: bytes, begins: IntArray, ends: IntArray, frame: str) -> PoseA
 
 
 class _StampedMessages:
-    """Messages that consist of a header and float64 values.
-
-    `is_decoded` (n,) is False for a message that is truncated or not little-endian CDR.
-    """
+    """Messages that consist of a header and float64 values; `is_decoded` (n,) is False if they are
+    truncated or not little-endian CDR."""
 
     def __init__(self, content: bytes, begins: IntArray, ends: IntArray, n_doubles: int) -> None:
         self._data: NDArray[np.uint8] = np.frombuffer(content, np.uint8)

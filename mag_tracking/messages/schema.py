@@ -128,10 +128,7 @@ def stamp_dict(ns: int) -> MessageDict:
 
 
 def reading_of(message: MagneticField, sensor: str) -> Readings:
-    """Convert a MagneticField message to `Readings` with a single reading.
-
-    A covariance that is all zero, or whose first element is -1, is unknown.
-    """
+    """Convert a MagneticField message to `Readings` with a single reading."""
     f = message.magnetic_field
     C = known_covariances(np.array(message.magnetic_field_covariance, dtype=float).reshape(1, 3, 3))
     return Readings.single(sensor, stamp_ns(message.header.stamp), np.array([f.x, f.y, f.z]),
@@ -152,10 +149,8 @@ def known_covariances(C: FloatArray) -> FloatArray | None:
 
 
 def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
-    """Convert an Imu message to an `AccelerationSample`; NaN if it contains no acceleration.
-
-    The first element of the covariance is then -1.
-    """
+    """Convert an Imu message to an `AccelerationSample`; NaN if the first element of the
+    covariance, -1, marks that it contains no acceleration."""
     a = message.linear_acceleration
     is_present = message.linear_acceleration_covariance[0] != -1.0
     return AccelerationSample(stamp_ns(message.header.stamp), sensor,
@@ -163,10 +158,8 @@ def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
 
 
 def float64_array(values: ArrayLike) -> 'array[float]':
-    """Convert numbers of any shape to the array type of a float64[] field, in row-major order.
-
-    ROS accepts this type without conversion; it would check the elements of a list individually.
-    """
+    """Convert numbers of any shape to the array type of a float64[] field, in row-major order,
+    whose elements ROS does not check individually."""
     return array('d', np.ascontiguousarray(values, dtype=float).tobytes())
 
 
@@ -186,10 +179,8 @@ def header_dict(ns: int, frame: str) -> MessageDict:
 
 
 def magnetic_field_dicts(readings: Readings, frame: str = '') -> list[tuple[str, MessageDict]]:
-    """Convert `Readings` to one sensor_msgs/MagneticField per reading, with the name of its sensor.
-
-    The frame is by default the name of the sensor. An unknown covariance is all zero.
-    """
+    """Convert `Readings` to one sensor_msgs/MagneticField per reading, with the name of its sensor,
+    also the default frame; an unknown covariance is all zero."""
     C: FloatArray = np.zeros((len(readings), 9))
     if readings.covariance is not None:
         C = readings.covariance.reshape(-1, 9).copy()
@@ -202,10 +193,8 @@ def magnetic_field_dicts(readings: Readings, frame: str = '') -> list[tuple[str,
 
 
 def readings_dict(readings: Readings) -> MessageDict:
-    """Convert `Readings` to mag_tracking_msgs/FieldReadings.
-
-    Raises RecordingError if only some covariances are known, or `readings` is empty.
-    """
+    """Convert `Readings` to mag_tracking_msgs/FieldReadings; raises RecordingError if only some
+    covariances are known, or `readings` is empty."""
     C = readings.covariance
     if not len(readings) or C is not None and np.isnan(C).all(axis=(1, 2)).any():
         raise RecordingError('FieldReadings requires at least one reading, and covariances for '
@@ -219,10 +208,8 @@ def readings_dict(readings: Readings) -> MessageDict:
 
 
 def readings_of(message: FieldReadings) -> Readings:
-    """Convert a FieldReadings message to `Readings`.
-
-    Raises RecordingError if array lengths, sensor names, indices or timestamps are invalid.
-    """
+    """Convert a FieldReadings message to `Readings`; raises RecordingError if array lengths, sensor
+    names, indices or timestamps are invalid."""
     n, names = len(message.sensor), tuple(message.sensors)
     lengths = len(message.stamp), len(message.field), len(message.covariance)
     if lengths not in ((n, 3 * n, 0), (n, 3 * n, 9 * n)):

@@ -22,10 +22,8 @@ from mag_tracking.records import PoseUncertainty, Track
 
 
 def track_transform_dict(track: Track, frame: str, child_frame: str) -> MessageDict | None:
-    """Convert a `Track` to a tf2_msgs/TFMessage from the world frame to the target.
-
-    None if the pose is ambiguous, because a transform has neither a flag nor a covariance.
-    """
+    """Convert a `Track` to a tf2_msgs/TFMessage from the world frame to the target; None if
+    ambiguous, because a transform has neither a flag nor a covariance."""
     if track.ambiguous:
         return None
     return {'transforms': [{
@@ -46,9 +44,8 @@ def sensor_transform_dicts(network: SensorNetwork, stamp_ns: int) -> list[Messag
 def detections_3d_dict(track: Track, frame: str) -> MessageDict:
     """Convert a `Track` to vision_msgs/Detection3DArray, empty if it has ended or is withheld.
 
-    Each result of a detection is a kind of target with its probability and the pose of the track.
-    The bounding box has the length of the line of dipoles; its width and height are not observable
-    and are 0.
+    Each result is a kind of target with its probability and the pose of the track. Width and height
+    of the bounding box are not observable and are 0.
     """
     header = header_dict(track.stamp_ns, frame)
     if track.ended or track.topic_uncertainty is None:
@@ -84,11 +81,8 @@ _GREY = {'r': 0.35, 'g': 0.35, 'b': 0.35, 'a': 1.0}
 
 
 def track_markers(track: Track, frame: str) -> dict[str, Any]:
-    """Markers of a `Track`: ellipsoid, moment arrow and label, as a visualization_msgs/MarkerArray.
-
-    The ellipsoid shows the covariance of the pose topics, which covers all hypotheses of an
-    ambiguous track.
-    """
+    """Markers of a `Track` as a visualization_msgs/MarkerArray; the ellipsoid shows the covariance
+    of the pose topics, which covers all hypotheses of an ambiguous track."""
     return {'markers': [_ellipsoid(track, frame), _arrow(track, frame), _label(track, frame)]}
 
 

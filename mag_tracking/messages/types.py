@@ -226,10 +226,8 @@ _DECODE_ERRORS = (ValueError, TypeError, IndexError, KeyError, OverflowError, st
 
 
 def decode(message: RawMessage) -> SimpleNamespace:
-    """Decode the CDR bytes of a message to the fields of its type.
-
-    Raises RecordingError if the bytes do not match the type, or the schema is not supported.
-    """
+    """Decode the CDR bytes of a message to the fields of its type; raises RecordingError if they do
+    not match the type, or the schema is not supported."""
     key = message.schema.name, message.schema.data
     try:
         if key not in _decoders:

@@ -56,11 +56,8 @@ def check_size(size: int, limit: int) -> None:
 
 
 def expanded(compression: str, data: bytes, limit: int, is_cut: bool = False) -> bytes:
-    """Decompress zstd, lz4, bz2 or uncompressed data of at most `limit` bytes.
-
-    `is_cut` permits that the end is missing. Raises RefusedDataError beyond the limit or for
-    another compression, and the errors of the compression for damaged data.
-    """
+    """Decompress data to at most `limit` bytes; raises RefusedDataError beyond it or for an unknown
+    compression, and, unless `is_cut` permits a missing end, the errors for damaged data."""
     if compression in ('', 'none'):
         check_size(len(data), limit)
         return data

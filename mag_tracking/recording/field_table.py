@@ -73,11 +73,8 @@ class FieldTable(NamedTuple):
 
 
 def read_field_table(path: FilePath, options: TableOptions, with_times: bool = True) -> FieldTable:
-    """Read a table of readings; without `with_times`, the timestamps count the rows.
-
-    Raises RecordingError if the table is ambiguous or contradicts the options; the message names
-    the option that states the property.
-    """
+    """Read a table of readings; without `with_times`, the timestamps count the rows; if the table
+    is ambiguous, RecordingError names the option that states the property."""
     table = read_table(checked_path(path, RecordingError), options.separator, options.header,
                        options.encoding)
     columns = find_columns(table, options.columns, options.unit, options.sensor)

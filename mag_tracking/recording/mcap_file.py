@@ -72,10 +72,7 @@ def file_size(stream: BinaryIO) -> int:
 
 
 def records(stream: BinaryIO, begin: int, end: int) -> Iterator[Record]:
-    """Iterate over the positions of records without reading their content.
-
-    It ends at the offset `end` or after a record that exceeds it.
-    """
+    """Iterate over the positions of records up to the offset `end`, or a record that exceeds it."""
     while begin + RECORD_HEADER.size <= end:
         stream.seek(begin)
         opcode, length = RECORD_HEADER.unpack(stream.read(RECORD_HEADER.size))

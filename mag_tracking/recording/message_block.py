@@ -25,11 +25,8 @@ class ReadingStopped(Exception):
 
 def until_stopped(read: Callable[[Progress], Iterator[_Item]], progress: Progress | None = None,
                   stopped: Callable[[], bool] | None = None) -> Iterator[_Item]:
-    """Iterate over the items of `read`, which calls its `Progress` argument while it reads.
-
-    `stopped` is called after every item and every progress report; ReadingStopped is raised when it
-    returns true.
-    """
+    """Iterate over the items of `read`, until `stopped` returns true after an item or a report of
+    its `Progress` argument; ReadingStopped is raised then."""
     def advance(n: int) -> None:
         if progress is not None:
             progress(n)

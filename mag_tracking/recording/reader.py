@@ -123,10 +123,8 @@ def _files(path: Path) -> list[Path]:
 
 
 def _listed_file(file: Path) -> Path:
-    """Return a file of a folder, or the file that resulted from decompressing it.
-
-    Raises RecordingError if the file does not exist or is compressed.
-    """
+    """Return a file of a folder, or the file that resulted from decompressing it; raises
+    RecordingError if neither exists."""
     program = _COMPRESSED_SUFFIXES.get(file.suffix)
     if program is not None and file.with_suffix('').exists():
         return file.with_suffix('')

@@ -112,10 +112,8 @@ class Recorder:
             self._latched[name] = deque(self._latched.get(name, ()), latched)
 
     def write(self, name: str, data: bytes, log_ns: int, publish_ns: int | None = None) -> None:
-        """Record a CDR message of a registered topic, or count it as dropped.
-
-        `log_ns` is the time of receipt, also the default of `publish_ns`.
-        """
+        """Record a CDR message of a registered topic, received at `log_ns`, or count it as
+        dropped."""
         message = (self._sequence[name], data, log_ns, publish_ns or log_ns)
         self._sequence[name] += 1
         if self._file and self._file.counts and self._file.size >= self._split_bytes:
@@ -130,10 +128,8 @@ class Recorder:
             self._latched[name].append(message)
 
     def tick(self, now_ns: int) -> None:
-        """Flush or split the file, and retry writing the metadata, when due.
-
-        To be called several times per second with a monotonic clock.
-        """
+        """Flush or split the file, and retry writing the metadata, when due; to be called several
+        times per second with a monotonic clock."""
         self._now_ns = now_ns
         self._opened_ns = now_ns if self._opened_ns is None else self._opened_ns
         if self._file and now_ns - self._flushed_ns >= FLUSH_INTERVAL_NS:

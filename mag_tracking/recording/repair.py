@@ -237,11 +237,7 @@ def _replace_end(raw: io.FileIO, end: int, index: bytes) -> None:
 
 def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -> int:
     """Repair a truncated MCAP file or folder, including `metadata.yaml`; return the number of
-    files.
-
-    Raises RecordingError if no message can be recovered, OutputError if the recording is still
-    being recorded.
-    """
+    files; raises RecordingError if nothing can be recovered, OutputError while it is recorded."""
     path = checked_path(path, RecordingError)
     files = [path] if path.is_file() else sorted(path.glob('*.mcap'), key=_number)
     if not files:

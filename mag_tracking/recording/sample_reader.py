@@ -375,10 +375,8 @@ def _candidates(types: Mapping[str, str], frames: Mapping[str, set[str]]) -> str
 
 
 def _namespace(recording: Recording, network: SensorNetwork) -> str:
-    """Namespace of the network's relative topics: configured, found in the recording, or '/'.
-
-    Raises RecordingError if the recording contains them in several namespaces.
-    """
+    """Namespace of the network's relative topics: configured, found in the recording, or '/';
+    raises RecordingError if the recording has several."""
     if network.namespace is not None:
         return network.namespace
     names = [name for name, kind in recording.types.items()

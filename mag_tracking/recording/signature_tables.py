@@ -69,10 +69,8 @@ def read_signatures(path: FilePath, is_labelled: bool = True) -> list[Signature]
 
 
 def _read_by_sample(table: CsvTable) -> list[Signature]:
-    """Read a table with one row per sample.
-
-    The columns that contain neither field, label, time nor pass identify the signature of a row.
-    """
+    """Read a table with one row per sample; the columns without field, label, time or pass identify
+    the signature."""
     path, header = table.path, table.header
     axes = {name: match for name in header if (match := _AXIS_COLUMN.fullmatch(name.lower()))}
     names = [name for name in header if name not in (*axes, LABEL, TIME, PASS)]
@@ -135,10 +133,8 @@ def _read_by_row(table: CsvTable) -> list[Signature]:
 
 
 class _Fields:
-    """Field columns of a table by axis, from `columns`: [(axis, unit, names)].
-
-    Raises LabelsError if an axis is duplicated, or only some columns have a unit.
-    """
+    """Field columns of a table by axis, from `columns`: [(axis, unit, names)]; raises LabelsError
+    if they are inconsistent."""
 
     def __init__(self, path: FilePath, columns: list[tuple[str, str, list[str]]]) -> None:
         columns = sorted(columns)

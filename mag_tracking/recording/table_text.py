@@ -186,10 +186,8 @@ class CsvTable(NamedTuple):
         return [(line, dict(zip(self.header, row, strict=True))) for line, row in self.rows]
 
     def numbers(self, names: Sequence[str], optional: Collection[str] = ()) -> FloatArray:
-        """Values (n, len(names)) of columns; NaN if empty in the columns `optional`.
-
-        Raises RecordingError if a column is missing or a cell is not a number.
-        """
+        """Values (n, len(names)) of columns, NaN if empty in the columns `optional`; raises
+        RecordingError if a column is missing or a cell is not a number."""
         for name in names:
             if name not in self.header:
                 raise RecordingError(f'{self.path}: column {name} is missing')
@@ -219,11 +217,8 @@ def read_csv(path: FilePath, header: Sequence[str] = ()) -> CsvTable:
 
 
 def _csv_lines(path: FilePath) -> Lines:
-    """Non-empty lines of a CSV file as (line number, cells).
-
-    Tabs, semicolons, bars and white space also separate cells. Decimal commas, which need one of
-    them, become points.
-    """
+    """Non-empty lines of a CSV file as (line number, cells); tabs, semicolons, bars and white space
+    also separate cells, and permit decimal commas, which become points."""
     lines, _ = read_text(path)
     first = next((line for line in lines if line.strip() and not line.startswith('#')), '')
     separator = next((c for c in '\t;|,' if c in first), ' ' if len(first.split()) > 1 else ',')

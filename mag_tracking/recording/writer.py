@@ -40,10 +40,8 @@ Opener: TypeAlias = Callable[[Path], io.FileIO]
 
 
 def offered_qos(reliable: bool = True, latched: bool = False) -> str:
-    """QoS profile of a topic as rosbag2 writes it in `offered_qos_profiles`, YAML.
-
-    Without `reliable` it is best-effort, without `latched` volatile.
-    """
+    """QoS profile of a topic as rosbag2 writes it, YAML: reliable or best-effort, latched or
+    volatile."""
     text = OFFERED_QOS if reliable else OFFERED_QOS.replace('reliability: reliable',
                                                             'reliability: best_effort')
     return text.replace('durability: volatile', 'durability: transient_local') if latched else text
@@ -77,10 +75,8 @@ def open_unbuffered(path: Path) -> io.FileIO:
 
 
 def open_locked(path: Path) -> io.FileIO:
-    """Create a file as `open_unbuffered`, and lock it if the file system supports locks.
-
-    The lock prevents a repair of a file that is still being written.
-    """
+    """Create a file as `open_unbuffered`, and lock it, if possible, against repair while it is
+    written."""
     stream = open_unbuffered(path)
     with suppress(OSError):
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -139,10 +135,8 @@ def check_no_other_recording(path: Path) -> None:
 
 def write_metadata(folder: Path, files: Sequence[FileSummary], topics: Mapping[str, Topic],
                    opener: Opener = open_locked) -> None:
-    """Write the `metadata.yaml` of rosbag2 atomically, with the topics by name.
-
-    Raises OSError, or RecordingError if the QoS profiles of a topic are not valid YAML.
-    """
+    """Write the `metadata.yaml` of rosbag2 atomically, with the topics by name; raises OSError, or
+    RecordingError if the QoS profiles of a topic are not valid YAML."""
     no_counts: Counter[str] = Counter()
     counts = sum((f.counts for f in files), no_counts)
     start, duration = _span([t for f in files for t in (f.first_ns, f.last_ns) if t is not None])
@@ -286,11 +280,10 @@ class McapFileWriter:
 
 
 class RecordingWriter:
-    """Writes messages to an MCAP file that rosbag2 can play; a context manager.
+    """Writes messages to an MCAP file and a `metadata.yaml` in its folder; a context manager.
 
-    A `metadata.yaml` in the same folder makes the folder a rosbag2 recording. Small chunks limit
-    the loss in a crash. `latched` are the topics with transient local durability. Parent folders
-    are created; raises OutputError if the folder contains another recording.
+    `latched` are the topics with transient local durability. Parent folders are created; raises
+    OutputError if the folder contains another recording.
     """
 
     def __init__(self, path: str | PathLike[str], latched: Collection[str] = ()) -> None:

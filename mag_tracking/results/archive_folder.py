@@ -246,10 +246,9 @@ class ArchiveFolder:
 
     def complete(self, recording: Path, work: Path, state: list[list[Any]],
                  summary: Mapping[str, Any]) -> None:
-        """Mark a recording as processed, after all of its tables are written, and remove `work`.
-
-        `state` is that of the beginning: a recording that has changed meanwhile is processed again.
-        """
+        """Mark a recording as processed, after all of its tables are written, and remove `work`;
+        `state` is that of the beginning, so that a recording that has changed meanwhile is
+        processed again."""
         replace_text(self.path / _DONE / f'{recording_key(recording)}.json',
                      json.dumps({**summary, 'state': state}, indent=1) + '\n')
         _remove(work)
@@ -282,8 +281,7 @@ def join_tables(parts: Iterable[Path], shifts: Iterable[int], table: str, folder
                 name: str) -> int:
     """Concatenate the tables of a recording's segments, write a file per day, and count the rows.
 
-    `parts` are in chronological order; each of `shifts` is added to the column `track_id` of its
-    part. The files are `folder`/`table`/date=.../`name`.parquet.
+    Each of `shifts` is added to the column `track_id` of its part (chronological).
     """
     pa = import_pyarrow()
     n, day_ns = 0, pa.scalar(86_400 * NS)

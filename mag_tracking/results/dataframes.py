@@ -39,10 +39,8 @@ _DETECTION_FIELDS = {
 
 
 def pose_array(tracks: Sequence[Track]) -> StructArray:
-    """Structured array (n,) of the poses of tracks: fields of `Track`, `id` as `track_id`.
-
-    The closing record of a track (`ended`) is skipped, because it repeats the last pose.
-    """
+    """Structured array (n,) of the poses of tracks, without the closing records (`ended`), which
+    repeat the last pose: fields of `Track`, `id` as `track_id`."""
     return _array([t for t in tracks if not t.ended], _POSE_FIELDS)
 
 

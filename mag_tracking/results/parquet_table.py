@@ -28,10 +28,7 @@ _MAGIC = b'PAR1'
 
 
 def check_row(row: Mapping[str, Any], columns: Iterable[Column]) -> None:
-    """Check a row of texts, integers and times from a file; raises ValueError.
-
-    Integers and times may be None.
-    """
+    """Check a row of texts, and of integers and times (or None), from a file; raises ValueError."""
     for column in columns:
         if column.name not in row:
             raise ValueError(f'{column.name} is missing')
@@ -74,8 +71,7 @@ def is_complete(path: Path) -> bool:
 class TableWriter:
     """Writer of a Parquet file, in batches of rows; a context manager.
 
-    Parent folders are created. An existing file is replaced only on success; after an error, none
-    is created.
+    An existing file is replaced only on success; after an error, none is created.
     """
 
     def __init__(self, path: Path, columns: Iterable[Column]) -> None:

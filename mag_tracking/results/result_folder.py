@@ -96,10 +96,8 @@ class ResultFolder(RecordReceiver):
             self._recording.add_frame(frame)
 
     def add_track(self, track: Track) -> None:
-        """Write a track record to the recording, and rows for its pose and each hypothesis.
-
-        The last record of a track has no new pose and adds no rows.
-        """
+        """Write a track record to the recording, and, unless it is the last one without a new pose,
+        rows for its pose and each hypothesis."""
         self._recording.add_track(track)
         if not track.ended:
             self._write('poses.csv', track)

@@ -86,11 +86,8 @@ def check_rerun() -> None:
 
 def write_rerun(path: str | PathLike[str], network: Sensors, logs: Mapping[int, TrackLog],
                 smoothed: Mapping[int, SmoothedLog]) -> None:
-    """Write sensors and tracks (poses, 90 % regions, speeds, fields) to a Rerun recording.
-
-    `logs` and `smoothed` are by track id. Raises MissingDependencyError without rerun-sdk, and
-    OutputError if the file cannot be written.
-    """
+    """Write sensors and tracks (poses, 90 % regions, speeds, fields), by track id, to a Rerun
+    recording; raises MissingDependencyError without rerun-sdk, and OutputError."""
     check_rerun()
     import rerun
 

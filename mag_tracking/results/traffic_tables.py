@@ -110,11 +110,8 @@ def write_fleet(path: Path, fleet: dict[str, list[FleetPass]]) -> None:
 
 def passage_row(recording: str, passage: VehiclePassage, class_names: Sequence[str],
                 delay: dict[str, Any], vehicle: dict[str, Any]) -> dict[str, Any]:
-    """Values of a passage by column, in the units of the table; NaN if unknown.
-
-    `delay` has the columns of the speed from the delay between sensors, `vehicle` those of the
-    matching enrolled vehicle (empty without a fleet).
-    """
+    """Values of a passage by column; NaN if unknown; `delay` has the columns of the speed from the
+    delay between sensors, `vehicle` those of the enrolled vehicle (empty without a fleet)."""
     known = {'recording': recording, **delay, **vehicle, **{
         f'p_{name}': float(p)
         for name, p in zip(class_names, passage.class_probabilities, strict=True)}}
@@ -132,11 +129,8 @@ def summary_rows(recording: str, summary: TrafficSummary) -> list[dict[str, Any]
 
 def write_traffic(folder: Path, rows: Mapping[str, Sequence[Mapping[str, Any]]],
                   tables: Mapping[str, Sequence[Column]]) -> None:
-    """Write tables to a folder as CSV and Parquet.
-
-    Tables without rows have only a header. Without pyarrow, no Parquet files are written, and those
-    of an earlier run are removed.
-    """
+    """Write tables to a folder as CSV and, if pyarrow is installed, as Parquet; otherwise the
+    Parquet files of an earlier run are removed."""
     folder = output_folder(folder)
     try:
         for name, columns in tables.items():
