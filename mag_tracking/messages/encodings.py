@@ -187,9 +187,7 @@ def _axis_value(field: Any, axis: str) -> float:
 
 
 CDR = 'cdr'
-"""Encoding of ROS 2 messages in MCAP files."""
 ROS1 = 'ros1'
-"""Encoding of ROS 1 messages in MCAP files."""
 _XCDR2 = (6, 7)
 """Second byte of a message in XCDR2 of plain types, big and little endian."""
 _ENCAPSULATIONS = {2: 'CDR with parameter lists', 3: 'CDR with parameter lists', 6: 'XCDR2',

@@ -62,11 +62,8 @@ def detections_3d_dict(track: Track, frame: str) -> MessageDict:
 
 
 TRACK_NAMESPACES = ('ellipsoid', 'moment', 'label')
-"""Marker namespaces of a track."""
 SENSOR_NAMESPACES = ('sensors', 'sensor_labels')
-"""Marker namespaces of a sensor."""
 LIFETIME_S = 2
-"""[s] Lifetime of the markers of a track."""
 _ARROW, _CUBE, _SPHERE, _TEXT = 0, 1, 2, 9
 _ADD, _DELETE = 0, 2
 _REGION_RADIUS = 2.5003

@@ -109,7 +109,6 @@ DEFINITIONS: dict[str, str] = {
     'mag_tracking_msgs/msg/TrackArray': (
         'std_msgs/Header header\nmag_tracking_msgs/Track[] tracks\n'),
 }
-"""Definition of each message type, as {type: definition}."""
 
 
 MAGNETIC_FIELD = 'sensor_msgs/msg/MagneticField'
@@ -131,11 +130,8 @@ RAW_READINGS = 'field_readings'
 """Topic of raw readings of many sensors. Like the topics below, it is relative to the namespace of
 the nodes and independent of the node names."""
 CALIBRATED_READINGS = 'field_readings_calibrated'
-"""Topic of calibrated readings of many sensors."""
 CALIBRATION_STATE = 'calibration_state'
-"""Topic of the calibration of all sensors."""
 NETWORK_FRAME = 'network_frame'
-"""Topic of network frames."""
 
 _BUILT_IN = {'bool', 'byte', 'char', 'string', 'wstring', 'float32', 'float64',
              *(f'{u}int{n}' for u in ('', 'u') for n in (8, 16, 32, 64))}

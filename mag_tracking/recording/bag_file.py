@@ -30,9 +30,7 @@ if TYPE_CHECKING:
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 ROS1_MAGIC = b'#ROSBAG V2.0'
-"""First bytes of a ROS 1 bag."""
 SQLITE_MAGIC = b'SQLite format 3\0'
-"""First bytes of an SQLite database."""
 BLOCK_SIZE = 256
 """Largest number of messages that are read at once."""
 BLOCK_BYTES = 16 << 20

@@ -33,7 +33,6 @@ from mag_tracking.time_text import DAY_NS
 from mag_tracking.units import NS, time_unit
 
 SUFFIXES = ('.csv', '.tsv', '.txt')
-"""File name extensions of tables."""
 USUAL_FIELD_T = (1e-5, 2e-4)
 """Range of the median magnitude of a field that is not influenced by magnets [T]."""
 MAX_RELATIVE_NS = 10 * 365 * DAY_NS

@@ -33,7 +33,6 @@ from mag_tracking.recording.message_block import ChannelKind, MessageBlock, Prog
 from mag_tracking.units import LATEST_NS
 
 MAGIC = b'\x89MCAP0\r\n'
-"""First and last bytes of a file."""
 MIN_BYTES_PER_MESSAGE = 128
 """The largest number of messages in a chunk is its largest size divided by this number, because
 the position of each message also takes memory."""
@@ -45,7 +44,6 @@ _FOOTER = struct.Struct('<BQQQI8s')
 _CHUNK_HEADER = struct.Struct('<QQQII')
 """Times of the first and last message [ns], uncompressed size, CRC, length of the compression."""
 _MAX_NAME = 64
-"""Largest accepted length of the name of a compression."""
 _CRC_STEP = 1 << 20
 CONTENT = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 """Operation codes of the records in a chunk, which may also be outside of chunks."""
@@ -61,7 +59,6 @@ class Record(NamedTuple):
 
     opcode: int
     begin: int
-    """Offset of the operation code, bytes."""
     end: int
     """Offset after the record, bytes. Beyond the end of the file for a truncated record."""
 
@@ -85,7 +82,6 @@ class ChunkHeader(NamedTuple):
     """Fields of a chunk before its content."""
 
     start_ns: int
-    """Log time of the first message [ns]."""
     end_ns: int
     """Log time of the last message [ns]."""
     crc: int

@@ -48,7 +48,6 @@ class ChannelKind(NamedTuple):
     type: str
     """Message type, as from `type_of`."""
     schema: Schema
-    """Schema in the file."""
     encoding: str = CDR
 
     @property
@@ -93,7 +92,6 @@ class MessageBlock:
     """Block of messages in order of log time."""
 
     data: bytes
-    """Bytes of all messages."""
     kinds: Mapping[int, ChannelKind]
     """Topic and type by channel number."""
     channel: IntArray

@@ -61,7 +61,6 @@ class TopicFindings(NamedTuple):
     """Topics with timestamps since 1970, on which the timestamp 0 is missing. The timestamps of a
     simulation begin at 0."""
     frames: dict[str, set[str]]
-    """The frame_ids of the first messages of each topic."""
 
     def shared(self, names: Collection[str]) -> frozenset[str]:
         """Topics with the readings of several of the sensors `names`, named by their frame_id."""
@@ -143,9 +142,7 @@ BATCH_SIZE = 256
 """Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
 few readings. The caller can stop only between batches."""
 MAX_UNKNOWN_SENSORS = 20
-"""Number of sensors outside the network whose readings are counted by sensor."""
 MAX_TOPICS = 10
-"""Number of topics that an error lists."""
 
 
 class SampleReader:

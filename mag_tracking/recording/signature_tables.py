@@ -56,7 +56,6 @@ class LabelledInterval(NamedTuple):
     sensor: str
     """Name of the sensor. Empty for all sensors."""
     row: int
-    """Line number in the table."""
 
 
 def read_signatures(path: FilePath, is_labelled: bool = True) -> list[Signature]:

@@ -20,7 +20,6 @@ from mag_tracking.recording.table_text import (
 from mag_tracking.units import field_unit, time_unit
 
 SAMPLE_LINES = 400
-"""Number of lines from which the layout is found."""
 MAX_BAD_FRACTION = 0.1
 """Maximum fraction of rows that may be unusable."""
 _SEPARATOR_NAMES = {name: separator for separator, name in SEPARATORS.items()}

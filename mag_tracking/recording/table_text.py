@@ -23,7 +23,6 @@ Lines: TypeAlias = list[tuple[int, list[str]]]
 SEPARATORS = {'\t': 'tab', ';': 'semicolon', '|': 'bar', ',': 'comma', ' ': 'spaces'}
 """Names of the separators that are recognised. White space of any length is one separator."""
 COMMENTS = ('#', '%', '//')
-"""Beginnings of comment lines."""
 _MARKS = ((codecs.BOM_UTF8, 'utf-8-sig'), (codecs.BOM_UTF32_LE, 'utf-32'),
           (codecs.BOM_UTF32_BE, 'utf-32'), (codecs.BOM_UTF16_LE, 'utf-16'),
           (codecs.BOM_UTF16_BE, 'utf-16'))

@@ -220,7 +220,6 @@ class OrderedTimes:
 
     values: list[int]
     session: list[int]
-    """Session of each row, from 0."""
     rows: list[int]
     """Indices of the rows, in the order of `values`."""
     notes: list[str] = field(default_factory=list)

@@ -19,13 +19,11 @@ from mag_tracking.report.metrics import Truth
 from mag_tracking.units import LATEST_NS, NS
 
 TRUTH_TYPES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY)
-"""Types of messages that carry true poses."""
 _Rows: TypeAlias = tuple[IntArray, FloatArray]
 """Times (n,) [ns], and positions and quaternions (n, 7)."""
 _NS_PER_UNIT = {'stamp_ns': 1, 't': NS, 'time': NS}
 """Nanoseconds per unit, by column."""
 _QUATERNION, _MOMENT = ('qx', 'qy', 'qz', 'qw'), ('mx', 'my', 'mz')
-"""Columns of a truth table."""
 
 
 class TruthTopics:

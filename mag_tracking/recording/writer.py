@@ -62,7 +62,6 @@ class FileSummary(NamedTuple):
 
     name: str
     counts: Counter[str]
-    """Number of messages by topic."""
     first_ns: int | None = None
     """Log time of the first message, ns. None if the file has no messages."""
     last_ns: int | None = None

@@ -21,10 +21,8 @@ VERSION = 3
 comparable."""
 
 MAX_BUFFERED_ROWS = 5000
-"""Maximum number of rows that are buffered in memory."""
 
 _MAGIC = b'PAR1'
-"""First and last bytes of a file."""
 
 
 def check_row(row: Mapping[str, Any], columns: Iterable[Column]) -> None:

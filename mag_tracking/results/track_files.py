@@ -67,9 +67,7 @@ def write_tum(path: str | PathLike[str], stamp_ns: Sequence[int], position: Sequ
 
 
 RERUN_FILE = 'tracks.rrd'
-"""File name of the Rerun recording in a result folder."""
 TIME = 'stamp'
-"""Name of the timeline."""
 MIN_MOMENT = 1e-12
 """Minimum magnitude by which a moment is divided to obtain its direction [A m²]."""
 SCALE_3D = float(np.sqrt(chdtri(3, 0.1)))

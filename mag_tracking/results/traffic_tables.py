@@ -62,7 +62,6 @@ def write_events(folder: str | PathLike[str], events: Iterable[PassEvent]) -> No
 
 
 VERSION = 1
-"""Version of the file format."""
 
 
 @dataclass(frozen=True)
