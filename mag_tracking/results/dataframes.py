@@ -102,7 +102,7 @@ def with_time_index(frame: 'pd.DataFrame', column: str) -> 'pd.DataFrame':
 
 
 def array_dataframe(columns: Iterable[Column], rows: StructArray) -> 'pd.DataFrame':
-    """Convert an array of `results.result_arrays` to a DataFrame."""
+    """Convert an array of this module to a DataFrame."""
     columns = tuple(columns)
     fields = {name: rows[name] for name in rows.dtype.names or ()}
     record = SimpleNamespace(**{'id': fields.get('track_id'), **fields})

@@ -2,9 +2,10 @@
 
 import csv
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
+from itertools import chain
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -43,22 +44,29 @@ def write_events(folder: str | PathLike[str], events: Iterable[PassEvent]) -> No
     """Write `events.csv` and `signatures.csv` to a folder."""
     folder, events = output_folder(folder), list(events)
     try:
-        with new_text_file(folder / 'events.csv', newline='') as stream:
-            writer = csv.writer(stream)
-            writer.writerow(names_of(EVENTS))
-            writer.writerows(map(event_row, events))
-        with new_text_file(folder / 'signatures.csv', newline='') as stream:
-            writer = csv.writer(stream)
-            writer.writerow(names_of(SIGNATURES))
-            for event in events:
-                offsets_s = event.time_scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN,
-                                                           len(event.signature))
-                closest_s = (event.closest_ns - event.onset_ns) / NS
-                writer.writerows([event.sensor, event.number, _number(closest_s + t),
-                                  *(_number(1e9 * v) for v in field)]
-                                 for t, field in zip(offsets_s, event.signature, strict=True))
+        _write_csv(folder / 'events.csv', EVENTS, map(event_row, events))
+        _write_csv(folder / 'signatures.csv', SIGNATURES, chain.from_iterable(
+            map(_signature_rows, events)))
     except OSError as error:
         raise OutputError(f'cannot write to {folder}: {error.strerror}') from error
+
+
+def _signature_rows(event: PassEvent) -> Iterator[list[object]]:
+    """Cells of the samples of an event's signature."""
+    offsets_s = event.time_scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN,
+                                               len(event.signature))
+    closest_s = (event.closest_ns - event.onset_ns) / NS
+    for t, field in zip(offsets_s, event.signature, strict=True):
+        yield [event.sensor, event.number, _number(closest_s + t),
+               *(_number(1e9 * v) for v in field)]
+
+
+def _write_csv(path: Path, columns: Iterable[Column], rows: Iterable[Iterable[object]]) -> None:
+    """Write a CSV file with the names of the columns; raises OSError."""
+    with new_text_file(path, newline='') as stream:
+        writer = csv.writer(stream)
+        writer.writerow(names_of(columns))
+        writer.writerows(rows)
 
 
 VERSION = 1
@@ -133,10 +141,8 @@ def write_traffic(folder: Path, rows: Mapping[str, Sequence[Mapping[str, Any]]],
     folder = output_folder(folder)
     try:
         for name, columns in tables.items():
-            with new_text_file(folder / f'{name}.csv', newline='') as stream:
-                writer = csv.DictWriter(stream, [c.name for c in columns])
-                writer.writeheader()
-                writer.writerows({k: _csv_value(v) for k, v in row.items()} for row in rows[name])
+            _write_csv(folder / f'{name}.csv', columns, (
+                [_csv_value(row.get(c.name, '')) for c in columns] for row in rows[name]))
             parquet = folder / f'{name}.parquet'
             if find_spec('pyarrow') is None:
                 parquet.unlink(missing_ok=True)
