@@ -37,7 +37,6 @@ def cdr_of_ros1(data: bytes, type_name: str) -> bytes:
 
 @functools.cache
 def _decode_errors() -> tuple[type[Exception], ...]:
-    """Exceptions that `rosbags` raises for damaged messages."""
     from rosbags.serde import SerdeError
 
     # Damaged bytes can also trigger assertions of the library, and too large or invalid strings.
@@ -47,14 +46,12 @@ def _decode_errors() -> tuple[type[Exception], ...]:
 
 @functools.cache
 def _ros1_types() -> 'Typestore':
-    """Definitions of the ROS 1 message types, for `rosbags`."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS1_NOETIC)
 
 
 def _as_dicts(value: Any) -> Any:
-    """Convert a message to nested dicts."""
     if dataclasses.is_dataclass(value):
         return {f.name: _as_dicts(getattr(value, f.name)) for f in dataclasses.fields(value)
                 if not f.name.startswith('__')}
@@ -119,7 +116,6 @@ def _has(message: Any, name: str) -> bool:
 
 
 def _part(message: Any, name: str) -> Any:
-    """Value of a field; None if it is missing."""
     return getattr(message, name) if _has(message, name) else None
 
 

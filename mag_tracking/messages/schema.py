@@ -250,7 +250,6 @@ def pose_dict(ns: int, frame: str, position: FloatArray, quaternion: FloatArray)
 
 
 def _pose(position: FloatArray, quaternion: FloatArray) -> MessageDict:
-    """Build a geometry_msgs/Pose as a dict."""
     return {'position': xyz(position), 'orientation': quaternion_dict(quaternion)}
 
 
@@ -306,7 +305,6 @@ def hypotheses_dict(track: Track, frame: str) -> MessageDict:
 
 
 def _hypothesis_dict(h: Hypothesis) -> MessageDict:
-    """Convert a `Hypothesis` to mag_tracking_msgs/Hypothesis."""
     return {'arrival': h.arrival, 'kind': h.kind, 'weight': h.weight,
             'position': xyz(h.position), 'velocity': xyz(h.velocity),
             'covariance': h.covariance.ravel().tolist(), 'moment': xyz(h.moment)}

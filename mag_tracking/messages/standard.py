@@ -117,7 +117,6 @@ def _smallest_distance(positions: FloatArray) -> float:
 
 def _marker(track: Track, frame: str, namespace: str, shape: int,
             **message_fields: Any) -> dict[str, Any]:
-    """Build a visualization_msgs/Marker as a dict."""
     return {'header': header_dict(track.stamp_ns, frame), 'ns': namespace, 'id': track.id,
             'type': shape, **message_fields}
 

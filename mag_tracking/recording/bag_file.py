@@ -101,7 +101,6 @@ class BagFile(RecordingFile):
                 progress(size - reported)
 
     def _raw(self, start_ns: int | None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Iterate over (topic, type, log time [ns], bytes); the losses are counted."""
         with self._open_reader() as reader:
             yield from (self._ros1_messages if self._is_ros1 else self._sqlite_messages)(
                 reader, start_ns)

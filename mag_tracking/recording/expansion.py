@@ -68,32 +68,21 @@ def expanded(compression: str, data: bytes, limit: int, is_cut: bool = False) ->
     pieces = _PIECES[compression](data)
     while True:
         try:
-            piece = next(pieces, None)
+            piece = next(pieces, b'')
         except (zstandard.ZstdError, RuntimeError, OSError, ValueError, EOFError):
             if not is_cut:
                 raise
-            piece = None
-        if piece is None:
+            piece = b''
+        if not piece:
             return out.getvalue()
         check_size(out.tell() + len(piece), limit)
         out.write(piece)
 
 
 def _zstd_pieces(data: bytes) -> Iterator[bytes]:
-    """Decompress one frame piece by piece."""
     with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as reader:
         while piece := reader.read(_STEP):
             yield piece
-
-
-def _lz4_pieces(data: bytes) -> Iterator[bytes]:
-    """Decompress one frame piece by piece."""
-    return _pieces(lz4.frame.LZ4FrameDecompressor(), data)
-
-
-def _bz2_pieces(data: bytes) -> Iterator[bytes]:
-    """Decompress one stream piece by piece."""
-    return _pieces(bz2.BZ2Decompressor(), data)
 
 
 def _pieces(decompressor: 'bz2.BZ2Decompressor | lz4.frame.LZ4FrameDecompressor',
@@ -109,7 +98,9 @@ def _pieces(decompressor: 'bz2.BZ2Decompressor | lz4.frame.LZ4FrameDecompressor'
 
 
 _PIECES: dict[str, Callable[[bytes], Iterator[bytes]]] = {
-    'zstd': _zstd_pieces, 'lz4': _lz4_pieces, 'bz2': _bz2_pieces}
+    'zstd': _zstd_pieces,
+    'lz4': lambda data: _pieces(lz4.frame.LZ4FrameDecompressor(), data),
+    'bz2': lambda data: _pieces(bz2.BZ2Decompressor(), data)}
 
 
 def expanded_message(data: bytes) -> bytes:

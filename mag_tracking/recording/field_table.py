@@ -130,7 +130,6 @@ class _Rows:
         table.rows.clear()
 
     def _column(self, j: int) -> str:
-        """Name of a column, for messages."""
         return self.table.header[j] if self.table.header else f'column {j + 1}'
 
     def _add(self, line: int, cells: Sequence[str], sensor: str, key: int, decimal: str) -> None:

@@ -165,7 +165,6 @@ class Recorder:
         return True
 
     def _finish(self, file: McapFileWriter) -> None:
-        """Complete and close the open file."""
         if self._attempt(file, file.flush) and self._attempt(file, file.finish):
             self._report_recovery()
             self._add_finished(file)
@@ -173,7 +172,6 @@ class Recorder:
             self._write_metadata()
 
     def _add_finished(self, file: McapFileWriter) -> None:
-        """Add the summary and the size of a closed file to those of the recording."""
         self._summaries.append(file.summary())
         self._finished_bytes += file.size
 

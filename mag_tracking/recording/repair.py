@@ -115,7 +115,6 @@ class _Scan:
         return rows, end
 
     def _add_chunk(self, record: Record) -> None:
-        """Add a chunk and its records."""
         header = chunk_header(self._stream, record)
         data = chunk_content(self._stream, record, self._limit)
         self._rows, _ = self._add_content(data)
@@ -142,7 +141,6 @@ class _Scan:
                                       last_ns, 0, {}, first_ns, len(data)))
 
     def _lacks_index(self) -> bool:
-        """Whether the message index of any channel in the last chunk is missing."""
         return bool(self.chunks) and (
             set(self.chunks[-1].message_index_offsets) != set(self._rows[:, 0].tolist()))
 

@@ -183,10 +183,11 @@ class SampleReader:
         self.clocks: dict[str, ClockSpan] = {}
         self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
         self._frames = FrameCheck(recording.path)
-        self._unstamped, self._dated, self._shared = self._examine_topics(network)
+        self._found = self._examine_topics(network)
+        self._shared = self._found.shared(network.names)
 
-    def _examine_topics(self, network: SensorNetwork) -> tuple[frozenset[str], ...]:
-        """Find topics without timestamps, with dates, and of several sensors; check the types."""
+    def _examine_topics(self, network: SensorNetwork) -> TopicFindings:
+        """Check the types and the first messages of the topics."""
         types = self._recording.types
         topics = [topic for topic in self._sensors if topic in types]
         for topic in topics:
@@ -194,15 +195,14 @@ class SampleReader:
                 raise RecordingError(f'{self._recording.path}: {topic} carries {types[topic]}, not '
                                      f'{MAGNETIC_FIELD} in tesla: convert the messages')
         if self._is_batched:
-            return frozenset(), frozenset(), frozenset()
+            return TopicFindings(frozenset(), frozenset(), {})
         found = examine_topics(self._recording, topics or [
             topic for topic, kind in types.items() if kind == MAGNETIC_FIELD])
-        shared = found.shared(network.names)
-        if types and not topics and not shared:
+        if types and not topics and not found.shared(network.names):
             raise RecordingError(
                 f'{self._recording.path} has none of the network\'s topics '
                 f'({", ".join(self._sensors)}); {_candidates(types, found.frames)}')
-        return found.unstamped, found.dated, shared
+        return found
 
     def missing_topics(self) -> list[str]:
         """Topics of the network that are not in the recording; none if one topic carries several
@@ -319,10 +319,10 @@ class SampleReader:
         reading = self._network_readings(reading_of(content, sensor))
         if not reading.stamp_ns.all():
             cause = f'{ZERO_STAMP} on {message.topic}'
-            if message.topic in self._unstamped:
+            if message.topic in self._found.unstamped:
                 self.rejected[f'{cause}, read with its log time'] += 1
                 reading = replace(reading, stamp_ns=np.array([message.log_time_ns]))
-            elif message.topic in self._dated:
+            elif message.topic in self._found.dated:
                 self.rejected[cause] += 1
                 return
         if len(reading):

@@ -197,7 +197,6 @@ def _stamp(path: FilePath, line: int, column: str, cells: dict[str, str], first_
 
 
 def _check_overlaps(path: FilePath, intervals: list[LabelledInterval]) -> None:
-    """Raise LabelsError if two intervals of a sensor overlap."""
     ordered = sorted(intervals, key=lambda i: i.begin_ns)
     for k, first in enumerate(ordered):
         for second in ordered[k + 1:]:

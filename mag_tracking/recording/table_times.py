@@ -194,7 +194,6 @@ def _plausible(step: float, span: float) -> str:
 
 
 def _rates(step_s: float, span_s: float) -> str:
-    """Describe rate and span."""
     return f'{1.0 / step_s if step_s else 0.0:.4g} Hz over {span_text(span_s)}'
 
 

@@ -229,7 +229,6 @@ class McapFileWriter:
             self._mark_intact()
 
     def _open_channel(self, name: str, topic: Topic) -> None:
-        """Register the schema and the channel of a topic."""
         if topic.type not in self._schemas:
             encoding = 'ros2msg' if topic.definition else ''
             self._schemas[topic.type] = self._writer.register_schema(
@@ -245,7 +244,6 @@ class McapFileWriter:
             raise OSError(errno.ENOENT, 'the file was removed')
 
     def _complete_chunk(self) -> None:
-        """Write the pending messages."""
         if self.pending:
             self._writer.flush()
             self._mark_intact()

@@ -137,7 +137,6 @@ def recording_state(recording: Path) -> list[list[Any]]:
 
 
 def _hash(text: str) -> str:
-    """First eight hexadecimal digits of the SHA-256 hash of a string."""
     return hashlib.sha256(text.encode(errors='backslashreplace')).hexdigest()[:8]
 
 
@@ -311,7 +310,6 @@ def common_columns(recording: Path, stamp_ns: int | None) -> dict[str, Any]:
 
 
 def _read_summary(path: Path) -> dict[str, Any]:
-    """Read the summary of a processed recording; raises OutputError."""
     summary = _read_json(path)
     try:
         check_row(summary, TABLES['recordings'])
@@ -323,7 +321,6 @@ def _read_summary(path: Path) -> dict[str, Any]:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file of the archive; raises OutputError."""
     try:
         content = json.loads(path.read_text())
     except (OSError, ValueError, RecursionError) as error:

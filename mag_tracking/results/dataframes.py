@@ -57,19 +57,17 @@ def detection_array(detections: Sequence[Detection]) -> StructArray:
 def _array(records: Sequence[Track | SmoothedPose | Detection], fields: Mapping[str, str]
            ) -> StructArray:
     """Convert records to a structured array (n,) of the attributes that `fields` names."""
-    columns = {name: [_value(r, name) for r in records] for name in fields}
+    columns: dict[str, list[Any]] = {
+        name: [getattr(r, 'id' if name == 'track_id' else name) for r in records]
+        for name in fields}
+    if 'doubts' in columns:
+        columns['doubts'] = [' '.join(doubts) for doubts in columns['doubts']]
     dtype = [(name, f'U{max(_TEXT_WIDTH, *map(len, columns[name]), 1)}' if kind == 'U' else kind)
              for name, kind in fields.items()]
     out = np.zeros(len(records), dtype=dtype)
     for name, values in columns.items():
         out[name] = np.array(values, dtype=out[name].dtype).reshape(out[name].shape)
     return out
-
-
-def _value(record: Track | SmoothedPose | Detection, name: str) -> Any:
-    """Value of a record for the array field `name`; doubts are joined by spaces."""
-    value = getattr(record, 'id' if name == 'track_id' else name)
-    return ' '.join(value) if name == 'doubts' else value
 
 
 def dataframe(columns: Iterable[Column], values: Mapping[str, Any]) -> 'pd.DataFrame':

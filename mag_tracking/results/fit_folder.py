@@ -60,7 +60,6 @@ def fit_row(fit: PassFit, is_reported: bool = True) -> dict[str, Any]:
 
 
 def _std(P: FloatArray) -> FloatArray:
-    """Standard deviations of a covariance."""
     std: FloatArray = np.sqrt(np.diagonal(P))
     return std
 

@@ -106,7 +106,6 @@ class TableWriter:
             self._writer.write_table(table)
 
     def _flush(self) -> None:
-        """Write the buffered rows."""
         rows, self._rows = self._rows, []
         if rows:
             rows = [{name: _stored(value) for name, value in row.items()} for row in rows]

@@ -104,7 +104,6 @@ class ResultFolder(RecordReceiver):
             self._add_hypotheses(track)
 
     def _add_hypotheses(self, track: Track) -> None:
-        """Write one row per hypothesis."""
         h = track.hypotheses
         if not isinstance(h, Hypotheses):
             assert not h, 'expected the hypotheses as arrays'
@@ -136,5 +135,4 @@ class ResultFolder(RecordReceiver):
 
 
 def _csv_cell(text: str) -> str:
-    """Quote a string for a CSV file, if necessary."""
     return f'"{text.replace(_QUOTE, 2 * _QUOTE)}"' if _SPECIAL & {*text} else text

@@ -206,7 +206,6 @@ class TrackRecording:
         self._smoothed.append(pose)
 
     def _write_smoothed(self) -> None:
-        """Write the buffered poses of a smoothed track."""
         poses = self._smoothed
         if not poses:
             return
@@ -223,5 +222,4 @@ class TrackRecording:
                     disturbance.stamp_ns)
 
     def _write(self, name: str, kind: str, content: MessageDict, stamp_ns: int) -> None:
-        """Write a message on the topic `/tracker_node/<name>`."""
         self._writer.write(f'/tracker_node/{name}', kind, content, stamp_ns)
