@@ -23,6 +23,24 @@ from mag_tracking.units import NS, TIME_UNITS, unit_since_1970
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
+CDR = 'cdr'
+ROS1 = 'ros1'
+_ENCAPSULATIONS = {2: 'CDR with parameter lists', 3: 'CDR with parameter lists', 6: 'XCDR2',
+                   7: 'XCDR2', 8: 'XCDR2 with delimiters', 9: 'XCDR2 with delimiters',
+                   10: 'XCDR2 with parameter lists', 11: 'XCDR2 with parameter lists'}
+"""Encodings that DDS may use in place of plain CDR, by the second byte of a message (DDS-XTypes
+1.3, table 60)."""
+_FIELD_DOUBLES = 12
+"""Number of float64 values in a MagneticField: x, y, z and the covariance."""
+_STAMPS = ('stamp', 'timestamp')
+_SECONDS = ('sec', 'secs', 'seconds')
+_NANOSECONDS = ('nanosec', 'nsec', 'nsecs', 'nanos')
+SELF_DESCRIBED = ('json', 'protobuf')
+"""Encodings whose messages are converted by means of their schema or of their own names."""
+UNDECODABLE = 'undecodable message'
+"""Fault of a message whose bytes do not match its type."""
+
+
 def cdr_of_ros1(data: bytes, type_name: str) -> bytes:
     """Convert a serialised ROS 1 message to CDR; empty if damaged or of an unsupported type (name
     in ROS 2)."""
@@ -56,16 +74,6 @@ def _as_dicts(value: Any) -> Any:
         return {f.name: _as_dicts(getattr(value, f.name)) for f in dataclasses.fields(value)
                 if not f.name.startswith('__')}
     return value.tolist() if isinstance(value, np.ndarray) else value
-
-
-_STAMPS = ('stamp', 'timestamp')
-_SECONDS = ('sec', 'secs', 'seconds')
-_NANOSECONDS = ('nanosec', 'nsec', 'nsecs', 'nanos')
-
-SELF_DESCRIBED = ('json', 'protobuf')
-"""Encodings whose messages are converted by means of their schema or of their own names."""
-UNDECODABLE = 'undecodable message'
-"""Fault of a message whose bytes do not match its type."""
 
 
 class MissingPartError(ValueError):
@@ -182,26 +190,12 @@ def _axis_value(field: Any, axis: str) -> float:
     return float(value)
 
 
-CDR = 'cdr'
-ROS1 = 'ros1'
-_XCDR2 = (6, 7)
-"""Second byte of a message in XCDR2 of plain types, big and little endian."""
-_ENCAPSULATIONS = {2: 'CDR with parameter lists', 3: 'CDR with parameter lists', 6: 'XCDR2',
-                   7: 'XCDR2', 8: 'XCDR2 with delimiters', 9: 'XCDR2 with delimiters',
-                   10: 'XCDR2 with parameter lists', 11: 'XCDR2 with parameter lists'}
-"""Encodings that DDS may use in place of plain CDR, by the second byte of a message (DDS-XTypes
-1.3, table 60)."""
-_FIELD_DOUBLES = 12
-"""Number of float64 values in a MagneticField: x, y, z and the covariance."""
-
-
 def type_of(encoding: str, schema: Schema) -> str:
-    """Message type of a channel.
-
-    It is the name of the ROS 2 type if messages can be converted to it, otherwise the name of the
-    schema with the encoding, such as 'std_msgs/msg/String (json)'.
-    """
-    name = _ros2_name(schema.name)
+    """Message type of a channel: the name in ROS 2 if messages can be converted to it, otherwise
+    the name of the schema with the encoding, such as 'std_msgs/msg/String (json)'."""
+    # Names in ROS 1 have two parts, those in IDL colons.
+    parts = schema.name.replace('::', '/').split('/')
+    name = '/'.join((parts[0], 'msg', parts[1]) if len(parts) == 2 else parts)
     if encoding == CDR:
         return name
     if encoding in SELF_DESCRIBED and (name == MAGNETIC_FIELD or b'magnetic_field' in schema.data):
@@ -209,12 +203,6 @@ def type_of(encoding: str, schema: Schema) -> str:
     if encoding == ROS1 and name in DEFINITIONS:
         return name
     return f'{schema.name or "no schema"} ({encoding or "no encoding"})'
-
-
-def _ros2_name(name: str) -> str:
-    """Name of a type as in ROS 2, from that name or the names in ROS 1 and in IDL."""
-    parts = name.replace('::', '/').split('/')
-    return '/'.join((parts[0], 'msg', parts[1]) if len(parts) == 2 else parts)
 
 
 def cdr_of(encoding: str, kind: str, schema: Schema, data: bytes) -> tuple[bytes, str]:
@@ -227,7 +215,7 @@ def cdr_of(encoding: str, kind: str, schema: Schema, data: bytes) -> tuple[bytes
     elif encoding != CDR:
         return b'', f'message in the encoding {encoding or "(none)"}'
     elif len(data) > 1 and data[1] in _ENCAPSULATIONS:
-        if kind != MAGNETIC_FIELD or data[1] not in _XCDR2:
+        if kind != MAGNETIC_FIELD or _ENCAPSULATIONS[data[1]] != 'XCDR2':
             return b'', f'message in the encoding {_ENCAPSULATIONS[data[1]]}'
         data = _cdr_of_xcdr2(data)
     return data, '' if data else UNDECODABLE

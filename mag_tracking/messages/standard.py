@@ -20,6 +20,21 @@ from mag_tracking.messages.types import MessageDict
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import PoseUncertainty, Track
 
+TRACK_NAMESPACES = ('ellipsoid', 'moment', 'label')
+SENSOR_NAMESPACES = ('sensors', 'sensor_labels')
+LIFETIME_S = 2
+_ARROW, _CUBE, _SPHERE, _TEXT = 0, 1, 2, 9
+_ADD, _DELETE = 0, 2
+_REGION_RADIUS = 2.5003
+"""Radius of the 90 % region in standard deviations (chi-square, 3 degrees of freedom)."""
+SENSOR_SIZE_M = 0.3
+"""[m] Maximum length of a sensor marker; the length is at most half the smallest sensor
+distance."""
+_UPRIGHT = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
+_BLUE, _RED = {'r': 0.0, 'g': 0.45, 'b': 0.7}, {'r': 0.84, 'g': 0.37, 'b': 0.0}
+"""Colours that remain distinguishable with colour blindness (Okabe and Ito)."""
+_GREY = {'r': 0.35, 'g': 0.35, 'b': 0.35, 'a': 1.0}
+
 
 def track_transform_dict(track: Track, frame: str, child_frame: str) -> MessageDict | None:
     """Convert a `Track` to a tf2_msgs/TFMessage from the world frame to the target; None if
@@ -59,22 +74,6 @@ def detections_3d_dict(track: Track, frame: str) -> MessageDict:
     return {'header': header, 'detections': [{
         'header': header, 'id': str(track.id), 'results': results,
         'bbox': {'center': pose['pose'], 'size': {'x': float(track.length), 'y': 0.0, 'z': 0.0}}}]}
-
-
-TRACK_NAMESPACES = ('ellipsoid', 'moment', 'label')
-SENSOR_NAMESPACES = ('sensors', 'sensor_labels')
-LIFETIME_S = 2
-_ARROW, _CUBE, _SPHERE, _TEXT = 0, 1, 2, 9
-_ADD, _DELETE = 0, 2
-_REGION_RADIUS = 2.5003
-"""Radius of the 90 % region in standard deviations (chi-square, 3 degrees of freedom)."""
-SENSOR_SIZE_M = 0.3
-"""[m] Maximum length of a sensor marker; the length is at most half the smallest sensor
-distance."""
-_UPRIGHT = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
-_BLUE, _RED = {'r': 0.0, 'g': 0.45, 'b': 0.7}, {'r': 0.84, 'g': 0.37, 'b': 0.0}
-"""Colours that remain distinguishable with colour blindness (Okabe and Ito)."""
-_GREY = {'r': 0.35, 'g': 0.35, 'b': 0.35, 'a': 1.0}
 
 
 def track_markers(track: Track, frame: str) -> dict[str, Any]:

@@ -35,8 +35,6 @@ FLUSH_INTERVAL_NS = 400_000_000
 tick interval."""
 MIN_FREE_BYTES = 4 << 20
 """Minimum free disk space for a new file after a failure [bytes]."""
-
-
 _Message: TypeAlias = tuple[int, bytes, int, int]
 """Sequence number, CDR, log time [ns] and publish time [ns]."""
 
@@ -100,11 +98,11 @@ class Recorder:
 
     def add_topic(self, name: str, type_name: str, definition: str = '', qos: str | None = None,
                   latched: int = 0) -> None:
-        """Register a topic before its first message, or change its number of latched messages.
+        """Register a topic before its first message, or change its number of latched messages,
+        which are repeated at the start of each later file.
 
         Without `definition` (`ros2msg` schema), only ROS can read the messages. `qos` is a result
-        of `offered_qos`. The latest `latched` messages are repeated at the start of each later
-        file.
+        of `offered_qos`.
         """
         # All files use the same profile, because readers use it to match channels across files.
         self._topics.setdefault(name, Topic(type_name, definition, qos or offered_qos()))
@@ -154,8 +152,8 @@ class Recorder:
             self._report(f'the recording {self.folder} could not be completed: free disk space, '
                          f'then run mag-tracking repair {self.folder}')
 
-    def _attempt(self, file: McapFileWriter, action: Callable[..., None],
-                 *arguments: object) -> bool:
+    def _attempt(self, file: McapFileWriter, action: Callable[..., None], *arguments: object
+                 ) -> bool:
         """Call `action` on the open file; abandon the file on failure. Return True on success."""
         try:
             action(*arguments)

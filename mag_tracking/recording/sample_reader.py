@@ -49,6 +49,14 @@ MIN_DATE_S = 1e8
 N_FRAME_CHANGES = 3
 """Number of changes of frame_id after which a topic has several sensors. A driver that was
 restarted with another frame changes it once or twice."""
+TRUTH_PREFIX = 'ground_truth/'
+"""Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
+never for tracking."""
+BATCH_SIZE = 256
+"""Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
+few readings. The caller can stop only between batches."""
+MAX_UNKNOWN_SENSORS = 20
+MAX_TOPICS = 10
 
 
 class TopicFindings(NamedTuple):
@@ -133,16 +141,6 @@ class FrameCheck:
                 f'{self._path}: {topic} carries several sensors, with the frame_ids {names}: '
                 'name the sensors of the network file as the frame_ids, or record each sensor on a '
                 'topic of its own')
-
-
-TRUTH_PREFIX = 'ground_truth/'
-"""Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
-never for tracking."""
-BATCH_SIZE = 256
-"""Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
-few readings. The caller can stop only between batches."""
-MAX_UNKNOWN_SENSORS = 20
-MAX_TOPICS = 10
 
 
 class SampleReader:

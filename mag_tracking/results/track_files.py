@@ -54,6 +54,15 @@ from mag_tracking.report.page_scene import Sensors
 from mag_tracking.report.track_log import SmoothedLog, TrackLog
 from mag_tracking.units import NS
 
+RERUN_FILE = 'tracks.rrd'
+TIME = 'stamp'
+MIN_MOMENT = 1e-12
+"""Minimum magnitude by which a moment is divided to obtain its direction [A m²]."""
+SCALE_3D = float(np.sqrt(chdtri(3, 0.1)))
+"""Radius of a 90 % ellipsoid, in standard deviations."""
+LATCHED = ('/tf_static', '/tracker_node/sensor_markers')
+"""Latched topics, with one message each."""
+
 
 def write_tum(path: str | PathLike[str], stamp_ns: Sequence[int], position: Sequence[FloatArray],
               orientation: Sequence[FloatArray]) -> None:
@@ -64,14 +73,6 @@ def write_tum(path: str | PathLike[str], stamp_ns: Sequence[int], position: Sequ
         seconds = f'{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d}'
         lines.append(' '.join([seconds, *(f'{float(v):.9g}' for v in (*p, *q))]))
     replace_text(path, '\n'.join(lines) + '\n')
-
-
-RERUN_FILE = 'tracks.rrd'
-TIME = 'stamp'
-MIN_MOMENT = 1e-12
-"""Minimum magnitude by which a moment is divided to obtain its direction [A m²]."""
-SCALE_3D = float(np.sqrt(chdtri(3, 0.1)))
-"""Radius of a 90 % ellipsoid, in standard deviations."""
 
 
 def check_rerun() -> None:
@@ -129,10 +130,6 @@ def _write_track(rerun: Any, stream: Any, network: Sensors, log: TrackLog) -> No
     period = log.stamp_ns[-1] - log.stamp_ns[-2] if len(log.stamp_ns) > 1 else NS
     stream.set_time(TIME, timestamp=np.datetime64(log.stamp_ns[-1] + period, 'ns'))
     stream.log(root, rerun.Clear(recursive=True))
-
-
-LATCHED = ('/tf_static', '/tracker_node/sensor_markers')
-"""Latched topics, with one message each."""
 
 
 class TrackRecording:

@@ -28,6 +28,8 @@ from mag_tracking.results.columns import (
 from mag_tracking.results.parquet_table import TableWriter
 from mag_tracking.units import NS
 
+FLEET_VERSION = 1
+
 
 def event_row(event: PassEvent) -> list[object]:
     """Cells of an event by column; numbers with a unit have six significant digits."""
@@ -69,9 +71,6 @@ def _write_csv(path: Path, columns: Iterable[Column], rows: Iterable[Iterable[ob
         writer.writerows(rows)
 
 
-VERSION = 1
-
-
 @dataclass(frozen=True)
 class FleetPass:
     """One pass of an enrolled vehicle."""
@@ -92,9 +91,9 @@ def read_fleet(path: str | PathLike[str]) -> dict[str, list[FleetPass]]:
     try:
         with open(path, encoding='utf-8') as stream:
             content = json.load(stream)
-        if content['mag_tracking.fleet'] != VERSION:
+        if content['mag_tracking.fleet'] != FLEET_VERSION:
             raise RecordingError(f'{path}: fleet version {content["mag_tracking.fleet"]} is not '
-                                 f'supported; expected {VERSION}')
+                                 f'supported; expected {FLEET_VERSION}')
         return {str(name): [FleetPass(
             np.array(p['moment'], dtype=float).reshape(3),
             np.array(p['covariance'], dtype=float).reshape(3, 3), float(p['heading']),
@@ -111,7 +110,7 @@ def write_fleet(path: Path, fleet: dict[str, list[FleetPass]]) -> None:
     vehicles = {name: [{k: v.tolist() if isinstance(v, np.ndarray) else v
                         for k, v in asdict(p).items()} for p in passes]
                 for name, passes in fleet.items()}
-    replace_text(path, json.dumps({'mag_tracking.fleet': VERSION, 'vehicles': vehicles},
+    replace_text(path, json.dumps({'mag_tracking.fleet': FLEET_VERSION, 'vehicles': vehicles},
                                   indent=1) + '\n')
 
 
