@@ -15,7 +15,7 @@ import duckdb
 import mag_tracking as mt
 from mag_tracking.apps.archive import archive
 from mag_tracking.pipeline import settings_for
-from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.archive_folder import TABLES
 from mag_tracking.results.parquet_table import schema_of
 
 ROOT = Path(__file__).resolve().parents[1]

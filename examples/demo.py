@@ -19,7 +19,7 @@ from mag_tracking.analysis.track_errors import interpolate_truth, pass_errors
 from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.errors import MagTrackingError, OutputError
 from mag_tracking.files import replace_text
-from mag_tracking.messages.frame import frame_of
+from mag_tracking.messages.network import frame_of
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.convert import track_of

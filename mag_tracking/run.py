@@ -9,7 +9,7 @@ from mag_tracking.errors import OutputError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline
 from mag_tracking.record_receiver import Step
-from mag_tracking.recording.interruptible import Progress, ReadingStopped, until_stopped
+from mag_tracking.recording.message_block import Progress, ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings

@@ -10,7 +10,7 @@ import pytest
 from mag_tracking.apps.replay import replay
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
-from mag_tracking.recording.importers import import_pose_table
+from mag_tracking.recording.pose_table import import_pose_table
 from mag_tracking.recording.reader import Recording
 from support.bundled import DATA, NETWORK_FILE, ROOT, vehicle_path
 from support.ros_domain import RosDomain

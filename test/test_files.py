@@ -19,9 +19,9 @@ from mag_tracking.recording.recorder import Recorder
 from mag_tracking.recording.repair import repair
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.report.style import save_figure
-from mag_tracking.results.event_tables import write_events
 from mag_tracking.results.fit_folder import FitFolder
 from mag_tracking.results.result_folder import ResultFolder
+from mag_tracking.results.traffic_tables import write_events
 from mag_tracking.settings import read_parameter_file
 from support.bundled import vehicle_path
 from support.networks import line_network

@@ -2,7 +2,7 @@
 
 from mag_tracking.drivers.configuration import settings_by_kind
 from mag_tracking.pipeline import Settings, settings_for
-from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.archive_folder import TABLES
 from mag_tracking.results.columns import EVENTS, FITS, RESULT_TABLES, SIGNATURES, traffic_tables
 from mag_tracking.settings import USER, flatten
 from mag_tracking.stages.track.doubts import MEANINGS

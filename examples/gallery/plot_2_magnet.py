@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import mag_tracking as mt
-from mag_tracking.recording.importers import import_pose_table
+from mag_tracking.recording.pose_table import import_pose_table
 
 DATA = Path(mt.__file__).parents[1] / 'test' / 'data' / 'magnet_16_sensors'
 folder = tempfile.TemporaryDirectory()

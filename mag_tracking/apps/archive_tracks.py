@@ -13,8 +13,7 @@ from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.apps.replay import TrackHistory
 from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.records import SmoothedPose, Track
-from mag_tracking.results.archive_folder import common_columns
-from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.archive_folder import TABLES, common_columns
 from mag_tracking.results.columns import MOMENT, names_of, row_of
 from mag_tracking.results.fit_folder import pass_rows
 from mag_tracking.results.parquet_table import TableWriter

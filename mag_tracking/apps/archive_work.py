@@ -32,8 +32,7 @@ from mag_tracking.pipeline import Pipeline, Settings
 from mag_tracking.record_receiver import Step
 from mag_tracking.recording.reader import Recording
 from mag_tracking.records import FieldFrame
-from mag_tracking.results.archive_folder import common_columns, join_tables, recording_key
-from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.archive_folder import TABLES, common_columns, join_tables, recording_key
 from mag_tracking.results.parquet_table import TableWriter, check_row
 from mag_tracking.run import RecordingSource, run
 from mag_tracking.stages.track.manager import TrackManager

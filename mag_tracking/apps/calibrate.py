@@ -17,7 +17,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings
 from mag_tracking.quantities import quantity
 from mag_tracking.record_receiver import RecordReceiver
-from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
+from mag_tracking.recording.message_block import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import AccelerationSample, Track

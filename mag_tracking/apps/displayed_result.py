@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from tqdm.auto import tqdm
 
 from mag_tracking.errors import MissingDependencyError
-from mag_tracking.recording.interruptible import Progress
+from mag_tracking.recording.message_block import Progress
 from mag_tracking.run import RecordingSource, Source
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from mag_tracking.calibration.survey import SurveySettings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings
 from mag_tracking.record_receiver import Step
-from mag_tracking.recording.interruptible import Progress
+from mag_tracking.recording.message_block import Progress
 from mag_tracking.records import Readings
 from mag_tracking.run import RecordingSource, run
 from mag_tracking.stages.align.frame_period import frame_period_warning

@@ -15,7 +15,7 @@ from mag_tracking.inference.identification import (
 )
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0
-from mag_tracking.results.fleet_file import FleetPass
+from mag_tracking.results.traffic_tables import FleetPass
 
 
 def earth_field_strength(network: SensorNetwork) -> FloatArray:

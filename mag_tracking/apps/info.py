@@ -14,7 +14,7 @@ from mag_tracking.messages.types import FIELD_READINGS, MAGNETIC_FIELD, decode
 from mag_tracking.quantities import occurrences, quantity
 from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sensor_topics import fault_of
+from mag_tracking.recording.sample_reader import fault_of
 from mag_tracking.units import NS
 
 BATCH_SIZE = 4096

@@ -31,7 +31,7 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.truth import read_truth_table
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.results.result_folder import ResultFolder, figure_name
-from mag_tracking.results.tum_file import write_tum
+from mag_tracking.results.track_files import write_tum
 from mag_tracking.run import (
     Failure,
     RecordingSource,

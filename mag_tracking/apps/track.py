@@ -19,8 +19,13 @@ from mag_tracking.quantities import quantity
 from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.records import Detection, SmoothedPose, Track
 from mag_tracking.results.columns import COMPLETE, DETECTIONS, POSES, SMOOTHED
-from mag_tracking.results.dataframes import array_dataframe, with_time_index
-from mag_tracking.results.result_arrays import detection_array, pose_array, smoothed_array
+from mag_tracking.results.dataframes import (
+    array_dataframe,
+    detection_array,
+    pose_array,
+    smoothed_array,
+    with_time_index,
+)
 from mag_tracking.run import RecordingSource, RunReport, run
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit, fit_ellipsoid
 from mag_tracking.errors import RecordingError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.recording.interruptible import Progress, ReadingStopped, until_stopped
+from mag_tracking.recording.message_block import Progress, ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import Readings

@@ -13,7 +13,7 @@ from mag_tracking.event_records import PassEvent
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline
 from mag_tracking.quantities import quantity
-from mag_tracking.results.event_tables import write_events
+from mag_tracking.results.traffic_tables import write_events
 from mag_tracking.run import RunReport
 from mag_tracking.stages.events.stage import MAX_DURATION_S
 from mag_tracking.units import NS

@@ -53,7 +53,7 @@ def _import(args: argparse.Namespace) -> int:
     """Run `mag-tracking import`."""
     # Imported here because other commands do not need them.
     from mag_tracking.recording.field_table import describe, import_field_table
-    from mag_tracking.recording.importers import import_pose_table
+    from mag_tracking.recording.pose_table import import_pose_table
 
     if args.background is not None:
         if args.columns is not None:

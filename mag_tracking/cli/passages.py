@@ -20,8 +20,14 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline
 from mag_tracking.quantities import quantity
 from mag_tracking.results.columns import DIRECTIONS, traffic_tables
-from mag_tracking.results.fleet_file import FleetPass, read_fleet, write_fleet
-from mag_tracking.results.traffic_tables import passage_row, summary_rows, write_traffic
+from mag_tracking.results.traffic_tables import (
+    FleetPass,
+    passage_row,
+    read_fleet,
+    summary_rows,
+    write_fleet,
+    write_traffic,
+)
 from mag_tracking.run import RunReport
 
 

@@ -41,7 +41,7 @@ from mag_tracking.pipeline import STAGES, Pipeline, Settings
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.report.page import WARNING
-from mag_tracking.results.rerun_file import RERUN_FILE, check_rerun, write_rerun
+from mag_tracking.results.track_files import RERUN_FILE, check_rerun, write_rerun
 from mag_tracking.run import RecordingSource, Sink, output_error, run
 from mag_tracking.stages.track.doubts import MEANINGS
 

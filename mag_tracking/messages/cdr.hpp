@@ -31,7 +31,7 @@ class Bytes {
         data_.append(reinterpret_cast<const char*>(&value), sizeof(T));
     }
 
-    void add_string(const std::string& text) {
+    void add(const std::string& text) {
         add_length(text.size() + 1);
         data_.append(text.c_str(), text.size() + 1);
     }
@@ -63,16 +63,22 @@ inline void check_python() {
     if (PyErr_Occurred()) throw py::error_already_set();
 }
 
-template <class T>
-class Float : public Value {
+// Encoder of a value of a built-in type, which `Type::convert` makes of a Python object.
+template <class Type>
+class Scalar : public Value {
   public:
-    explicit Float(const py::handle& default_value) : default_(number(default_value)) {}
+    explicit Scalar(const py::handle& default_value) : default_(Type::convert(default_value)) {}
     void add(const py::handle& value, Bytes& out) const override {
-        out.add(value.is_none() ? default_ : number(value));
+        out.add(value.is_none() ? default_ : Type::convert(value));
     }
 
   private:
-    static T number(const py::handle& value) {
+    decltype(Type::convert(py::handle())) default_;
+};
+
+template <class T>
+struct Float {
+    static T convert(const py::handle& value) {
         if (PyFloat_CheckExact(value.ptr())) return narrow(PyFloat_AS_DOUBLE(value.ptr()));
         // Like float(), which also accepts strings.
         const auto converted = py::reinterpret_steal<py::object>(PyNumber_Float(value.ptr()));
@@ -84,19 +90,11 @@ class Float : public Value {
             throw std::overflow_error("beyond the range of its type: " + std::to_string(value));
         return T(value);
     }
-    T default_;
 };
 
 template <class T>
-class Integer : public Value {
-  public:
-    explicit Integer(const py::handle& default_value) : default_(number(default_value)) {}
-    void add(const py::handle& value, Bytes& out) const override {
-        out.add(value.is_none() ? default_ : number(value));
-    }
-
-  private:
-    static T number(const py::handle& value) {
+struct Integer {
+    static T convert(const py::handle& value) {
         const auto integer = py::reinterpret_steal<py::object>(
             PyLong_CheckExact(value.ptr()) ? value.inc_ref().ptr() : PyNumber_Long(value.ptr()));
         check_python();
@@ -113,34 +111,18 @@ class Integer : public Value {
     static std::uint64_t to_64_bits(PyObject* integer, std::false_type) {
         return PyLong_AsUnsignedLongLong(integer);
     }
-    T default_;
 };
 
-class Boolean : public Value {
-  public:
-    explicit Boolean(const py::handle& default_value) : default_(is_true(default_value)) {}
-    void add(const py::handle& value, Bytes& out) const override {
-        out.add(value.is_none() ? default_ : is_true(value));
-    }
-
-  private:
-    static bool is_true(const py::handle& value) {
+struct Boolean {
+    static bool convert(const py::handle& value) {
         const int truth = PyObject_IsTrue(value.ptr());
         check_python();
         return truth != 0;
     }
-    bool default_;
 };
 
-class String : public Value {
-  public:
-    explicit String(const py::handle& default_value) : default_(py::str(default_value)) {}
-    void add(const py::handle& value, Bytes& out) const override {
-        out.add_string(value.is_none() ? default_ : std::string(py::str(value)));
-    }
-
-  private:
-    std::string default_;
+struct String {
+    static std::string convert(const py::handle& value) { return py::str(value); }
 };
 
 // Field of a message.

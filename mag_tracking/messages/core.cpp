@@ -7,27 +7,24 @@
 namespace mag_tracking {
 namespace {
 
-template <class T>
-std::shared_ptr<const Value> value_of(const py::handle& default_value, const py::handle& zero) {
-    return std::make_shared<T>(default_value.is_none() ? zero : default_value);
-}
-
 // Encoder of a built-in type; raises ValueError for any other type.
-std::shared_ptr<const Value> built_in(const std::string& type, const py::object& default_value) {
-    const py::int_ zero(0);
-    if (type == "float64") return value_of<Float<double>>(default_value, zero);
-    if (type == "float32") return value_of<Float<float>>(default_value, zero);
-    if (type == "int8") return value_of<Integer<std::int8_t>>(default_value, zero);
-    if (type == "uint8" || type == "byte" || type == "char")
-        return value_of<Integer<std::uint8_t>>(default_value, zero);
-    if (type == "int16") return value_of<Integer<std::int16_t>>(default_value, zero);
-    if (type == "uint16") return value_of<Integer<std::uint16_t>>(default_value, zero);
-    if (type == "int32") return value_of<Integer<std::int32_t>>(default_value, zero);
-    if (type == "uint32") return value_of<Integer<std::uint32_t>>(default_value, zero);
-    if (type == "int64") return value_of<Integer<std::int64_t>>(default_value, zero);
-    if (type == "uint64") return value_of<Integer<std::uint64_t>>(default_value, zero);
-    if (type == "bool") return value_of<Boolean>(default_value, zero);
-    if (type == "string") return value_of<String>(default_value, py::str(""));
+std::shared_ptr<const Value> built_in(const std::string& type, const py::object& given) {
+    const py::object zero = type == "string" ? py::object(py::str("")) : py::object(py::int_(0));
+    const auto of = [&](auto kind) -> std::shared_ptr<const Value> {
+        return std::make_shared<Scalar<decltype(kind)>>(given.is_none() ? zero : given);
+    };
+    if (type == "float64") return of(Float<double>());
+    if (type == "float32") return of(Float<float>());
+    if (type == "int8") return of(Integer<std::int8_t>());
+    if (type == "uint8" || type == "byte" || type == "char") return of(Integer<std::uint8_t>());
+    if (type == "int16") return of(Integer<std::int16_t>());
+    if (type == "uint16") return of(Integer<std::uint16_t>());
+    if (type == "int32") return of(Integer<std::int32_t>());
+    if (type == "uint32") return of(Integer<std::uint32_t>());
+    if (type == "int64") return of(Integer<std::int64_t>());
+    if (type == "uint64") return of(Integer<std::uint64_t>());
+    if (type == "bool") return of(Boolean());
+    if (type == "string") return of(String());
     throw py::value_error("type cannot be encoded: " + type);
 }
 

@@ -16,11 +16,9 @@ _HEADER_TYPE = np.dtype([('encapsulation', 'u1', 4), ('sec', '<i4'), ('nanosec',
                          ('length', '<u4')])
 """Layout of a message before its frame name; `length` includes the terminating zero of the name."""
 _FIELD_DOUBLES = 12
-"""Number of float64 values in a MagneticField: x, y, z and the covariance."""
 _HASH_BASE, _HASH_MASK = np.uint64(6364136223846793005), 2**62 - 1
 """Base of the hash of a frame name, modulo 2**64, and the bits that are kept."""
 _POSE_DOUBLES = 7
-"""Number of float64 values in a pose: x, y, z and the quaternion."""
 
 
 class FieldArrays(NamedTuple):
@@ -31,7 +29,6 @@ class FieldArrays(NamedTuple):
     CDR, or in a frame with a non-ASCII name. The corresponding elements of the other arrays are
     invalid."""
     stamp_ns: IntArray
-    """(n,) [ns] Timestamps."""
     field: FloatArray
     """(n, 3) [T] Field, sensor frame."""
     covariance: FloatArray | None
@@ -47,7 +44,6 @@ class PoseArrays(NamedTuple):
     """(n,) False for a message that must be decoded individually: it is damaged, not little-endian
     CDR, or in another frame. The corresponding elements of the other arrays are invalid."""
     stamp_ns: IntArray
-    """(n,) [ns] Timestamps."""
     pose: FloatArray
     """(n, 7) Position [m] and quaternion xyzw."""
 
@@ -73,10 +69,8 @@ def poses(content: bytes, begins: IntArray, ends: IntArray, frame: str) -> PoseA
 
 
 class _StampedMessages:
-    """Messages that consist of a header and float64 values.
-
-    `is_decoded` (n,) is False for a message that is truncated or not little-endian CDR.
-    """
+    """Messages that consist of a header and float64 values; `is_decoded` (n,) is False if they are
+    truncated or not little-endian CDR."""
 
     def __init__(self, content: bytes, begins: IntArray, ends: IntArray, n_doubles: int) -> None:
         self._data: NDArray[np.uint8] = np.frombuffer(content, np.uint8)

@@ -2,6 +2,7 @@
 
 from array import array
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +16,7 @@ from mag_tracking.event_records import (
     VehiclePassage,
 )
 from mag_tracking.geometry import rotation_from_quaternion
-from mag_tracking.messages.shapes import FieldReadings, Imu, MagneticField, MessageDict, Time
+from mag_tracking.messages.types import MessageDict
 from mag_tracking.records import (
     AccelerationSample,
     Detection,
@@ -29,6 +30,93 @@ from mag_tracking.records import (
 from mag_tracking.units import LATEST_NS
 
 
+class Time(Protocol):
+    """Interface of builtin_interfaces/Time."""
+
+    sec: int
+    nanosec: int
+
+
+class Header(Protocol):
+    """Interface of std_msgs/Header."""
+
+    stamp: Time
+    frame_id: str
+
+
+class Vector3(Protocol):
+    """Interface of geometry_msgs/Vector3 and Point."""
+
+    x: float
+    y: float
+    z: float
+
+
+class Quaternion(Vector3, Protocol):
+    """Interface of geometry_msgs/Quaternion."""
+
+    w: float
+
+
+class MagneticField(Protocol):
+    """Interface of sensor_msgs/MagneticField."""
+
+    header: Header
+    magnetic_field: Vector3
+    magnetic_field_covariance: Sequence[float]
+
+
+class Imu(Protocol):
+    """Interface of sensor_msgs/Imu; only the acceleration is read."""
+
+    header: Header
+    linear_acceleration: Vector3
+    linear_acceleration_covariance: Sequence[float]
+
+
+class FieldReadings(Protocol):
+    """Interface of mag_tracking_msgs/FieldReadings."""
+
+    header: Header
+    sensors: Sequence[str]
+    sensor: Sequence[int]
+    stamp: Sequence[int]
+    field: Sequence[float]
+    covariance: Sequence[float]
+
+
+class NetworkFrame(Protocol):
+    """Interface of mag_tracking_msgs/NetworkFrame."""
+
+    header: Header
+    sensors: Sequence[str]
+    field: Sequence[float]
+    covariance: Sequence[float]
+    n_samples: Sequence[int]
+    time_offset: Sequence[float]
+    target_present: bool
+    statistic: float
+    degrees_of_freedom: int
+
+
+class SensorCalibration(Protocol):
+    """Interface of mag_tracking_msgs/SensorCalibration, limited to the fields that are read."""
+
+    sensor: str
+    doubtful: bool
+    doubtful_since: Time
+    doubtful_until: Time
+    orientation: Quaternion
+    orientation_std: Sequence[float]
+
+
+class CalibrationState(Protocol):
+    """Interface of mag_tracking_msgs/CalibrationState."""
+
+    header: Header
+    sensors: Sequence[SensorCalibration]
+
+
 def stamp_ns(stamp: Time) -> int:
     """Convert builtin_interfaces/Time to nanoseconds."""
     return stamp.sec * 1_000_000_000 + stamp.nanosec
@@ -40,10 +128,7 @@ def stamp_dict(ns: int) -> MessageDict:
 
 
 def reading_of(message: MagneticField, sensor: str) -> Readings:
-    """Convert a MagneticField message to `Readings` with a single reading.
-
-    A covariance that is all zero, or whose first element is -1, is unknown.
-    """
+    """Convert a MagneticField message to `Readings` with a single reading."""
     f = message.magnetic_field
     C = known_covariances(np.array(message.magnetic_field_covariance, dtype=float).reshape(1, 3, 3))
     return Readings.single(sensor, stamp_ns(message.header.stamp), np.array([f.x, f.y, f.z]),
@@ -64,10 +149,8 @@ def known_covariances(C: FloatArray) -> FloatArray | None:
 
 
 def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
-    """Convert an Imu message to an `AccelerationSample`; NaN if it contains no acceleration.
-
-    The first element of the covariance is then -1.
-    """
+    """Convert an Imu message to an `AccelerationSample`; NaN if the first element of the
+    covariance, -1, marks that it contains no acceleration."""
     a = message.linear_acceleration
     is_present = message.linear_acceleration_covariance[0] != -1.0
     return AccelerationSample(stamp_ns(message.header.stamp), sensor,
@@ -75,10 +158,8 @@ def acceleration_of(message: Imu, sensor: str) -> AccelerationSample:
 
 
 def float64_array(values: ArrayLike) -> 'array[float]':
-    """Convert numbers of any shape to the array type of a float64[] field, in row-major order.
-
-    ROS accepts this type without conversion; it would check the elements of a list individually.
-    """
+    """Convert numbers of any shape to the array type of a float64[] field, in row-major order,
+    whose elements ROS does not check individually."""
     return array('d', np.ascontiguousarray(values, dtype=float).tobytes())
 
 
@@ -87,16 +168,19 @@ def xyz(v: Sequence[float] | FloatArray) -> dict[str, float]:
     return {'x': float(v[0]), 'y': float(v[1]), 'z': float(v[2])}
 
 
+def quaternion_dict(q: FloatArray) -> dict[str, float]:
+    """Convert a quaternion xyzw to a geometry_msgs/Quaternion."""
+    return dict(zip('xyzw', map(float, q), strict=True))
+
+
 def header_dict(ns: int, frame: str) -> MessageDict:
     """Build a std_msgs/Header."""
     return {'stamp': stamp_dict(ns), 'frame_id': frame}
 
 
 def magnetic_field_dicts(readings: Readings, frame: str = '') -> list[tuple[str, MessageDict]]:
-    """Convert `Readings` to one sensor_msgs/MagneticField per reading, with the name of its sensor.
-
-    The frame is by default the name of the sensor. An unknown covariance is all zero.
-    """
+    """Convert `Readings` to one sensor_msgs/MagneticField per reading, with the name of its sensor,
+    also the default frame; an unknown covariance is all zero."""
     C: FloatArray = np.zeros((len(readings), 9))
     if readings.covariance is not None:
         C = readings.covariance.reshape(-1, 9).copy()
@@ -109,10 +193,8 @@ def magnetic_field_dicts(readings: Readings, frame: str = '') -> list[tuple[str,
 
 
 def readings_dict(readings: Readings) -> MessageDict:
-    """Convert `Readings` to mag_tracking_msgs/FieldReadings.
-
-    Raises RecordingError if only some covariances are known, or `readings` is empty.
-    """
+    """Convert `Readings` to mag_tracking_msgs/FieldReadings; raises RecordingError if only some
+    covariances are known, or `readings` is empty."""
     C = readings.covariance
     if not len(readings) or C is not None and np.isnan(C).all(axis=(1, 2)).any():
         raise RecordingError('FieldReadings requires at least one reading, and covariances for '
@@ -126,10 +208,8 @@ def readings_dict(readings: Readings) -> MessageDict:
 
 
 def readings_of(message: FieldReadings) -> Readings:
-    """Convert a FieldReadings message to `Readings`.
-
-    Raises RecordingError if array lengths, sensor names, indices or timestamps are invalid.
-    """
+    """Convert a FieldReadings message to `Readings`; raises RecordingError if array lengths, sensor
+    names, indices or timestamps are invalid."""
     n, names = len(message.sensor), tuple(message.sensors)
     lengths = len(message.stamp), len(message.field), len(message.covariance)
     if lengths not in ((n, 3 * n, 0), (n, 3 * n, 9 * n)):
@@ -170,9 +250,7 @@ def pose_dict(ns: int, frame: str, position: FloatArray, quaternion: FloatArray)
 
 
 def _pose(position: FloatArray, quaternion: FloatArray) -> MessageDict:
-    """Build a geometry_msgs/Pose as a dict."""
-    return {'position': xyz(position),
-            'orientation': {**xyz(quaternion), 'w': float(quaternion[3])}}
+    return {'position': xyz(position), 'orientation': quaternion_dict(quaternion)}
 
 
 def pose_covariance(uncertainty: Track | SmoothedPose | PoseUncertainty) -> FloatArray:
@@ -227,7 +305,6 @@ def hypotheses_dict(track: Track, frame: str) -> MessageDict:
 
 
 def _hypothesis_dict(h: Hypothesis) -> MessageDict:
-    """Convert a `Hypothesis` to mag_tracking_msgs/Hypothesis."""
     return {'arrival': h.arrival, 'kind': h.kind, 'weight': h.weight,
             'position': xyz(h.position), 'velocity': xyz(h.velocity),
             'covariance': h.covariance.ravel().tolist(), 'moment': xyz(h.moment)}

@@ -16,7 +16,7 @@ from mag_tracking_msgs.msg import PassEvent as PassEventMessage
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.calibration.background import RunningBackground
-from mag_tracking.messages.frame import frame_dict
+from mag_tracking.messages.network import frame_dict
 from mag_tracking.messages.schema import detection_dict, pass_event_dict, reading_of
 from mag_tracking.messages.types import CALIBRATED_READINGS, NETWORK_FRAME, TRACK_ARRAY
 from mag_tracking.nodes import stage_node

@@ -17,8 +17,8 @@ from visualization_msgs.msg import MarkerArray
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.interrupts import recorded_signals
-from mag_tracking.messages.frame import frame_of
-from mag_tracking.messages.markers import SENSOR_NAMESPACES
+from mag_tracking.messages.network import frame_of
+from mag_tracking.messages.standard import SENSOR_NAMESPACES
 from mag_tracking.messages.types import NETWORK_FRAME
 from mag_tracking.nodes.convert import smoothed_path_of, track_of
 from mag_tracking.nodes.middleware import RMWError, init_ros

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from diagnostic_msgs.msg import DiagnosticStatus
 from mag_tracking_msgs.msg import SensorCalibration
 
-from mag_tracking.messages.calibration_state import sensor_dict
+from mag_tracking.messages.network import sensor_dict
 from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes.background_store import BackgroundStore
 from mag_tracking.nodes.convert import to_message

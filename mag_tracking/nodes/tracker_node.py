@@ -35,9 +35,7 @@ from mag_tracking.calibration.doubtful_times import (
 )
 from mag_tracking.errors import RecordingError
 from mag_tracking.event_records import Disturbance
-from mag_tracking.messages.calibration_state import doubtful_times, with_orientations
-from mag_tracking.messages.frame import frame_of
-from mag_tracking.messages.markers import delete_markers, sensor_markers, track_markers
+from mag_tracking.messages.network import doubtful_times, frame_of, with_orientations
 from mag_tracking.messages.schema import (
     disturbance_dict,
     hypotheses_dict,
@@ -48,9 +46,14 @@ from mag_tracking.messages.schema import (
     smoothed_track_dict,
     track_dict,
 )
-from mag_tracking.messages.shapes import MessageDict
-from mag_tracking.messages.standard import detections_3d_dict, track_transform_dict
-from mag_tracking.messages.types import CALIBRATION_STATE, NETWORK_FRAME
+from mag_tracking.messages.standard import (
+    delete_markers,
+    detections_3d_dict,
+    sensor_markers,
+    track_markers,
+    track_transform_dict,
+)
+from mag_tracking.messages.types import CALIBRATION_STATE, NETWORK_FRAME, MessageDict
 from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes import stage_node
 from mag_tracking.nodes.convert import to_message

@@ -73,10 +73,8 @@ def write_backgrounds(path: str | PathLike[str], texts: Mapping[str, str]) -> No
 def read_backgrounds(path: str | PathLike[str], network: SensorNetwork,
                      settings: CalibrateSettings
                      ) -> tuple[dict[str, StoredBackground], dict[str, str]]:
-    """Usable backgrounds, and the reasons for those refused, by sensor.
-
-    A missing file has none. Raises RecordingError for a file of another kind or version.
-    """
+    """Usable backgrounds, and the reasons for those refused, by sensor; none if the file is
+    missing, and RecordingError for another kind or version."""
     try:
         content = json.loads(Path(path).read_text())
     except FileNotFoundError:

@@ -13,13 +13,15 @@ from typing import TYPE_CHECKING, Any
 import lz4.frame
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.ros1 import cdr_of_ros1
-from mag_tracking.messages.types import schema_of
-from mag_tracking.recording.decode_errors import DECODE_ERRORS
-from mag_tracking.recording.expansion import RefusedDataError, expanded, largest_chunk
-from mag_tracking.recording.interruptible import Progress
-from mag_tracking.recording.message_block import MessageBlock
-from mag_tracking.recording.raw_message import RawMessage
+from mag_tracking.messages.encodings import cdr_of_ros1
+from mag_tracking.messages.types import RawMessage, schema_of
+from mag_tracking.recording.expansion import (
+    DECODE_ERRORS,
+    RefusedDataError,
+    expanded,
+    largest_chunk,
+)
+from mag_tracking.recording.message_block import MessageBlock, Progress, RecordingFile
 from mag_tracking.units import LATEST_NS
 
 if TYPE_CHECKING:
@@ -28,9 +30,7 @@ if TYPE_CHECKING:
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 ROS1_MAGIC = b'#ROSBAG V2.0'
-"""First bytes of a ROS 1 bag."""
 SQLITE_MAGIC = b'SQLite format 3\0'
-"""First bytes of an SQLite database."""
 BLOCK_SIZE = 256
 """Largest number of messages that are read at once."""
 BLOCK_BYTES = 16 << 20
@@ -39,30 +39,17 @@ _ROS1_COMPRESSIONS: dict[object, str] = {bz2.decompress: 'bz2', lz4.frame.decomp
 """Compression of a chunk by the decompressor that the library uses."""
 
 
-class BagFile:
-    """Reader of one bag of a recording; raises RecordingError if the file is not a bag.
-
-    Attributes
-    ----------
-    types : message type by topic
-    message_counts : number of messages by topic
-    start_ns, end_ns : log times of the first and last message; None without messages
-    losses : number of unreadable parts by description, updated in place
-    """
+class BagFile(RecordingFile):
+    """Reader of one bag of a recording; raises RecordingError if the file is not a bag."""
 
     def __init__(self, path: Path, losses: 'Counter[str]') -> None:
-        self._path, self._losses = path, losses
+        super().__init__(path, losses)
         with open(path, 'rb') as stream:
             self._is_ros1 = stream.read(len(ROS1_MAGIC)) == ROS1_MAGIC
-        self._lost_offsets: set[int] = set()
         log = path.with_name(f'{path.name}-wal')
         if not self._is_ros1 and log.is_file() and log.stat().st_size:
             losses[f'write-ahead logs that are not read ({log.name}: run `sqlite3 {path.name} '
                    '"PRAGMA wal_checkpoint(TRUNCATE)"`)'] = 1
-        self.types: dict[str, str] = {}
-        self.message_counts: Counter[str] = Counter()
-        self.start_ns: int | None = None
-        self.end_ns: int | None = None
         with self._open_reader() as reader:
             for connection in reader.connections:
                 if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
@@ -77,30 +64,20 @@ class BagFile:
 
     def _open_reader(self) -> AbstractContextManager[Any]:
         """Open the bag with the reader of `rosbags`; raises RecordingError."""
+        # Imported here because most recordings are MCAP and do not need the library.
+        from rosbags.rosbag1 import Reader
+        from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
         try:
-            reader = self._new_reader()
+            reader = (Reader if self._is_ros1 else Sqlite3Reader)(self._path)
             reader.open()
         except bag_errors() as error:
             raise RecordingError(f'{self._path} cannot be read as a bag: {error}') from error
         return closing(reader)
 
-    def _new_reader(self) -> 'Ros1Reader | Sqlite3Reader':
-        """Create the reader of `rosbags` for this type of bag."""
-        # Imported here because most recordings are MCAP and do not need the library.
-        if self._is_ros1:
-            from rosbags.rosbag1 import Reader
-
-            return Reader(self._path)
-        from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
-
-        return Sqlite3Reader(self._path)
-
     def blocks(self, start_ns: int | None = None,
                progress: Progress | None = None) -> Iterator[MessageBlock]:
-        """Iterate over blocks of CDR messages from `start_ns` on, in order of log time.
-
-        `progress` is called with the number of bytes read since the last call.
-        """
+        """Iterate over blocks of CDR messages from `start_ns` on, in order of log time."""
         size, total = self._path.stat().st_size, max(self.message_counts.total(), 1)
         reported = n = 0
         messages: list[RawMessage] = []
@@ -124,7 +101,6 @@ class BagFile:
                 progress(size - reported)
 
     def _raw(self, start_ns: int | None) -> Iterator[tuple[str, str, int, bytes]]:
-        """Iterate over (topic, type, log time [ns], bytes); the losses are counted."""
         with self._open_reader() as reader:
             yield from (self._ros1_messages if self._is_ros1 else self._sqlite_messages)(
                 reader, start_ns)
@@ -182,12 +158,6 @@ class BagFile:
                 reader.indexes[number].append(entry)
             # The library has closed the chunk before the damaged one.
             reader.current_chunk = (-1, BytesIO())
-
-    def _count_loss(self, offset: int, description: str) -> None:
-        """Count the damaged chunk at byte `offset`, unless it has already been counted."""
-        if offset not in self._lost_offsets:
-            self._lost_offsets.add(offset)
-            self._losses[description] += 1
 
 
 @functools.cache

@@ -2,15 +2,22 @@
 
 import bz2
 import os
+import struct
+import zlib
 from collections.abc import Callable, Iterator
 from io import BytesIO
 
 import lz4.frame
 import zstandard
+from mcap.exceptions import McapError
+from mcap.stream_reader import CRCValidationError
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.recording.decode_errors import DECODE_ERRORS
 
+DECODE_ERRORS: tuple[type[Exception], ...] = (
+    McapError, CRCValidationError, ValueError, KeyError, EOFError, struct.error, zlib.error,
+    zstandard.ZstdError, RuntimeError, UnicodeDecodeError, MemoryError, OverflowError)
+"""Exceptions that the MCAP library and its decompressors raise for damaged bytes."""
 LARGEST_CHUNK_MB = 256.0
 """Largest size of a decompressed chunk, message or record that is read [MB]."""
 LARGEST_CHUNK_VARIABLE = 'MAG_TRACKING_LARGEST_CHUNK_MB'
@@ -49,11 +56,8 @@ def check_size(size: int, limit: int) -> None:
 
 
 def expanded(compression: str, data: bytes, limit: int, is_cut: bool = False) -> bytes:
-    """Decompress zstd, lz4, bz2 or uncompressed data of at most `limit` bytes.
-
-    `is_cut` permits that the end is missing. Raises RefusedDataError beyond the limit or for
-    another compression, and the errors of the compression for damaged data.
-    """
+    """Decompress data to at most `limit` bytes; raises RefusedDataError beyond it or for an unknown
+    compression, and, unless `is_cut` permits a missing end, the errors for damaged data."""
     if compression in ('', 'none'):
         check_size(len(data), limit)
         return data
@@ -64,32 +68,21 @@ def expanded(compression: str, data: bytes, limit: int, is_cut: bool = False) ->
     pieces = _PIECES[compression](data)
     while True:
         try:
-            piece = next(pieces, None)
+            piece = next(pieces, b'')
         except (zstandard.ZstdError, RuntimeError, OSError, ValueError, EOFError):
             if not is_cut:
                 raise
-            piece = None
-        if piece is None:
+            piece = b''
+        if not piece:
             return out.getvalue()
         check_size(out.tell() + len(piece), limit)
         out.write(piece)
 
 
 def _zstd_pieces(data: bytes) -> Iterator[bytes]:
-    """Decompress one frame piece by piece."""
     with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as reader:
         while piece := reader.read(_STEP):
             yield piece
-
-
-def _lz4_pieces(data: bytes) -> Iterator[bytes]:
-    """Decompress one frame piece by piece."""
-    return _pieces(lz4.frame.LZ4FrameDecompressor(), data)
-
-
-def _bz2_pieces(data: bytes) -> Iterator[bytes]:
-    """Decompress one stream piece by piece."""
-    return _pieces(bz2.BZ2Decompressor(), data)
 
 
 def _pieces(decompressor: 'bz2.BZ2Decompressor | lz4.frame.LZ4FrameDecompressor',
@@ -105,7 +98,9 @@ def _pieces(decompressor: 'bz2.BZ2Decompressor | lz4.frame.LZ4FrameDecompressor'
 
 
 _PIECES: dict[str, Callable[[bytes], Iterator[bytes]]] = {
-    'zstd': _zstd_pieces, 'lz4': _lz4_pieces, 'bz2': _bz2_pieces}
+    'zstd': _zstd_pieces,
+    'lz4': lambda data: _pieces(lz4.frame.LZ4FrameDecompressor(), data),
+    'bz2': lambda data: _pieces(bz2.BZ2Decompressor(), data)}
 
 
 def expanded_message(data: bytes) -> bytes:

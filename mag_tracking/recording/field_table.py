@@ -6,9 +6,8 @@ from array import array
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from os import PathLike
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,16 +18,21 @@ from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.table_columns import IGNORED, Columns, find_columns, sensor_name
 from mag_tracking.recording.table_layout import Table, read_table
-from mag_tracking.recording.table_order import MAX_STEPS, check_resolution, order_times
-from mag_tracking.recording.table_text import find_decimal, parse_number
-from mag_tracking.recording.table_times import check_range, read_times, span_text
+from mag_tracking.recording.table_text import FilePath, find_decimal, parse_number
+from mag_tracking.recording.table_times import (
+    MAX_STEPS,
+    check_range,
+    check_resolution,
+    order_times,
+    read_times,
+    span_text,
+)
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Readings
 from mag_tracking.time_text import DAY_NS
 from mag_tracking.units import NS, time_unit
 
 SUFFIXES = ('.csv', '.tsv', '.txt')
-"""File name extensions of tables."""
 USUAL_FIELD_T = (1e-5, 2e-4)
 """Range of the median magnitude of a field that is not influenced by magnets [T]."""
 MAX_RELATIVE_NS = 10 * 365 * DAY_NS
@@ -36,40 +40,29 @@ MAX_RELATIVE_NS = 10 * 365 * DAY_NS
 _DECIMALS = {'ms': 3, 'us': 6, 'ns': 9}
 """Number of decimals of a second in a column of this unit."""
 
-_Path: TypeAlias = str | PathLike[str]
-
 
 @dataclass(frozen=True)
 class TableOptions:
-    """Properties of a table that the user states; empty ones are found from the table."""
+    """Properties of a table that the user states, as the options of `mag-tracking import`; empty
+    ones are found from the table."""
 
     columns: Sequence[str] = ()
-    """Assignments as for `parse_columns`."""
     unit: str = ''
-    """Unit of the field, as for `units.field_scale`."""
     time_unit: str = ''
-    """Unit of times that are numbers, as for `units.time_scale`."""
     sensor: str = ''
-    """Name of the only sensor, if the table does not name it."""
     sensors: Mapping[str, str] = field(default_factory=dict)
-    """Name of the sensor for each text in the sensor column; - discards its readings."""
     separator: str = ''
     decimal: str = ''
     header: int | None = None
-    """Number of the header line; 0 without one."""
     encoding: str = ''
     date_order: str = ''
-    """dmy, mdy or ymd."""
     rate: float | None = None
     """Rate of the readings of a sensor [Hz], which replaces the times after the first."""
     wrap: int = 0
-    """Number at which the time returns to 0."""
     jumps: str = ''
-    """'split' or 'sort', if the time runs backwards or jumps ahead by years."""
 
 
-@dataclass(frozen=True)
-class FieldTable:
+class FieldTable(NamedTuple):
     """Readings of a table."""
 
     sessions: list[Readings]
@@ -78,17 +71,14 @@ class FieldTable:
     """What was found out about the layout, and numbers of ignored and unusable rows."""
 
 
-def read_field_table(path: _Path, options: TableOptions, with_times: bool = True) -> FieldTable:
-    """Read a table of readings; without `with_times`, the timestamps count the rows.
-
-    Raises RecordingError if the table is ambiguous or contradicts the options; the message names
-    the option that states the property.
-    """
+def read_field_table(path: FilePath, options: TableOptions, with_times: bool = True) -> FieldTable:
+    """Read a table of readings; without `with_times`, the timestamps count the rows; if the table
+    is ambiguous, RecordingError names the option that states the property."""
     table = read_table(checked_path(path, RecordingError), options.separator, options.header,
                        options.encoding)
     columns = find_columns(table, options.columns, options.unit, options.sensor)
     if not with_times:
-        columns, options = replace(columns, time=()), replace(options, rate=1.0)
+        columns, options = columns._replace(time=()), replace(options, rate=1.0)
     decimal = _decimal(table, columns, options)
     rows = _Rows(table, columns, decimal, options)
     table.check_bad_rows(len(rows.lines))
@@ -112,8 +102,7 @@ def read_field_table(path: _Path, options: TableOptions, with_times: bool = True
 class _Rows:
     """Rows of a table whose numbers are valid; the others are added to `table.bad`."""
 
-    def __init__(self, table: Table, columns: Columns, decimal: str, options: TableOptions
-                 ) -> None:
+    def __init__(self, table: Table, columns: Columns, decimal: str, options: TableOptions) -> None:
         self.table, self.columns = table, columns
         self.lines: list[int] = []
         self.texts: list[str] = []
@@ -141,7 +130,6 @@ class _Rows:
         table.rows.clear()
 
     def _column(self, j: int) -> str:
-        """Name of a column, for messages."""
         return self.table.header[j] if self.table.header else f'column {j + 1}'
 
     def _add(self, line: int, cells: Sequence[str], sensor: str, key: int, decimal: str) -> None:
@@ -250,40 +238,32 @@ def _sessions(rows: _Rows, stamps: Sequence[int], session: Sequence[int], order:
     out = []
     for s in range(max(session, default=0) + 1):
         chosen = [i for i, (k, _) in enumerate(rows.names) if k in place and place[k][1] == s]
-        if not chosen:
-            continue
-        times = [place[rows.names[i][0]][0] for i in chosen]
-        readings = Readings.by_name([rows.names[i][1] for i in chosen], times,
-                                    fields[chosen])
-        out.append(readings.part(np.argsort(times, kind='stable')))
+        if chosen:
+            times = [place[rows.names[i][0]][0] for i in chosen]
+            readings = Readings.by_name([rows.names[i][1] for i in chosen], times, fields[chosen])
+            out.append(readings.part(np.argsort(times, kind='stable')))
     return out
 
 
-def import_field_table(table: _Path, options: TableOptions, out: _Path
+def import_field_table(table: FilePath, options: TableOptions, out: FilePath
                        ) -> tuple[list[Path], FieldTable]:
-    """Import a table as recordings with the readings on `/NAME/imu/mag`.
-
-    `out` receives `<table>.mcap` and `metadata.yaml`, or folders `session_1`, `session_2`, ... if
-    the clock restarts.
-    """
+    """Import a table as recordings in `out`, or in its folders `session_1`, `session_2`, ... if the
+    clock restarts."""
     content = read_field_table(table, options)
     recordings = []
     for k, readings in enumerate(content.sessions):
         folder = Path(out) / f'session_{k + 1}' if len(content.sessions) > 1 else Path(out)
         recordings.append(folder / f'{Path(table).stem}.mcap')
         with RecordingWriter(recordings[-1]) as writer:
-            for name, message, stamp in zip(readings.sensor_names(), (
-                    m for _, m in magnetic_field_dicts(readings)), readings.stamp_ns.tolist(),
-                    strict=True):
+            for (name, message), stamp in zip(
+                    magnetic_field_dicts(readings), readings.stamp_ns.tolist(), strict=True):
                 writer.write(f'/{name}/imu/mag', MAGNETIC_FIELD, message, stamp)
     return recordings, content
 
 
 def describe(readings: Readings) -> list[str]:
-    """Number, rate, gaps and median field of each sensor's readings (chronological), one line each.
-
-    A warning follows if all fields have an unusual magnitude.
-    """
+    """Number, rate, gaps and median field of each sensor's readings (chronological), one line each,
+    and warnings."""
     out, magnitudes = [], []
     spans: dict[str, tuple[int, int]] = {}
     begin = int(readings.stamp_ns.min())

@@ -1,7 +1,13 @@
-"""Reader of one MCAP file, which checks each chunk and skips damaged chunks."""
+"""Reader of one MCAP file, which checks each chunk and skips damaged chunks.
 
+Reference: MCAP format specification, version 0.
+"""
+
+import os
+import struct
+import zlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -9,35 +15,159 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
+from mcap.reader import make_reader
 from mcap.records import Channel, ChunkIndex, Schema, Statistics
 from mcap.summary import Summary
 
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.recording import core
-from mag_tracking.recording.decode_errors import DECODE_ERRORS
-from mag_tracking.recording.expansion import RefusedDataError, check_size, largest_chunk
-from mag_tracking.recording.interruptible import Progress
-from mag_tracking.recording.mcap_records import (
-    MAGIC,
-    MIN_BYTES_PER_MESSAGE,
-    Record,
-    chunk_content,
-    file_size,
-    has_footer,
-    read_summary,
-    records,
+from mag_tracking.recording.expansion import (
+    DECODE_ERRORS,
+    RefusedDataError,
+    check_size,
+    expanded,
+    largest_chunk,
 )
-from mag_tracking.recording.message_block import ChannelKind, MessageBlock
+from mag_tracking.recording.message_block import ChannelKind, MessageBlock, Progress, RecordingFile
 from mag_tracking.units import LATEST_NS
 
+MAGIC = b'\x89MCAP0\r\n'
+MIN_BYTES_PER_MESSAGE = 128
+"""The largest number of messages in a chunk is its largest size divided by this number, because
+the position of each message also takes memory."""
+RECORD_HEADER = struct.Struct('<BQ')
+"""Operation code and length of the content of a record."""
+_FOOTER = struct.Struct('<BQQQI8s')
+"""Record `Footer` (operation code, length, start of summary and of summary offsets, CRC) and
+`MAGIC`."""
+_CHUNK_HEADER = struct.Struct('<QQQII')
+"""Times of the first and last message [ns], uncompressed size, CRC, length of the compression."""
+_MAX_NAME = 64
+_CRC_STEP = 1 << 20
+CONTENT = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+"""Operation codes of the records in a chunk, which may also be outside of chunks."""
 MAX_MERGED_SIZE = 64 << 20
 """Size of a chunk above which its messages are not sorted among those of other chunks, because
 that takes several times the memory [bytes]."""
 UNCHUNKED_SIZE = 1 << 20
 """Number of bytes of consecutive records outside of chunks that are read at once."""
-_DEFINITION_TYPES: dict[int, type[Schema] | type[Channel]] = {
-    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
+
+
+class Record(NamedTuple):
+    """Position of a record in a file."""
+
+    opcode: int
+    begin: int
+    end: int
+    """Offset after the record, bytes. Beyond the end of the file for a truncated record."""
+
+
+def file_size(stream: BinaryIO) -> int:
+    """Size of an open file in bytes."""
+    return os.fstat(stream.fileno()).st_size
+
+
+def records(stream: BinaryIO, begin: int, end: int) -> Iterator[Record]:
+    """Iterate over the positions of records up to the offset `end`, or a record that exceeds it."""
+    while begin + RECORD_HEADER.size <= end:
+        stream.seek(begin)
+        opcode, length = RECORD_HEADER.unpack(stream.read(RECORD_HEADER.size))
+        record = Record(opcode, begin, begin + RECORD_HEADER.size + length)
+        yield record
+        begin = record.end
+
+
+class ChunkHeader(NamedTuple):
+    """Fields of a chunk before its content."""
+
+    start_ns: int
+    end_ns: int
+    """Log time of the last message [ns]."""
+    crc: int
+    """CRC of the content; 0 if unknown."""
+    compression: str
+    size: int
+    """Size of the compressed content, bytes."""
+
+
+def chunk_header(stream: BinaryIO, chunk: Record) -> ChunkHeader:
+    """Read the header of a chunk, up to the beginning of its content; raises ValueError or EOFError
+    if it is damaged."""
+    stream.seek(chunk.begin)
+    opcode, length = RECORD_HEADER.unpack(stream.read(RECORD_HEADER.size))
+    if opcode != Opcode.CHUNK or chunk.begin + RECORD_HEADER.size + length != chunk.end:
+        raise ValueError('no chunk at the indexed offset')
+    start_ns, end_ns, _, crc, name_length = _CHUNK_HEADER.unpack(
+        stream.read(_CHUNK_HEADER.size))
+    if name_length > _MAX_NAME:
+        raise ValueError('the name of the compression is too long')
+    compression = stream.read(name_length).decode()
+    (size,) = struct.unpack('<Q', stream.read(8))
+    if stream.tell() + size > chunk.end:
+        raise EOFError('the content exceeds its chunk')
+    return ChunkHeader(start_ns, end_ns, crc, compression, size)
+
+
+def chunk_content(stream: BinaryIO, chunk: Record, limit: int) -> bytes:
+    """Read and decompress the records in a chunk, at most `limit` bytes.
+
+    Of a chunk beyond the end of the file, the part that was written is read without checking the
+    CRC, which covers the whole. Raises one of DECODE_ERRORS, also RefusedDataError.
+    """
+    is_cut = chunk.end > file_size(stream)
+    header = chunk_header(stream, chunk)
+    check_size(min(header.size, file_size(stream) - stream.tell()), limit)
+    data = expanded(header.compression, stream.read(header.size), limit, is_cut)
+    if header.crc and not is_cut and zlib.crc32(data) != header.crc:
+        raise ValueError('the CRC of the chunk is wrong')
+    return data
+
+
+def definitions_of(data: bytes, places: Iterable[tuple[int, int, int]]
+                   ) -> Iterator[Schema | Channel]:
+    """Schemas and channels at the `places` (opcode, begin, end) in the records of a chunk."""
+    for opcode, begin, end in places:
+        kind: type[Schema] | type[Channel] = Schema if opcode == Opcode.SCHEMA else Channel
+        yield kind.read(ReadDataStream(BytesIO(data[begin:end])))
+
+
+def _footer(stream: BinaryIO) -> tuple[int, int] | None:
+    """Return the offset of the summary (0 if there is none) and its CRC (0 if unknown); None if the
+    file is incomplete: it does not end with a footer."""
+    size = file_size(stream)
+    if size < len(MAGIC) + _FOOTER.size:
+        return None
+    stream.seek(size - _FOOTER.size)
+    opcode, length, start, _, crc, magic = _FOOTER.unpack(stream.read(_FOOTER.size))
+    is_valid = opcode == Opcode.FOOTER and length == 20 and magic == MAGIC
+    return (start, crc) if is_valid else None
+
+
+def read_summary(stream: BinaryIO) -> Summary | None:
+    """Read the summary of a file; None if it is missing or damaged."""
+    start, crc = _footer(stream) or (0, 0)
+    if start == 0:
+        return None
+    try:
+        if crc:
+            _check_crc(stream, start, crc)
+        stream.seek(0)
+        return make_reader(stream).get_summary()
+    except DECODE_ERRORS:
+        return None
+
+
+def _check_crc(stream: BinaryIO, start: int, crc: int) -> None:
+    """Check the CRC of the summary from byte `start`; raises ValueError."""
+    # The CRC covers the summary and the footer up to the CRC itself.
+    remaining, found = file_size(stream) - 12 - start, 0
+    stream.seek(start)
+    while remaining > 0:
+        data = stream.read(min(remaining, _CRC_STEP))
+        found, remaining = zlib.crc32(data, found), remaining - len(data)
+    if found != crc:
+        raise ValueError('the CRC of the summary is wrong')
 
 
 class _Part(NamedTuple):
@@ -46,46 +176,30 @@ class _Part(NamedTuple):
     record: Record
     """Position. The operation code is that of the first record."""
     start_ns: int
-    """Log time of the first message [ns]."""
     end_ns: int
-    """Log time of the last message [ns]."""
 
 
-class McapFile:
+class McapFile(RecordingFile):
     """Reader of one MCAP file of a recording; raises RecordingError for another kind of file.
 
     Schemas and channels are those of the summary and of the parts that were read. A file without a
     summary is read once when it is opened, to find its topics and chunks.
-
-    Attributes
-    ----------
-    types : message type by topic
-    message_counts : number of messages by topic; empty if unknown
-    start_ns, end_ns : log times of the first and last message; None without messages
-    losses : number of unreadable parts by description, updated in place
     """
 
     def __init__(self, path: Path, losses: 'Counter[str]') -> None:
-        self.message_counts: Counter[str] = Counter()
-        self.start_ns: int | None = None
-        self.end_ns: int | None = None
-        self._path, self._losses, self._limit = path, losses, largest_chunk()
-        self._lost_offsets: set[int] = set()
+        super().__init__(path, losses)
+        self._limit = largest_chunk()
         self._channels, self._counts = _Channels(), Counter[int]()
         self._parts: list[_Part] = []
         with open(path, 'rb') as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise RecordingError(f'{path} is not an MCAP file')
             summary = read_summary(stream)
-            if summary is None and not has_footer(stream):
+            if summary is None and _footer(stream) is None:
                 self._losses[f'files without a valid index ({path.name}, possibly truncated)'] = 1
             self._inspect(stream, summary or Summary())
         self._parts.sort(key=lambda part: part.start_ns)
-
-    @property
-    def types(self) -> dict[str, str]:
-        """Message type by topic."""
-        return {kind.topic: kind.type for kind in self._channels.kinds.values()}
+        self.types = {kind.topic: kind.type for kind in self._channels.kinds.values()}
 
     def _inspect(self, stream: BinaryIO, summary: Summary) -> None:
         """Find the parts of the file, the topics, the message counts and the times."""
@@ -131,7 +245,7 @@ class McapFile:
         for record in records(stream, begin, end):
             begin = record.begin
             is_valid = record.end <= end and record.opcode != 0
-            in_run = is_valid and record.opcode in (*_DEFINITION_TYPES, Opcode.MESSAGE)
+            in_run = is_valid and record.opcode in CONTENT
             if run and (not in_run or record.end - run.begin > UNCHUNKED_SIZE):
                 self._add_scanned(stream, run)
                 run = None
@@ -161,8 +275,7 @@ class McapFile:
             return
         if len(rows):
             self._parts.append(_Part(record, int(rows[:, 1].min()), int(rows[:, 1].max())))
-            self._counts.update(dict(zip(
-                *(a.tolist() for a in np.unique(rows[:, 0], return_counts=True)), strict=True)))
+            self._counts.update(sorted(rows[:, 0].tolist()))
 
     def _read(self, stream: BinaryIO, record: Record) -> tuple[bytes, IntArray]:
         """Read the records of a part: their bytes and the rows of its messages; raises one of
@@ -177,18 +290,14 @@ class McapFile:
                                                  self._limit // MIN_BYTES_PER_MESSAGE)
         if end < len(data) and record.end <= file_size(stream):
             raise EOFError('the chunk ends within a record')
-        for kind, first, last in definitions:
-            self._channels.add(_DEFINITION_TYPES[kind].read(
-                ReadDataStream(BytesIO(data[first:last]))))
+        for definition in definitions_of(data, definitions):
+            self._channels.add(definition)
         return data, rows
 
     def blocks(self, start_ns: int | None = None,
                progress: Progress | None = None) -> Iterator[MessageBlock]:
         """Iterate over the messages chunk by chunk, in order of log time, without chunks that end
-        before `start_ns`.
-
-        `progress` is called with the number of bytes read since the last call.
-        """
+        before `start_ns`."""
         pending = MessageBlock.of_messages([])
         parts = [p for p in self._parts if start_ns is None or p.end_ns >= start_ns]
         starts = [p.start_ns for p in parts[1:]]
@@ -230,12 +339,6 @@ class McapFile:
         self._count_loss(part.record.begin, f'damaged segments ({self._path.name}, '
                          f'{duration_s:.1f} s long, {start_s:.1f} s after the start'
                          f'{_reason(error)})')
-
-    def _count_loss(self, offset: int, description: str, n: int = 1) -> None:
-        """Count the unreadable part at byte `offset`, unless it has already been counted."""
-        if offset not in self._lost_offsets:
-            self._lost_offsets.add(offset)
-            self._losses[description] += n
 
 
 def _is_valid(index: Sequence[ChunkIndex], size: int) -> bool:

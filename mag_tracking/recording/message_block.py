@@ -1,32 +1,54 @@
-"""Blocks of messages: their bytes, and arrays of their channels, log times and byte positions."""
+"""Messages of a recording in blocks, and reading that can be stopped."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from pathlib import Path
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from mcap.records import Schema
 
 from mag_tracking.arrays import IntArray
 from mag_tracking.messages.encodings import CDR, cdr_of, type_of
-from mag_tracking.messages.types import ROS_SCHEMA, schema_of
+from mag_tracking.messages.types import ROS_SCHEMA, RawMessage, schema_of
 from mag_tracking.recording.expansion import expanded_message
-from mag_tracking.recording.raw_message import RawMessage
+
+Progress: TypeAlias = Callable[[int], object]
+"""Function that is called with the number of bytes read since the last call."""
+_Item = TypeVar('_Item')
+
+
+class ReadingStopped(Exception):
+    """Raised when the caller stops the reading."""
+
+
+def until_stopped(read: Callable[[Progress], Iterator[_Item]], progress: Progress | None = None,
+                  stopped: Callable[[], bool] | None = None) -> Iterator[_Item]:
+    """Iterate over the items of `read`, until `stopped` returns true after an item or a report of
+    its `Progress` argument; ReadingStopped is raised then."""
+    def advance(n: int) -> None:
+        if progress is not None:
+            progress(n)
+        check()
+
+    def check() -> None:
+        if stopped is not None and stopped():
+            raise ReadingStopped
+
+    for item in read(advance):
+        yield item
+        check()
 
 
 class ChannelKind(NamedTuple):
     """Topic and type of the messages of a channel."""
 
     topic: str
-    """Name of the topic."""
     type: str
-    """Message type. A magnetic field in a supported encoding has the type
-    sensor_msgs/msg/MagneticField. The type of other messages that are not CDR ends with their
-    encoding, such as 'std_msgs/msg/String (json)'."""
+    """Message type, as from `type_of`."""
     schema: Schema
-    """Schema in the file."""
     encoding: str = CDR
-    """Encoding of the messages. Encodings other than CDR must be converted."""
 
     @property
     def is_cdr(self) -> bool:
@@ -39,18 +61,42 @@ class ChannelKind(NamedTuple):
         return cls(topic, type_of(encoding, schema), schema, encoding)
 
 
+class RecordingFile:
+    """One file of a recording.
+
+    Attributes
+    ----------
+    types : message type by topic
+    message_counts : number of messages by topic; empty if unknown
+    start_ns, end_ns : log times of the first and last message; None without messages
+    losses : number of unreadable parts by description, updated in place
+    """
+
+    def __init__(self, path: Path, losses: Counter[str]) -> None:
+        self._path, self._losses = path, losses
+        self._lost_offsets: set[int] = set()
+        self.types: dict[str, str] = {}
+        self.message_counts: Counter[str] = Counter()
+        self.start_ns: int | None = None
+        self.end_ns: int | None = None
+
+    def _count_loss(self, offset: int, description: str, n: int = 1) -> None:
+        """Count the unreadable part at byte `offset`, unless it has already been counted."""
+        if offset not in self._lost_offsets:
+            self._lost_offsets.add(offset)
+            self._losses[description] += n
+
+
 @dataclass(frozen=True)
 class MessageBlock:
     """Block of messages in order of log time."""
 
     data: bytes
-    """Bytes of all messages."""
     kinds: Mapping[int, ChannelKind]
     """Topic and type by channel number."""
     channel: IntArray
     """Channel number of each message, (n,)."""
     log_time_ns: IntArray
-    """Log time of each message, (n,) ns."""
     begin: IntArray
     """Index in `data` of the first byte of each message, (n,)."""
     end: IntArray

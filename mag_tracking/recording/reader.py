@@ -11,13 +11,12 @@ from pathlib import Path
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path
+from mag_tracking.messages.types import RawMessage
 from mag_tracking.recording.bag_file import ROS1_MAGIC, SQLITE_MAGIC, BagFile
 from mag_tracking.recording.file_kind import HEAD_SIZE, describe_file
-from mag_tracking.recording.interruptible import Progress
+from mag_tracking.recording.mcap_file import MAGIC as MCAP_MAGIC
 from mag_tracking.recording.mcap_file import McapFile
-from mag_tracking.recording.mcap_records import MAGIC as MCAP_MAGIC
-from mag_tracking.recording.message_block import MessageBlock
-from mag_tracking.recording.raw_message import RawMessage
+from mag_tracking.recording.message_block import MessageBlock, Progress
 from mag_tracking.yaml_file import read_yaml
 
 SUFFIXES = ('.mcap', '.db3', '.bag')
@@ -124,10 +123,8 @@ def _files(path: Path) -> list[Path]:
 
 
 def _listed_file(file: Path) -> Path:
-    """Return a file of a folder, or the file that resulted from decompressing it.
-
-    Raises RecordingError if the file does not exist or is compressed.
-    """
+    """Return a file of a folder, or the file that resulted from decompressing it; raises
+    RecordingError if neither exists."""
     program = _COMPRESSED_SUFFIXES.get(file.suffix)
     if program is not None and file.with_suffix('').exists():
         return file.with_suffix('')

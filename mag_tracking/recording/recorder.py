@@ -18,25 +18,23 @@ from typing import TypeAlias
 
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path
-from mag_tracking.recording.mcap_file_writer import McapFileWriter
 from mag_tracking.recording.repair import finish_file
-from mag_tracking.recording.rosbag2_folder import (
+from mag_tracking.recording.writer import (
     FileSummary,
+    McapFileWriter,
     Opener,
     Topic,
     check_no_recording,
-    open_new,
+    offered_qos,
+    open_locked,
     write_metadata,
 )
-from mag_tracking.recording.writer import offered_qos
 
 FLUSH_INTERVAL_NS = 400_000_000
 """Interval between flushes [ns]. A crash loses the messages of at most one flush interval plus one
 tick interval."""
 MIN_FREE_BYTES = 4 << 20
 """Minimum free disk space for a new file after a failure [bytes]."""
-
-
 _Message: TypeAlias = tuple[int, bytes, int, int]
 """Sequence number, CDR, log time [ns] and publish time [ns]."""
 
@@ -64,7 +62,7 @@ class Recorder:
 
     def __init__(self, folder: str | PathLike[str], split_bytes: int = 10**9,
                  split_ns: int = 3600 * 10**9, retry_ns: int = 2 * 10**9,
-                 report: Callable[[str], object] = print, opener: Opener = open_new) -> None:
+                 report: Callable[[str], object] = print, opener: Opener = open_locked) -> None:
         self.folder = checked_path(folder, OutputError)
         self._split_bytes, self._split_ns, self._retry_ns = split_bytes, split_ns, retry_ns
         self._report, self._opener = report, opener
@@ -100,11 +98,11 @@ class Recorder:
 
     def add_topic(self, name: str, type_name: str, definition: str = '', qos: str | None = None,
                   latched: int = 0) -> None:
-        """Register a topic before its first message, or change its number of latched messages.
+        """Register a topic before its first message, or change its number of latched messages,
+        which are repeated at the start of each later file.
 
         Without `definition` (`ros2msg` schema), only ROS can read the messages. `qos` is a result
-        of `offered_qos`. The latest `latched` messages are repeated at the start of each later
-        file.
+        of `offered_qos`.
         """
         # All files use the same profile, because readers use it to match channels across files.
         self._topics.setdefault(name, Topic(type_name, definition, qos or offered_qos()))
@@ -112,10 +110,8 @@ class Recorder:
             self._latched[name] = deque(self._latched.get(name, ()), latched)
 
     def write(self, name: str, data: bytes, log_ns: int, publish_ns: int | None = None) -> None:
-        """Record a CDR message of a registered topic, or count it as dropped.
-
-        `log_ns` is the time of receipt, also the default of `publish_ns`.
-        """
+        """Record a CDR message of a registered topic, received at `log_ns`, or count it as
+        dropped."""
         message = (self._sequence[name], data, log_ns, publish_ns or log_ns)
         self._sequence[name] += 1
         if self._file and self._file.counts and self._file.size >= self._split_bytes:
@@ -130,10 +126,8 @@ class Recorder:
             self._latched[name].append(message)
 
     def tick(self, now_ns: int) -> None:
-        """Flush or split the file, and retry writing the metadata, when due.
-
-        To be called several times per second with a monotonic clock.
-        """
+        """Flush or split the file, and retry writing the metadata, when due; to be called several
+        times per second with a monotonic clock."""
         self._now_ns = now_ns
         self._opened_ns = now_ns if self._opened_ns is None else self._opened_ns
         if self._file and now_ns - self._flushed_ns >= FLUSH_INTERVAL_NS:
@@ -158,8 +152,8 @@ class Recorder:
             self._report(f'the recording {self.folder} could not be completed: free disk space, '
                          f'then run mag-tracking repair {self.folder}')
 
-    def _attempt(self, file: McapFileWriter, action: Callable[..., None],
-                 *arguments: object) -> bool:
+    def _attempt(self, file: McapFileWriter, action: Callable[..., None], *arguments: object
+                 ) -> bool:
         """Call `action` on the open file; abandon the file on failure. Return True on success."""
         try:
             action(*arguments)
@@ -169,15 +163,13 @@ class Recorder:
         return True
 
     def _finish(self, file: McapFileWriter) -> None:
-        """Complete and close the open file."""
-        if self._attempt(file, file.finish):
+        if self._attempt(file, file.flush) and self._attempt(file, file.finish):
             self._report_recovery()
             self._add_finished(file)
             self._file = None
             self._write_metadata()
 
     def _add_finished(self, file: McapFileWriter) -> None:
-        """Add the summary and the size of a closed file to those of the recording."""
         self._summaries.append(file.summary())
         self._finished_bytes += file.size
 

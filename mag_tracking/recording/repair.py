@@ -14,48 +14,39 @@ from typing import BinaryIO
 
 import numpy as np
 import zstandard
-from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import (
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Schema,
-    Statistics,
-)
+from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Schema, Statistics
 
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import checked_path, new_binary_file
 from mag_tracking.recording import core
 from mag_tracking.recording.bag_file import ROS1_MAGIC, SQLITE_MAGIC
-from mag_tracking.recording.decode_errors import DECODE_ERRORS
-from mag_tracking.recording.expansion import largest_chunk
+from mag_tracking.recording.expansion import DECODE_ERRORS, largest_chunk
 from mag_tracking.recording.file_kind import HEAD_SIZE, describe_file
-from mag_tracking.recording.mcap_file import McapFile
-from mag_tracking.recording.mcap_records import (
+from mag_tracking.recording.mcap_file import (
+    CONTENT,
     MAGIC,
     MIN_BYTES_PER_MESSAGE,
     RECORD_HEADER,
+    McapFile,
     Record,
     chunk_content,
     chunk_header,
+    definitions_of,
     file_size,
     read_summary,
     records,
 )
-from mag_tracking.recording.rosbag2_folder import (
+from mag_tracking.recording.writer import (
+    MESSAGE_HEADER,
     FileSummary,
     Topic,
     UnbufferedWriter,
     write_metadata,
 )
-
-MESSAGE_PREFIX = 31
-"""Number of bytes of a message record before its data."""
 
 
 class _Scan:
@@ -98,7 +89,7 @@ class _Scan:
             self._is_damaged = True
             self._add_chunk(record)
             self._is_damaged = False
-        elif record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+        elif record.opcode in CONTENT:
             self._stream.seek(record.begin)
             self._add_content(self._stream.read(record.end - record.begin))
         elif record.opcode == Opcode.MESSAGE_INDEX and self.chunks and not self._is_damaged:
@@ -112,23 +103,18 @@ class _Scan:
         complete records."""
         rows, definitions, end = core.records_of(
             data, 2**63 - 1, self._limit // MIN_BYTES_PER_MESSAGE)
-        for opcode, first, last in definitions:
-            content = ReadDataStream(io.BytesIO(data[first:last]))
-            if opcode == Opcode.SCHEMA:
-                schema = Schema.read(content)
-                self.schemas[schema.id] = schema
+        for definition in definitions_of(data, definitions):
+            if isinstance(definition, Schema):
+                self.schemas[definition.id] = definition
             else:
-                channel = Channel.read(content)
-                self.channels[channel.id] = channel
-        numbers, counts = np.unique(rows[:, 0], return_counts=True)
-        self.counts.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
+                self.channels[definition.id] = definition
+        self.counts.update(sorted(rows[:, 0].tolist()))
         if len(rows):
             times = (*self.times, int(rows[:, 1].min()), int(rows[:, 1].max()))
             self.times = [min(times), max(times)]
         return rows, end
 
     def _add_chunk(self, record: Record) -> None:
-        """Add a chunk and its records."""
         header = chunk_header(self._stream, record)
         data = chunk_content(self._stream, record, self._limit)
         self._rows, _ = self._add_content(data)
@@ -155,7 +141,6 @@ class _Scan:
                                       last_ns, 0, {}, first_ns, len(data)))
 
     def _lacks_index(self) -> bool:
-        """Whether the message index of any channel in the last chunk is missing."""
         return bool(self.chunks) and (
             set(self.chunks[-1].message_index_offsets) != set(self._rows[:, 0].tolist()))
 
@@ -175,7 +160,7 @@ class _Scan:
         for channel in dict.fromkeys(self._rows[:, 0].tolist()):
             chunk.message_index_offsets[channel] = end + len(indexes)
             rows = self._rows[self._rows[:, 0] == channel]
-            entries = np.stack((rows[:, 1], rows[:, 2] - MESSAGE_PREFIX), axis=1).astype('<u8')
+            entries = np.stack((rows[:, 1], rows[:, 2] - MESSAGE_HEADER), axis=1).astype('<u8')
             indexes += RECORD_HEADER.pack(Opcode.MESSAGE_INDEX, 6 + entries.nbytes) + struct.pack(
                 '<HI', channel, entries.nbytes) + entries.tobytes()
         chunk.message_index_length = len(indexes)
@@ -250,11 +235,7 @@ def _replace_end(raw: io.FileIO, end: int, index: bytes) -> None:
 
 def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -> int:
     """Repair a truncated MCAP file or folder, including `metadata.yaml`; return the number of
-    files.
-
-    Raises RecordingError if no message can be recovered (none is complete, or the files have an
-    index and damaged chunks), OutputError if the recording is still being recorded.
-    """
+    files; raises RecordingError if nothing can be recovered, OutputError while it is recorded."""
     path = checked_path(path, RecordingError)
     files = [path] if path.is_file() else sorted(path.glob('*.mcap'), key=_number)
     if not files:
@@ -268,7 +249,7 @@ def repair(path: str | PathLike[str], report: Callable[[str], object] = print) -
         raise RecordingError(f'{path} cannot be repaired: all .mcap files are empty')
     for file in empty_files:
         report(f'{file} is empty and was skipped')
-    for file in [file for file in files if file not in empty_files]:
+    for file in (file for file in files if file not in empty_files):
         try:
             lines = finish_file(file)
             if not lines:

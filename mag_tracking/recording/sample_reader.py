@@ -1,36 +1,54 @@
 """Extraction of readings, accelerations and true poses from a recording."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from mag_tracking.analysis.track_errors import Truth
 from mag_tracking.arrays import IntArray
 from mag_tracking.errors import RecordingError
+from mag_tracking.messages.encodings import UNDECODABLE
 from mag_tracking.messages.message_arrays import magnetic_fields
-from mag_tracking.messages.schema import acceleration_of, reading_of, readings_of
-from mag_tracking.messages.shapes import MagneticField
+from mag_tracking.messages.schema import (
+    MagneticField,
+    acceleration_of,
+    reading_of,
+    readings_of,
+    stamp_ns,
+)
 from mag_tracking.messages.types import (
     FIELD_READINGS,
     IMU,
     MAGNETIC_FIELD,
     RAW_READINGS,
+    RawMessage,
     decode,
 )
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute, namespaces_of
-from mag_tracking.recording.interruptible import Progress
-from mag_tracking.recording.message_block import MessageBlock
-from mag_tracking.recording.raw_message import RawMessage
+from mag_tracking.recording.message_block import MessageBlock, Progress
 from mag_tracking.recording.reader import Recording
-from mag_tracking.recording.sensor_topics import FrameCheck, examine_topics, fault_of
 from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
 from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.stages.health.input_findings import ZERO_STAMP
+from mag_tracking.units import NS
 
+N_FIRST_MESSAGES = 200
+"""Number of messages by which the topics of a recording are checked before it is read."""
+MAX_FIRST_BLOCKS = 50
+"""Number of blocks after which the check ends in any case."""
+MIN_DATE_S = 1e8
+"""Least timestamp that is a date, and not the time since the start of a simulation or a computer
+[s since 1970]."""
+N_FRAME_CHANGES = 3
+"""Number of changes of frame_id after which a topic has several sensors. A driver that was
+restarted with another frame changes it once or twice."""
 TRUTH_PREFIX = 'ground_truth/'
 """Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,
 never for tracking."""
@@ -38,9 +56,91 @@ BATCH_SIZE = 256
 """Maximum number of messages per batch of readings. The overhead of a batch equals the cost of a
 few readings. The caller can stop only between batches."""
 MAX_UNKNOWN_SENSORS = 20
-"""Number of sensors outside the network whose readings are counted by sensor."""
 MAX_TOPICS = 10
-"""Number of topics that an error lists."""
+
+
+class TopicFindings(NamedTuple):
+    """Properties of the topics of sensors."""
+
+    unstamped: frozenset[str]
+    """Topics whose first two messages have the timestamp 0. One such message may be the first of
+    a simulation."""
+    dated: frozenset[str]
+    """Topics with timestamps since 1970, on which the timestamp 0 is missing. The timestamps of a
+    simulation begin at 0."""
+    frames: dict[str, set[str]]
+
+    def shared(self, names: Collection[str]) -> frozenset[str]:
+        """Topics with the readings of several of the sensors `names`, named by their frame_id."""
+        return frozenset(topic for topic, frames in self.frames.items()
+                         if len(frames) > 1 and frames <= set(names))
+
+
+def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindings:
+    """Examine the first messages of the sensors' topics; raises RecordingError if none is
+    readable."""
+    n_zero: Counter[str] = Counter()
+    n_read: Counter[str] = Counter()
+    faults: Counter[str] = Counter()
+    latest_ns: Counter[str] = Counter()
+    frames: dict[str, set[str]] = {}
+    for message in islice(_first_messages(recording, topics), N_FIRST_MESSAGES):
+        try:
+            header = decode(message).header
+        except (RecordingError, AttributeError):
+            faults[fault_of(message)] += 1
+            continue
+        n_zero[message.topic] += stamp_ns(header.stamp) == 0 and n_read[message.topic] < 2
+        n_read[message.topic] += 1
+        latest_ns[message.topic] = max(latest_ns[message.topic], stamp_ns(header.stamp))
+        frames.setdefault(message.topic, set()).add(header.frame_id)
+    if faults and not n_read:
+        (cause, _), = faults.most_common(1)
+        raise RecordingError(f'{recording.path}: no message of the sensors can be read: {cause}')
+    return TopicFindings(
+        frozenset(topic for topic, n in n_zero.items() if n == 2),
+        frozenset(topic for topic, ns in latest_ns.items() if ns > MIN_DATE_S * NS), frames)
+
+
+def _first_messages(recording: Recording, topics: Collection[str]) -> Iterator[RawMessage]:
+    """Iterate over the messages on some topics in the first blocks of a recording."""
+    for block in islice(recording.blocks(), MAX_FIRST_BLOCKS):
+        yield from (message for message in block if message.topic in topics)
+
+
+def fault_of(message: RawMessage) -> str:
+    """Cause for which a message cannot be read."""
+    return f'{message.fault or UNDECODABLE} on {message.topic}'
+
+
+class FrameCheck:
+    """Check that each topic has the readings of one sensor."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._frames: dict[str, list[str]] = {}
+        self._numbers: dict[str, int] = {}
+
+    def number(self, topic: str) -> int:
+        """Number of the latest frame of a topic, as in `FieldArrays.frame`; -1 if it has none
+        yet."""
+        return self._numbers.get(topic, -1)
+
+    def check(self, topic: str, frame: str, number: int = -1) -> None:
+        """Check the frame of a reading, and store its number; raises RecordingError if the topic
+        alternates between frames."""
+        self._numbers[topic] = number
+        frames = self._frames.setdefault(topic, [frame])
+        if frame == frames[-1]:
+            return
+        is_new = frame not in frames
+        frames.append(frame)
+        if not is_new and len(frames) > N_FRAME_CHANGES:
+            names = ', '.join(sorted(set(frames)))
+            raise RecordingError(
+                f'{self._path}: {topic} carries several sensors, with the frame_ids {names}: '
+                'name the sensors of the network file as the frame_ids, or record each sensor on a '
+                'topic of its own')
 
 
 class SampleReader:
@@ -81,10 +181,11 @@ class SampleReader:
         self.clocks: dict[str, ClockSpan] = {}
         self._is_batched = recording.types.get(self._batch_topic) == FIELD_READINGS
         self._frames = FrameCheck(recording.path)
-        self._unstamped, self._dated, self._shared = self._examine_topics(network)
+        self._found = self._examine_topics(network)
+        self._shared = self._found.shared(network.names)
 
-    def _examine_topics(self, network: SensorNetwork) -> tuple[frozenset[str], ...]:
-        """Find topics without timestamps, with dates, and of several sensors; check the types."""
+    def _examine_topics(self, network: SensorNetwork) -> TopicFindings:
+        """Check the types and the first messages of the topics."""
         types = self._recording.types
         topics = [topic for topic in self._sensors if topic in types]
         for topic in topics:
@@ -92,15 +193,14 @@ class SampleReader:
                 raise RecordingError(f'{self._recording.path}: {topic} carries {types[topic]}, not '
                                      f'{MAGNETIC_FIELD} in tesla: convert the messages')
         if self._is_batched:
-            return frozenset(), frozenset(), frozenset()
+            return TopicFindings(frozenset(), frozenset(), {})
         found = examine_topics(self._recording, topics or [
             topic for topic, kind in types.items() if kind == MAGNETIC_FIELD])
-        shared = found.shared(network.names)
-        if types and not topics and not shared:
+        if types and not topics and not found.shared(network.names):
             raise RecordingError(
                 f'{self._recording.path} has none of the network\'s topics '
                 f'({", ".join(self._sensors)}); {_candidates(types, found.frames)}')
-        return found.unstamped, found.dated, shared
+        return found
 
     def missing_topics(self) -> list[str]:
         """Topics of the network that are not in the recording; none if one topic carries several
@@ -145,7 +245,7 @@ class SampleReader:
                                       np.append(rows, self._truth.add_block(block)))
         parts, n_added = [], 0
         for k in other_messages:
-            for record, _ in self._records_of([block.message(k)], {}):
+            for record, _ in self._records([block.message(k)], {}):
                 if isinstance(record, Readings):
                     n = int(np.searchsorted(rows, k))
                     parts += [batch.part(slice(n_added, n)), record]
@@ -164,25 +264,20 @@ class SampleReader:
     def readings_as_received(self, progress: Progress | None = None
                              ) -> Iterator[tuple[Readings, int]]:
         """Iterate over (readings, log time [ns]) of each message, in order of log time."""
-        for record, log_time_ns in self._records({}, progress):
+        for record, log_time_ns in self._records(self._recording.messages(progress=progress), {}):
             if isinstance(record, Readings):
                 yield record, log_time_ns
 
     def readings_and_accelerations(self, progress: Progress | None = None
                                    ) -> Iterator[Readings | AccelerationSample]:
         """Iterate over readings and accelerations message by message, in order of log time."""
-        return (record for record, _ in self._records(self._imus, progress))
+        messages = self._recording.messages(progress=progress)
+        return (record for record, _ in self._records(messages, self._imus))
 
-    def _records(self, imus: Mapping[str, Sequence[str]], progress: Progress | None
+    def _records(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
                  ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
-        """Iterate over (batch of readings or acceleration, log time [ns]); `imus` maps topics of
-        accelerations to sensors."""
-        return self._records_of(self._recording.messages(progress=progress), imus)
-
-    def _records_of(self, messages: Iterable[RawMessage], imus: Mapping[str, Sequence[str]]
-                    ) -> Iterator[tuple[Readings | AccelerationSample, int]]:
         """Decode messages to (record, log time [ns]), collect the true poses, and count the
-        messages that cannot be decoded."""
+        messages that cannot be decoded; `imus` maps topics of accelerations to sensors."""
         for message in messages:
             sensor = self._sensors.get(message.topic)
             is_truth = self._truth.accepts(message.topic, message.type)
@@ -222,10 +317,10 @@ class SampleReader:
         reading = self._network_readings(reading_of(content, sensor))
         if not reading.stamp_ns.all():
             cause = f'{ZERO_STAMP} on {message.topic}'
-            if message.topic in self._unstamped:
+            if message.topic in self._found.unstamped:
                 self.rejected[f'{cause}, read with its log time'] += 1
                 reading = replace(reading, stamp_ns=np.array([message.log_time_ns]))
-            elif message.topic in self._dated:
+            elif message.topic in self._found.dated:
                 self.rejected[cause] += 1
                 return
         if len(reading):
@@ -275,10 +370,8 @@ def _candidates(types: Mapping[str, str], frames: Mapping[str, set[str]]) -> str
 
 
 def _namespace(recording: Recording, network: SensorNetwork) -> str:
-    """Namespace of the network's relative topics: configured, found in the recording, or '/'.
-
-    Raises RecordingError if the recording contains them in several namespaces.
-    """
+    """Namespace of the network's relative topics: configured, found in the recording, or '/';
+    raises RecordingError if the recording has several."""
     if network.namespace is not None:
         return network.namespace
     names = [name for name, kind in recording.types.items()

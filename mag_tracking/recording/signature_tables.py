@@ -7,9 +7,12 @@ per signature (`label`, and the samples in order). A table of intervals has `lab
 
 import json
 import re
-from dataclasses import asdict, dataclass, fields
-from os import PathLike
-from typing import Any
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, fields
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -18,59 +21,56 @@ from mag_tracking.analysis.signature_classifier import VERSION, SignatureModel
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import LabelsError, RecordingError
 from mag_tracking.files import checked_path, replace_text
-from mag_tracking.recording.csv_file import Lines, number, read_csv
+from mag_tracking.recording.table_text import CsvTable, FilePath, number, read_csv
 from mag_tracking.units import NS
 
 LABEL, TIME, PASS = 'label', 'time_s', 'pass'
 MIN_EPOCH_S = 1e8
 """Larger times [s] are measured from 1970, smaller times from the first reading."""
-
 MAX_TIME_S = 1e11
-"""Maximum valid time [s]."""
-
 UNITS = {'t': 1.0, 'ut': 1e-6, 'nt': 1e-9}
 """Tesla per unit, by suffix of the column."""
 
 _VERSION_ENTRY = 'mag_tracking.classes'
+_Entry: TypeAlias = tuple[str, Callable[[Any], bool], Callable[[Any], Any]]
+_NUMBER: _Entry = ('a number', lambda v: isinstance(v, (int, float)) and not isinstance(v, bool),
+                   float)
+_TEXT: _Entry = ('a string', lambda v: isinstance(v, str), str)
+_NAMES: _Entry = ('a list of names', lambda v: isinstance(v, list) and all(
+    isinstance(name, str) for name in v), tuple)
+_ENTRIES: dict[str, _Entry] = {
+    'temperature': _NUMBER, 'limit': _NUMBER, 'method': _TEXT, 'unit': _TEXT, 'classes': _NAMES,
+    'axes': _NAMES, 'examples': ('a mapping from classes to numbers', lambda v: isinstance(
+        v, dict) and all(isinstance(n, int) for n in v.values()), dict)}
+"""What is expected of an entry of a model file that is no array, test and conversion."""
 _AXIS_COLUMN = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?')
 _SAMPLE_COLUMN = re.compile(r'b?(?P<axis>[xyz])(_(?P<unit>t|ut|nt))?_?(?P<number>\d+)')
 
 
-@dataclass(frozen=True)
-class LabelledInterval:
+class LabelledInterval(NamedTuple):
     """An interval of a recording in which one target passed."""
 
     begin_ns: int
-    """Beginning of the interval, ns since 1970."""
     end_ns: int
-    """End of the interval, ns since 1970."""
     label: str
-    """Name of the class."""
     sensor: str
     """Name of the sensor. Empty for all sensors."""
     row: int
-    """Line number in the table, for error messages."""
 
 
-def read_signatures(path: str | PathLike[str], is_labelled: bool = True) -> list[Signature]:
-    """Read the signatures of a table.
-
-    Raises LabelsError if required labels are missing, a signature has several, or columns are
-    invalid.
-    """
-    header, lines = read_csv(path)
-    if LABEL not in header and is_labelled:
+def read_signatures(path: FilePath, is_labelled: bool = True) -> list[Signature]:
+    """Read the signatures of a table; raises LabelsError if it is inconsistent."""
+    table = read_csv(path)
+    if LABEL not in table.header and is_labelled:
         raise LabelsError(f'{path}: column {LABEL!r} is missing; the columns are '
-                          f'{", ".join(header)}')
-    return _read_by_sample(path, header, lines) if TIME in header \
-        else _read_by_row(path, header, lines)
+                          f'{", ".join(table.header)}')
+    return _read_by_sample(table) if TIME in table.header else _read_by_row(table)
 
 
-def _read_by_sample(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
-    """Read a table with one row per sample.
-
-    The columns that contain neither field, label, time nor pass identify the signature of a row.
-    """
+def _read_by_sample(table: CsvTable) -> list[Signature]:
+    """Read a table with one row per sample; the columns without field, label, time or pass identify
+    the signature."""
+    path, header = table.path, table.header
     axes = {name: match for name in header if (match := _AXIS_COLUMN.fullmatch(name.lower()))}
     names = [name for name in header if name not in (*axes, LABEL, TIME, PASS)]
     if not axes:
@@ -80,8 +80,7 @@ def _read_by_sample(path: str | PathLike[str], header: list[str], lines: Lines) 
                           'such as \'signature\'')
     fields = _Fields(path, [(m['axis'], m['unit'] or '', [name]) for name, m in axes.items()])
     found: dict[tuple[str, ...], list[tuple[int, dict[str, str]]]] = {}
-    for line, row in lines:
-        cells = dict(zip(header, row, strict=True))
+    for line, cells in table.by_name():
         found.setdefault(tuple(cells[n] for n in names), []).append((line, cells))
     out = []
     for key, rows in found.items():
@@ -105,12 +104,12 @@ def _unique_value(source: str, column: str, rows: list[tuple[int, dict[str, str]
     return values[0]
 
 
-def _read_by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> list[Signature]:
+def _read_by_row(table: CsvTable) -> list[Signature]:
     """Read a table with one row per signature and its samples in columns x0, x1, ..., y0, ..."""
+    path = table.path
     axes: dict[tuple[str, str], list[tuple[int, str]]] = {}
-    for name in header:
-        match = _SAMPLE_COLUMN.fullmatch(name.lower())
-        if match:
+    for name in table.header:
+        if match := _SAMPLE_COLUMN.fullmatch(name.lower()):
             axes.setdefault((match['axis'], match['unit'] or ''), []).append(
                 (int(match['number']), name))
     for found in axes.values():
@@ -124,8 +123,7 @@ def _read_by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> 
     fields = _Fields(path, [(axis, unit, [name for _, name in sorted(found)])
                             for (axis, unit), found in axes.items()])
     out = []
-    for line, row in lines:
-        cells = dict(zip(header, row, strict=True))
+    for line, cells in table.by_name():
         field = fields.parse_row(line, cells)
         out.append(fields.signature(np.arange(len(field), dtype=float), field,
                                     cells.get(LABEL, '').strip(), f'{path}: row {line}',
@@ -134,18 +132,14 @@ def _read_by_row(path: str | PathLike[str], header: list[str], lines: Lines) -> 
 
 
 class _Fields:
-    """Field columns of a table by axis, from `columns`: [(axis, unit, names)].
+    """Field columns of a table by axis, from `columns`: [(axis, unit, names)]; raises LabelsError
+    if they are inconsistent."""
 
-    Raises LabelsError if an axis is duplicated, or only some columns have a unit.
-    """
-
-    def __init__(self, path: str | PathLike[str], columns: list[tuple[str, str, list[str]]]
-                 ) -> None:
+    def __init__(self, path: FilePath, columns: list[tuple[str, str, list[str]]]) -> None:
         columns = sorted(columns)
-        axes = [axis for axis, _, _ in columns]
-        duplicates = sorted({axis for axis in axes if axes.count(axis) > 1})
-        if duplicates:
-            raise LabelsError(f'{path}: several columns contain the axis {duplicates[0]}')
+        for (axis, _, _), (following, _, _) in pairwise(columns):
+            if axis == following:
+                raise LabelsError(f'{path}: several columns contain the axis {axis}')
         units = [unit for _, unit, _ in columns if unit]
         if units and len(units) < len(columns):
             raise LabelsError(f'{path}: only some fields have a unit (_t, _ut or _nt)')
@@ -168,21 +162,17 @@ class _Fields:
         return Signature(t[inner], field[inner], label, source, axes, self._unit, group or source)
 
 
-def read_intervals(path: str | PathLike[str], first_ns: int) -> list[LabelledInterval]:
-    """Read the labelled intervals of a recording whose first reading is at `first_ns`.
-
-    Raises LabelsError if a column or label is missing, an interval does not end after it begins, or
-    two intervals of a sensor overlap.
-    """
-    header, lines = read_csv(path)
-    unit = 'ns' if 'begin_ns' in header else 's'
-    missing = [n for n in (LABEL, f'begin_{unit}', f'end_{unit}') if n not in header]
+def read_intervals(path: FilePath, first_ns: int) -> list[LabelledInterval]:
+    """Read the labelled intervals of a recording whose first reading is at `first_ns`; raises
+    LabelsError if they are inconsistent."""
+    table = read_csv(path)
+    unit = 'ns' if 'begin_ns' in table.header else 's'
+    missing = [n for n in (LABEL, f'begin_{unit}', f'end_{unit}') if n not in table.header]
     if missing:
         raise LabelsError(f'{path}: missing columns: {", ".join(missing)}; the columns are '
-                          f'{", ".join(header)}')
+                          f'{", ".join(table.header)}')
     out = []
-    for line, row in lines:
-        cells = dict(zip(header, row, strict=True))
+    for line, cells in table.by_name():
         begin, end = (_stamp(path, line, f'{name}_{unit}', cells, first_ns)
                       for name in ('begin', 'end'))
         if end <= begin:
@@ -195,8 +185,7 @@ def read_intervals(path: str | PathLike[str], first_ns: int) -> list[LabelledInt
     return out
 
 
-def _stamp(path: str | PathLike[str], line: int, column: str, cells: dict[str, str],
-           first_ns: int) -> int:
+def _stamp(path: FilePath, line: int, column: str, cells: dict[str, str], first_ns: int) -> int:
     """Convert a cell to ns since 1970; small times [s] are relative to `first_ns`."""
     value = number(path, line, column, cells[column], True)
     if abs(value) > (MAX_TIME_S * NS if column.endswith('_ns') else MAX_TIME_S):
@@ -207,8 +196,7 @@ def _stamp(path: str | PathLike[str], line: int, column: str, cells: dict[str, s
     return round(value * NS) + (0 if value > MIN_EPOCH_S else first_ns)
 
 
-def _check_overlaps(path: str | PathLike[str], intervals: list[LabelledInterval]) -> None:
-    """Raise LabelsError if two intervals of a sensor overlap."""
+def _check_overlaps(path: FilePath, intervals: list[LabelledInterval]) -> None:
     ordered = sorted(intervals, key=lambda i: i.begin_ns)
     for k, first in enumerate(ordered):
         for second in ordered[k + 1:]:
@@ -219,14 +207,14 @@ def _check_overlaps(path: str | PathLike[str], intervals: list[LabelledInterval]
                                   'overlap: a signature must contain only one target')
 
 
-def write_model(path: str | PathLike[str], model: SignatureModel) -> None:
+def write_model(path: FilePath, model: SignatureModel) -> None:
     """Write a trained model as JSON."""
     content = {name: value.tolist() if isinstance(value, np.ndarray) else value
                for name, value in asdict(model).items()}
     replace_text(path, json.dumps({_VERSION_ENTRY: VERSION, **content}, indent=1) + '\n')
 
 
-def read_model(path: str | PathLike[str]) -> SignatureModel:
+def read_model(path: FilePath) -> SignatureModel:
     """Read a model written by `write_model`; raises RecordingError for another version."""
     path = checked_path(path, RecordingError)
     try:
@@ -264,31 +252,12 @@ def _parse_model(content: Any) -> SignatureModel:
 
 def _parse_entry(name: str, value: Any) -> Any:
     """Convert an entry of a model file to the type of its field; raise ValueError if invalid."""
-    if name in ('temperature', 'limit'):
-        expected = 'a number'
-        is_valid = isinstance(value, (int, float)) and not isinstance(value, bool)
-        try:
-            value = float(value) if is_valid else value
-        except OverflowError:
-            is_valid = False
-    elif name in ('method', 'unit'):
-        expected, is_valid = 'a string', isinstance(value, str)
-    elif name == 'examples':
-        expected = 'a mapping from classes to numbers'
-        is_valid = isinstance(value, dict) and all(isinstance(n, int) for n in value.values())
-    elif name in ('classes', 'axes'):
-        expected = 'a list of names'
-        is_valid = isinstance(value, list) and all(isinstance(v, str) for v in value)
-        value = tuple(value) if is_valid else value
-    else:
-        expected, is_valid = 'a list of numbers', isinstance(value, list)
-        try:
-            value = np.array(value, dtype=float)
-        except (ValueError, TypeError, OverflowError):
-            is_valid = False
-    if not is_valid:
-        raise ValueError(f'{name}: expected {expected}')
-    return value
+    expected, is_valid, convert = _ENTRIES.get(name, (
+        'a list of numbers', lambda v: isinstance(v, list), partial(np.array, dtype=float)))
+    with suppress(ValueError, TypeError, OverflowError):
+        if is_valid(value):
+            return convert(value)
+    raise ValueError(f'{name}: expected {expected}')
 
 
 def _check_model(model: SignatureModel) -> None:

@@ -3,8 +3,7 @@
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from mag_tracking.errors import RecordingError
 from mag_tracking.recording.table_layout import Table
@@ -37,8 +36,7 @@ _AXIS = re.compile(r'(?P<rest>.*?)(?P<prefix>magnetometer|magnetic|mag|field|com
 _UNIT_AT_END = re.compile(r'(.*\S)\s*[(\[](.*)[)\]]\s*|(.*[^\s_,/])\s*[\s_,/]+(\S+)').fullmatch
 
 
-@dataclass(frozen=True)
-class Axis:
+class Axis(NamedTuple):
     """Column of one axis of one sensor."""
 
     sensor: str
@@ -49,8 +47,7 @@ class Axis:
     """Tesla per unit."""
 
 
-@dataclass(frozen=True)
-class Columns:
+class Columns(NamedTuple):
     """Columns of a table of readings."""
 
     time: tuple[int, ...]
@@ -64,13 +61,11 @@ class Columns:
 
 
 def parse_columns(texts: Sequence[str]) -> _Assigned:
-    """Parse assignments to (columns of the time, column of the sensor name, {sensor: {axis:
-    column}}).
+    """Parse assignments; raises RecordingError if one is invalid, duplicated or missing.
 
     `time=COLUMN`, or `time=DATE+TIME` for two columns, and either `x=COLUMN` and so on (one row per
     reading; the sensor is ''), with `sensor=COLUMN` if there are several sensors, or
     `NAME.x=COLUMN` and so on (one row for all sensors). Axes that were not measured are omitted.
-    Raises RecordingError if an assignment is invalid, duplicated or missing.
     """
     found: dict[str, str] = {}
     for text in texts:
@@ -95,7 +90,7 @@ def parse_columns(texts: Sequence[str]) -> _Assigned:
 
 
 def sensor_name(text: str, where: str, names: Mapping[str, str] | None = None) -> str:
-    """Convert a text at `where` to the name of a sensor, by `names` or as `mag_3` for 3; raises
+    """Name of a sensor from a text at `where`, by `names` or as `mag_3` for 3; raises
     RecordingError."""
     text = text.strip()
     if names and text in names:
@@ -111,14 +106,15 @@ def sensor_name(text: str, where: str, names: Mapping[str, str] | None = None) -
 def find_columns(table: Table, assigned: Sequence[str], unit: str, sensor: str) -> Columns:
     """Find the columns of a table by assignments (`parse_columns`), or else by their names.
 
-    Assignments are names or numbers from 1. An empty `unit` is that of the header; `sensor` names
-    the only sensor if the columns name none. Raises RecordingError if a column is missing or
-    ambiguous, or the unit is unknown.
+    An empty `unit` is that of the header; `sensor` names the only sensor if the columns name none.
+    Raises RecordingError if a column is missing or ambiguous, or the unit is unknown.
     """
     time, sensor_column, axes = parse_columns(assigned) if assigned else _by_header(table)
     notes = [] if assigned else [_assignment_note(time, sensor_column, axes)]
-    times = _time_columns(table, time)
-    scales = {} if not unit else {'': field_scale(unit, '--unit')}
+    # A name may itself contain a plus sign.
+    parts = [time] if not time or time in (table.header or ()) else time.split('+')
+    times = tuple(_index(table, name) for name in parts if time)
+    stated_scale = field_scale(unit, '--unit') if unit else 0.0
     found, units = [], set()
     for name, columns in axes.items():
         if not name and sensor_column is None:
@@ -132,9 +128,8 @@ def find_columns(table: Table, assigned: Sequence[str], unit: str, sensor: str) 
                 raise RecordingError(
                     f'{table.path}: --unit is missing: column {column} states no unit of the '
                     f'field; give {", ".join(FIELD_UNITS)}, or counts per unit such as 1090/G')
-            scale = scales[''] if unit else FIELD_UNITS[stated]
-            found.append(Axis(name, 'xyz'.index(axis), j, scale))
-    if unit and any(u and abs(FIELD_UNITS[u] / scales[''] - 1.0) > 1e-9 for u in units):
+            found.append(Axis(name, 'xyz'.index(axis), j, stated_scale or FIELD_UNITS[stated]))
+    if unit and any(u and abs(FIELD_UNITS[u] / stated_scale - 1.0) > 1e-9 for u in units):
         notes.append(f'warning: --unit {unit} differs from {" ".join(sorted(units - {""}))} in '
                      'the header')
     elif not unit:
@@ -142,15 +137,6 @@ def find_columns(table: Table, assigned: Sequence[str], unit: str, sensor: str) 
     names_column = None if sensor_column is None else _index(table, sensor_column)
     return Columns(times, names_column, tuple(found), time,
                    _time_unit_of(table, times[0]) if len(times) == 1 else '', tuple(notes))
-
-
-def _time_columns(table: Table, time: str) -> tuple[int, ...]:
-    """Indices of the columns of the time; a name may itself contain a plus sign."""
-    if not time:
-        return ()
-    if '+' in time and table.header and time in table.header:
-        return (_index(table, time),)
-    return tuple(_index(table, name) for name in time.split('+'))
 
 
 def _index(table: Table, column: str) -> int:
@@ -192,8 +178,7 @@ def split_unit(name: str) -> tuple[str, str]:
 def _unit_of(table: Table, j: int) -> str:
     """Unit of the field of a column in the header or the line of units; '' if none is stated."""
     texts = [split_unit(table.header[j])[1]] if table.header else []
-    texts += table.units[j:j + 1]
-    return next((unit for text in texts if (unit := field_unit(text))), '')
+    return next(filter(None, map(field_unit, [*texts, *table.units[j:j + 1]])), '')
 
 
 def _time_unit_of(table: Table, j: int) -> str:
@@ -201,8 +186,7 @@ def _time_unit_of(table: Table, j: int) -> str:
     texts = [split_unit(table.header[j])[1], table.header[j]] if table.header else []
     if table.header and table.header[j].strip() in ('s', 't', 'h', 'd', 'min'):
         texts.pop()
-    texts += table.units[j:j + 1]
-    return next((unit for text in texts if (unit := time_unit(text))), '')
+    return next(filter(None, map(time_unit, [*texts, *table.units[j:j + 1]])), '')
 
 
 def _by_header(table: Table) -> _Assigned:
@@ -216,8 +200,7 @@ def _by_header(table: Table) -> _Assigned:
     sensors: list[str] = []
     axes: dict[str, dict[str, str]] = {}
     of_unknown_unit = ''
-    names = [name for k, name in enumerate(table.header) if name]
-    for name in names:
+    for name in filter(None, table.header):
         base, unit = split_unit(name)
         words = _words(base)
         if set(words) & _OTHER_WORDS:

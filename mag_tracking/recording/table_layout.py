@@ -10,6 +10,7 @@ from mag_tracking.quantities import quantity
 from mag_tracking.recording.table_text import (
     COMMENTS,
     SEPARATORS,
+    Lines,
     find_separator,
     is_missing,
     is_value,
@@ -19,7 +20,6 @@ from mag_tracking.recording.table_text import (
 from mag_tracking.units import field_unit, time_unit
 
 SAMPLE_LINES = 400
-"""Number of lines from which the layout is found."""
 MAX_BAD_FRACTION = 0.1
 """Maximum fraction of rows that may be unusable."""
 _SEPARATOR_NAMES = {name: separator for separator, name in SEPARATORS.items()}
@@ -31,13 +31,11 @@ class Table:
 
     path: Path
     header: list[str] | None
-    """Names of the columns; None without a header line."""
     units: list[str]
     """Cells of the line of units; empty without one."""
     header_line: int
     """Number of the header line; 0 without one."""
-    rows: list[tuple[int, list[str]]]
-    """Line number and cells of each row."""
+    rows: Lines
     separator: str
     notes: list[str]
     """What was found out: encoding, separator, header."""
@@ -49,19 +47,18 @@ class Table:
     def check_bad_rows(self, n_good: int) -> None:
         """Raise the first fault as RecordingError if more than `MAX_BAD_FRACTION` of the rows, or
         all, are unusable."""
-        if self.bad and len(self.bad) > MAX_BAD_FRACTION * (n_good + len(self.bad)):
+        n, n_bad = n_good + len(self.bad), len(self.bad)
+        if n_bad > MAX_BAD_FRACTION * n:
             line, fault = min(self.bad)
-            others = f' ({len(self.bad)} of {n_good + len(self.bad)} rows are unusable)' \
-                if len(self.bad) > 1 else ''
+            others = f' ({n_bad} of {n} rows are unusable)' if n_bad > 1 else ''
             raise RecordingError(f'{self.path}: row {line}: {fault}{others}')
 
 
 def read_table(path: Path, separator: str = '', header: int | None = None,
                encoding: str = '') -> Table:
-    """Read a table of text; what is not given is found.
+    """Read a table of text; what is not given is found, or RecordingError names the option.
 
-    `separator` may be a name in `SEPARATORS`; `header` is a line number, 0 for none. Raises
-    RecordingError that names the property and the option that states it.
+    `separator` may be a name in `SEPARATORS`; `header` is a line number, 0 for none.
     """
     lines, found_encoding = read_text(path, encoding)
     numbers = [k for k, line in enumerate(lines) if line.strip()]
@@ -212,7 +209,7 @@ def _read_rows(table: Table, lines: list[str], numbers: list[int], n: int) -> No
             table.bad.append((k + 1, f'{quantity(len(cells), "cell")}, expected {n}'))
 
 
-def _is_cut(cell: str, rows: Sequence[tuple[int, list[str]]]) -> bool:
+def _is_cut(cell: str, rows: Lines) -> bool:
     """Whether the last cell of a file has fewer decimals than all other cells of its column."""
     others = [cells[-1] for _, cells in rows if is_missing(cells[-1]) == is_missing(cell)]
     return bool(rows) and _n_decimals(cell) < min(map(_n_decimals, others), default=1)

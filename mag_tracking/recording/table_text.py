@@ -1,21 +1,28 @@
-"""Text of tables: encoding, separator and decimal mark."""
+"""Text of tables: encoding, separator, decimal mark, and the cells of CSV files."""
 
 import codecs
 import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 from os import PathLike
+from typing import NamedTuple, TypeAlias
 
+import numpy as np
+
+from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.files import checked_path
 from mag_tracking.recording.file_kind import binary_kind
 
+FilePath: TypeAlias = str | PathLike[str]
+Lines: TypeAlias = list[tuple[int, list[str]]]
+"""Line number and cells of each line that is not empty."""
 SEPARATORS = {'\t': 'tab', ';': 'semicolon', '|': 'bar', ',': 'comma', ' ': 'spaces'}
 """Names of the separators that are recognised. White space of any length is one separator."""
 COMMENTS = ('#', '%', '//')
-"""Beginnings of comment lines."""
 _MARKS = ((codecs.BOM_UTF8, 'utf-8-sig'), (codecs.BOM_UTF32_LE, 'utf-32'),
           (codecs.BOM_UTF32_BE, 'utf-32'), (codecs.BOM_UTF16_LE, 'utf-16'),
           (codecs.BOM_UTF16_BE, 'utf-16'))
@@ -36,12 +43,9 @@ _POINT_DECIMALS = re.compile(
     r'[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?[0-9]{1,3}(?:,[0-9]{3}){2,}').fullmatch
 
 
-def read_text(path: str | PathLike[str], encoding: str = '') -> tuple[list[str], str]:
-    """Lines (without ends and NUL characters) and encoding of a text file.
-
-    The encoding is found: a byte order mark, UTF-16 by its zero bytes, UTF-8, or else Windows-1252.
-    Raises RecordingError if the file is not text.
-    """
+def read_text(path: FilePath, encoding: str = '') -> tuple[list[str], str]:
+    """Lines (without ends and NUL characters) and encoding of a text file; raises RecordingError
+    if the file is not text."""
     path = checked_path(path, RecordingError)
     try:
         data, kind = path.read_bytes(), binary_kind(path)
@@ -65,7 +69,7 @@ def read_text(path: str | PathLike[str], encoding: str = '') -> tuple[list[str],
 
 
 def _encoding_of(data: bytes) -> str:
-    """Find the encoding of a text."""
+    """Encoding by a byte order mark, UTF-16 by its zero bytes, UTF-8, or else Windows-1252."""
     for mark, name in _MARKS:
         if data.startswith(mark):
             return name
@@ -76,11 +80,9 @@ def _encoding_of(data: bytes) -> str:
                 and begin[1 - first::2].count(0) < 0.1 * len(begin):
             return name
     for name in ('utf-8', 'cp1252'):
-        try:
+        with suppress(UnicodeDecodeError):
             data.decode(name)
-        except UnicodeDecodeError:
-            continue
-        return name
+            return name
     return 'latin-1'
 
 
@@ -135,8 +137,7 @@ def find_decimal(cells: Iterable[str], separator: str) -> str:
     """Decimal mark of numbers, '.' or ','; empty if they fit both or contradict each other."""
     marked = {cell for cell in cells if (',' in cell or '.' in cell) and _NUMBER(cell)
               and not _DATE(cell)}
-    with_comma = any(',' in cell for cell in marked)
-    if not with_comma:
+    if not any(',' in cell for cell in marked):
         return '.'
     comma = any(map(_COMMA_DECIMALS, marked))
     point = any(map(_POINT_DECIMALS, marked))
@@ -170,3 +171,70 @@ def plain_number(cell: str, decimal: str) -> str:
         cell = cell.replace(',', '')
     return cell if cell.isascii() and "'" not in cell and ' ' not in cell \
         else cell.translate(_GROUPING)
+
+
+class CsvTable(NamedTuple):
+    """Cells of a CSV file."""
+
+    path: FilePath
+    header: Sequence[str]
+    rows: Lines
+
+    def by_name(self) -> list[tuple[int, dict[str, str]]]:
+        """Line number, and cells by column, of each row."""
+        return [(line, dict(zip(self.header, row, strict=True))) for line, row in self.rows]
+
+    def numbers(self, names: Sequence[str], optional: Collection[str] = ()) -> FloatArray:
+        """Values (n, len(names)) of columns, NaN if empty in the columns `optional`; raises
+        RecordingError if a column is missing or a cell is not a number."""
+        for name in names:
+            if name not in self.header:
+                raise RecordingError(f'{self.path}: column {name} is missing')
+        indices = [self.header.index(name) for name in names]
+        return np.array([[number(self.path, line, name, row[j], name not in optional)
+                          for name, j in zip(names, indices, strict=True)]
+                         for line, row in self.rows])
+
+
+def read_csv(path: FilePath, header: Sequence[str] = ()) -> CsvTable:
+    """Read a CSV file; raises RecordingError if a row is too long or short.
+
+    If `header` names the columns, the file has no header, and # begins a comment line.
+    """
+    lines = _csv_lines(path)
+    if header:
+        lines = [(line, row) for line, row in lines if not row[0].startswith('#')]
+    elif lines:
+        header, lines = [name.strip() for name in lines[0][1]], lines[1:]
+    if not lines:
+        raise RecordingError(f'{path} has no rows')
+    for line, row in lines:
+        if len(row) != len(header):
+            raise RecordingError(f'{path}: row {line}: expected {len(header)} columns, '
+                                 f'got {len(row)}')
+    return CsvTable(path, header, lines)
+
+
+def _csv_lines(path: FilePath) -> Lines:
+    """Non-empty lines of a CSV file as (line number, cells); tabs, semicolons, bars and white space
+    also separate cells, and permit decimal commas, which become points."""
+    lines, _ = read_text(path)
+    first = next((line for line in lines if line.strip() and not line.startswith('#')), '')
+    separator = next((c for c in '\t;|,' if c in first), ' ' if len(first.split()) > 1 else ',')
+    rows = [(k + 1, split_line(line, separator)) for k, line in enumerate(lines) if line.strip()]
+    if separator == ',' or find_decimal((c for _, row in rows for c in row), separator) != ',':
+        return rows
+    return [(line, [plain_number(cell, ',') if is_number(cell) else cell for cell in row])
+            for line, row in rows]
+
+
+def number(path: FilePath, line: int, column: str, text: str, finite: bool) -> float:
+    """Convert a cell to a number, NaN if it is empty; raises RecordingError for NaN if `finite`,
+    and for infinity."""
+    try:
+        value = float(text) if text.strip() else np.nan
+    except ValueError:
+        raise RecordingError(f'{path}: row {line}: {column} is {text!r}, not a number') from None
+    if np.isinf(value) or (finite and np.isnan(value)):
+        raise RecordingError(f'{path}: row {line}: {column} is not a finite number')
+    return value

@@ -1,12 +1,15 @@
-"""Times of a table: exact conversion of numbers and dates to nanoseconds, with the unit found."""
+"""Times of a table: exact conversion to nanoseconds, the unit found, and their order."""
 
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from decimal import Context, Decimal, InvalidOperation
 from fractions import Fraction
+from typing import NamedTuple
 
 from mag_tracking.errors import RecordingError, SettingsError
+from mag_tracking.quantities import occurrences
 from mag_tracking.recording.table_text import is_missing, is_number, plain_number
 from mag_tracking.time_text import DATE_ORDERS, DAY_NS, FORMS, date_order, parse_time
 from mag_tracking.units import LATEST_NS, NS, TIME_UNITS, time_scale, time_unit, unit_since_1970
@@ -28,10 +31,20 @@ _COUNTER_LIMITS = (2**15, 2**16, 2**20, 2**24, 2**31, 2**32)
 _CLOCK_LIMITS_S = (60, 3600, 86400, 7 * 86400)
 _TIME_OF_DAY = re.compile('[0-2][0-9][0-5][0-9][0-5][0-9](?:[.][0-9]+)?').fullmatch
 """hhmmss and decimals, as in NMEA 0183."""
+JUMPS = ('split', 'sort')
+"""Meanings of a time that runs backwards: the clock restarted, or the rows are out of order."""
+MAX_GAP_NS = 5 * 365 * DAY_NS
+"""Maximum interval between two readings [ns]. A clock that is set after its start jumps farther."""
+MAX_STEPS = 5
+"""Maximum interval, in median intervals, that counts as uninterrupted."""
+MAX_EQUAL_FRACTION = 0.5
+"""Maximum fraction of times that equal the previous time of the sensor."""
+_REMEDY = ('. If the clock restarted or was set, give --jumps split (each part becomes a '
+           'recording); if the counter returns to 0 after N, --wrap N; if the rows are out of '
+           'order, --jumps sort')
 
 
-@dataclass
-class Times:
+class Times(NamedTuple):
     """Times of the rows of a table, exact integers."""
 
     values: list[int | None]
@@ -53,26 +66,28 @@ class Times:
         return [(v * numerator + half) // denominator - self.offset_ns for v in values]
 
 
-def step_of(values: Sequence[int | None], keys: Sequence[int]) -> int:
-    """Median interval between successive times of the same series (`keys`); 0 if no time
-    increases."""
+def _successive(values: Iterable[int | None], keys: Iterable[int]) -> Iterator[tuple[int, int]]:
+    """Iterate over the pairs of successive times of the same series (`keys`)."""
     last: dict[int, int] = {}
-    steps = []
     for value, key in zip(values, keys, strict=True):
         if value is not None:
-            if key in last and value != last[key]:
-                steps.append(abs(value - last[key]))
+            if key in last:
+                yield last[key], value
             last[key] = value
-    return sorted(steps)[len(steps) // 2] if steps else 0
+
+
+def _step_of(values: Sequence[int | None], keys: Sequence[int]) -> int:
+    """Median interval between successive times of a series; 0 if no time increases."""
+    steps = sorted(abs(b - a) for a, b in _successive(values, keys) if a != b)
+    return steps[len(steps) // 2] if steps else 0
 
 
 def read_times(where: str, texts: Sequence[str], keys: Sequence[int], decimal: str, unit: str,
                header_unit: str, order: str) -> Times:
-    """Convert the times of a table.
+    """Convert the times of a table, whose series (sensors) are `keys`.
 
-    `keys` are the series (sensors) of the times. An empty `unit` is that of the header, or else
-    found from the values; an empty `order` of day, month and year is found. Raises RecordingError,
-    with the option that states it, if form or unit is ambiguous.
+    An empty `unit` or `order` of a date is found; if it is ambiguous, RecordingError names the
+    option that states it.
     """
     if order and order not in DATE_ORDERS:
         raise SettingsError(f'--date-order: expected one of {", ".join(DATE_ORDERS)}, got '
@@ -89,7 +104,7 @@ def read_times(where: str, texts: Sequence[str], keys: Sequence[int], decimal: s
         return _read_dates(where, texts, order)
     values = [_exact(t, decimal) for t in texts]
     # Several readings may share a coarse time.
-    step = round(step_of(values, keys) * min(1.0, len(set(values)) * len(set(keys)) / len(values)))
+    step = round(_step_of(values, keys) * min(1.0, len(set(values)) * len(set(keys)) / len(values)))
     scale, offset, notes = _unit_of(where, values, step, unit, header_unit)
     limits = (*(n * _SUB for n in _COUNTER_LIMITS),
               *(round(s * NS / scale) for s in _CLOCK_LIMITS_S))
@@ -179,7 +194,6 @@ def _plausible(step: float, span: float) -> str:
 
 
 def _rates(step_s: float, span_s: float) -> str:
-    """Describe rate and span."""
     return f'{1.0 / step_s if step_s else 0.0:.4g} Hz over {span_text(span_s)}'
 
 
@@ -197,3 +211,115 @@ def check_range(where: str, line: int, stamp_ns: int) -> None:
     if not 0 <= stamp_ns <= LATEST_NS:
         raise RecordingError(f'{where}: row {line}: {stamp_ns / NS:.6g} s is not a valid time '
                              'since 1970; check --time-unit')
+
+
+@dataclass
+class OrderedTimes:
+    """Times that do not run backwards within a session."""
+
+    values: list[int]
+    session: list[int]
+    rows: list[int]
+    """Indices of the rows, in the order of `values`."""
+    notes: list[str] = field(default_factory=list)
+    outliers: list[int] = field(default_factory=list)
+    """Indices of rows whose time contradicts those before and after."""
+
+
+def order_times(where: str, times: Times, texts: Sequence[str], keys: Sequence[int],
+                lines: Sequence[int], wrap: int = 0, jumps: str = '') -> OrderedTimes:
+    """Unwrap times that run backwards, or divide them into sessions; sort them only on request.
+
+    Rows without a time are left out. `wrap` is the number at which the time returns to 0; by
+    default, usual numbers are recognised. Raises RecordingError if a time runs backwards for an
+    unknown reason or jumps ahead by years.
+    """
+    if jumps and jumps not in JUMPS:
+        raise SettingsError(f'--jumps: expected {" or ".join(JUMPS)}, got {jumps!r}')
+    raw = {k: value for k, value in enumerate(times.values) if value is not None}
+    tolerance = MAX_STEPS * _step_of(times.values, keys)
+    out = _usable_rows(raw, keys, -1 if jumps or wrap else tolerance)
+    last: dict[int, int] = {}
+    offset: Counter[int] = Counter()
+    session: Counter[int] = Counter()
+    wraps: Counter[int] = Counter()
+    for k in out.rows:
+        value, key = raw[k], keys[k]
+        change = value - raw[last[key]] if key in last else 0
+        limit = 0 if change >= 0 else wrap * times.unit or next(
+            (n for n in times.limits if 0 < change + n <= tolerance), 0)
+        if limit:
+            offset[key] += limit
+            wraps[limit] += 1
+        elif change < 0 or change * times.scale > MAX_GAP_NS:
+            if not jumps:
+                direction = 'runs backwards' if change < 0 else 'jumps ahead'
+                raise RecordingError(
+                    f'{where}: row {lines[k]}: the time {direction}, from {texts[last[key]]} in '
+                    f'row {lines[last[key]]} to {texts[k]}{_REMEDY}')
+            if jumps == 'split':
+                session[key] += 1
+                offset[key] = 0
+        last[key] = k
+        out.values.append(value + offset[key])
+        out.session.append(session[key])
+    if len({session[key] for key in last}) > 1:
+        raise RecordingError(f'{where}: the clocks of the sensors restart at different rows; '
+                             'import the rows of each sensor separately')
+    out.notes += [f'the time restarts after {n / times.unit:.12g} ({occurrences(count)}), unwrapped'
+                  for n, count in wraps.items()]
+    return out
+
+
+def _usable_rows(raw: dict[int, int], keys: Sequence[int], tolerance: int) -> OrderedTimes:
+    """Order the rows, and leave out those with outlying times unless `tolerance` is negative."""
+    rows = list(raw)
+    out = OrderedTimes([], [], rows)
+    if _is_reversed(raw, rows, keys):
+        rows.reverse()
+        out.notes.append('rows from the last to the first')
+    if tolerance >= 0:
+        out.outliers = _outliers(raw, rows, keys, tolerance)
+        dropped = set(out.outliers)
+        out.rows = [k for k in rows if k not in dropped]
+    return out
+
+
+def _is_reversed(raw: dict[int, int], rows: Sequence[int], keys: Sequence[int]) -> bool:
+    """Whether all times decrease, as in an export with the newest row first."""
+    n_earlier = 0
+    for before, value in _successive((raw[k] for k in rows), (keys[k] for k in rows)):
+        if value > before:
+            return False
+        n_earlier += value < before
+    return n_earlier > 1
+
+
+def _outliers(raw: dict[int, int], rows: Sequence[int], keys: Sequence[int], tolerance: int
+              ) -> list[int]:
+    """Rows whose single time jumps far away, while the next time continues the series."""
+    series: dict[int, list[int]] = {}
+    for k in rows:
+        series.setdefault(keys[k], []).append(k)
+    return [k for s in series.values() for before, k, after in zip(s, s[1:], s[2:], strict=False)
+            if 0 <= raw[after] - raw[before] <= tolerance and not
+            raw[before] - tolerance <= raw[k] <= raw[after] + tolerance]
+
+
+def check_resolution(where: str, texts: Sequence[str], values: Sequence[int], keys: Sequence[int]
+                     ) -> None:
+    """Raise RecordingError, with cause and remedy, if more than `MAX_EQUAL_FRACTION` of the times
+    equal the previous one of the series (`keys`)."""
+    is_equal = [a == b for a, b in _successive(values, keys)]
+    equal = sum(is_equal) / len(is_equal) if is_equal else 0.0
+    if equal <= MAX_EQUAL_FRACTION:
+        return
+    coarse = 'all times are equal' if len(set(values)) == 1 else \
+        'their resolution is too coarse, or rows are repeated'
+    cause = next((f'a spreadsheet rounded them to {text}; write the column with all digits '
+                  '(as a number, not in scientific notation)' for text in texts
+                  if 'e+' in text.lower()), f'{coarse}; write more digits of the time')
+    raise RecordingError(
+        f'{where}: {100.0 * equal:.0f} % of the times equal the previous time of the sensor, such '
+        f'as {texts[0]}: {cause}, or give the rate of the readings with --rate HZ, which spaces '
+        'them evenly')

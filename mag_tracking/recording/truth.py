@@ -1,7 +1,6 @@
 """True poses from topics of a recording or from a table, for reports and never for tracking."""
 
 from collections import Counter
-from os import PathLike
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -15,25 +14,23 @@ from mag_tracking.geometry import quaternion_between
 from mag_tracking.messages.message_arrays import poses
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.messages.types import ODOMETRY, POSE, POSE_WITH_COVARIANCE
-from mag_tracking.recording.csv_file import Lines, number, read_csv
 from mag_tracking.recording.message_block import MessageBlock
+from mag_tracking.recording.table_text import FilePath, number, read_csv
 from mag_tracking.units import LATEST_NS, NS
 
 TRUTH_TYPES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY)
-"""Types of messages that carry true poses."""
 _Rows: TypeAlias = tuple[IntArray, FloatArray]
 """Times (n,) [ns], and positions and quaternions (n, 7)."""
 _NS_PER_UNIT = {'stamp_ns': 1, 't': NS, 'time': NS}
 """Nanoseconds per unit, by column."""
-_POSITION, _QUATERNION, _MOMENT = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw'), ('mx', 'my', 'mz')
-"""Columns of a truth table."""
+_QUATERNION, _MOMENT = ('qx', 'qy', 'qz', 'qw'), ('mx', 'my', 'mz')
 
 
 class TruthTopics:
-    """Collects true poses from `topic`, or all topics below `prefix`, and counts rejections by
-    cause.
+    """Collects true poses from `topic`, or all topics below `prefix`.
 
-    Poses in other frames than the world frame of the network cannot be compared and are rejected.
+    Poses in other frames than the world frame of the network cannot be compared; they are counted
+    in `rejected`, by cause.
     """
 
     def __init__(self, prefix: str, frame: str, topic: str | None = None) -> None:
@@ -82,30 +79,28 @@ class TruthTopics:
         return out
 
 
-def read_truth_table(path: str | PathLike[str],
-                     axis: ArrayLike = (0.0, 0.0, 1.0)) -> dict[str, Truth]:
-    """Read true poses in the frame of the network from a CSV file, as one target named after the
-    file.
+def read_truth_table(path: FilePath, axis: ArrayLike = (0.0, 0.0, 1.0)) -> dict[str, Truth]:
+    """Read true poses in the frame of the network from a CSV file, as one target with its name.
 
     Columns: `stamp_ns` [ns], or `t` or `time` [s], since 1970; `x`, `y` [m]; optionally `z` [m],
     and `qx`, `qy`, `qz`, `qw` or, for a magnet, the direction `mx`, `my`, `mz` of its moment, which
     is `axis` (3,) in the frame of the magnet. Quaternions are NaN without orientations.
     """
-    header, rows = read_csv(path)
-    time = next((name for name in _NS_PER_UNIT if name in header), None)
+    table = read_csv(path)
+    time = next((name for name in _NS_PER_UNIT if name in table.header), None)
     if time is None:
         raise RecordingError(f'{path}: column stamp_ns, t or time is missing')
-    stamps = np.array([_stamp(path, line, time, row[header.index(time)]) for line, row in rows],
+    j = table.header.index(time)
+    stamps = np.array([_stamp(path, line, time, row[j]) for line, row in table.rows],
                       dtype=np.int64)
-
-    position = _columns(path, header, rows, _POSITION[:2 + ('z' in header)])
-    if any(name in header for name in _QUATERNION):
-        quaternion = _unit(_columns(path, header, rows, _QUATERNION))
-    elif any(name in header for name in _MOMENT):
+    position = table.numbers('xyz' if 'z' in table.header else 'xy')
+    if any(name in table.header for name in _QUATERNION):
+        quaternion = _unit(table.numbers(_QUATERNION))
+    elif any(name in table.header for name in _MOMENT):
         quaternion = np.array([quaternion_between(axis, m) if m.any() else np.full(4, np.nan)
-                               for m in _columns(path, header, rows, _MOMENT)])
+                               for m in table.numbers(_MOMENT)])
     else:
-        quaternion = np.full((len(rows), 4), np.nan)
+        quaternion = np.full((len(stamps), 4), np.nan)
     position = np.pad(position, ((0, 0), (0, 3 - position.shape[1])))
     order = np.argsort(stamps, kind='stable')
     return {Path(path).stem: (stamps[order], position[order], quaternion[order])}
@@ -118,24 +113,12 @@ def _unit(quaternion: FloatArray) -> FloatArray:
     return unit
 
 
-def _columns(path: str | PathLike[str], header: list[str], rows: Lines,
-             names: tuple[str, ...]) -> FloatArray:
-    """Values (n, len(names)) of columns that must exist and be finite."""
-    for name in names:
-        if name not in header:
-            raise RecordingError(f'{path}: column {name} is missing')
-    return np.array([[number(path, line, name, row[header.index(name)], True) for name in names]
-                     for line, row in rows])
-
-
-def _stamp(path: str | PathLike[str], line: int, column: str, text: str) -> int:
+def _stamp(path: FilePath, line: int, column: str, text: str) -> int:
     """Convert a cell to ns since 1970, without rounding for integers in `stamp_ns`."""
     try:
-        stamp = int(text) if column == 'stamp_ns' else None
+        time_ns: float = int(text if column == 'stamp_ns' else '')
     except ValueError:
-        stamp = None
-    time_ns = stamp if stamp is not None else \
-        number(path, line, column, text, True) * _NS_PER_UNIT[column]
+        time_ns = number(path, line, column, text, True) * _NS_PER_UNIT[column]
     if abs(time_ns) > LATEST_NS:
         raise RecordingError(f'{path}: row {line}: {column} is {text.strip()}, not a valid time')
     return round(time_ns)

@@ -20,14 +20,12 @@ class Column(NamedTuple):
     """Description of a column of a table."""
 
     name: str
-    """Name of the column."""
     kind: str
     """Type: 't' for UTC time, 'i' for integer, 'f' for float, 's' for string, 'b' for boolean, and
     'C' for a (6, 6) matrix in row-major order, which is NaN if it is unknown."""
     unit: str
     """Unit; empty for a dimensionless column."""
     meaning: str
-    """Description."""
     get: Callable[[Any], Any] | None = None
     """Function that returns the value of a record; None for the attribute `name`."""
 
@@ -120,7 +118,6 @@ DISTURBANCES = (
 
 RESULT_TABLES = {'poses.csv': POSES, 'poses_smoothed.csv': SMOOTHED, 'detections.csv': DETECTIONS,
                  'disturbances.csv': DISTURBANCES, 'hypotheses.csv': HYPOTHESES}
-"""Columns of the CSV files in a result folder."""
 
 EVENTS = (
     *columns_of('s', '', sensor='name of the sensor'),

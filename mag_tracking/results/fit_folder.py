@@ -19,10 +19,8 @@ _NAMES = names_of(FITS)
 
 
 def fit_row(fit: PassFit, is_reported: bool = True) -> dict[str, Any]:
-    """Values of a fit by column, without those that identify the pass; NaN if not trusted.
-
-    A fit that is neither trusted nor reported for its pass lacks its trusted quantities too.
-    """
+    """Values of a fit by column, without those that identify the pass; NaN if not trusted, also for
+    the trusted quantities of a fit that is neither trusted nor reported."""
     row: dict[str, Any] = dict.fromkeys(_NAMES[_NAMES.index('stamp_ns'):], math.nan)
     row |= {'ambiguous': '', 'trusted': '', 'n_dipoles': fit.n_dipoles, 'reason': fit.reason,
             'stamp_ns': fit.data.stamp_ns, 'n_values': fit.data.n_values,
@@ -60,7 +58,6 @@ def fit_row(fit: PassFit, is_reported: bool = True) -> dict[str, Any]:
 
 
 def _std(P: FloatArray) -> FloatArray:
-    """Standard deviations of a covariance."""
     std: FloatArray = np.sqrt(np.diagonal(P))
     return std
 
@@ -78,11 +75,8 @@ def pass_rows(fitted_pass: FittedPass) -> list[dict[str, Any]]:
 
 
 class FitFolder:
-    """Writes `fits.csv` and `fits.json` to a folder; a context manager.
-
-    Rows are written immediately. `fits.json`, with the entries of `summary`, is written on exit,
-    even after an error.
-    """
+    """Writes `fits.csv` continuously, and on exit, even after an error, `fits.json` with the
+    entries of `summary`; a context manager."""
 
     def __init__(self, folder: str | PathLike[str]) -> None:
         self.folder = output_folder(folder)

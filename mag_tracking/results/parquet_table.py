@@ -21,17 +21,12 @@ VERSION = 3
 comparable."""
 
 MAX_BUFFERED_ROWS = 5000
-"""Maximum number of rows that are buffered in memory."""
 
 _MAGIC = b'PAR1'
-"""First and last bytes of a file."""
 
 
 def check_row(row: Mapping[str, Any], columns: Iterable[Column]) -> None:
-    """Check a row of texts, integers and times from a file; raises ValueError.
-
-    Integers and times may be None.
-    """
+    """Check a row of texts, and of integers and times (or None), from a file; raises ValueError."""
     for column in columns:
         if column.name not in row:
             raise ValueError(f'{column.name} is missing')
@@ -74,8 +69,7 @@ def is_complete(path: Path) -> bool:
 class TableWriter:
     """Writer of a Parquet file, in batches of rows; a context manager.
 
-    Parent folders are created. An existing file is replaced only on success; after an error, none
-    is created.
+    An existing file is replaced only on success; after an error, none is created.
     """
 
     def __init__(self, path: Path, columns: Iterable[Column]) -> None:
@@ -112,7 +106,6 @@ class TableWriter:
             self._writer.write_table(table)
 
     def _flush(self) -> None:
-        """Write the buffered rows."""
         rows, self._rows = self._rows, []
         if rows:
             rows = [{name: _stored(value) for name, value in row.items()} for row in rows]

@@ -18,8 +18,7 @@ from mag_tracking.recording import core
 from mag_tracking.recording.writer import check_no_other_recording
 from mag_tracking.records import Detection, FieldFrame, Hypotheses, SmoothedPose, Track
 from mag_tracking.results.columns import RESULT_TABLES, names_of, row_of
-from mag_tracking.results.rerun_file import RERUN_FILE
-from mag_tracking.results.track_recording import TrackRecording
+from mag_tracking.results.track_files import RERUN_FILE, TrackRecording
 
 REPORT = 'report.html'
 """File name of the report in a result folder."""
@@ -96,17 +95,14 @@ class ResultFolder(RecordReceiver):
             self._recording.add_frame(frame)
 
     def add_track(self, track: Track) -> None:
-        """Write a track record to the recording, and rows for its pose and each hypothesis.
-
-        The last record of a track has no new pose and adds no rows.
-        """
+        """Write a track record to the recording, and, unless it is the last one without a new pose,
+        rows for its pose and each hypothesis."""
         self._recording.add_track(track)
         if not track.ended:
             self._write('poses.csv', track)
             self._add_hypotheses(track)
 
     def _add_hypotheses(self, track: Track) -> None:
-        """Write one row per hypothesis."""
         h = track.hypotheses
         if not isinstance(h, Hypotheses):
             assert not h, 'expected the hypotheses as arrays'
@@ -136,5 +132,4 @@ class ResultFolder(RecordReceiver):
 
 
 def _csv_cell(text: str) -> str:
-    """Quote a string for a CSV file, if necessary."""
     return f'"{text.replace(_QUOTE, 2 * _QUOTE)}"' if _SPECIAL & {*text} else text

@@ -20,8 +20,7 @@ from mag_tracking.apps.archive_work import Job, cut, join, track_segment
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import FieldFrame
-from mag_tracking.results.archive_folder import common_columns, join_tables
-from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.archive_folder import TABLES, common_columns, join_tables
 from mag_tracking.results.parquet_table import TableWriter
 from mag_tracking.stages.track.doubts import CLOCKS_APART
 from support.archives import command, rows, same_tables, wait_for

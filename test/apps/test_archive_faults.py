@@ -21,8 +21,12 @@ from mag_tracking.cli import main
 from mag_tracking.errors import ClusterError, OutputError, RecordingError
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
-from mag_tracking.results.archive_folder import ArchiveFolder, recording_key, recording_state
-from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.archive_folder import (
+    TABLES,
+    ArchiveFolder,
+    recording_key,
+    recording_state,
+)
 from mag_tracking.results.parquet_table import TableWriter
 from support.archives import command, rows, same_tables, wait_for
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path

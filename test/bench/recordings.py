@@ -24,7 +24,7 @@ from mag_tracking.analysis.track_errors import interpolate_truth
 from mag_tracking.apps.replay import replay
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.recording.importers import import_pose_table
+from mag_tracking.recording.pose_table import import_pose_table
 from mag_tracking.recording.reader import Recording
 from mag_tracking.records import Track
 from support.bundled import DATA, NETWORK_FILE, ROOT, VEHICLES, vehicle_path

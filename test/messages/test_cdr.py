@@ -8,9 +8,14 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.writer import Writer
 
-from mag_tracking.messages.definitions import DEFINITIONS
-from mag_tracking.messages.types import decode, definition, encoder, schema_of
-from mag_tracking.recording.raw_message import RawMessage
+from mag_tracking.messages.types import (
+    DEFINITIONS,
+    RawMessage,
+    decode,
+    definition,
+    encoder,
+    schema_of,
+)
 
 MARKER = 'visualization_msgs/msg/Marker'
 HEADER = 'std_msgs/msg/Header'

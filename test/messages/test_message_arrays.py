@@ -7,8 +7,7 @@ import pytest
 
 from mag_tracking.messages.message_arrays import magnetic_fields, poses
 from mag_tracking.messages.schema import header_dict, magnetic_field_dicts, reading_of
-from mag_tracking.messages.types import MAGNETIC_FIELD, POSE, decode, encoder, schema_of
-from mag_tracking.recording.raw_message import RawMessage
+from mag_tracking.messages.types import MAGNETIC_FIELD, POSE, RawMessage, decode, encoder, schema_of
 from mag_tracking.records import Readings
 
 

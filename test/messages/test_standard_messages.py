@@ -6,18 +6,16 @@ import numpy as np
 import pytest
 
 from mag_tracking.geometry import rotation_from_quaternion
-from mag_tracking.messages.markers import (
+from mag_tracking.messages.schema import pose_message_dict
+from mag_tracking.messages.standard import (
     LIFETIME_S,
     SENSOR_NAMESPACES,
     TRACK_NAMESPACES,
     delete_markers,
-    sensor_markers,
-    track_markers,
-)
-from mag_tracking.messages.schema import pose_message_dict
-from mag_tracking.messages.standard import (
     detections_3d_dict,
+    sensor_markers,
     sensor_transform_dicts,
+    track_markers,
     track_transform_dict,
 )
 from support.networks import line_network

@@ -19,8 +19,8 @@ from websockets.sync.client import connect
 
 from mag_tracking.cli import main
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.markers import sensor_markers
 from mag_tracking.messages.schema import track_dict
+from mag_tracking.messages.standard import sensor_markers
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.convert import to_message, track_of
 from mag_tracking.nodes.runner import TrackPrinter

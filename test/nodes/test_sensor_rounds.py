@@ -6,7 +6,7 @@ from unittest.mock import Mock
 import pytest
 
 from mag_tracking.calibration.doubtful_times import DOUBTFUL_BACKGROUND, merged
-from mag_tracking.messages.calibration_state import doubtful_times
+from mag_tracking.messages.network import doubtful_times
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.sensor_rounds import SensorRounds
 from mag_tracking.pipeline import settings_for

@@ -13,9 +13,13 @@ from rosbags.typesys import Stores, get_typestore
 
 from mag_tracking.errors import SettingsError
 from mag_tracking.messages.types import MAGNETIC_FIELD, definition
-from mag_tracking.recording.decode_errors import DECODE_ERRORS
-from mag_tracking.recording.expansion import LARGEST_CHUNK_VARIABLE, expanded, expanded_message
-from mag_tracking.recording.mcap_records import MAGIC
+from mag_tracking.recording.expansion import (
+    DECODE_ERRORS,
+    LARGEST_CHUNK_VARIABLE,
+    expanded,
+    expanded_message,
+)
+from mag_tracking.recording.mcap_file import MAGIC
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.repair import repair
 

@@ -3,7 +3,7 @@
 import pytest
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.recording.importers import import_pose_table
+from mag_tracking.recording.pose_table import import_pose_table
 from mag_tracking.recording.reader import Recording
 
 HEADER = ('id,timestamp,Bx,By,Bz,sensor_x,sensor_y,sensor_z,sensor_ox,sensor_oy,sensor_oz,'

@@ -24,7 +24,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 
 from mag_tracking.messages.types import MAGNETIC_FIELD, definition, encoder
-from mag_tracking.recording.mcap_records import MAGIC
+from mag_tracking.recording.mcap_file import MAGIC
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.writer import RecordingWriter
 from support.bundled import ROOT

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 import mag_tracking as mt
 from mag_tracking.cli import main
 from mag_tracking.errors import RecordingError
-from mag_tracking.messages.self_described import field_decoder
+from mag_tracking.messages.encodings import field_decoder
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.recording.reader import Recording
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path

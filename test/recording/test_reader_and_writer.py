@@ -12,9 +12,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mag_tracking.errors import OutputError, RecordingError
-from mag_tracking.messages.definitions import DEFINITIONS
 from mag_tracking.messages.schema import header_dict, reading_of, track_dict
-from mag_tracking.messages.types import MAGNETIC_FIELD, TRACK_ARRAY, decode
+from mag_tracking.messages.types import DEFINITIONS, MAGNETIC_FIELD, TRACK_ARRAY, decode
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import MAX_TOPICS, RecordingWriter

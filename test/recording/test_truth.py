@@ -15,17 +15,17 @@ from mag_tracking.messages.types import (
     MAGNETIC_FIELD,
     POSE,
     POSE_WITH_COVARIANCE,
+    RawMessage,
     encoder,
     schema_of,
 )
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.message_block import MessageBlock
-from mag_tracking.recording.raw_message import RawMessage
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.truth import TruthTopics, read_truth_table
 from mag_tracking.recording.writer import RecordingWriter
-from mag_tracking.results.tum_file import write_tum
+from mag_tracking.results.track_files import write_tum
 from support.bundled import QUICK, vehicle_path
 from support.counters import assert_counts
 from support.networks import line_network

@@ -6,8 +6,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from mag_tracking.results.archive_folder import common_columns
-from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.archive_folder import TABLES, common_columns
 from mag_tracking.results.parquet_table import TableWriter
 
 STAMPS_NS = [1_789_000_000_123_456_789, 1_789_000_000_123_456_999, 1_789_003_600_000_000_001]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mag_tracking.cli import main
-from mag_tracking.results.rerun_file import RERUN_FILE, write_rerun
+from mag_tracking.results.track_files import RERUN_FILE, write_rerun
 from support.bundled import NETWORK_FILE, vehicle_path
 
 NAME = 'straight_small_left'

@@ -5,7 +5,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from mag_tracking.messages.markers import SENSOR_NAMESPACES, TRACK_NAMESPACES
+from mag_tracking.messages.standard import SENSOR_NAMESPACES, TRACK_NAMESPACES
 
 TOPICS = {'/mag_1/imu/mag_calibrated', '/mag_2/imu/mag_calibrated', '/tf', '/tf_static',
           *(f'/tracker_node/{name}' for name in (

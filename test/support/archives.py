@@ -6,7 +6,7 @@ import time
 
 import duckdb
 
-from mag_tracking.results.archive_tables import TABLES
+from mag_tracking.results.archive_folder import TABLES
 from support.bundled import NETWORK_FILE, QUICK, parameter_file, vehicle_path
 
 NAMES = ('straight_car_right', 'straight_small_left', 'junction_left_to_right')

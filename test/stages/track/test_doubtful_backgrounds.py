@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mag_tracking.calibration.doubtful_times import DOUBTFUL_BACKGROUND
-from mag_tracking.messages.calibration_state import doubtful_times, sensor_dict
+from mag_tracking.messages.network import doubtful_times, sensor_dict
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Readings, SmoothedPose, Track

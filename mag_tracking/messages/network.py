@@ -1,4 +1,4 @@
-"""Conversion of the calibration of a network to and from its message."""
+"""Frames and calibrations of a network as messages, and from messages."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -7,25 +7,73 @@ from typing import Protocol
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
-from mag_tracking.messages.schema import stamp_dict, stamp_ns, xyz
-from mag_tracking.messages.shapes import CalibrationState, MessageDict
+from mag_tracking.inference.axes import MIN_PIVOT, smallest_pivots
+from mag_tracking.messages.schema import (
+    CalibrationState,
+    NetworkFrame,
+    float64_array,
+    header_dict,
+    quaternion_dict,
+    stamp_dict,
+    stamp_ns,
+    xyz,
+)
+from mag_tracking.messages.types import MessageDict
 from mag_tracking.network import SensorNetwork
+from mag_tracking.records import FieldFrame
+
+MAX_OFFSET_S = 60.0
+"""[s] Maximum time offset of a sensor within a frame; equals the maximum of `align.period_s`."""
 
 
-class _Background(Protocol):
-    """Interface of `RunningBackground`."""
+class NamedSensors(Protocol):
+    """Sensors with names, such as a `SensorNetwork`."""
 
     @property
-    def ready(self) -> bool: ...
-    @property
-    def frozen(self) -> bool: ...
-    @property
-    def n_relearnt(self) -> int: ...
-    @property
-    def covariance(self) -> FloatArray | None: ...
+    def names(self) -> tuple[str, ...]:
+        """Sensor names."""
+
+
+def frame_dict(frame: FieldFrame, network: SensorNetwork) -> MessageDict:
+    """Convert a `FieldFrame` to mag_tracking_msgs/NetworkFrame."""
+    return {'header': header_dict(frame.stamp_ns, network.frame), 'sensors': list(network.names),
+            'field': float64_array(frame.field), 'covariance': float64_array(frame.covariance),
+            'n_samples': frame.n_samples.tolist(), 'time_offset': float64_array(frame.time_offset),
+            'target_present': frame.target_present,
+            'statistic': frame.statistic, 'degrees_of_freedom': frame.degrees_of_freedom}
+
+
+def frame_of(message: NetworkFrame, network: NamedSensors) -> FieldFrame:
+    """Convert a NetworkFrame, with the network's sensors in the same order, to a `FieldFrame`;
+    raises RecordingError if it does not match the network or a value is invalid."""
+    n = len(network.names)
+    if tuple(message.sensors) != network.names:
+        raise RecordingError(f'NetworkFrame has sensors {", ".join(message.sensors)}; the network '
+                             f'has {", ".join(network.names)}')
+    lengths = {name: len(getattr(message, name)) for name in (
+        'field', 'covariance', 'n_samples', 'time_offset')}
+    required = dict(zip(lengths, (3 * n, 9 * n, n, n), strict=True))
+    if lengths != required:
+        raise RecordingError(f'NetworkFrame of {n} sensors: expected array lengths {required}; '
+                             f'got {lengths}')
+    frame = FieldFrame(
+        stamp_ns(message.header.stamp), np.array(message.field).reshape(n, 3),
+        np.array(message.covariance).reshape(n, 3, 3), np.array(message.n_samples, dtype=int),
+        np.array(message.time_offset, dtype=float), bool(message.target_present),
+        float(message.statistic), int(message.degrees_of_freedom))
+    if np.isinf(frame.field).any():
+        raise RecordingError('NetworkFrame: a field is infinite; expected finite values, or NaN '
+                             'for a missing axis')
+    if not (np.abs(frame.time_offset) <= MAX_OFFSET_S).all():
+        raise RecordingError(f'NetworkFrame: time offsets are {frame.time_offset.tolist()} s; '
+                             f'the maximum is {MAX_OFFSET_S:g} s')
+    if not (smallest_pivots(frame.field, frame.covariance) > MIN_PIVOT).all():
+        raise RecordingError('NetworkFrame: a covariance is not positive definite')
+    return frame
 
 
 class _Calibration(Protocol):
@@ -33,16 +81,14 @@ class _Calibration(Protocol):
 
     def background(self, sensor: str) -> FloatArray: ...
     def latest_doubt(self, sensor: str) -> tuple[int, int | None] | None: ...
-    def backgrounds(self) -> Mapping[str, _Background]: ...
+    def backgrounds(self) -> Mapping[str, RunningBackground]: ...
     def counts_of(self, sensor: str) -> Mapping[str, int]: ...
     def last_stamp_ns(self, sensor: str) -> int | None: ...
 
 
 def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> MessageDict:
-    """Convert the calibration of sensor `j` to mag_tracking_msgs/SensorCalibration.
-
-    Unknown values are NaN.
-    """
+    """Convert the calibration of sensor `j` to mag_tracking_msgs/SensorCalibration; unknown values
+    are NaN."""
     name = network.names[j]
     background, counts = calibrate.backgrounds()[name], calibrate.counts_of(name)
     ready = background.ready and calibrate.last_stamp_ns(name) is not None
@@ -57,7 +103,7 @@ def sensor_dict(calibrate: _Calibration, network: SensorNetwork, j: int) -> Mess
             'covariance': (np.full((3, 3), np.nan) if C is None else C).ravel().tolist(),
             'n_samples': counts['accepted'], 'n_rejected': counts['rejected'],
             'n_relearnt': background.n_relearnt,
-            'orientation': {**xyz(q), 'w': float(q[3])},
+            'orientation': quaternion_dict(q),
             'orientation_std': (np.full(3, np.nan) if std is None else std).tolist(),
             'clock_offset': float(network.clock_offset[j]),
             'clock_offset_std': float('nan') if record is None else record.clock_offset_std,
@@ -75,11 +121,8 @@ def doubtful_times(message: CalibrationState) -> dict[str, DoubtfulTimes]:
 
 
 def with_orientations(network: SensorNetwork, message: CalibrationState) -> SensorNetwork:
-    """Copy a network, with the sensor orientations of a CalibrationState.
-
-    Raises RecordingError if the sensors or the frame differ from the network's, or an orientation
-    or its std is invalid.
-    """
+    """Copy a network, with the sensor orientations of a CalibrationState; raises RecordingError if
+    sensors or frame differ from the network's, or an orientation or its std is invalid."""
     names = tuple(s.sensor for s in message.sensors)
     if names != network.names:
         raise RecordingError(f'CalibrationState has sensors {", ".join(names)}; the network has '

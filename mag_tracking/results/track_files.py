@@ -1,13 +1,23 @@
-"""Recording `tracks.mcap` of the messages that the nodes would publish, for ROS viewers.
+"""Tracks in the formats of other programs: TUM RGB-D (evo), the Rerun viewer and ROS.
 
-It contains fields, tracks, poses, odometry, paths, smoothed tracks, markers, transforms and
-disturbances.
+The recording `tracks.mcap` contains the messages that the nodes would publish: fields, tracks,
+poses, odometry, paths, smoothed tracks, markers, transforms and disturbances.
 """
 
+import sys
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from os import PathLike
+from typing import Any
 
+import numpy as np
+from scipy.special import chdtri
+
+from mag_tracking.analysis.track_log import SmoothedLog, TrackLog
+from mag_tracking.arrays import FloatArray
+from mag_tracking.errors import MissingDependencyError, OutputError
 from mag_tracking.event_records import Disturbance
-from mag_tracking.messages.markers import delete_markers, sensor_markers, track_markers
+from mag_tracking.files import new_binary_file, replace_text
 from mag_tracking.messages.schema import (
     disturbance_dict,
     header_dict,
@@ -18,8 +28,14 @@ from mag_tracking.messages.schema import (
     smoothed_track_dict,
     track_dict,
 )
-from mag_tracking.messages.shapes import MessageDict
-from mag_tracking.messages.standard import sensor_transform_dicts, track_transform_dict
+from mag_tracking.messages.standard import (
+    delete_markers,
+    ellipsoid_axes,
+    sensor_markers,
+    sensor_transform_dicts,
+    track_markers,
+    track_transform_dict,
+)
 from mag_tracking.messages.types import (
     DISTURBANCE,
     MAGNETIC_FIELD,
@@ -30,13 +46,89 @@ from mag_tracking.messages.types import (
     SMOOTHED_TRACK,
     TRACK_ARRAY,
     TRANSFORMS,
+    MessageDict,
 )
 from mag_tracking.network import SensorNetwork
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import FieldFrame, Readings, SmoothedPose, Track
+from mag_tracking.units import NS
 
+RERUN_FILE = 'tracks.rrd'
+TIME = 'stamp'
+MIN_MOMENT = 1e-12
+"""Minimum magnitude by which a moment is divided to obtain its direction [A m²]."""
+SCALE_3D = float(np.sqrt(chdtri(3, 0.1)))
+"""Radius of a 90 % ellipsoid, in standard deviations."""
 LATCHED = ('/tf_static', '/tracker_node/sensor_markers')
 """Latched topics, with one message each."""
+
+
+def write_tum(path: str | PathLike[str], stamp_ns: Sequence[int], position: Sequence[FloatArray],
+              orientation: Sequence[FloatArray]) -> None:
+    """Write poses as lines of `time x y z qx qy qz qw`, in s and m; orientations are xyzw."""
+    lines = []
+    for stamp, p, q in zip(stamp_ns, position, orientation, strict=True):
+        # Formatted from integers: a float has a resolution of only 0.2 us for times since 1970.
+        seconds = f'{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d}'
+        lines.append(' '.join([seconds, *(f'{float(v):.9g}' for v in (*p, *q))]))
+    replace_text(path, '\n'.join(lines) + '\n')
+
+
+def check_rerun() -> None:
+    """Raise MissingDependencyError if rerun-sdk is not installed."""
+    if find_spec('rerun') is None:
+        raise MissingDependencyError(
+            'Rerun recordings require the package rerun-sdk; install it with: '
+            f'{sys.executable} -m pip install rerun-sdk')
+
+
+def write_rerun(path: str | PathLike[str], network: SensorNetwork, logs: Mapping[int, TrackLog],
+                smoothed: Mapping[int, SmoothedLog]) -> None:
+    """Write sensors and tracks (poses, 90 % regions, speeds, fields), by track id, to a Rerun
+    recording; raises MissingDependencyError without rerun-sdk, and OutputError."""
+    check_rerun()
+    import rerun
+
+    stream = rerun.RecordingStream('mag_tracking')
+    try:
+        # Create a new file first, so that a link of this name is not followed.
+        new_binary_file(path).close()
+        stream.save(path)
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f'cannot write {path}: {error}') from error
+    stream.log(f'{network.frame}/sensors', rerun.Points3D(
+        network.positions, labels=list(network.names)), static=True)
+    for log in logs.values():
+        _write_track(rerun, stream, network, log)
+    for track in smoothed.values():
+        stream.log(f'{network.frame}/track_{track.id}/smoothed', rerun.LineStrips3D(
+            [np.array(track.position)]), static=True)
+    stream.flush()
+    stream.disconnect()
+
+
+def _write_track(rerun: Any, stream: Any, network: SensorNetwork, log: TrackLog) -> None:
+    """Log the poses of a track, and clear the track one period after its last pose."""
+    root = f'{network.frame}/track_{log.id}'
+    for k, ns in enumerate(log.stamp_ns):
+        stream.set_time(TIME, timestamp=np.datetime64(ns, 'ns'))
+        std, orientation = ellipsoid_axes(log.covariance[k][:3, :3])
+        stream.log(f'{root}/region', rerun.Ellipsoids3D(
+            centers=[log.position[k]], half_sizes=[SCALE_3D * std],
+            quaternions=[rerun.Quaternion(xyzw=orientation)]))
+        stream.log(f'{root}/pose', rerun.Points3D([log.position[k]], labels=[
+            f'{log.id} {log.kind[k]}{"?" if log.ambiguous[k] else ""}']))
+        magnitude = max(float(np.linalg.norm(log.moment[k])), MIN_MOMENT)
+        stream.log(f'{root}/moment', rerun.Arrows3D(
+            origins=[log.position[k]], vectors=[log.moment[k] / magnitude]))
+        stream.log(f'speed/track_{log.id}', rerun.Scalars(float(np.hypot(*log.velocity[k][:2]))))
+        for j, name in enumerate(network.names):
+            for source, fields in (('measured', log.measured[k]), ('predicted', log.predicted[k])):
+                stream.log(f'field/{name}/{source}', rerun.Scalars(1e9 * fields[j]))
+    # The last pose stays visible for one period.
+    period = log.stamp_ns[-1] - log.stamp_ns[-2] if len(log.stamp_ns) > 1 else NS
+    stream.set_time(TIME, timestamp=np.datetime64(log.stamp_ns[-1] + period, 'ns'))
+    stream.log(root, rerun.Clear(recursive=True))
 
 
 class TrackRecording:
@@ -110,7 +202,6 @@ class TrackRecording:
         self._smoothed.append(pose)
 
     def _write_smoothed(self) -> None:
-        """Write the buffered poses of a smoothed track."""
         poses = self._smoothed
         if not poses:
             return
@@ -127,5 +218,4 @@ class TrackRecording:
                     disturbance.stamp_ns)
 
     def _write(self, name: str, kind: str, content: MessageDict, stamp_ns: int) -> None:
-        """Write a message on the topic `/tracker_node/<name>`."""
         self._writer.write(f'/tracker_node/{name}', kind, content, stamp_ns)
