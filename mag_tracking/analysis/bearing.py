@@ -4,7 +4,7 @@ import numpy as np
 
 from mag_tracking.analysis.pass_result import Bearing, PassFit
 from mag_tracking.arrays import FloatArray
-from mag_tracking.physics.anderson import closest_approach
+from mag_tracking.physics.passes import closest_approach
 
 MIN_CPA_FRACTION = 1e-3
 """Minimum CPA range relative to the distance travelled during the pass. At a smaller ratio, the

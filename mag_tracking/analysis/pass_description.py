@@ -23,7 +23,7 @@ from mag_tracking.analysis.pass_trust import (
 )
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.crlb import bound, cpa_information, information
-from mag_tracking.inference.separable_fit import Minimum
+from mag_tracking.inference.least_squares import Minimum
 from mag_tracking.physics.passes import SuperposedPasses
 
 PATH_TOLERANCE = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2, 0.3])

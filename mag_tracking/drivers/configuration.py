@@ -25,8 +25,7 @@ from typing import Any, TypeVar
 
 from mag_tracking.drivers.device_clock import ClockSettings
 from mag_tracking.drivers.driver import IGNORED, Driver
-from mag_tracking.drivers.framed_device import FramedDevice
-from mag_tracking.drivers.reading import Device
+from mag_tracking.drivers.reading import Device, FramedDevice
 from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.sensor_network import SensorNetwork

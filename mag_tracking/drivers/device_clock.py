@@ -14,15 +14,56 @@ points above it reduces its likelihood by a factor of e. Slopes within that rang
 about as likely.
 """
 
+import itertools
 import math
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
-from mag_tracking.drivers.lower_line import Point, slope_range
 from mag_tracking.drivers.reading import DeviceDate
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 from mag_tracking.units import NS, TIME_UNITS, unit_since_1970
+
+Point: TypeAlias = tuple[float, float]
+"""Coordinates (x, y) of a point."""
+
+
+def lower_hull(points: Sequence[Point]) -> list[Point]:
+    """Vertices of the lower convex hull; points and vertices ascend in x, then y."""
+    hull: list[Point] = []
+    for x, y in points:
+        while len(hull) > 1:
+            (u, v), (w, z) = hull[-2:]
+            if (w - u) * (y - v) > (z - v) * (x - u):
+                break
+            hull.pop()
+        hull.append((x, y))
+    return hull
+
+
+def slope_range(points: Sequence[Point]) -> tuple[float, float]:
+    """Smallest and largest slope about as likely as that of the best line under the points.
+
+    The best line, according to Moon et al., is the edge of the lower convex hull at the mean of x.
+    At least three points ascend in x, then y, with at least two values of x. Both slopes are equal
+    if all points are on the best line.
+    """
+    hull = lower_hull(points)
+    middle = sum(x for x, _ in points) / len(points)
+    for (u, v), (x, y) in itertools.pairwise(hull):
+        if x >= middle:
+            slope = (y - v) / (x - u)
+            height = v + slope * (middle - u)
+            break
+    # Two points are always on the line. The median is insensitive to stalls of the link.
+    heights = sorted(y - height - slope * (x - middle) for x, y in points)[2:]
+    floor = height - heights[len(heights) // 2] / math.log(2.0) / len(points)
+    low = max((y - floor) / (x - middle) for x, y in hull if x < middle)
+    high = min((y - floor) / (x - middle) for x, y in hull if x > middle)
+    return min(low, slope), max(high, slope)
+
 
 NO_TICKS = 'readings without a device time'
 OUT_OF_RANGE = 'device times outside the counter range'

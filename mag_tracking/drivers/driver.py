@@ -16,11 +16,9 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray
 from mag_tracking.drivers.device_clock import ArrivalClock, ClockSettings, DeviceClock
-from mag_tracking.drivers.field_strength import FieldStrength
 from mag_tracking.drivers.reading import Arrival, Axes, Device, DeviceDate, Reading
-from mag_tracking.drivers.sequence import SequenceCheck
+from mag_tracking.drivers.sensor_checks import FieldStrength, SequenceCheck, SingleSource, contest
 from mag_tracking.drivers.settings import STAMPED_BY, DriverSettings, acceleration_scale
-from mag_tracking.drivers.single_source import SingleSource, contest
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample, Readings
 from mag_tracking.units import NS, TIME_UNITS, field_scale, unit_since_1970

@@ -5,7 +5,7 @@ from typing import Protocol
 import numpy as np
 
 from mag_tracking.errors import RecordingError
-from mag_tracking.inference.axes import MIN_PIVOT, smallest_pivots
+from mag_tracking.inference.covariances import MIN_PIVOT, smallest_pivots
 from mag_tracking.messages.schema import float64_array, header_dict, stamp_ns
 from mag_tracking.messages.shapes import MessageDict, NetworkFrame
 from mag_tracking.network import SensorNetwork

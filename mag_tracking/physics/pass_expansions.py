@@ -1,6 +1,6 @@
 """Expansions of the field of a straight pass: multipoles about one point, or Anderson functions.
 
-The classes implement `inference.separable_fit.SeparableModel`: the field is linear in all
+The classes implement `inference.least_squares.SeparableModel`: the field is linear in all
 parameters except the path parameters.
 """
 
@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.physics.anderson import anderson_functions
 from mag_tracking.physics.multipole import multipole_jacobians
+from mag_tracking.physics.passes import anderson_functions
 
 _N_MOMENTS = {1: 3, 2: 8, 3: 15}
 """Number of moments for each highest order of an expansion."""
@@ -64,7 +64,7 @@ class AndersonPass:
     Path parameters (2): time of the CPA [s], speed over range at the CPA [1/s]. Linear parameters
     (9): coefficients of the three functions on each axis of the sensor [T], axis by axis. A dipole
     has only six independent coefficients; nine free ones keep the model linear. TSP14 eq. (22),
-    (23), corrected as in `anderson`.
+    (23), corrected as in `passes`.
     """
 
     t: FloatArray

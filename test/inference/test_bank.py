@@ -7,8 +7,7 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
-from mag_tracking.inference.initial_bank import InitialBank
+from mag_tracking.inference.filter_bank import FilterBank, InitialBank, log_sum_exp
 from mag_tracking.physics.dipole import MU0, sensor_fields
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.stages.track.initiation_vehicle import moment_directions

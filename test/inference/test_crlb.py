@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mag_tracking.inference.axes import whitened_energy
+from mag_tracking.inference.covariances import whitened_energy
 from mag_tracking.inference.crlb import (
     bound,
     cpa_information,

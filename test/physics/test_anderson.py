@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from mag_tracking.physics.anderson import (
+from mag_tracking.physics.dipole import dipole_field
+from mag_tracking.physics.passes import (
     anderson_coefficients,
     anderson_field,
     anderson_functions,
     closest_approach,
 )
-from mag_tracking.physics.dipole import dipole_field
 
 settings.register_profile('ci', derandomize=True, deadline=None, max_examples=60)
 settings.load_profile('ci')

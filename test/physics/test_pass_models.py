@@ -7,13 +7,17 @@ import pytest
 
 from mag_tracking.analysis.pass_data import separable_problem
 from mag_tracking.analysis.pass_fit import fit_pass
-from mag_tracking.inference.least_squares import refine
-from mag_tracking.inference.separable_fit import SeparableProblem
+from mag_tracking.inference.least_squares import SeparableProblem, refine
 from mag_tracking.physics import pass_expansions, passes
-from mag_tracking.physics.anderson import anderson_field
 from mag_tracking.physics.multipole import multipole_moments
 from mag_tracking.physics.pass_expansions import AndersonPass, MultipolePass
-from mag_tracking.physics.passes import RowPass, SuperposedPasses
+from mag_tracking.physics.passes import (
+    N_PATH,
+    RowPass,
+    SteadyPass,
+    SuperposedPasses,
+    anderson_field,
+)
 from mag_tracking.simulation.scenario import random_vehicle
 from support.passes import NOISE, measured, network_of
 
@@ -24,9 +28,12 @@ EXAMPLES = {
     **{f'RowPass with n_dipoles={d}': RowPass(T, POSITIONS, M, d) for d in (1, 2, 3, 4)},
     **{f'MultipolePass of order {d}': MultipolePass(T, POSITIONS, M, d) for d in (1, 2, 3)},
     'AndersonPass': AndersonPass(T, M),
-    'SuperposedPasses': SuperposedPasses.from_orders((1, 3), T, POSITIONS, M)}
+    'SuperposedPasses': SuperposedPasses.from_orders((1, 3), T, POSITIONS, M),
+    'SteadyPass': SteadyPass(T, POSITIONS, M, np.full(6, -1), np.arange(N_PATH), np.zeros(N_PATH),
+                             3)}
 N_PARAMETERS = {
-    name: model.path_slices[-1].stop if isinstance(model, SuperposedPasses) else len(model.names)
+    name: model.path_slices[-1].stop if isinstance(model, SuperposedPasses)
+    else N_PATH if isinstance(model, SteadyPass) else len(model.names)
     for name, model in EXAMPLES.items()}
 """Number of path parameters of each model."""
 

@@ -5,7 +5,7 @@ import pytest
 
 from mag_tracking.physics import core
 from mag_tracking.physics.dipole import K_DIPOLE, MU0
-from mag_tracking.physics.steady_pass import N_PATH
+from mag_tracking.physics.passes import N_PATH
 
 RNG = np.random.default_rng(3)
 HYPOTHESES, SENSORS, DIPOLES, STATES, SAMPLES = 2, 4, 3, 19, 5

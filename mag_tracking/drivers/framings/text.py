@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from mag_tracking.drivers.framings.checksums import xor8
+from mag_tracking.drivers.framings.binary import xor8
 from mag_tracking.drivers.framings.fields import (
     AXES,
     SKIP,

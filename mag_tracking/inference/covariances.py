@@ -1,4 +1,4 @@
-"""Covariances of the three axes of a sensor, any of which may be missing."""
+"""Covariances of sensor axes, any of which may be missing, of mixtures and of two estimates."""
 
 import numpy as np
 
@@ -58,3 +58,33 @@ def _contiguous(y: FloatArray, C: FloatArray) -> tuple[FloatArray, FloatArray]:
         raise ValueError('expected measurements (n, 3) and covariances (n, 3, 3), got '
                          f'{y.shape} and {C.shape}')
     return plain(y), plain(C)
+
+
+def second_moment(weights: FloatArray, differences: FloatArray,
+                  covariances: FloatArray) -> FloatArray:
+    """Second moment (d, d) of a Gaussian mixture about an estimate, [BarShalom01]_ section 1.4.16.
+
+    `differences` (n, d) are the component means minus the estimate; `weights` need no
+    normalisation. It is the covariance if the estimate is the mean of the mixture.
+    """
+    w = weights / weights.sum()
+    moment: FloatArray = (np.einsum('n,nij->ij', w, covariances)
+                          + np.einsum('n,ni,nj->ij', w, differences, differences))
+    return moment
+
+
+def inflated_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
+    """Inflate `P`, whose state begins with x and y, to cover another estimate ([Uhlmann03]_).
+
+    `difference` is the other estimate minus this one, for the first components. The std along its
+    horizontal part becomes at least the length of that part; the other components are inflated in
+    proportion to their differences, fully correlated. `P` itself is returned if it suffices. The
+    covariance of the other estimate is not used.
+    """
+    d = difference[:2]
+    square, variance = float(d @ d), float(d @ P[:2, :2] @ d)
+    if not square > 0.0 or square**2 <= variance:
+        return P
+    padded_difference = np.zeros(len(P))
+    padded_difference[:len(difference)] = difference
+    return P + (1.0 - variance / square**2) * np.outer(padded_difference, padded_difference)
