@@ -7,7 +7,6 @@
 #include "dipole.hpp"
 #include "motion.hpp"
 #include "mounting.hpp"
-#include "multipole.hpp"
 #include "passes.hpp"
 #include "sensor_fields.hpp"
 #include "steady_pass.hpp"
@@ -80,25 +79,6 @@ py::tuple sensor_fields(const Array& positions, const Array& R_sw, const Array& 
                           positions_, R_, std::size_t(n_sensors), h_, H_, size);
     }
     return py::make_tuple(h, H, gradient);
-}
-
-py::tuple multipoles(const Array& d, const Array& moments) {
-    Shape shape = rows_of(d, "d");
-    const Size k = moments.ndim() ? moments.shape(moments.ndim() - 1) : 0;
-    if (k != 3 && k != 8 && k != 15)
-        throw py::value_error("moments: needs a last axis of length 3, 8 or 15");
-    const double* d_ = input_of(d, "d", shape);
-    Array B(shape), dB_dd(with(shape, 3)), dB_dm(with(shape, k));
-    shape.back() = k;
-    const double* m = input_of(moments, "moments", shape);
-    double *B_ = B.mutable_data(), *by_place = dB_dd.mutable_data();
-    double* by_moment = dB_dm.mutable_data();
-    const Size n = d.size() / 3;
-    {
-        py::gil_scoped_release release;
-        set_multipoles(d_, m, std::size_t(n), int(k), B_, by_place, by_moment);
-    }
-    return py::make_tuple(B, dB_dd, dB_dm);
 }
 
 py::tuple mounted_fields(const Array& h, const Array& H, const Array& angles) {
@@ -290,7 +270,6 @@ PYBIND11_MODULE(core, module) {
     module.def("dipole_jacobians", &dipole_jacobians, IN(d), IN(m));
     module.def("sensor_fields", &sensor_fields, IN(positions), IN(R_sw), IN(r), IN(m), IN(dr_dx),
                IN(dm_dx));
-    module.def("multipoles", &multipoles, IN(d), IN(moments));
     module.def("rotated_fields", &mounted_fields, IN(h), IN(H), IN(angles));
     module.def("propagate_turn", &propagate_turn, IN(x), py::arg("dt"), py::arg("mean_factor"),
                py::arg("final_factor"));

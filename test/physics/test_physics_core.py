@@ -28,7 +28,6 @@ CALLS = {
         'r': normal(HYPOTHESES, DIPOLES, 3), 'm': normal(HYPOTHESES, DIPOLES, 3),
         'dr_dx': normal(HYPOTHESES, DIPOLES, 3, STATES),
         'dm_dx': normal(HYPOTHESES, DIPOLES, 3, STATES)},
-    'multipoles': {'d': normal(4, 3), 'moments': normal(4, 15)},
     'rotated_fields': {
         'h': normal(HYPOTHESES, SENSORS, 3), 'H': normal(HYPOTHESES, SENSORS, 3, STATES),
         'angles': normal(HYPOTHESES, SENSORS, 3)},
