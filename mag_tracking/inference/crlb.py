@@ -9,7 +9,6 @@ or not positive (semi)definite raise ValueError.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -203,23 +202,13 @@ def snr(h: ArrayLike, C: ArrayLike) -> FloatArray:
     return energy
 
 
-def snr_at_distance(moment: float | FloatArray, noise_std: float | FloatArray,
-                    distance: float | FloatArray) -> FloatArray:
-    """Energy ratio of one sample at a `distance` [m] from a dipole, perpendicular to its axis.
-
-    Along the axis it is four times larger. `moment` is in A m² (300-600 for a car, 1800 for a
-    truck), `noise_std` in T per axis (1.1e-8 in TSP14). T10 eq. (5.20), (5.21); eq. (5.23) prints
-    the squared norm of R instead of the norm. Moment and noise in T10 eq. (5.22) are both too small
-    by a factor of about 450.
-    """
-    return cast(FloatArray, (_K_DIPOLE * moment / (noise_std * distance**3))**2)
-
-
 def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
               ratio: float | FloatArray) -> FloatArray:
-    """Distance [m] at which `snr_at_distance` equals `ratio` (9.2 in T10), T10 eq. (5.24).
+    """Distance [m] across the axis of a dipole at which one sample has the energy `ratio`.
 
-    Along the axis of the dipole it is larger by a factor of 2^(1/3).
+    Along the axis it is larger by a factor of 2^(1/3). `moment` is in A m², `noise_std` in T per
+    axis; `ratio` is 9.2 in T10. T10 eq. (5.20)-(5.24): eq. (5.23) prints the squared norm of R
+    instead of the norm; moment and noise in eq. (5.22) are too small by a factor of about 450.
     """
     distance: FloatArray = np.cbrt(_K_DIPOLE * moment / (noise_std * np.sqrt(ratio)))
     return distance

@@ -6,7 +6,7 @@ This is exact for a target at the height of the sensor. A sensor in the lane doe
 direction.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -108,14 +108,6 @@ def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
     if not width:
         return 0
     return int(np.clip(round(LAG_FRACTION * width), 1, max(1, min(max_lag, len(field) // 4))))
-
-
-def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int]) -> int:
-    """Lag of the smallest mean error probability over training windows; PHD15 Paper B eq. (19)."""
-    windows = list(windows)
-    errors = [np.mean([field_rotation(w, noise_std, lag).error_probability for w in windows])
-              for lag in lags]
-    return lags[int(np.argmin(errors))]
 
 
 def fused_log_odds(log_odds: Iterable[float], same_side: Iterable[bool]) -> float:

@@ -15,6 +15,13 @@ from numpy.typing import ArrayLike
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.physics import core
 
+anderson_residual = core.anderson_residual
+"""Residual sum of squares of a fit of Anderson functions and a constant to each column of `y`.
+
+`t` (n,) is in s, `y` (n, k) whitened; `time` is that of the CPA and `scale` [s] its range over the
+speed. TSP14 eq. (22), (23), with the exponent 5/2.
+"""
+
 
 def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatArray]:
     """Time, range and relative position of the closest point of approach (CPA) of a pass.
@@ -36,15 +43,6 @@ def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatA
     if distance <= 1e-15 * np.linalg.norm(r0):
         distance, r_cpa = 0.0, np.zeros(3)
     return float(travelled / speed), distance, r_cpa
-
-
-def anderson_residual(t: FloatArray, y: FloatArray, time: float, scale: float) -> float:
-    """Residual sum of squares of a fit of Anderson functions and a constant to each column of `y`.
-
-    `t` (n,) is in s, `y` (n, k) whitened and contiguous; `time` is that of the CPA and `scale` [s]
-    its range over the speed. TSP14 eq. (22), (23), with the exponent 5/2.
-    """
-    return core.anderson_residual(t, y, time, scale)
 
 
 @dataclass(frozen=True)

@@ -47,19 +47,14 @@ def constant_velocity(dt: float) -> FloatArray:
     return F
 
 
-def coordinated_turn(x: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Propagate states (n, n_x) along an arc at constant turn rate; return also the Jacobians.
+def decaying_turn(x: FloatArray, dt: float, mean_factor: float, final_factor: float
+                  ) -> tuple[FloatArray, FloatArray]:
+    """Propagate states (n, n_x) along an arc; return also the Jacobians. [BarShalom01]_ 11.7.
 
     The first six states are position and velocity, the last is the turn rate [rad/s], anticlockwise
-    from above; a negative `dt` propagates backwards. [BarShalom01]_ section 11.7.
+    from above, whose mean over `dt` and final value are the given factors of the initial rate. A
+    negative `dt` propagates backwards.
     """
-    return decaying_turn(x, dt, 1.0, 1.0)
-
-
-def decaying_turn(x: FloatArray, dt: float, mean_factor: float, final_factor: float
-                ) -> tuple[FloatArray, FloatArray]:
-    """Propagate states as `coordinated_turn`, with a turn rate whose mean over `dt` and final value
-    are the given factors of the initial rate."""
     return core.propagate_turn(np.ascontiguousarray(x, dtype=float), dt, mean_factor, final_factor)
 
 
