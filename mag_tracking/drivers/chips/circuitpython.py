@@ -24,7 +24,7 @@ from typing import Any
 
 from smbus2 import i2c_msg
 
-from mag_tracking.drivers.chips.chip import Conversion, Measurement, Registers
+from mag_tracking.drivers.chips.chip import Chip, Conversion, Measurement, Registers
 from mag_tracking.errors import DeviceError
 
 TIMEOUT_NS = 250_000_000
@@ -119,10 +119,8 @@ class BusioI2c:
             raise DeviceError('timeout while the driver waited for its chip')
 
 
-class CircuitpythonChip:
-    """Chip read through a CircuitPython driver `module.Class` in units of `scale` [T], a `Chip`."""
-
-    IDENTITY = ()
+class CircuitpythonChip(Chip):
+    """Chip read through a CircuitPython driver `module.Class` in units of `scale` [T]."""
 
     def __init__(self, registers: Registers, name: str, address: int, scale: float) -> None:
         self._registers, self._name, self._address = registers, name, address

@@ -31,6 +31,7 @@ from dataclasses import dataclass
 
 from mag_tracking.drivers.chips.chip import (
     CONVERSION_MARGIN,
+    Chip,
     Conversion,
     Measurement,
     Registers,
@@ -67,7 +68,7 @@ class Mmc5603Settings(Mmc5983maSettings):
         'ms', (1.2, 6.6))
 
 
-class Mmc5983ma:
+class Mmc5983ma(Chip):
     """MMC5983MA magnetometer; the module describes its timing, axes and scale."""
 
     IDENTITY = ((0x2F, 0x30),)
@@ -81,7 +82,7 @@ class Mmc5983ma:
 
     def __init__(self, registers: Registers, settings: Mmc5983maSettings,
                  count: Callable[[str], None]) -> None:
-        self._registers = registers
+        super().__init__(registers, settings, count)
         self._bandwidth = look_up_choice(f'{self.NAME}.conversion_ms', settings.conversion_ms,
                                          self.BANDWIDTHS)
         self._conversion_ns = round(settings.conversion_ms * 1e6)

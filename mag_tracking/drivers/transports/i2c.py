@@ -22,28 +22,24 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
-import smbus2
+from smbus2 import SMBus
 
 from mag_tracking.drivers.chips.chip import (
     Bus,
     Chip,
-    ChipClass,
     ChipLocation,
     Conversion,
     Registers,
-    SmBus,
-    check_identity,
 )
 from mag_tracking.drivers.chips.circuitpython import UNITS, CircuitpythonChip
+from mag_tracking.drivers.chips.continuous import Lis3mdl, Lis3mdlSettings, Rm3100, Rm3100Settings
 from mag_tracking.drivers.chips.honeywell import Hmc5883l, Hmc5883lSettings, Hmc5983
-from mag_tracking.drivers.chips.lis3mdl import Lis3mdl, Lis3mdlSettings
 from mag_tracking.drivers.chips.memsic import (
     Mmc5603,
     Mmc5603Settings,
     Mmc5983ma,
     Mmc5983maSettings,
 )
-from mag_tracking.drivers.chips.rm3100 import Rm3100, Rm3100Settings
 from mag_tracking.drivers.reading import Arrival, Reading
 from mag_tracking.drivers.transports.polled import Closable
 from mag_tracking.errors import DeviceError, SettingsError
@@ -129,7 +125,7 @@ def _parse_address(name: str, role: str, digits: str, lowest: int) -> int:
 
 CLOSE_WAIT_S = 0.1
 """[s] Maximum time that `close` waits for a `read` in another thread, in addition to one cycle."""
-_CLASSES: tuple[ChipClass, ...] = (Mmc5983ma, Mmc5603, Hmc5883l, Hmc5983, Rm3100, Lis3mdl)
+_CLASSES: tuple[type[Chip], ...] = (Mmc5983ma, Mmc5603, Hmc5883l, Hmc5983, Rm3100, Lis3mdl)
 CHIPS = {cls.NAME: cls for cls in _CLASSES}
 """Supported chips by name."""
 NO_ANSWER_ERRNOS = (errno.EREMOTEIO, errno.ENXIO)
@@ -173,7 +169,7 @@ class I2cDevice(Closable):
 
     SETTINGS = I2cSettings
 
-    def __init__(self, settings: I2cSettings, open_bus: Callable[[int], SmBus] = smbus2.SMBus,
+    def __init__(self, settings: I2cSettings, open_bus: Callable[[int], SMBus] = SMBus,
                  monotonic_ns: Callable[[], int] = time.monotonic_ns,
                  sleep: Callable[[float], object] = time.sleep) -> None:
         if settings.sensors == ('',):
@@ -243,7 +239,7 @@ class I2cDevice(Closable):
         label = f'{self._name}: {name} ({sensor.chip}, {sensor.location})'
         registers = Registers(bus, sensor.location)
         try:
-            check_identity(chip, registers)
+            chip.check_identity(registers)
             chip.set_up()
         except DeviceError as error:
             matching = [] if sensor.chip not in CHIPS else self._matching_chips(registers)
@@ -257,7 +253,7 @@ class I2cDevice(Closable):
         names = []
         for name, cls in CHIPS.items():
             try:
-                check_identity(cls, registers)
+                cls.check_identity(registers)
             except (DeviceError, OSError):
                 continue
             names.append(name)
