@@ -46,7 +46,6 @@ def lower_hull(points: Sequence[Point]) -> list[Point]:
 def slope_range(points: Sequence[Point]) -> tuple[float, float]:
     """Smallest and largest slope about as likely as that of the best line under the points.
 
-    The best line, according to Moon et al., is the edge of the lower convex hull at the mean of x.
     At least three points ascend in x, then y, with at least two values of x. Both slopes are equal
     if all points are on the best line.
     """
@@ -119,10 +118,7 @@ class ClockSettings:
 
 
 class ArrivalClock:
-    """Clock that timestamps readings by their arrival, with the interface of `DeviceClock`.
-
-    The counters and examples are always empty, the estimates always NaN.
-    """
+    """Clock that timestamps readings by their arrival, with the interface of `DeviceClock`."""
 
     drift_ppm = spread_s = stamp_std = math.nan
 
@@ -133,7 +129,7 @@ class ArrivalClock:
         self._min_delay_ns = round(settings.min_delay_s * 1e9)
 
     def stamp(self, ticks: float | None, arrival_ns: int) -> int:
-        """Monotonic time of arrival minus the minimum delay, ns; `ticks` are not used."""
+        """Monotonic time of arrival minus the minimum delay, ns."""
         return arrival_ns - self._min_delay_ns
 
 
@@ -207,30 +203,18 @@ class DeviceClock:
     tick or with the drift estimated before a restart. A reading that does not fit the clock gets no
     timestamp. A new clock starts when three consecutive different device times agree on it for
     longer than the delivery of queued messages could explain, or when no reading has fitted the old
-    clock for `window_s`. If readings of two clocks alternate, the older clock is kept.
-
-    If the device time hardly advances while readings arrive, as in whole seconds or with a wrong
-    `tick_s`, readings are timestamped by their arrival.
-
-    The rounding error of float64 is below 1 ns for 30 days, and below 0.1 µs for ten years.
-
-    Raises SettingsError if `min_step_s` exceeds `max_delay_s`, or the counter wraps within four
-    times `min_step_s`.
+    clock for `window_s`. If readings of two clocks alternate, the older clock is kept. The rounding
+    error of float64 is below 1 ns for 30 days, and below 0.1 µs for ten years.
 
     Attributes
     ----------
     counts : number of readings without a timestamp, by cause
     restarts : number of clocks started after the first, by cause
     examples : first device time and what to change, by cause; the dict is replaced, never changed
-    drift_ppm : ratio of the true to the nominal tick, minus 1, ppm; positive for a slow device; NaN
-        until estimated
-    spread_s : 95th percentile of the delays of recent messages, relative to the fastest; NaN until
-        estimated
-    stamp_std : error of a timestamp [s] due to delays and changes of the drift: 90th percentile of
-        the
-        height above the line, over the lowest points of all blocks; without an error of
-        `min_delay_s`;
-        NaN until estimated, and again after a restart
+    drift_ppm : ratio of the true to the nominal tick, minus 1, ppm; positive for a slow device
+    spread_s : 95th percentile of the delays of recent messages, relative to the fastest
+    stamp_std : error of a timestamp [s] due to delays and changes of the drift, without that of
+        `min_delay_s`: 90th percentile of the height of the lowest points above the line
     """
 
     def __init__(self, settings: ClockSettings) -> None:
@@ -268,11 +252,7 @@ class DeviceClock:
 
     def stamp(self, ticks: float | None, arrival_ns: int) -> int | None:
         """Update the clock with a reading; return its monotonic measurement time, ns, at most
-        `arrival_ns` minus the minimum delay.
-
-        `ticks` are at least 0 and less than `wrap`; repeated and slightly earlier values are
-        accepted. The cause of an unknown time, None, is counted in `counts`.
-        """
+        `arrival_ns` minus the minimum delay, or None."""
         if ticks is None:
             self.counts[NO_TICKS] += 1
             return None

@@ -8,7 +8,7 @@ framing, the chips on a bus, or the simulator.
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias, TypeVar
 
 Axes: TypeAlias = tuple[float, float, float]
 """Components x, y and z of a vector."""
@@ -85,16 +85,28 @@ class Chunk(NamedTuple):
     """Origin of the bytes, such as an MQTT topic or a UDP address; empty if unknown."""
 
 
-class Transport(Protocol):
-    """Receives bytes over a connection.
+class Arrival(NamedTuple):
+    """Reading with its time of arrival."""
+
+    arrival_ns: int
+    """`time.monotonic_ns()` at arrival."""
+    reading: Reading
+    source: str = ''
+    """Source of the chunk that contains the reading. All readings of one source share a clock."""
+
+
+Item = TypeVar('Item')
+
+
+class Connection(Protocol[Item]):
+    """Receives chunks or readings.
 
     Only `close` may be called before `open`, or while another thread calls a method.
     """
 
-    is_message_oriented: bool
-    """Whether each chunk is a complete message (a datagram), so that no frame spans two chunks."""
-    counts: Counter[str]
-    """Number of losses by cause, such as 'empty datagrams'."""
+    @property
+    def counts(self) -> Counter[str]:
+        """Number of losses by cause, such as 'empty datagrams'."""
 
     def open(self) -> None:
         """Open the connection.
@@ -105,17 +117,17 @@ class Transport(Protocol):
             If opening fails. The message includes the remedy, and nothing remains open.
         """
 
-    def read(self, timeout_s: float) -> list[Chunk]:
-        """Return the data received; wait only if no data is available.
+    def read(self, timeout_s: float) -> list[Item]:
+        """Return what was received; wait only if nothing is available.
 
         Parameters
         ----------
         timeout_s : float, s
-            Maximum time to wait for data.
+            Maximum time to wait.
 
         Returns
         -------
-        list of Chunk
+        list of Chunk or Arrival
             Empty if nothing arrived in time.
 
         Raises
@@ -128,53 +140,15 @@ class Transport(Protocol):
         """Close the connection. May be called twice, and before `open`."""
 
 
-class Arrival(NamedTuple):
-    """Reading with its time of arrival."""
+class Transport(Connection[Chunk], Protocol):
+    """Receives bytes over a connection."""
 
-    arrival_ns: int
-    """`time.monotonic_ns()` at arrival."""
-    reading: Reading
-    source: str = ''
-    """Source of the chunk that contains the reading. All readings of one source share a clock."""
+    is_message_oriented: bool
+    """Whether each chunk is a complete message (a datagram), so that no frame spans two chunks."""
 
 
-class Device(Protocol):
-    """Receives readings of sensors. The calling rules of `Transport` apply."""
-
-    @property
-    def counts(self) -> Counter[str]:
-        """Number of losses by cause."""
-
-    def open(self) -> None:
-        """Open the device.
-
-        Raises
-        ------
-        DeviceError
-            If opening fails. The message includes the remedy, and nothing remains open.
-        """
-
-    def read(self, timeout_s: float) -> list[Arrival]:
-        """Return the readings received; wait only if no reading is available.
-
-        Parameters
-        ----------
-        timeout_s : float, s
-            Maximum time to wait for a reading.
-
-        Returns
-        -------
-        list of Arrival
-            Empty if nothing arrived in time.
-
-        Raises
-        ------
-        DeviceError
-            If the connection is lost.
-        """
-
-    def close(self) -> None:
-        """Close the device. May be called twice, and before `open`."""
+class Device(Connection[Arrival], Protocol):
+    """Receives readings of sensors."""
 
 
 class FramedDevice:

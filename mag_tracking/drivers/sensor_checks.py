@@ -17,25 +17,18 @@ MAX_GAP = 1_000_000
 
 
 class SequenceCheck:
-    """Checks the sequence numbers of one sensor, which return to 0 at `wrap` (0: never).
-
-    `counts` are lost, late, duplicate and implausible readings.
-    """
+    """Checks the sequence numbers of one sensor, which return to 0 at `wrap` (0: never)."""
 
     def __init__(self, wrap: int) -> None:
         self._wrap = wrap
         self.counts: Counter[str] = Counter()
-        self._begin()
-
-    def _begin(self) -> None:
-        """Discard the stored numbers; the next reading starts a new sequence."""
-        self._newest_number: int | None = None
-        self._values: dict[int, bytes] = {}
-        self._lost_numbers: dict[int, bool] = {}
+        self.pause()
 
     def pause(self) -> None:
         """Start a new sequence, so that numbers skipped during a pause are not counted as lost."""
-        self._begin()
+        self._newest_number: int | None = None
+        self._values: dict[int, bytes] = {}
+        self._lost_numbers: dict[int, bool] = {}
 
     def is_new(self, sequence: int, values: bytes) -> bool:
         """Record a reading; return whether it is not a duplicate (the same number and values).
@@ -50,7 +43,7 @@ class SequenceCheck:
                     else self._distance(sequence, self._newest_number))
         if distance > MAX_GAP:
             self.counts['sequence jumps'] += 1
-            self._begin()
+            self.pause()
         elif distance > 0:
             self._record_gap(sequence, distance - 1)
         elif sequence in self._lost_numbers:
@@ -62,7 +55,7 @@ class SequenceCheck:
             return False
         else:
             self.counts['sequence restarts'] += 1
-            self._begin()
+            self.pause()
             distance = 1
         if distance > 0:
             self._newest_number = sequence
@@ -79,9 +72,8 @@ class SequenceCheck:
 
     def _record_gap(self, sequence: int, n: int) -> None:
         """Count the `n` skipped numbers before `sequence` as lost."""
-        if not n:
-            return
-        self.counts['lost'] += n
+        if n:
+            self.counts['lost'] += n
         for number in range(sequence - min(n, MAX_REMEMBERED), sequence):
             self._lost_numbers[number % self._wrap if self._wrap else number] = True
         _trim(self._lost_numbers)
@@ -164,57 +156,45 @@ class _Sender:
 class SingleSource:
     """Selects the steadiest source of a sensor's readings and counts `changes`.
 
-    The first source is selected. It remains selected until it has been silent for
-    `RELEASE_TIMEOUT_S` and for `MAX_INTERVALS` of its intervals, or another source is steadier by
-    `MARGIN`. Stray messages, whether before the start of the device or later, therefore do not
-    block the device, and two equal sources do not alternate.
+    The first source remains selected until it has been silent for `RELEASE_TIMEOUT_S` and for
+    `MAX_INTERVALS` of its intervals, or another source is steadier by `MARGIN`. Stray messages
+    therefore do not block the device, and two equal sources do not alternate.
     """
 
     def __init__(self) -> None:
         self.changes = 0
-        self._selected: Source | None = None
+        self.selected: Source | None = None
         # In the order of the latest readings, except for the selected source.
         self._senders: OrderedDict[Source, _Sender] = OrderedDict()
-
-    @property
-    def selected(self) -> Source | None:
-        """Selected source; None before the first reading."""
-        return self._selected
 
     def accepts(self, source: Source, now_ns: int) -> bool:
         """Update the selection at a monotonic time; return whether `source` is selected."""
         sender = self._senders.get(source)
         if sender is None:
             sender = self._senders[source] = _Sender(now_ns)
-            self._drop_oldest()
+            if len(self._senders) > MAX_SENDERS:
+                del self._senders[next(s for s in self._senders if s != self.selected)]
         sender.add(now_ns)
-        if source == self._selected:
+        if source == self.selected:
             return True
         self._senders.move_to_end(source)
         if self._is_better(sender, now_ns):
-            self.changes += self._selected is not None
-            self._selected = source
-        return source == self._selected
+            self.changes += self.selected is not None
+            self.selected = source
+        return source == self.selected
 
     def _is_better(self, sender: _Sender, now_ns: int) -> bool:
         """Whether a source is preferable to the selected one."""
-        if self._selected is None or self._selected not in self._senders:
+        if self.selected is None or self.selected not in self._senders:
             return True
-        selected = self._senders[self._selected]
+        selected = self._senders[self.selected]
         selected.advance(now_ns)
         return selected.is_silent(now_ns) or sender.unsteadiness + MARGIN < selected.unsteadiness
 
-    def _drop_oldest(self) -> None:
-        """Drop the source that was silent longest, except the selected one, if there are too
-        many."""
-        if len(self._senders) > MAX_SENDERS:
-            del self._senders[next(s for s in self._senders if s != self._selected)]
-
     def rates_hz(self, now_ns: int) -> dict[Source, float]:
-        """Forget silent sources other than the selected one; return the rates of the others, 0 for
-        a single reading."""
+        """Forget silent sources other than the selected one; return the rates of the others."""
         silent = {s for s, sender in self._senders.items() if sender.is_silent(now_ns)}
-        for source in silent - {self._selected}:
+        for source in silent - {self.selected}:
             del self._senders[source]
         return {source: sender.rate_hz() for source, sender in self._senders.items()
                 if source not in silent}
@@ -258,10 +238,7 @@ class FieldStrength:
         self._since_ns: dict[str, int] = {}
 
     def add(self, readings: Readings) -> list[str]:
-        """Add readings; return the sensors that are judged as weak by this call.
-
-        Readings with a missing axis are not judged.
-        """
+        """Return the sensors that are judged as weak; readings with a missing axis are skipped."""
         if self._judged.issuperset(readings.names):
             return []
         weak = []

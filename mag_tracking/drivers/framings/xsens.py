@@ -30,9 +30,9 @@ import struct
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
-from mag_tracking.drivers.reading import Parsed, Reading
+from mag_tracking.drivers.reading import Axes, Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
@@ -63,9 +63,6 @@ _ORIENTATIONS = {'quaternion', 'euler', 'matrix'}
 _FORMATS = {'float': _FLOAT, 'fp12.20': _FIXED_12_20}
 
 
-_Triple: TypeAlias = tuple[float, float, float]
-
-
 class DecodedMessage(NamedTuple):
     """Reading of a data message, and the causes for which data were ignored."""
 
@@ -75,7 +72,7 @@ class DecodedMessage(NamedTuple):
     """One cause for each occurrence of ignored data."""
 
 
-def _three_reals(data: bytes, precision: int) -> _Triple | None:
+def _three_reals(data: bytes, precision: int) -> Axes | None:
     """Decode three real numbers; None if the length of `data` does not match `precision`."""
     layout = _TRIPLE_FORMATS[precision]
     if len(data) != layout.size:
@@ -90,11 +87,9 @@ def _three_reals(data: bytes, precision: int) -> _Triple | None:
     return values
 
 
-def _decode_packet(identifier: int, data: bytes) -> tuple[str, float | _Triple | None] | None:
-    """Decode a packet into (attribute of `Reading`, value), None if it is not used.
-
-    The value is None if the length of the packet is wrong.
-    """
+def _decode_packet(identifier: int, data: bytes) -> tuple[str, float | Axes | None] | None:
+    """Decode a packet into (attribute of `Reading`, value), None if it is not used; the value is
+    None if the length of the packet is wrong."""
     if identifier == _PACKET_COUNTER:
         return 'sequence', int.from_bytes(data, 'big') if len(data) == 2 else None
     if identifier == _SAMPLE_TIME_FINE:
@@ -111,9 +106,8 @@ def read_mtdata2(data: bytes) -> DecodedMessage | None:
     """Decode DATA of an MTData2 message; None if the packets do not fill it, or a used one has an
     invalid length.
 
-    A packet is an identifier (u16), the length of its data (u8), and the data. Unused packets are
-    counted only if they contain raw values (0xA0..) or other magnetic data (0xC0..).
-    SampleTimeCoarse (0x1070) is too coarse for a clock.
+    A packet is an identifier (u16), the length of its data (u8), and the data. SampleTimeCoarse
+    (0x1070) is too coarse for a clock.
     """
     values: dict[str, Any] = {}
     causes: list[str] = []
@@ -142,8 +136,7 @@ def read_mtdata2(data: bytes) -> DecodedMessage | None:
 
 
 def _decoded_message(values: Mapping[str, Any], causes: Sequence[str]) -> DecodedMessage:
-    """Create a message from {attribute of `Reading`: value}; without field and acceleration, it has
-    no reading."""
+    """Message from {attribute of `Reading`: value}."""
     if 'field' in values or 'acceleration' in values:
         return DecodedMessage(Reading(**values), tuple(causes))
     return DecodedMessage(None, (*causes, 'messages without field or acceleration'))
@@ -152,10 +145,8 @@ def _decoded_message(values: Mapping[str, Any], causes: Sequence[str]) -> Decode
 class MTDataLayout:
     """Layout of MTData messages, which do not describe it, so that it must be configured.
 
-    `blocks`, in this order: 'temp', 'acc', 'gyr', 'mag', one of 'quaternion', 'euler' and 'matrix',
-    'analog_1', 'analog_2', 'status', 'counter'. `number_format` of all real numbers is 'float' or
-    'fp12.20'. `size` is the length of DATA in bytes. Raises SettingsError if a block is unknown or
-    out of order, there are several orientations, or neither 'acc' nor 'mag'.
+    `blocks` are keys of `_BLOCK_LENGTHS` in its order, at most one of them an orientation;
+    `number_format` is a key of `_FORMATS`. `size` is the length of DATA in bytes.
     """
 
     def __init__(self, blocks: Sequence[str], number_format: str) -> None:
@@ -321,7 +312,7 @@ class XsensFraming:
         return Parsed(tuple(readings), position, {c: n for c, n in rejected.items() if n})
 
     def _parse_step(self, window: bytes, more: bool) -> _ParseStep:
-        """Parse the message at the beginning of `window`; `more` is true if bytes may follow."""
+        """Parse the message at the beginning of `window`; `more` bytes may follow."""
         message = _message_at(window, 0, self._longest)
         if message is None:
             return _REJECT_STEP
@@ -341,8 +332,8 @@ class XsensFraming:
 
     def _search_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
                        more: bool) -> _ParseStep | None:
-        """Search `outer` for another data message; return a step that rejects `outer` or waits for
-        more bytes, or None without a message."""
+        """Step that rejects `outer` for another data message in it, or waits for more bytes; None
+        without a message."""
         rejection = _REJECT_STEP._replace(causes=('messages that contain the start of another',))
         index = 0
         while True:
@@ -365,10 +356,8 @@ class XsensFraming:
 
     @staticmethod
     def _next_start(window: bytes, index: int, end: int, complete: bool) -> int:
-        """Index of the next message start from `index` on; -1 if no message starts before `end`.
-
-        Both bytes of the start must be before `end` if `complete` is set, otherwise only the first.
-        """
+        """Index of the next message start from `index` on, of which both bytes (if `complete`) or
+        the first are before `end`; -1 if there is none."""
         found = window.find(_START, index, end if complete else end + 1)
         if found < 0 and not complete and end == len(window) and window.endswith(_PREAMBLE, index):
             return end - 1
