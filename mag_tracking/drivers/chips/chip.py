@@ -41,8 +41,7 @@ class Bus:
 
     No channel is open during a transfer to a chip directly on the bus. The only register of a
     multiplexer has one bit for each channel and is written without a register number (TCA9548A data
-    sheet, SCPS207, section 8.5). Transfers raise OSError if `smbus` is None, a bus that is not
-    open.
+    sheet, SCPS207, section 8.5). `smbus` is None for a bus that is not open.
     """
 
     def __init__(self, smbus: SMBus | None, monotonic_ns: Callable[[], int],
@@ -54,7 +53,7 @@ class Bus:
 
     @property
     def smbus(self) -> SMBus:
-        """Interface to the open bus; raises OSError if none is open."""
+        """Interface to the open bus."""
         if self._smbus is None:
             raise OSError(errno.ENODEV, 'the bus is not open')
         return self._smbus
@@ -92,8 +91,7 @@ class Registers:
         return self._bus.smbus.read_byte_data(self._location.address, register)
 
     def read_block(self, register: int, length: int) -> bytes:
-        """Read up to 32 successive registers; raises OSError if the block is shorter than
-        requested."""
+        """Read up to 32 successive registers."""
         self._bus.select(self._location)
         block = bytes(self._bus.smbus.read_i2c_block_data(self._location.address, register, length))
         if len(block) != length:
@@ -166,7 +164,7 @@ class Chip:
 
 
 def look_up_choice(name: str, value: Value, choices: Mapping[Value, Choice]) -> Choice:
-    """Look up the value of a setting in `choices`; raises SettingsError if it is not permitted."""
+    """Look up the value of a setting in `choices`."""
     if value not in choices:
         raise SettingsError(f'{name}: expected one of {", ".join(map(str, choices))}, got {value}')
     return choices[value]

@@ -71,7 +71,7 @@ class Hmc5883l(Chip):
         self._gain_bits = list(GAINS).index(settings.range_ut) << 5
 
     def set_up(self) -> None:
-        """Configure the chip, and make a measurement with the old gain."""
+        """Configure the chip."""
         self._registers.write(CONFIGURATION_A, self.CONFIGURATION)
         self._registers.write(CONFIGURATION_B, self._gain_bits)
         # The first measurement after a change of the gain still uses the old gain.
@@ -79,10 +79,7 @@ class Hmc5883l(Chip):
         self._registers.sleep(CONVERSION_S * CONVERSION_MARGIN)
 
     def measure(self) -> Measurement:
-        """Make a single measurement, None if it is not finished in time; yields times to wait, s.
-
-        Raises OSError if the chip has lost its configuration.
-        """
+        """Make a single measurement, None if it is not finished in time."""
         self._registers.write(MODE, SINGLE_MEASUREMENT)
         start_ns = self._registers.monotonic_ns()
         yield CONVERSION_S * CONVERSION_MARGIN

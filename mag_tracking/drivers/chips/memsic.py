@@ -97,10 +97,7 @@ class Mmc5983ma(Chip):
         self._registers.write(self.CONTROL_1, self._bandwidth)
 
     def measure(self) -> Measurement:
-        """Make one measurement if the stored offset is recent enough, otherwise a SET/RESET pair.
-
-        Yields times to wait [s]; the result is None if a conversion is not finished in time.
-        """
+        """Make one measurement if the stored offset is recent enough, otherwise a SET/RESET pair."""
         if self._offset is None or (
                 self._registers.monotonic_ns() - self._offset_ns >= self._set_reset_ns):
             return (yield from self._measure_pair())
@@ -112,10 +109,7 @@ class Mmc5983ma(Chip):
         return _conversion(middle_ns, (x, y, z))
 
     def _measure_pair(self) -> Measurement:
-        """Measure after SET and after RESET, store the offset, and return the corrected conversion.
-
-        The result is None if a conversion is not finished in time.
-        """
+        """Measure after SET and after RESET, and store the offset."""
         conversions = []
         for pulse in (SET, RESET):
             self._registers.write(self.CONTROL_0, pulse)

@@ -17,7 +17,7 @@ import math
 import re
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -46,6 +46,12 @@ from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.settings import param
 from mag_tracking.units import field_scale
 
+CLOSE_WAIT_S = 0.1
+"""[s] Maximum time that `close` waits for a `read` in another thread, in addition to one cycle."""
+_CLASSES: tuple[type[Chip], ...] = (Mmc5983ma, Mmc5603, Hmc5883l, Hmc5983, Rm3100, Lis3mdl)
+CHIPS = {cls.NAME: cls for cls in _CLASSES}
+"""Supported chips by name."""
+NO_ANSWER_ERRNOS = (errno.EREMOTEIO, errno.ENXIO)
 ENTRY = re.compile(r'(?P<name>[^:]+):(?P<chip>[^:]+):0x(?P<address>[0-9a-fA-F]{2})'
                    r'(@0x(?P<multiplexer>[0-9a-fA-F]{2})\.(?P<channel>[0-7]))?(:(?P<unit>[^:]+))?')
 
@@ -60,13 +66,9 @@ class Sensor(NamedTuple):
     """[T] Unit of the driver of the chip."""
 
 
-def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor]:
-    """Parse the entries name:chip:address[@multiplexer.channel][:unit] of a bus.
-
-    A chip that is not in `known` must be a module.Class. Raises SettingsError if an entry is not
-    valid or two conflict.
-    """
-    sensors = [parse_sensor(entry, known) for entry in entries]
+def _parse_sensors(entries: Sequence[str]) -> list[Sensor]:
+    """Parse the entries name:chip:address[@multiplexer.channel][:unit] of a bus."""
+    sensors = [_parse_sensor(entry) for entry in entries]
     multiplexers = {s.location.multiplexer for s in sensors} - {None}
     for i, sensor in enumerate(sensors):
         if sensor.location.address in multiplexers:
@@ -75,34 +77,31 @@ def parse_sensors(entries: Sequence[str], known: Collection[str]) -> list[Sensor
         for other in sensors[:i]:
             if other.name == sensor.name:
                 raise SettingsError(f'sensors: {sensor.name} appears twice')
-            if _conflict(sensor.location, other.location):
+            # A chip directly on the bus always answers.
+            if sensor.location == other.location or (
+                    sensor.location.address == other.location.address
+                    and None in (sensor.location.multiplexer, other.location.multiplexer)):
                 raise SettingsError(f'sensors: {other.name} and {sensor.name} both answer at '
                                     f'{sensor.location}')
     return sensors
 
 
-def _conflict(one: ChipLocation, other: ChipLocation) -> bool:
-    """Whether both chips would answer one request; a chip directly on the bus always answers."""
-    return one.address == other.address and (
-        one == other or None in (one.multiplexer, other.multiplexer))
-
-
-def parse_sensor(entry: str, known: Collection[str]) -> Sensor:
-    """Parse one entry, as `parse_sensors` does."""
+def _parse_sensor(entry: str) -> Sensor:
+    """Parse one entry; the chip is one of `CHIPS` or a module.Class."""
     match = ENTRY.fullmatch(entry)
     if match is None:
         raise SettingsError('sensors: expected name:chip:0xNN or name:chip:0xNN@0xNN.channel, '
                             f'followed by :unit for a CircuitPython driver, got {entry!r}')
     name, chip = match['name'], match['chip']
-    if chip not in known and '.' not in chip:
+    if chip not in CHIPS and '.' not in chip:
         raise SettingsError(f'sensors: {name}: chip {chip} is neither one of '
-                            f'{", ".join(known)} nor a module.Class')
+                            f'{", ".join(CHIPS)} nor a module.Class')
     address = _parse_address(name, 'address', match['address'], 0x08)
     location = ChipLocation(address)
     if match['multiplexer'] is not None:
         location = ChipLocation(address, _parse_address(
             name, 'multiplexer', match['multiplexer'], 0x70), int(match['channel']))
-    if chip in known:
+    if chip in CHIPS:
         if match['unit'] is not None:
             raise SettingsError(f'sensors: {name}: the unit of {chip} is known; remove '
                                 f':{match["unit"]}')
@@ -115,20 +114,12 @@ def parse_sensor(entry: str, known: Collection[str]) -> Sensor:
 
 
 def _parse_address(name: str, role: str, digits: str, lowest: int) -> int:
-    """Parse the digits of an address; raises SettingsError if it is not in `lowest` .. 0x77."""
+    """Parse the digits of an address from `lowest` to 0x77."""
     address = int(digits, 16)
     if not lowest <= address <= 0x77:
         raise SettingsError(f'sensors: {name}: {role} {address:#04x} is outside '
                             f'{lowest:#04x} .. 0x77')
     return address
-
-
-CLOSE_WAIT_S = 0.1
-"""[s] Maximum time that `close` waits for a `read` in another thread, in addition to one cycle."""
-_CLASSES: tuple[type[Chip], ...] = (Mmc5983ma, Mmc5603, Hmc5883l, Hmc5983, Rm3100, Lis3mdl)
-CHIPS = {cls.NAME: cls for cls in _CLASSES}
-"""Supported chips by name."""
-NO_ANSWER_ERRNOS = (errno.EREMOTEIO, errno.ENXIO)
 
 
 @dataclass(frozen=True)
@@ -159,13 +150,7 @@ class I2cSettings:
 
 
 class I2cDevice(Closable):
-    """Chips on one I2C bus, read in tesla, a `reading.Device`.
-
-    `open_bus` opens the bus with a given number as an `smbus2.SMBus` or equivalent. `counts` are
-    missed polling cycles and, for each sensor, failed readings, cycles without a new conversion,
-    and overwritten conversions. Raises SettingsError if no sensor is configured or a setting is not
-    valid.
-    """
+    """Chips on one I2C bus, read in tesla, a `reading.Device`."""
 
     SETTINGS = I2cSettings
 
@@ -174,9 +159,10 @@ class I2cDevice(Closable):
                  sleep: Callable[[float], object] = time.sleep) -> None:
         if settings.sensors == ('',):
             raise SettingsError('sensors: at least one is required, such as A:lis3mdl:0x1c')
-        self._sensors = {s.name: s for s in parse_sensors(settings.sensors, CHIPS)}
+        self._sensors = {s.name: s for s in _parse_sensors(settings.sensors)}
         self.counts: Counter[str] = Counter()
         self._settings, self._open_bus = settings, open_bus
+        self._name = f'/dev/i2c-{settings.bus}'
         self._monotonic_ns, self._sleep = monotonic_ns, sleep
         self._period_ns = round(1e9 / settings.rate_hz)
         super().__init__()
@@ -189,8 +175,7 @@ class I2cDevice(Closable):
         self._chips = self._create_chips(Bus(None, monotonic_ns, sleep))
 
     def open(self) -> None:
-        """Open the bus, identify the chips and configure them; raises DeviceError if one is missing
-        or of another type."""
+        """Open the bus, identify the chips and configure them."""
         with self._lock:
             self._release()
             try:
@@ -211,11 +196,6 @@ class I2cDevice(Closable):
             self._n_failed.clear()
             self._n_silent.clear()
 
-    @property
-    def _name(self) -> str:
-        """Path of the bus, for messages."""
-        return f'/dev/i2c-{self._settings.bus}'
-
     def _create_chips(self, bus: Bus) -> dict[str, Chip]:
         """Create the chips {sensor name: chip} without access to the bus."""
         chips: dict[str, Chip] = {}
@@ -234,7 +214,7 @@ class I2cDevice(Closable):
         self.counts[f'{cause}: {name}'] += 1
 
     def _set_up(self, name: str, chip: Chip, bus: Bus) -> None:
-        """Identify and configure a chip; raises DeviceError if this fails."""
+        """Identify and configure a chip."""
         sensor = self._sensors[name]
         label = f'{self._name}: {name} ({sensor.chip}, {sensor.location})'
         registers = Registers(bus, sensor.location)
@@ -271,8 +251,7 @@ class I2cDevice(Closable):
         return f'cannot be read: {error.strerror or error}'
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """Return the readings of the next polling cycle with at least one reading; none after
-        `close`."""
+        """Readings of the next polling cycle with at least one reading; none after `close`."""
         with self._lock:
             end_ns = self._monotonic_ns() + round(timeout_s * 1e9)
             while True:
@@ -288,10 +267,7 @@ class I2cDevice(Closable):
                     return sorted(arrivals, key=lambda a: a.arrival_ns)
 
     def _wait(self, end_ns: int) -> bool:
-        """Wait for the next polling cycle, at most until `end_ns`; return whether it is due.
-
-        Missed cycles are counted.
-        """
+        """Wait for the next polling cycle, at most until `end_ns`; return whether it is due."""
         while not self._closing:
             now_ns = self._monotonic_ns()
             n_missed = (now_ns - self._due_ns) // self._period_ns
@@ -334,10 +310,7 @@ class I2cDevice(Closable):
         return arrivals
 
     def _arrivals(self, name: str, conversion: Conversion | None) -> list[Arrival]:
-        """Return a list with the arrival of a conversion; empty if the conversion is missing.
-
-        A missing conversion is counted; too many in succession mark the device as lost.
-        """
+        """List with the arrival of a conversion; too many missing ones mark the device as lost."""
         self._n_failed[name] = 0
         if conversion is None:
             self._count('polling cycles without a new conversion', name)
