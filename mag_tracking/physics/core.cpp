@@ -24,6 +24,18 @@ Shape rows_of(const Array& array, const char* name) {
     return {array.shape(), array.shape() + array.ndim()};
 }
 
+// Array of a shape whose elements `set` writes without the interpreter lock.
+template <class Set>
+Array filled(const Shape& shape, Set set) {
+    Array array(shape);
+    double* out = array.mutable_data();
+    {
+        py::gil_scoped_release release;
+        set(out);
+    }
+    return array;
+}
+
 Shape with(Shape shape, Size last) {
     shape.push_back(last);
     return shape;
@@ -32,17 +44,13 @@ Shape with(Shape shape, Size last) {
 Array dipole_field(const Array& d, const Array& m) {
     const Shape shape = rows_of(d, "d");
     const double *d_ = input_of(d, "d", shape), *m_ = input_of(m, "m", shape);
-    Array B(shape);
-    double* out = B.mutable_data();
     const Size n = d.size();
-    {
-        py::gil_scoped_release release;
+    return filled(shape, [&](double* B) {
         for (Size i = 0; i < n; i += 3) {
-            for (int a = 0; a < 3; ++a) out[i + a] = 0.0;
-            Dipole({d_[i], d_[i + 1], d_[i + 2]}, {m_[i], m_[i + 1], m_[i + 2]}).add_field(out + i);
+            for (int a = 0; a < 3; ++a) B[i + a] = 0.0;
+            Dipole({d_[i], d_[i + 1], d_[i + 2]}, {m_[i], m_[i + 1], m_[i + 2]}).add_field(B + i);
         }
-    }
-    return B;
+    });
 }
 
 py::tuple dipole_jacobians(const Array& d, const Array& m) {
@@ -180,13 +188,8 @@ Array row_bases(const Array& theta, const Array& offsets, const Array& t, const 
     const Row row = row_of(offsets);
     const Size n = length_of(theta, "theta", 2), n_theta = row.n > 1 ? 7 : 6;
     const double* theta_ = input_of(theta, "theta", {n, n_theta});
-    Array A({n, 3 * samples.n, Size(3 * row.n)});
-    double* out = A.mutable_data();
-    {
-        py::gil_scoped_release release;
-        set_row_bases(theta_, n, int(n_theta), row, samples, out);
-    }
-    return A;
+    return filled({n, 3 * samples.n, Size(3 * row.n)},
+                  [&](double* A) { set_row_bases(theta_, n, int(n_theta), row, samples, A); });
 }
 
 Array row_derivatives(const Array& theta, const Array& moments, const Array& offsets,
@@ -196,13 +199,9 @@ Array row_derivatives(const Array& theta, const Array& moments, const Array& off
     const Size n = length_of(theta, "theta", 2), n_theta = row.n > 1 ? 7 : 6;
     const double* theta_ = input_of(theta, "theta", {n, n_theta});
     const double* m = input_of(moments, "moments", {n, 3 * row.n});
-    Array D({n, 3 * samples.n, n_theta});
-    double* out = D.mutable_data();
-    {
-        py::gil_scoped_release release;
-        set_row_derivatives(theta_, m, n, int(n_theta), row, samples, out);
-    }
-    return D;
+    return filled({n, 3 * samples.n, n_theta}, [&](double* D) {
+        set_row_derivatives(theta_, m, n, int(n_theta), row, samples, D);
+    });
 }
 
 // Clock of each of `n` samples; raises ValueError for a clock that is not in `theta`.
@@ -223,13 +222,9 @@ Array steady_bases(const Array& theta, const Array& offsets, const Array& t, con
     const std::int64_t* clocks = clocks_of(clock, samples.n, theta);
     const Size n = theta.shape(0), n_theta = theta.shape(1);
     const double* theta_ = input_of(theta, "theta", {n, n_theta});
-    Array A({n, 3 * samples.n, Size(3 * row.n)});
-    double* out = A.mutable_data();
-    {
-        py::gil_scoped_release release;
-        set_steady_bases(theta_, n, int(n_theta), row, samples, clocks, out);
-    }
-    return A;
+    return filled({n, 3 * samples.n, Size(3 * row.n)}, [&](double* A) {
+        set_steady_bases(theta_, n, int(n_theta), row, samples, clocks, A);
+    });
 }
 
 Array steady_derivatives(const Array& theta, const Array& moments, const Array& offsets,
@@ -241,13 +236,9 @@ Array steady_derivatives(const Array& theta, const Array& moments, const Array& 
     const Size n = theta.shape(0), n_theta = theta.shape(1);
     const double* theta_ = input_of(theta, "theta", {n, n_theta});
     const double* m = input_of(moments, "moments", {n, 3 * row.n});
-    Array D({n, 3 * samples.n, n_theta});
-    double* out = D.mutable_data();
-    {
-        py::gil_scoped_release release;
-        set_steady_derivatives(theta_, m, n, int(n_theta), row, samples, clocks, out);
-    }
-    return D;
+    return filled({n, 3 * samples.n, n_theta}, [&](double* D) {
+        set_steady_derivatives(theta_, m, n, int(n_theta), row, samples, clocks, D);
+    });
 }
 
 double residual(const Array& t, const Array& y, double time, double scale) {

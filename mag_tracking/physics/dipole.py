@@ -9,11 +9,9 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.physics import core
 
 MU0 = 4e-7 * math.pi
-"""Vacuum permeability [T m/A]; 4e-7 pi, as in the cited papers."""
-
+"""Vacuum permeability [T m/A], as in the cited papers."""
 K_DIPOLE = core.K_DIPOLE
 """Constant mu0 / (4 pi) of the dipole field [T m/A]."""
-
 
 sensor_fields = core.sensor_fields
 """Field (n_hyp, n_sensors, 3) [T, sensor frame] of dipoles, its derivative and its gradient.

@@ -6,7 +6,7 @@ design matrix of the moments, and the derivatives of the field with respect to t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -27,8 +27,7 @@ def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatA
     """Time, range and relative position of the closest point of approach (CPA) of a pass.
 
     `r0` [m] is the position relative to the sensor at time zero, `v0` [m/s] the velocity. The range
-    is zero if they are parallel (below 1e-15 ‖r0‖). Raises ValueError if `v0` is zero or not
-    finite. TSP14 eq. (24).
+    is zero if they are parallel. TSP14 eq. (24).
     """
     r0, v0 = np.asarray(r0, dtype=float), np.asarray(v0, dtype=float)
     speed = np.linalg.norm(v0)
@@ -43,6 +42,16 @@ def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatA
     if distance <= 1e-15 * np.linalg.norm(r0):
         distance, r_cpa = 0.0, np.zeros(3)
     return float(travelled / speed), distance, r_cpa
+
+
+def _offsets_of(n_dipoles: int) -> FloatArray:
+    """Offsets of the dipoles from the centre of the row, (d,), relative to its length."""
+    return np.linspace(-0.5, 0.5, n_dipoles) if n_dipoles > 1 else np.zeros(1)
+
+
+def _combinations_of(offsets: FloatArray) -> FloatArray:
+    """Orthogonal matrix, (d, d), of combinations of the moments on one axis."""
+    return np.linalg.qr(np.vander(offsets, increasing=True))[0]
 
 
 @dataclass(frozen=True)
@@ -81,14 +90,11 @@ class RowPass:
     @cached_property
     def combinations(self) -> FloatArray:
         """Orthogonal matrix, (3 d, 3 d), that converts linear parameters to moments of the row."""
-        powers = np.vander(self._dipole_offsets, increasing=True)
-        return np.kron(np.linalg.qr(powers)[0], np.eye(3))
+        return np.kron(_combinations_of(self._offsets), np.eye(3))
 
     @cached_property
-    def _dipole_offsets(self) -> FloatArray:
-        """Offsets of the dipoles from the centre of the row, (d,), relative to its length."""
-        d = self.n_dipoles
-        return np.linspace(-0.5, 0.5, d, dtype=np.float64) if d > 1 else np.zeros(1)
+    def _offsets(self) -> FloatArray:
+        return _offsets_of(self.n_dipoles)
 
     def with_nonnegative_length(self, theta: FloatArray,
                                 p: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -102,15 +108,15 @@ class RowPass:
     def basis(self, theta: FloatArray) -> FloatArray:
         """Whitened design matrices (n_paths, 3 n, 3 n_dipoles); NaN where a dipole is at a
         sensor."""
-        A = core.row_bases(np.ascontiguousarray(theta), self._dipole_offsets, self.t,
-                           self.positions, self.M)
+        A = core.row_bases(np.ascontiguousarray(theta), self._offsets, self.t, self.positions,
+                           self.M)
         return A @ self.combinations if self.n_dipoles > 1 else A
 
     def derivative(self, theta: FloatArray, p: FloatArray) -> FloatArray:
         """Derivative (n_paths, 3 n, 6 or 7) of basis(theta) p with respect to theta."""
         return core.row_derivatives(
             np.ascontiguousarray(theta), np.ascontiguousarray(p @ self.combinations.T),
-            self._dipole_offsets, self.t, self.positions, self.M)
+            self._offsets, self.t, self.positions, self.M)
 
 
 @dataclass(frozen=True)
@@ -119,13 +125,11 @@ class SuperposedPasses:
     concatenated."""
 
     rows: tuple[RowPass, ...]
-    """Pass of each row. All passes have the same samples."""
 
     @classmethod
     def from_orders(cls, orders: Sequence[int], t: FloatArray, positions: FloatArray,
                     M: FloatArray) -> 'SuperposedPasses':
-        """Create the passes of rows with `orders` dipoles and the same samples, as for
-        `RowPass`."""
+        """Create the passes of rows with `orders` dipoles and the same samples."""
         return cls(tuple(RowPass(t, positions, M, n_dipoles) for n_dipoles in orders))
 
     @cached_property
@@ -144,8 +148,7 @@ class SuperposedPasses:
 
     def with_nonnegative_length(self, theta: FloatArray,
                                 p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Equivalent parameters with non-negative lengths; see
-        `RowPass.with_nonnegative_length`."""
+        """As `RowPass.with_nonnegative_length`, for each row."""
         converted = [row.with_nonnegative_length(path, p[moment_slice])
                      for row, path, moment_slice in zip(self.rows, self.split(theta),
                                                         self.moment_slices, strict=True)]
@@ -167,7 +170,7 @@ class SuperposedPasses:
 
 
 def _consecutive_slices(lengths: Sequence[int]) -> tuple[slice, ...]:
-    """Create consecutive slices of the given lengths, from index zero."""
+    """Slices of the given lengths, one after the other from index zero."""
     ends = np.cumsum(lengths).tolist()
     return tuple(slice(end - length, end) for end, length in zip(ends, lengths, strict=True))
 
@@ -187,49 +190,43 @@ N_STRAIGHT = PATH.index('acceleration')
 class SteadyPass:
     """A row of `n_dipoles` dipoles on a path with constant acceleration and turn acceleration.
 
-    The path parameters `PATH` and the clock offsets are concatenated; the entries `free` are the
-    non-linear parameters theta, all others are constants from `fixed`. The linear parameters
-    (3 n_dipoles) are coefficients of orthogonal combinations of the moments. The tracker fits this
-    model in compiled code (`stages/track/steady_fit.hpp`); `basis` and `derivative` are for
-    searches with a prior and for simulations.
+    The row rotates with the vehicle. The path parameters `PATH` and the clock offsets are
+    concatenated; the entries `free` are the non-linear parameters theta, all others are constants
+    from `fixed`. The linear parameters are as in `RowPass`. The tracker fits this model in compiled
+    code (`stages/track/steady_fit.hpp`); `basis` and `derivative` are for searches with a prior and
+    for simulations.
     """
 
     t: FloatArray
-    """Timestamps of the samples, (n,) s."""
+    """As in `RowPass`."""
     positions: FloatArray
-    """Position of the sensor of each sample, (n, 3) m, world frame."""
+    """As in `RowPass`."""
     M: FloatArray
-    """Whitening matrix times world-to-sensor rotation of each sample, (n, 3, 3)."""
+    """As in `RowPass`."""
     clock: IntArray
     """Index of the clock of each sample, (n,); -1 for the reference clock, which has no offset."""
     free: IntArray
     """Indices of theta in the concatenated path parameters and clock offsets, ascending."""
     fixed: FloatArray
-    """Path parameters and clock offsets [s], (N_PATH + n_clocks,). The entries with the indices
-    `free` are ignored."""
+    """Path parameters and clock offsets [s], (N_PATH + n_clocks,); entries `free` are ignored."""
     n_dipoles: int
-    """Number of dipoles of the row."""
-    offsets: FloatArray = field(init=False)
-    """Offsets of the dipoles from the centre of the row, (d,), relative to its length."""
-    combinations: FloatArray = field(init=False)
-    """Orthogonal matrix, (d, d), that converts linear parameters to moments, for x, y or z."""
 
-    def __post_init__(self) -> None:
-        """Compute the offsets of the dipoles in the row and the combinations of their moments."""
-        d = self.n_dipoles
-        offsets = np.linspace(-0.5, 0.5, d) if d > 1 else np.zeros(1)
-        object.__setattr__(self, 'offsets', offsets)
-        object.__setattr__(self, 'combinations',
-                           np.linalg.qr(np.vander(offsets, increasing=True))[0])
+    @cached_property
+    def offsets(self) -> FloatArray:
+        """Offsets of the dipoles from the centre of the row, (d,), relative to its length."""
+        return _offsets_of(self.n_dipoles)
+
+    @cached_property
+    def combinations(self) -> FloatArray:
+        """Orthogonal matrix, (d, d), that converts linear parameters to moments, for x, y or z."""
+        return _combinations_of(self.offsets)
 
     @cached_property
     def _moment_transform(self) -> FloatArray:
-        """Matrix, (3 d, 3 d), that converts linear parameters to moments of the row."""
-        return np.kron(self.combinations, np.eye(3)).astype(np.float64)
+        return np.kron(self.combinations, np.eye(3))
 
     def all_parameters(self, theta: FloatArray) -> FloatArray:
-        """Path parameters and clock offsets (n_paths, N_PATH + n_clocks) with free parameters
-        `theta`."""
+        """Path parameters and clock offsets (n_paths, N_PATH + n_clocks) for free ones `theta`."""
         out = np.tile(self.fixed, (len(theta), 1))
         out[:, self.free] = theta
         return out

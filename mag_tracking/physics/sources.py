@@ -1,8 +1,7 @@
 """Source models of targets: states, exactly discretised motion, and dipoles.
 
-A source model maps a batch of target states to dipoles and their derivatives.
-`dipole.sensor_fields` computes the field at the sensors from the dipoles alone. A new type of
-target therefore requires only one new class, here or (for vehicles) in `vehicles.py`.
+A source model maps a batch of target states to dipoles and their derivatives, from which
+`dipole.sensor_fields` computes the field at the sensors.
 
 The process noise is the exact discretisation of continuous white noise in the highest derivative.
 T10 eq. (4.2) and ICASSP11 eq. (2) instead assume noise that is constant over a sample. PHD15 Paper
@@ -131,7 +130,6 @@ class Magnet:
     """Power spectral density of the angular acceleration, rad²/s³."""
 
     state_names = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mx', 'my', 'mz', 'wx', 'wy', 'wz')
-    """Names of the states in their order."""
 
     def dipoles(self, x: FloatArray) -> Dipoles:
         """Compute the dipole of each target state (n_hyp, 12)."""

@@ -19,8 +19,7 @@ def demagnetisation_factors(aspect: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Demagnetisation factors L1 along and L2 = (1 - L1)/2 across the axis of an ellipsoid.
 
     `aspect` is the semi-axis of revolution over the transverse one. L1 is 1/3 for a sphere; it
-    approaches 0 for a needle (`aspect` above 1) and 1 for a disk. Raises ValueError for an `aspect`
-    outside 1e-100 to 1e100.
+    approaches 0 for a needle (`aspect` above 1) and 1 for a disk.
 
     Instead of the closed form, 0/0 for a sphere, the underlying integral a b c/2 ∫ ds/((s + a^2)
     sqrt(...)) is evaluated as Carlson's R_D. MITRE12 eq. (A.2)-(A.4) with an error: t2 must be m -
@@ -40,8 +39,7 @@ def ellipsoid_moment(semi_axes: Sequence[float] | FloatArray, mu_r: float, headi
 
     The semi-axes (revolution, transverse) [m] are half the length and width of a vehicle; the axis
     of revolution is horizontal along `heading` [rad, from x to y]. `mu_r` is 11 in MITRE12 Table 1;
-    `earth_field` is B0 [T], and vectors are in the world frame. Raises ValueError unless the
-    semi-axes are positive and `mu_r` at least 1.
+    `earth_field` is B0 [T], and vectors are in the world frame.
 
     MITRE12 eq. (A.1), (A.5)-(A.7). There, B0/mu0 is printed as 2.5 B0/pi for B0 in microtesla, the
     moment is in the vehicle frame, the course is clockwise from north, and the vertical field in
@@ -134,8 +132,7 @@ class RowVehicle:
                        + self.difference_drift**2 * (np.eye(d) - averaging), np.eye(3))
 
     def dipoles(self, x: FloatArray) -> Dipoles:
-        """Compute the dipoles of target states; raises ValueError unless states match
-        `state_names`."""
+        """Compute the dipoles of target states (n_hyp, n_t)."""
         if x.shape[1:] != (len(self.state_names),):
             raise ValueError(f'{self.n_dipoles} dipoles need {len(self.state_names)} states, '
                              f'got an array of shape {x.shape}')
@@ -146,11 +143,9 @@ class RowVehicle:
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Predict states at constant velocity, or along an arc if the state has a turn rate.
 
-        See `SourceModel.propagate`. Backwards, or with zero variance in `P` so that straight paths
-        remain straight, the turn rate has no process noise. Without a turn rate, `F` (n_t, n_t) is
-        common to all hypotheses. The drift of the moments in `Q` is proportional to the magnitude
-        of the hard and soft iron moments; the effect of the turn rate noise on position and
-        velocity is neglected.
+        Backwards, or with zero variance in `P` so that straight paths remain straight, the turn
+        rate has no process noise. Without a turn rate, `F` (n_t, n_t) is common to all hypotheses.
+        The effect of the turn rate noise on position and velocity is neglected.
         """
         n = x.shape[1]
         Q = np.zeros((len(x), n, n))
@@ -171,8 +166,7 @@ class RowVehicle:
         return predicted, F_turn, Q
 
     def turn_variance(self, speed: FloatArray) -> FloatArray:
-        """Stationary variance [rad²/s²] of the turn rate at a horizontal speed; at most
-        `MAX_TURN_RATE` squared."""
+        """Stationary variance [rad²/s²] of the turn rate at a horizontal speed."""
         min_speed = self.turn_acceleration / MAX_TURN_RATE
         variance: FloatArray = np.square(self.turn_acceleration / np.maximum(speed, min_speed))
         return variance

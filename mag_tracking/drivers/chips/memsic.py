@@ -97,7 +97,7 @@ class Mmc5983ma(Chip):
         self._registers.write(self.CONTROL_1, self._bandwidth)
 
     def measure(self) -> Measurement:
-        """Make one measurement if the stored offset is recent enough, otherwise a SET/RESET pair."""
+        """Make one measurement if the stored offset is recent, otherwise a SET/RESET pair."""
         if self._offset is None or (
                 self._registers.monotonic_ns() - self._offset_ns >= self._set_reset_ns):
             return (yield from self._measure_pair())
