@@ -69,9 +69,8 @@ def observability(information: ArrayLike, names: Sequence[str],
     """Local observability of states from the eigenvalues of their Fisher information.
 
     Eigenvalues, condition number and rank refer to the states divided by `scale` (n_x,), their
-    typical magnitudes (default 1), required if the units differ by decades (metres and tesla).
-    Raises ValueError for an invalid matrix, scale or number of names. T10 sections 5.1-5.3 and
-    eq. (5.11); TSP14 section IV.
+    typical magnitudes (default 1), required if the units differ by decades (metres and tesla). T10
+    sections 5.1-5.3 and eq. (5.11); TSP14 section IV.
     """
     J = np.asarray(information, dtype=float)
     unit_diagonal('information', J)
@@ -114,7 +113,7 @@ def marginal(information: ArrayLike, keep: ArrayLike) -> FloatArray:
 
     This is the Schur complement J_kk - J_ko J_oo^-1 J_ok (TSP14 eq. (44)); its inverse is the block
     of the bound. It is zero in directions that `bound` finds unobservable; eliminated states need
-    not be observable. Raises ValueError for an index that is out of range or occurs twice.
+    not be observable.
     """
     J = np.asarray(information, dtype=float)
     try:
@@ -140,9 +139,8 @@ def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
     """Fisher information (9, 9) about [r0, v0, m] of a known range at the CPA (closest approach).
 
     `r0` [m] is the position at time zero relative to the sensor, `std` [m] that of the range
-    (zero in TSP14). Raises ValueError if `std` is not positive, `v0` is zero, or `r0` is parallel
-    to `v0`: the path then goes through the sensor. TSP14 eq. (35)-(37); the gradient with respect
-    to v0 printed in the proof of Proposition 2 lacks a minus sign.
+    (zero in TSP14). TSP14 eq. (35)-(37); the gradient with respect to v0 printed in the proof of
+    Proposition 2 lacks a minus sign.
     """
     r0, v0 = np.asarray(r0, dtype=float), np.asarray(v0, dtype=float)
     if r0.shape != (3,) or v0.shape != (3,):
@@ -215,8 +213,8 @@ def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
 
 
 def _inverse_root(J: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scale J to unit diagonal; return the scale (n,), a root G (n, rank) of the pseudo-inverse
-    G G' of the scaled matrix, and an orthonormal basis (n, n - rank) of its kernel."""
+    """Scale of J (n,) to unit diagonal, a root G (n, rank) of the pseudo-inverse G G' of the scaled
+    matrix, and an orthonormal basis (n, n - rank) of its kernel."""
     scale, w, V = unit_diagonal('information', J)
     zero = w <= RANK_TOLERANCE * w.max(initial=0.0)
     return scale, V[:, ~zero] / np.sqrt(w[~zero]), V[:, zero]

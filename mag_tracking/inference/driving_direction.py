@@ -62,8 +62,8 @@ def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotati
     """Correlation of the horizontal axes at a lag, with a variance of at least that of noise alone.
 
     `field` (n, 2) [T] is the field in x, y (z up) without the background; its first and last `lag`
-    samples must not contain the target. `noise_std` [T] is per axis. Raises ValueError unless 0 < 2
-    lag < n. PHD15 Paper B eq. (5), (11), (16).
+    samples must not contain the target. `noise_std` [T] is per axis. PHD15 Paper B eq. (5), (11),
+    (16).
     """
     n = len(field) - 2 * lag
     if lag < 1 or n < 1:
@@ -97,8 +97,8 @@ def _squared_lag_differences(field: FloatArray, lag: int) -> float:
 def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
     """Lag that matches the width of a pass; 0 if the field does not exceed the noise.
 
-    It is at least 1 and at most `max_lag`, the number of samples of the window before the pass and
-    after it, and a quarter of the window. `field` and `noise_std` are as for `field_rotation`.
+    `max_lag` is the number of samples of the window before the pass and after it. `field` and
+    `noise_std` are as for `field_rotation`.
     """
     window = 1 + len(field) // 20
     energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(window), 'same')
@@ -121,10 +121,8 @@ def fused_log_odds(log_odds: Iterable[float], same_side: Iterable[bool]) -> floa
 
 
 def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
-    """Horizontal field (n, 2) in the world frame from readings (n, 3) in the sensor frame.
-
-    A missing axis (NaN) that is nearly vertical is ignored; otherwise the component is NaN.
-    """
+    """Horizontal field (n, 2) in the world frame from readings (n, 3) in the sensor frame; a
+    missing axis (NaN) that is nearly vertical is ignored."""
     out: FloatArray = np.zeros((len(field), 2))
     for a in range(3):
         missing = np.isnan(field[:, a])

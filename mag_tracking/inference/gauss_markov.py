@@ -47,8 +47,8 @@ class GaussMarkovVectors:
                     dt: float) -> float:
         """Update with scalar measurements; return their log-density [nats] given the earlier ones.
 
-        Measurement i is H[i] (m,) times vector[i], plus noise of positive variance[i]. `vector` is
-        ascending, and `y` has no NaN. `dt` [s] is the time since the previous measurements.
+        Measurement i is H[i] (m,) times vector[i], plus noise of variance[i]. `vector` ascends, and
+        `y` has no NaN. `dt` [s] is the time since the previous measurements.
         """
         return core.step_vectors(self._x, self._P, self._log_w, self._densities,
                                  plain(vector, np.int64), plain(H), plain(y), plain(variance), dt,

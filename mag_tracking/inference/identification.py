@@ -77,9 +77,7 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, field_strength: 
 
     `moments` (n, 3) [A m²] and `field_strength` = B0/mu0 [A/m] are in the world frame; with 3
     B0/mu0, D is as defined in T10. Without `covariances`, moments have equal weight and the
-    residuals determine the covariance. Raises ValueError for invalid input, or if hard and soft
-    iron cannot be separated: a single heading, equal headings, or a vertical earth field. TSP14
-    section VI.E; T10 eq. (6.16).
+    residuals determine the covariance. TSP14 section VI.E; T10 eq. (6.16).
     """
     moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
     field_strength = np.asarray(field_strength, dtype=float)
@@ -115,8 +113,7 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, field_strength: 
 
 
 def _whitening_matrices(covariances: ArrayLike | None, n: int) -> FloatArray:
-    """Inverse Cholesky factors (n, 3, 3) of `n` covariances, identity matrices if None; raises
-    ValueError for a wrong shape or a covariance that is not positive definite."""
+    """Inverse Cholesky factors (n, 3, 3) of `n` covariances, identity matrices if None."""
     if covariances is None:
         return np.tile(np.eye(3), (n, 1, 1))
     covariances = np.asarray(covariances, dtype=float)
@@ -157,10 +154,11 @@ class EnrolledVehicle:
 
     def moment_at(self, heading: float, heading_std: float, field_strength: FloatArray
                   ) -> tuple[FloatArray, FloatArray] | None:
-        """Predict the moment (3,) [A m², world frame] of a pass at a heading, and its covariance.
+        """Predict the moment (3,) [A m², world frame] of a pass at a heading, and its covariance
+        without measurement noise.
 
-        `field_strength` is B0/mu0 [A/m, world frame]. The measurement noise is not included. None
-        if the vehicle was enrolled at another heading only. T10 eq. (6.16); TSP14 eq. (15), (16).
+        None if the vehicle was enrolled at another heading only. `field_strength` is B0/mu0 [A/m,
+        world frame]. T10 eq. (6.16); TSP14 eq. (15), (16).
         """
         pass_to_pass = PASS_TO_PASS_STD**2 * np.eye(3)
         if self.iron is None:
@@ -195,9 +193,8 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
           field_strength: FloatArray) -> EnrolledVehicle:
     """Enrol a vehicle from fitted moments (n, 3) [A m², world frame] of passes at known headings.
 
-    The variance between passes is added to `covariances`; `field_strength` is B0/mu0 [A/m, world].
-    Raises ValueError if there is no pass, a value is not finite, or the headings neither agree nor
-    differ by at least `MIN_HEADING_SEPARATION`.
+    The headings must agree, or differ by at least `MIN_HEADING_SEPARATION`. `field_strength` is
+    B0/mu0 [A/m, world frame].
     """
     moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
     if not len(moments):
@@ -222,7 +219,7 @@ def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance
              heading: float, heading_std: float, field_strength: FloatArray) -> Identification:
     """Identify the enrolled vehicle of a pass by its fitted moment (3,) [A m², world frame].
 
-    `heading` is in the world frame; `field_strength` is B0/mu0 [A/m, world frame].
+    `field_strength` is B0/mu0 [A/m, world frame].
     """
     log_p, distances, skipped = {}, {}, []
     for vehicle in vehicles:

@@ -28,8 +28,7 @@ def refine(residual_and_jacobian: ResidualAndJacobian, x: ArrayLike, n_iteration
     `residual_and_jacobian` returns whitened residuals, measured minus predicted, and the Jacobians
     of the prediction. Returns the final points; their costs, infinite if the model is not finite at
     the start; the pseudo-inverses of the information; and whether the step or the decrease of the
-    cost (at most the fraction `tolerance`) became negligible. Each start has its own damping; one
-    that reaches `MAX_DAMPING` has not converged. T10 section 2.3, Alg. 1.
+    cost (at most the fraction `tolerance`) became negligible. T10 section 2.3, Alg. 1.
     """
     x = np.array(x, dtype=float)
     residual, J, cost = _evaluate(residual_and_jacobian, x)
@@ -73,7 +72,7 @@ def _damped_step(J: FloatArray, residual: FloatArray, damping: FloatArray) -> Fl
 
 def _evaluate(residual_and_jacobian: ResidualAndJacobian, x: FloatArray
               ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Evaluate residuals, Jacobians and costs; the cost is infinite if any result is not finite."""
+    """Residuals, Jacobians and costs; the cost is infinite if any result is not finite."""
     with ignoring_overflow():
         residual, J = residual_and_jacobian(x)
         cost = np.einsum('ni,ni->n', residual, residual)
@@ -105,7 +104,7 @@ def score_sum_covariance(scores: FloatArray, lag: int) -> FloatArray:
     """Covariance of a sum of correlated scores (n, n_x), chronological ([NeweyWest87]_, Bartlett).
 
     `scores` are the gradients of each sample's cost at the minimum; beyond `lag` samples they are
-    independent. Positive semidefinite; about the information if model and noise are correct.
+    independent.
     """
     S = scores.T @ scores
     for k in range(1, min(lag, len(scores) - 1) + 1):
@@ -120,8 +119,8 @@ def model_error_covariance(t: Sequence[FloatArray], derivatives: Sequence[FloatA
 
     Residuals of model errors are correlated over `CORRELATION_TIME_S` and contain less information
     than their number suggests. For each sensor: ascending times [s], whitened derivatives
-    (n, k, n_x) and residuals (n, k). Positive semidefinite even if residuals are small by chance;
-    NaN if a variance in `covariance` (due to noise alone) is infinite.
+    (n, k, n_x) and residuals (n, k). NaN if a variance in `covariance` (due to noise alone) is
+    infinite.
     """
     scale = np.sqrt(np.diagonal(covariance))
     excess = np.zeros_like(covariance)
@@ -201,8 +200,7 @@ class SeparableProblem:
         return A - self._Q @ (self._Q.T @ A)
 
     def cost(self, theta: FloatArray) -> FloatArray:
-        """Minimum over p of the squared whitened residuals including the prior, (n,) for each
-        theta; infinite where the model is not finite."""
+        """Minimum over p of the squared whitened residuals including the prior, (n,)."""
         with ignoring_overflow():
             A = self._without_nuisance(self._model.basis(theta))
             p, _, _ = project_out_linear(A, self._y)
@@ -214,8 +212,7 @@ class SeparableProblem:
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Whitened residuals (n, n_y + n_known) and Jacobians of the prediction, for `refine`; the
-        n_known parameters with a prior come last."""
+        """Whitened residuals (n, n_y + n_known) and Jacobians of the prediction, for `refine`."""
         A = self._without_nuisance(self._model.basis(theta))
         p, residual, inverse = project_out_linear(A, self._y)
         D = self._without_nuisance(self._model.derivative(theta, p))
@@ -285,9 +282,8 @@ def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: Fl
                   n_distinct: int = 8) -> tuple[FloatArray, FloatArray]:
     """Minima (n, n_theta) of a reduced problem, and their costs.
 
-    All starting points are evaluated with `smooth`, and the best `n_refined` are refined by
-    `n_steps` Levenberg-Marquardt steps. The best `n_distinct` distinct ones (see `search`) are then
-    refined to minima of `coarse`.
+    Of all starting points, the best `n_refined` of `smooth` are refined by `n_steps` steps. The
+    best `n_distinct` distinct ones (see `search`) are then refined to minima of `coarse`.
     """
     theta, cost = starts, smooth.cost(starts)
     theta = theta[np.argsort(cost, kind='stable')[:n_refined]]
@@ -299,8 +295,7 @@ def coarse_minima(smooth: SeparableProblem, coarse: SeparableProblem, starts: Fl
 
 def fine_minimum(fine: SeparableProblem, theta: FloatArray, cost: FloatArray,
                  min_difference: FloatArray, n_best: int = 4) -> Minimum:
-    """Find the lowest minimum of `fine` from the `n_best` distinct points (see `search`) of lowest
-    cost."""
+    """Lowest minimum of `fine` from the `n_best` distinct points (see `search`) of lowest cost."""
     theta = theta[distinct(theta, cost, min_difference, n_best)]
     theta, cost, _, converged = refine(fine.residual_and_jacobian, theta, 100, 1e-8)
     order = np.argsort(cost, kind='stable')

@@ -14,7 +14,7 @@ def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
     """Whiten the rows of matrices `H` (..., n_y, n_x) to uncorrelated noise of variance 1.
 
     A row of NaN is not measured and becomes zero. `C` (..., n_y, n_y) broadcasts against `H`; None
-    if `H` is whitened already. Raises ValueError if `C` is not symmetric positive definite.
+    if `H` is whitened already.
     """
     H = np.asarray(H, dtype=float)
     if H.ndim < 2:
@@ -35,8 +35,7 @@ def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
 
 
 def leading_broadcast(name: str, A: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """Broadcast `A` read-only over leading axes to `shape`; raises ValueError naming `name` if the
-    last two lengths differ."""
+    """Broadcast `A` read-only over leading axes to `shape`."""
     A = np.asarray(A, dtype=float)
     try:
         if A.shape[-2:] == shape[-2:]:
@@ -46,20 +45,19 @@ def leading_broadcast(name: str, A: ArrayLike, shape: tuple[int, ...]) -> FloatA
     raise ValueError(f'{name} has shape {A.shape}, expected {shape}')
 
 
-def raise_for_invalid(name: str, requirement: str, A: FloatArray,
-                      is_invalid: BoolArray | np.bool_) -> None:
-    """Raise ValueError for the first matrix flagged in `is_invalid`; `requirement` is a property
-    such as 'symmetric'."""
+def raise_for_invalid(name: str, requirement: str, value: ArrayLike,
+                      is_invalid: BoolArray | np.bool_ | bool) -> None:
+    """Raise ValueError for the first entry of `value` that is flagged in `is_invalid`, if any."""
     for index in np.argwhere(is_invalid).tolist():
-        raise ValueError(f'{name}{index or ""} is not {requirement}: {A[tuple(index)].tolist()}')
+        actual = np.asarray(value)[tuple(index)].tolist()
+        raise ValueError(f'{name}{index or ""} must be {requirement}, got {actual}')
 
 
 def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Scale symmetric matrices `A` (..., n, n) to unit diagonal and decompose them.
 
     Returns the scale, the roots of the diagonal (1 where it is not positive); the ascending
-    eigenvalues of A / (scale scale'); and the eigenvectors in columns. Raises ValueError if a
-    matrix is not finite, symmetric and positive semidefinite.
+    eigenvalues of A / (scale scale'); and the eigenvectors in columns.
     """
     if A.ndim < 2 or A.shape[-1] != A.shape[-2]:
         raise ValueError(f'{name} must be square, got shape {A.shape}')

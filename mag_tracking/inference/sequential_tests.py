@@ -1,4 +1,8 @@
-"""Sequential tests of a track: Bayes factor of a target, and innovation consistency."""
+"""Sequential tests of a track: Bayes factor of a target, and innovation consistency.
+
+The normalised innovations squared (NIS) of a consistent filter are chi-square distributed; a
+filter that allows for model errors has smaller NIS. A single frame is not conclusive.
+"""
 
 from collections import deque
 
@@ -18,14 +22,14 @@ class SlidingSum:
         self._frames: deque[tuple[int, FloatArray]] = deque()
 
     def add(self, stamp_ns: int, value: ArrayLike) -> None:
-        """Add the value of a frame, with the same shape for all frames."""
+        """Add the value of a frame."""
         self._frames.append((stamp_ns, np.asarray(value, dtype=float)))
         while self._frames[0][0] < stamp_ns - self._window_ns:
             self._frames.popleft()
 
     @property
     def total(self) -> FloatArray:
-        """Sum of the values in the window, with the shape of a value; 0 before the first value."""
+        """Sum of the values in the window; 0 before the first value."""
         total: FloatArray = np.sum([value for _, value in self._frames], axis=0)
         return total
 
@@ -41,9 +45,7 @@ fit."""
 class TargetBayesFactor:
     """Bayes factor of a target against an alternative explanation, updated by each frame.
 
-    Attributes
-    ----------
-    log_ratio : log Bayes factor over the whole track, nats
+    `log_ratio` [nats] is its logarithm over the whole track.
     """
 
     def __init__(self) -> None:
@@ -55,9 +57,7 @@ class TargetBayesFactor:
     def add(self, log_ratio: float, stamp_ns: int, min_bayes_factor: float) -> None:
         """Add the log-density [nats] of a frame with a target minus that with the alternative.
 
-        The alternative is favoured at or below the reciprocal of `min_bayes_factor`. After a
-        `log_ratio` that is not finite, the Bayes factor remains unknown, and a target is never
-        favoured.
+        The alternative is favoured at or below the reciprocal of `min_bayes_factor`.
         """
         if not np.isfinite(log_ratio):
             self._is_known = False
@@ -72,7 +72,7 @@ class TargetBayesFactor:
 
     def would_be_favoured(self, log_ratio: float, min_bayes_factor: float) -> bool:
         """Whether a target would be favoured if the log-likelihood of the track increased by
-        `log_ratio` [nats]; False if the Bayes factor is unknown, or at or below `MIN_LOG_RATIO`."""
+        `log_ratio` [nats]."""
         return self._is_known and self.log_ratio > MIN_LOG_RATIO \
             and self.log_ratio + log_ratio >= float(np.log(min_bayes_factor))
 
@@ -86,11 +86,8 @@ class TargetBayesFactor:
         return bool(self._recent_sum.total < -np.log(min_bayes_factor))
 
     def disfavoured_s(self, stamp_ns: int) -> float:
-        """Time for which the Bayes factor of the whole track has favoured the alternative.
-
-        0 if the Bayes factor is unknown. 0 also if a target was favoured earlier, because the field
-        of a stopped vehicle is as smooth as the alternative.
-        """
+        """Time for which the Bayes factor of the whole track has favoured the alternative."""
+        # The field of a stopped vehicle, which was favoured earlier, is as smooth.
         if self._was_favoured or self._disfavoured_since_ns is None or not self._is_known:
             return 0.0
         return (stamp_ns - self._disfavoured_since_ns) / NS
@@ -113,8 +110,7 @@ class InnovationConsistency:
         self._recent_sum = SlidingSum(WINDOW_S)
 
     def add(self, nis: FloatArray, n_axes: FloatArray, stamp_ns: int) -> None:
-        """Add the NIS of each sensor in a frame (NaN if missing) and its number of measured
-        axes."""
+        """Add the NIS of each sensor in a frame (NaN if missing) and its number of axes."""
         values = np.stack([np.nan_to_num(nis), np.where(np.isnan(nis), 0, n_axes)])
         values = np.column_stack([values, values.sum(axis=1)])
         self._total += values
@@ -122,8 +118,7 @@ class InnovationConsistency:
 
     @property
     def excess(self) -> float:
-        """Largest significant ratio of actual to predicted innovation variance in the window; 1 if
-        the innovations of the network and of each sensor are consistent."""
+        """Largest significant ratio of actual to predicted innovation variance in the window."""
         recent = self._recent_sum.total
         fails = self._fails(recent)
         with np.errstate(invalid='ignore', divide='ignore'):
@@ -136,8 +131,7 @@ class InnovationConsistency:
         return bool(self._fails(self._total).any())
 
     def _fails(self, values: FloatArray) -> FloatArray:
-        """Flag the sums of NIS (n_sensors + 1,) above the threshold; `values` are sums and degrees
-        of freedom."""
+        """Flag the sums of NIS (n_sensors + 1,) above the threshold."""
         probability = np.append(np.full(self._n_sensors, FALSE_ALARM_PROBABILITY / self._n_sensors),
                                 FALSE_ALARM_PROBABILITY)
         nis, dof = values
