@@ -189,7 +189,9 @@ class SeparableProblem:
     def __init__(self, model: SeparableModel, y: FloatArray, nuisance: FloatArray | None = None,
                  prior: tuple[FloatArray, FloatArray] | None = None) -> None:
         self._model = model
-        self._prior = None if prior is None else _Prior(*prior)
+        mean, std = (np.zeros(0), np.zeros(0)) if prior is None else prior
+        self._known = np.flatnonzero(np.isfinite(std))
+        self._mean, self._std = mean[self._known], std[self._known]
         # The nuisance terms are projected out of model and measurements.
         self._Q = np.zeros((len(y), 0)) if nuisance is None else np.linalg.qr(nuisance)[0]
         self._y = y - self._Q @ (self._Q.T @ y)
@@ -207,8 +209,7 @@ class SeparableProblem:
             # Cheaper than the sum of the squared residuals, and accurate enough for a grid of
             # starting points.
             cost = self.energy - np.einsum('ni,ni->n', p, self._y @ A)
-            if self._prior is not None:
-                cost = cost + np.square(self._prior.residual(theta)).sum(axis=1)
+            cost = cost + np.square(self._prior_residual(theta)).sum(axis=1)
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -217,33 +218,20 @@ class SeparableProblem:
         p, residual, inverse = project_out_linear(A, self._y)
         D = self._without_nuisance(self._model.derivative(theta, p))
         J = D - A @ (inverse @ (np.swapaxes(A, 1, 2) @ D))
-        if self._prior is None:
-            return residual, J
-        prior_residual = self._prior.residual(theta)
-        return (np.hstack([residual, prior_residual]), np.concatenate(
-            [J, np.broadcast_to(self._prior.jacobian, (len(J), *self._prior.jacobian.shape))],
-            axis=1))
+        prior_J = np.eye(theta.shape[1])[self._known] / self._std[:, None]
+        return np.hstack([residual, self._prior_residual(theta)]), np.concatenate(
+            [J, np.broadcast_to(prior_J, (len(J), *prior_J.shape))], axis=1)
+
+    def _prior_residual(self, theta: FloatArray) -> FloatArray:
+        """Whitened residuals (n, n_known) of the parameters that have a prior."""
+        residual: FloatArray = (self._mean - theta[:, self._known]) / self._std
+        return residual
 
     def linear(self, theta: FloatArray) -> FloatArray:
         """Linear parameters (k,) that minimise the cost at one theta (n_theta,)."""
         p: FloatArray = project_out_linear(
             self._without_nuisance(self._model.basis(theta[None])), self._y)[0][0]
         return p
-
-
-class _Prior:
-    """Gaussian prior as whitened measurements of the n_known parameters that have a prior."""
-
-    def __init__(self, mean: FloatArray, std: FloatArray) -> None:
-        self._prior_indices = np.flatnonzero(np.isfinite(std))
-        self._mean, self._std = mean[self._prior_indices], std[self._prior_indices]
-        self.jacobian = (np.eye(len(mean)) / std)[self._prior_indices]
-        """Derivative of the whitened measurements, (n_known, n_theta)."""
-
-    def residual(self, theta: FloatArray) -> FloatArray:
-        """Whitened residuals (n, n_known) of the prior at theta (n, n_theta)."""
-        residual_of_prior: FloatArray = (self._mean - theta[:, self._prior_indices]) / self._std
-        return residual_of_prior
 
 
 @dataclass(frozen=True)
