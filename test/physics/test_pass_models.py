@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from mag_tracking.physics import passes
-from mag_tracking.physics.passes import (
-    N_PATH,
-    RowPass,
-    SteadyPass,
-    SuperposedPasses,
-)
+from mag_tracking.physics.passes import N_PATH, RowPass, SteadyPass, SuperposedPasses
 
 RNG = np.random.default_rng(4)
 T, POSITIONS, M = RNG.uniform(-1.0, 1.0, 6), RNG.uniform(-5.0, 5.0, (6, 3)), RNG.standard_normal(

@@ -9,12 +9,7 @@ from scipy.linalg import expm
 from mag_tracking.geometry import cross_matrix, left_jacobian, rotation_about_z
 from mag_tracking.physics import sources, vehicles
 from mag_tracking.physics.dipole import MU0, sensor_fields
-from mag_tracking.physics.sources import (
-    Magnet,
-    constant_velocity,
-    decaying_turn,
-    integrator_noise,
-)
+from mag_tracking.physics.sources import Magnet, constant_velocity, decaying_turn, integrator_noise
 from mag_tracking.physics.vehicles import MAX_TURN_RATE, RowVehicle, ellipsoid_moment
 
 EARTH, ACCELERATION = np.array([2e-6, 1.5e-5, -4.9e-5]), np.array([1.0, 1.0, 0.1])

@@ -24,22 +24,11 @@ from typing import NamedTuple
 
 from smbus2 import SMBus
 
-from mag_tracking.drivers.chips.chip import (
-    Bus,
-    Chip,
-    ChipLocation,
-    Conversion,
-    Registers,
-)
+from mag_tracking.drivers.chips.chip import Bus, Chip, ChipLocation, Conversion, Registers
 from mag_tracking.drivers.chips.circuitpython import UNITS, CircuitpythonChip
 from mag_tracking.drivers.chips.continuous import Lis3mdl, Lis3mdlSettings, Rm3100, Rm3100Settings
 from mag_tracking.drivers.chips.honeywell import Hmc5883l, Hmc5883lSettings, Hmc5983
-from mag_tracking.drivers.chips.memsic import (
-    Mmc5603,
-    Mmc5603Settings,
-    Mmc5983ma,
-    Mmc5983maSettings,
-)
+from mag_tracking.drivers.chips.memsic import Mmc5603, Mmc5603Settings, Mmc5983ma, Mmc5983maSettings
 from mag_tracking.drivers.reading import Arrival, Reading
 from mag_tracking.drivers.transports.polled import Closable
 from mag_tracking.errors import DeviceError, SettingsError
