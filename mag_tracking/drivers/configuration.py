@@ -45,7 +45,6 @@ KINDS = {
                'simulator': f'{_PACKAGE}.simulated_device:SimulatedDevice'},
 }
 """Class of each kind of transport, framing and device."""
-
 REQUIRED_MEMBERS = {'transport': ('is_message_oriented', 'open', 'read', 'close'),
                     'framing': ('parse',), 'device': ('open', 'read', 'close')}
 """Members that the class of a transport, framing or device must have besides `SETTINGS`."""

@@ -15,10 +15,8 @@ Axes: TypeAlias = tuple[float, float, float]
 
 
 class DeviceDate(float):
-    """Date and time of a device's clock, in microseconds since 1970 UTC.
-
-    The clock settings `tick_s` and `wrap` do not apply to it.
-    """
+    """Date and time of a device's clock, in microseconds since 1970 UTC, whatever the clock
+    settings."""
 
 
 class Reading(NamedTuple):
@@ -152,18 +150,13 @@ class Device(Connection[Arrival], Protocol):
 
 
 class FramedDevice:
-    """Device that applies a framing to the data of a transport, a `reading.Device`.
-
-    Attributes
-    ----------
-    CLOCK, DRIVER : settings common to all devices with this framing
-    examples : first rejected line and the remedy, by cause; the dict is replaced, never changed
-    """
+    """Device that applies a framing to the data of a transport, a `Device`."""
 
     def __init__(self, transport: Transport, framing: Framing) -> None:
         self._transport, self._framing = transport, framing
         self._unconsumed = b''
         self._rejected: Counter[str] = Counter()
+        # The first rejected line and the remedy, by cause; replaced, never changed.
         self.examples: dict[str, str] = {}
         self.CLOCK, self.DRIVER = (getattr(framing, name, {}) for name in ('CLOCK', 'DRIVER'))
 

@@ -101,7 +101,6 @@ ROUNDING_VARIANCE = 0.25
 """Variance of the readings in a second of a regular source, whose period is no part of a second."""
 MARGIN = 0.2
 """Difference of steadiness above which another source is selected."""
-
 Source: TypeAlias = tuple[str, str]
 """(name of the sensor at the device, source of the arrival)."""
 

@@ -26,8 +26,8 @@ def whitened_energy(y: FloatArray, C: FloatArray) -> tuple[FloatArray, IntArray]
 def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
     """Smallest pivot (n,) of each correlation matrix of `C` (n, 3, 3), over the measured axes.
 
-    A pivot is the fraction of an axis's variance that the preceding axes do not explain: 1 for
-    uncorrelated axes; NaN or at most 0 if the covariance is not positive definite.
+    A pivot is the fraction of an axis's variance that the preceding axes do not explain; NaN or at
+    most 0 if the covariance is not positive definite.
     """
     y, C = _contiguous(y, C)
     out = np.empty(len(y))
@@ -60,11 +60,8 @@ def _contiguous(y: FloatArray, C: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def second_moment(weights: FloatArray, differences: FloatArray,
                   covariances: FloatArray) -> FloatArray:
-    """Second moment (d, d) of a Gaussian mixture about an estimate, [BarShalom01]_ section 1.4.16.
-
-    `differences` (n, d) are the component means minus the estimate; `weights` need no
-    normalisation.
-    """
+    """Second moment (d, d) of a Gaussian mixture about an estimate ([BarShalom01]_ section 1.4.16),
+    from the `differences` (n, d) of the component means."""
     w = weights / weights.sum()
     moment: FloatArray = (np.einsum('n,nij->ij', w, covariances)
                           + np.einsum('n,ni,nj->ij', w, differences, differences))

@@ -23,10 +23,8 @@ from mag_tracking.inference.matrices import (
 
 RANK_TOLERANCE = 1e-12
 """Eigenvalues at or below this fraction of the largest eigenvalue count as zero."""
-
 _KERNEL_TOLERANCE = 1e-6
 """Component of a kernel along the axis of a state above which the state is unobservable."""
-
 _K_DIPOLE = 1e-7
 """mu0 / (4 pi) [T m/A]; not imported, because `inference` does not depend on `physics`."""
 
@@ -69,8 +67,7 @@ def observability(information: ArrayLike, names: Sequence[str],
     """Local observability of states from the eigenvalues of their Fisher information.
 
     Eigenvalues, condition number and rank refer to the states divided by `scale` (n_x,), their
-    typical magnitudes (default 1), required if the units differ by decades (metres and tesla). T10
-    sections 5.1-5.3 and eq. (5.11); TSP14 section IV.
+    typical magnitudes (default 1). T10 sections 5.1-5.3 and eq. (5.11); TSP14 section IV.
     """
     J = np.asarray(information, dtype=float)
     unit_diagonal('information', J)
@@ -192,8 +189,7 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
 def snr(h: ArrayLike, C: ArrayLike) -> FloatArray:
     """Signal-to-noise energy ratio h' C^-1 h of a noise-free field (..., n_y), T10 eq. (5.14).
 
-    It is the non-centrality parameter of `detection_theory.detection_probability`. NaN in `h` marks
-    an unmeasured axis; 0 if no axis is measured.
+    It is the non-centrality parameter of `detection_theory.detection_probability`.
     """
     A = whitened(np.asarray(h, dtype=float)[..., None], C)
     energy: FloatArray = np.einsum('...ij,...ij->...', A, A)

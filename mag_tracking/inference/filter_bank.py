@@ -145,10 +145,8 @@ class FilterBank:
         return is_separated
 
     def reweight(self, log_likelihood: FloatArray) -> float:
-        """Update the weights with the log-likelihoods of a frame; return the frame's log-evidence.
-
-        If no value is finite, the evidence is -inf and the weights do not change.
-        """
+        """Update the weights with the log-likelihoods of a frame; return the frame's log-evidence,
+        -inf if no value is finite, which leaves the weights unchanged."""
         log_likelihood = np.where(np.isfinite(log_likelihood), log_likelihood, -np.inf)
         joint_log_w = self.log_w + log_likelihood
         evidence = log_sum_exp(joint_log_w)

@@ -14,7 +14,6 @@ from mag_tracking.records import plain
 
 STRENGTHS = np.logspace(-1.5, 4.5, 13)
 """[1/s^1.5] Root spectral densities of the bank, relative to the scale of a component."""
-
 SWITCH_INTERVAL_S = 0.75
 """[s] Mean time between switches of the strength."""
 

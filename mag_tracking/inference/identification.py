@@ -128,10 +128,8 @@ def _whitening_matrices(covariances: ArrayLike | None, n: int) -> FloatArray:
 PASS_TO_PASS_STD = 20.0
 """Standard deviation of the moment of one vehicle between passes [A m²], in addition to the
 covariance of the fits (T10 Table 6.9: 14, 18 and 21 on the three axes)."""
-
 MIN_HEADING_SEPARATION = np.deg2rad(45.0)
 """Minimum difference of headings that separates hard from soft iron [rad]."""
-
 HEADING_TOLERANCE = np.deg2rad(10.0)
 """[rad] Maximum difference of headings at which a pass is compared with a vehicle that is enrolled
 at a single heading."""
@@ -191,11 +189,8 @@ class Identification:
 
 def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: FloatArray,
           field_strength: FloatArray) -> EnrolledVehicle:
-    """Enrol a vehicle from fitted moments (n, 3) [A m², world frame] of passes at known headings.
-
-    The headings must agree, or differ by at least `MIN_HEADING_SEPARATION`. `field_strength` is
-    B0/mu0 [A/m, world frame].
-    """
+    """Enrol a vehicle from fitted moments (n, 3) [A m², world frame] of passes at headings that
+    agree, or differ by at least `MIN_HEADING_SEPARATION`."""
     moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
     if not len(moments):
         raise ValueError(f'{name}: enrolment requires at least one pass')
@@ -217,10 +212,7 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
 
 def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance: FloatArray,
              heading: float, heading_std: float, field_strength: FloatArray) -> Identification:
-    """Identify the enrolled vehicle of a pass by its fitted moment (3,) [A m², world frame].
-
-    `field_strength` is B0/mu0 [A/m, world frame].
-    """
+    """Identify the enrolled vehicle of a pass by its fitted moment (3,) [A m², world frame]."""
     log_p, distances, skipped = {}, {}, []
     for vehicle in vehicles:
         predicted = vehicle.moment_at(heading, heading_std, field_strength)

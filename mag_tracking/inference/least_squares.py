@@ -16,7 +16,6 @@ from mag_tracking.inference.matrices import ignoring_overflow, pseudo_inverse
 
 ResidualAndJacobian: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Function of points (n, n_x) that returns residuals (n, n_y) and Jacobians (n, n_y, n_x)."""
-
 CORRELATION_TIME_S = 0.2
 """Correlation time of the model error of a vehicle [s]: a car length at 20 m/s."""
 
@@ -101,11 +100,8 @@ position would otherwise cancel each other with unbounded moments."""
 
 
 def score_sum_covariance(scores: FloatArray, lag: int) -> FloatArray:
-    """Covariance of a sum of correlated scores (n, n_x), chronological ([NeweyWest87]_, Bartlett).
-
-    `scores` are the gradients of each sample's cost at the minimum; beyond `lag` samples they are
-    independent.
-    """
+    """Covariance of a sum of correlated scores (n, n_x), the gradients of each sample's cost at the
+    minimum, independent beyond `lag` samples ([NeweyWest87]_, Bartlett)."""
     S = scores.T @ scores
     for k in range(1, min(lag, len(scores) - 1) + 1):
         pairs = scores[k:].T @ scores[:-k]

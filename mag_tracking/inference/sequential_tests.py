@@ -36,7 +36,6 @@ class SlidingSum:
 
 BAYES_FACTOR_WINDOW_S = 1.0
 """Length of the sliding window of `TargetBayesFactor.is_recently_disfavoured` [s]."""
-
 MIN_LOG_RATIO = -30.0
 """Log Bayes factor [nats] at or below which a track cannot become a target again, regardless of its
 fit."""
@@ -95,7 +94,6 @@ class TargetBayesFactor:
 
 WINDOW_S = 0.5
 """[s] Length of the window of latest frames that are tested together."""
-
 FALSE_ALARM_PROBABILITY = 1e-3
 """False-alarm probability of a test of the network, and of the tests of all sensors together."""
 

@@ -12,7 +12,6 @@ MU0 = 4e-7 * math.pi
 """Vacuum permeability [T m/A], as in the cited papers."""
 K_DIPOLE = core.K_DIPOLE
 """Constant mu0 / (4 pi) of the dipole field [T m/A]."""
-
 sensor_fields = core.sensor_fields
 """Field (n_hyp, n_sensors, 3) [T, sensor frame] of dipoles, its derivative and its gradient.
 
@@ -45,10 +44,8 @@ def _broadcast_pair(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray]
 
 
 def dipole_field(r: ArrayLike, m: ArrayLike) -> FloatArray:
-    """Flux density (..., 3) [T] of a point dipole `m` [A m²], NaN at r = 0; TSP14 eq. (2).
-
-    `r` [m] points from the source to the sensor; `r` and `m` broadcast.
-    """
+    """Flux density (..., 3) [T] of a point dipole `m` [A m²], NaN at r = 0; `r` [m] points from the
+    source to the sensor. TSP14 eq. (2)."""
     return core.dipole_field(*_broadcast_pair(r, m))
 
 

@@ -61,11 +61,8 @@ class RowPass:
     Path parameters (6, or 7 for two or more dipoles): centre r0 of the row at time zero [m],
     velocity v0 [m/s], length L from the first to the last dipole [m]. Linear parameters
     (3 n_dipoles): coefficients of orthogonal combinations of the moments [A m², world frame], from
-    tail to head.
-
-    The row is parallel to v0, as in TSP14 eq. (18)-(21), whereas the row of `vehicles.RowVehicle`
-    is horizontal. If v0 is zero, a row of two or more dipoles has no direction, and the field is
-    NaN.
+    tail to head. The row is parallel to v0, as in TSP14 eq. (18)-(21), whereas the row of
+    `vehicles.RowVehicle` is horizontal.
     """
 
     t: FloatArray
@@ -179,7 +176,6 @@ PATH = core.PATH
 """Names of the path parameters: position x, y, z [m] of the centre of the row, speed [m/s], heading
 [rad], climb [m/s] and turn_rate [rad/s] at time zero; length of the row [m]; acceleration [m/s^2];
 turn_acceleration [rad/s^2]. `core` defines the order."""
-
 N_PATH = len(PATH)
 """Number of path parameters."""
 N_STRAIGHT = PATH.index('acceleration')

@@ -143,11 +143,10 @@ class Magnet:
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Predict target states at constant velocity and constant angular velocity.
 
-        The process noise of a double integrator is mapped to the moment by w -> w x m; with `P`,
-        the second-order noise of the rotation is added. The moment is rotated by the full angle w
-        dt: the first-order m + dt (w x m) of PHD15 Paper A eq. (24) lengthens it by half the
-        squared angle in each step, and a filter with a known moment magnitude would overestimate
-        the distance.
+        The process noise of a double integrator is mapped to the moment by w -> w x m. The moment
+        is rotated by the full angle w dt: the first-order m + dt (w x m) of PHD15 Paper A eq. (24)
+        lengthens it by half the squared angle in each step, and a filter with a known moment
+        magnitude would overestimate the distance.
         """
         n, rotation_vector = len(x), dt * x[:, 9:12]
         R = rotation_from_quaternion(quaternion_from_rotation_vector(rotation_vector))

@@ -147,11 +147,8 @@ class Chip:
                                   f'of {expected:#04x}')
 
     def set_up(self) -> None:
-        """Configure the chip, regardless of its previous state.
-
-        Raises OSError if it does not answer, or DeviceError, with the reason, if it cannot be
-        configured.
-        """
+        """Configure the chip, regardless of its previous state; raises OSError if it does not
+        answer, or DeviceError, with the reason, if it cannot be configured."""
         raise NotImplementedError
 
     def measure(self) -> Measurement:

@@ -30,10 +30,8 @@ _Choice = TypeVar('_Choice', bound=str)
 
 
 class Rejected(ValueError):
-    """Rejection of a line or frame, with a cause such as 'with a wrong checksum' and a remedy.
-
-    The cause has no values of the line, because causes are counted.
-    """
+    """Rejection of a line or frame, with a remedy, and a cause such as 'with a wrong checksum',
+    which has no values of the line, because causes are counted."""
 
     def __init__(self, cause: str, remedy: str = '') -> None:
         super().__init__(cause)
@@ -197,10 +195,8 @@ def ignore_value(value: object) -> None:
 
 
 def decode_escapes(setting: str, text: str) -> bytes:
-    r"""Encode a string, with the escape sequences \n, \r, \t, \0, \\ and \xhh, as UTF-8.
-
-    Both kinds of YAML quotes thus have the same effect.
-    """
+    r"""Encode a string, with the escape sequences \n, \r, \t, \0, \\ and \xhh, as UTF-8, so that
+    both kinds of YAML quotes have the same effect."""
     def character(match: re.Match[str]) -> str:
         code = match[1]
         if code in _ESCAPED_CHARACTERS:

@@ -72,11 +72,8 @@ class Lines:
         self.max_length = max_length
 
     def parse(self, data: bytes, final: bool, read: Callable[[bytes], list[Reading]]) -> Parsed:
-        """Parse all lines; see `Framing.parse`.
-
-        `read` returns the readings of a line, valid UTF-8 that is neither empty nor too long, or
-        raises Rejected.
-        """
+        """Parse all lines, as `Framing.parse`; `read` returns the readings of a line, valid UTF-8
+        that is neither empty nor too long, or raises Rejected."""
         *lines, rest = data.split(self.end)
         if final:
             lines += [rest] if rest else []
