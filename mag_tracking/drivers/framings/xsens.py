@@ -222,15 +222,13 @@ class _ParseStep(NamedTuple):
     """Result of parsing a possible message at the beginning of a window."""
 
     length: int
-    """Number of bytes consumed; 0 if more bytes are needed."""
-    is_accepted: bool
-    """Whether the message is accepted."""
+    """Number of bytes consumed: 0 if more bytes are needed, 1 if the message is rejected."""
     causes: tuple[str, ...] = ()
     reading: Reading | None = None
 
 
-_WAIT_STEP = _ParseStep(0, False)
-_REJECT_STEP = _ParseStep(1, False)
+_WAIT_STEP = _ParseStep(0)
+_REJECT_STEP = _ParseStep(1)
 
 
 def _is_from_device(mid: int) -> bool:
@@ -304,8 +302,8 @@ class XsensFraming:
             if step.length == 0:
                 break
             position += step.length
-            if not step.is_accepted:
-                rejected['bytes between frames'] += step.length
+            if step.length == 1:
+                rejected['bytes between frames'] += 1
             rejected.update(step.causes)
             if step.reading is not None:
                 readings.append(step.reading)
@@ -327,8 +325,8 @@ class XsensFraming:
         if step is not None:
             return step
         if decoded is None:
-            return _ParseStep(message.end, True, (self._cause(window, message),))
-        return _ParseStep(message.end, True, decoded.causes, decoded.reading)
+            return _ParseStep(message.end, (self._cause(window, message),))
+        return _ParseStep(message.end, decoded.causes, decoded.reading)
 
     def _search_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
                        more: bool) -> _ParseStep | None:

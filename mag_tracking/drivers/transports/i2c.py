@@ -211,22 +211,10 @@ class I2cDevice(Closable):
             chip.check_identity(registers)
             chip.set_up()
         except DeviceError as error:
-            matching = [] if sensor.chip not in CHIPS else self._matching_chips(registers)
-            hint = f'; it is identified as {matching[0]}' if matching else ''
+            hint = _identity_hint(registers) if sensor.chip in CHIPS else ''
             raise DeviceError(f'{label}: {error}{hint}') from error
         except OSError as error:
             raise DeviceError(f'{label}: {self._fault(error)}') from error
-
-    def _matching_chips(self, registers: Registers) -> list[str]:
-        """Names of the supported chips whose identity matches the registers."""
-        names = []
-        for name, cls in CHIPS.items():
-            try:
-                cls.check_identity(registers)
-            except (DeviceError, OSError):
-                continue
-            names.append(name)
-        return names
 
     def _fault(self, error: OSError) -> str:
         """Explanation of a bus error, with the remedy."""
@@ -327,6 +315,17 @@ class I2cDevice(Closable):
         if self._bus is not None:
             self._bus.smbus.close()
             self._bus = None
+
+
+def _identity_hint(registers: Registers) -> str:
+    """Name the first supported chip whose identity matches the registers, if any."""
+    for name, chip in CHIPS.items():
+        try:
+            chip.check_identity(registers)
+        except (DeviceError, OSError):
+            continue
+        return f'; it is identified as {name}'
+    return ''
 
 
 def _open_error(error: OSError) -> str:
