@@ -128,16 +128,10 @@ py::tuple propagate_turn(const Array& x, double dt, double mean_factor, double f
     return py::make_tuple(moved, F);
 }
 
-// Raises ValueError if the states `x` (n, n_x) are too few for `n_dipoles` dipoles.
-void check_vehicles(const Array& x, int n_dipoles) {
-    length_of(x, "x", 2);
-    if (n_dipoles < 1 || x.shape(1) < 9 + 3 * Size(n_dipoles) + (n_dipoles > 1))
-        throw py::value_error("x: too few states for " + std::to_string(n_dipoles) + " dipoles");
-}
-
 py::tuple row_dipoles(const Array& x, int n_dipoles, const Array& field_strength) {
-    check_vehicles(x, n_dipoles);
-    const Size n = x.shape(0), n_x = x.shape(1), d = n_dipoles;
+    const Size n = length_of(x, "x", 2), n_x = x.shape(1), d = n_dipoles;
+    if (d < 1 || n_x < 9 + 3 * d + (d > 1))
+        throw py::value_error("x: too few states for " + std::to_string(d) + " dipoles");
     const double* x_ = input_of(x, "x", {n, n_x});
     const double* h = input_of(field_strength, "field_strength", {3});
     RowVehicle vehicle{};
@@ -153,22 +147,6 @@ py::tuple row_dipoles(const Array& x, int n_dipoles, const Array& field_strength
         vehicle.dipoles(x_ + p * n_x, r_ + 3 * d * p, m_ + 3 * d * p, dr + 3 * d * n_x * p,
                         dm + 3 * d * n_x * p);
     return py::make_tuple(r, m, dr_dx, dm_dx);
-}
-
-// Writes the process noise of the hard iron moments to Q (n, n_x, n_x): `walk` (3 d, 3 d) times
-// the squared magnitude of the iron.
-void set_moment_noise(const Array& x, const Array& walk, double field_strength2, Array Q) {
-    const Size k = length_of(walk, "walk", 2);
-    if (k % 3) throw py::value_error("walk: length must be a multiple of 3");
-    check_vehicles(x, int(k / 3));
-    const Size n = x.shape(0), n_x = x.shape(1);
-    const double *x_ = input_of(x, "x", {n, n_x}), *walk_ = input_of(walk, "walk", {k, k});
-    double* out = data_of(Q, "Q", {n, n_x, n_x});
-    for (Size p = 0; p < n; ++p, x_ += n_x, out += n_x * n_x) {
-        const double size2 = iron_size2(x_, int(k / 3), field_strength2);
-        for (Size i = 0; i < k; ++i)
-            for (Size j = 0; j < k; ++j) out[(6 + i) * n_x + 6 + j] = size2 * walk_[i * k + j];
-    }
 }
 
 Samples samples_of(const Array& t, const Array& positions, const Array& M) {
@@ -265,8 +243,6 @@ PYBIND11_MODULE(core, module) {
     module.def("propagate_turn", &propagate_turn, IN(x), py::arg("dt"), py::arg("mean_factor"),
                py::arg("final_factor"));
     module.def("row_dipoles", &row_dipoles, IN(x), IN(n_dipoles), IN(field_strength));
-    module.def("set_moment_noise", &set_moment_noise, IN(x), IN(walk), py::arg("field_strength2"),
-               IN(Q));
     module.def("row_bases", &row_bases, IN(theta), IN(offsets), IN(t), IN(positions), IN(M));
     module.def("row_derivatives", &row_derivatives, IN(theta), IN(moments), IN(offsets), IN(t),
                IN(positions), IN(M));

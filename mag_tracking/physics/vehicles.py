@@ -147,11 +147,13 @@ class RowVehicle:
         rate has no process noise. Without a turn rate, `F` (n_t, n_t) is common to all hypotheses.
         The effect of the turn rate noise on position and velocity is neglected.
         """
-        n = x.shape[1]
+        n, soft = x.shape[1], 6 + 3 * self.n_dipoles
         Q = np.zeros((len(x), n, n))
         Q[:, :6, :6] = integrator_noise(dt, self.acceleration_density)
-        core.set_moment_noise(np.ascontiguousarray(x, dtype=float), abs(dt) * self._moment_walk,
-                              float(self.field_strength @ self.field_strength), Q)
+        hard = x[:, 6:soft].reshape(len(x), self.n_dipoles, 3).sum(axis=1)
+        induced2 = x[:, soft:soft + 3]**2 * (self.field_strength @ self.field_strength) / 3.0
+        Q[:, 6:soft, 6:soft] = abs(dt) * self._moment_walk * (hard**2 + induced2).sum(
+            axis=1)[:, None, None]
         if not self.turn_acceleration:
             F = np.eye(n)
             F[:6, :6] = constant_velocity(dt)
