@@ -21,11 +21,8 @@ class Feature(NamedTuple):
     """A measured positive feature and its distribution in each class."""
 
     value: float
-    """Measured value, positive."""
     std: float
-    """Standard deviation of the measurement."""
     medians: Sequence[float]
-    """Median of the feature in each class."""
     spreads: Sequence[float]
     """Standard deviation of the natural logarithm of the feature in each class."""
 
@@ -140,7 +137,6 @@ class EnrolledVehicle:
     """A vehicle with its hard and soft iron, or with its moment at a single heading."""
 
     name: str
-    """Name of the vehicle."""
     iron: Iron | None
     """Hard and soft iron; None if all passes have about the same heading."""
     heading: float

@@ -72,7 +72,6 @@ class RowPass:
     M: FloatArray
     """Whitening matrix times world-to-sensor rotation of each sample, (n, 3, 3)."""
     n_dipoles: int = 1
-    """Number of dipoles of the row."""
 
     @cached_property
     def names(self) -> tuple[str, ...]:

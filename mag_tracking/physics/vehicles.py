@@ -101,7 +101,6 @@ class RowVehicle:
     """Random walk of the difference between a hard iron moment and the mean of the row, 1/s^0.5 per
     axis, normalised as `moment_drift`."""
     n_dipoles: int = 3
-    """Number of dipoles of the row."""
     turn_acceleration: float = 0.0
     """Standard deviation of the lateral acceleration of turning vehicles, m/s². Zero removes the
     turn rate from the state."""
