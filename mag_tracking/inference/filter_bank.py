@@ -23,7 +23,7 @@ _SINGULAR_TOLERANCE = 1e-15
 def log_sum_exp(a: ArrayLike) -> float:
     """log(sum(exp(a))) without overflow."""
     a = np.asarray(a, dtype=float)
-    top = np.max(a)
+    top = float(np.max(a))
     top = top if np.isfinite(top) else 0.0
     with np.errstate(divide='ignore'):
         return float(np.log(np.sum(np.exp(a - top))) + top)

@@ -46,7 +46,7 @@ def closest_approach(r0: ArrayLike, v0: ArrayLike) -> tuple[float, float, FloatA
 
 def _offsets_of(n_dipoles: int) -> FloatArray:
     """Offsets of the dipoles from the centre of the row, (d,), relative to its length."""
-    return np.linspace(-0.5, 0.5, n_dipoles) if n_dipoles > 1 else np.zeros(1)
+    return np.linspace(-0.5, 0.5, n_dipoles, dtype=np.float64) if n_dipoles > 1 else np.zeros(1)
 
 
 def _combinations_of(offsets: FloatArray) -> FloatArray:
@@ -86,7 +86,7 @@ class RowPass:
     @cached_property
     def combinations(self) -> FloatArray:
         """Orthogonal matrix, (3 d, 3 d), that converts linear parameters to moments of the row."""
-        return np.kron(_combinations_of(self._offsets), np.eye(3))
+        return np.kron(_combinations_of(self._offsets), np.eye(3)).astype(np.float64)
 
     @cached_property
     def _offsets(self) -> FloatArray:
@@ -218,7 +218,7 @@ class SteadyPass:
 
     @cached_property
     def _moment_transform(self) -> FloatArray:
-        return np.kron(self.combinations, np.eye(3))
+        return np.kron(self.combinations, np.eye(3)).astype(np.float64)
 
     def all_parameters(self, theta: FloatArray) -> FloatArray:
         """Path parameters and clock offsets (n_paths, N_PATH + n_clocks) for free ones `theta`."""
