@@ -106,7 +106,7 @@ def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
 
 def fused_log_odds(log_odds: Iterable[float], same_side: Iterable[bool]) -> float:
     """Sum the log-odds of left to right of sensors with independent errors; left and right are
-    exchanged on the other side of the road. PHD15 Paper B eq. (20)-(23)."""
+    exchanged on the other side of the road, PHD15 Paper B eq. (20)-(23)."""
     return float(sum(value if is_same_side else -value
                      for value, is_same_side in zip(log_odds, same_side, strict=True)))
 

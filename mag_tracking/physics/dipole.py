@@ -45,7 +45,7 @@ def _broadcast_pair(r: ArrayLike, m: ArrayLike) -> tuple[FloatArray, FloatArray]
 
 def dipole_field(r: ArrayLike, m: ArrayLike) -> FloatArray:
     """Flux density (..., 3) [T] of a point dipole `m` [A m²], NaN at r = 0; `r` [m] points from the
-    source to the sensor. TSP14 eq. (2)."""
+    source to the sensor, TSP14 eq. (2)."""
     return core.dipole_field(*_broadcast_pair(r, m))
 
 

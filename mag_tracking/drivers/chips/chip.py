@@ -124,9 +124,10 @@ Measurement: TypeAlias = Generator[float, None, Conversion | None]
 
 
 class Chip:
-    """Magnetometer chip. Creating an instance does not access the bus.
+    """Magnetometer chip.
 
-    `count` is called for each loss, with the cause as a plural noun phrase.
+    Creating an instance does not access the bus. `count` is called for each loss, with the cause as
+    a plural noun phrase.
     """
 
     NAME = ''
@@ -152,7 +153,7 @@ class Chip:
         raise NotImplementedError
 
     def measure(self) -> Measurement:
-        """Measure the field once; None if no new conversion is available. Yields times to wait, s.
+        """Measure the field once, None without a new conversion; yield the times to wait [s].
 
         The chips of a bus measure concurrently. While another chip uses the bus, the generator may
         be resumed later than requested. Raises OSError if the chip fails.
