@@ -2,7 +2,7 @@
 
 MITRE12 is Slater & Jacyna, Evaluating Detection and Estimation Capabilities of Magnetometer-Based
 Vehicle Sensors, 2012. The figures use the parameters of its tables and its equations, corrected as
-described in `physics.ellipsoid` and `inference.matched_filter`. The paper leaves several points
+described in `physics.vehicles` and `inference.matched_filter`. The paper leaves several points
 open; the following list states the choices made here. The first two choices reproduce the numbers
 of Figures 2 to 4; the alternatives that this program prints do not:
 
@@ -34,7 +34,7 @@ from mag_tracking.inference.matched_filter import (
     noise_spectrum,
 )
 from mag_tracking.physics.dipole import dipole_field, dipole_jacobians
-from mag_tracking.physics.ellipsoid import ellipsoid_moment
+from mag_tracking.physics.vehicles import ellipsoid_moment
 
 MPH = 0.44704
 """Mile per hour [m/s]."""

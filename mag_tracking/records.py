@@ -435,7 +435,7 @@ class Track:
     (n_sensors, 3) T, sensor frames."""
     mounting: FloatArray
     """Estimated mounting error of each sensor, (n_sensors, 3) rad: small angles as in
-    `physics.mounting`. (0, 3) if not estimated."""
+    `physics.dipole.rotated_fields`. (0, 3) if not estimated."""
     mounting_covariance: FloatArray
     """Covariance of `mounting`, (n_sensors, 3, 3) rad². (0, 3, 3) if not estimated."""
     hypotheses: Sequence[Hypothesis] = field(default=())

@@ -8,7 +8,7 @@ from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.crlb import path_bound
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import sensor_fields
-from mag_tracking.physics.motion import constant_velocity, integrator_noise
+from mag_tracking.physics.sources import constant_velocity, integrator_noise
 
 MIN_VELOCITY_STD = 1e-9
 """[m/s] Minimum standard deviation of the velocity prior, for targets at rest."""

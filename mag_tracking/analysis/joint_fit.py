@@ -27,8 +27,7 @@ from mag_tracking.analysis.pass_result import MAX_COST_RATIO, PassFit
 from mag_tracking.analysis.pass_trust import has_plausible_residual
 from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.geometry import overlap, propagated_path
-from mag_tracking.inference.least_squares import refine
-from mag_tracking.inference.separable_fit import coarse_minima, fine_minimum
+from mag_tracking.inference.least_squares import coarse_minima, fine_minimum, refine
 from mag_tracking.physics.passes import SuperposedPasses
 from mag_tracking.units import NS
 

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.inference.separable_fit import SeparableModel, SeparableProblem
+from mag_tracking.inference.least_squares import SeparableModel, SeparableProblem
 from mag_tracking.network import SensorNetwork
 from mag_tracking.units import NS
 

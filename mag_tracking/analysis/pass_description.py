@@ -18,8 +18,7 @@ from mag_tracking.analysis.pass_trust import (
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.geometry import cross_matrix
 from mag_tracking.inference.crlb import bound, cpa_information, information
-from mag_tracking.inference.least_squares import model_error_covariance
-from mag_tracking.inference.separable_fit import Minimum
+from mag_tracking.inference.least_squares import Minimum, model_error_covariance
 from mag_tracking.physics.passes import SuperposedPasses
 
 MIDDLE_FRACTION, MIN_MIDDLE_STD, MIDDLE_ACROSS_STD = 0.15, 0.4, 0.1

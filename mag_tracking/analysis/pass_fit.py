@@ -11,7 +11,7 @@ from mag_tracking.analysis.pass_description import PATH_TOLERANCE, SensorErrors,
 from mag_tracking.analysis.pass_result import PassFit
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.detection_theory import energy_threshold
-from mag_tracking.inference.separable_fit import search
+from mag_tracking.inference.least_squares import search
 from mag_tracking.physics.passes import RowPass
 
 N_COARSE = 24

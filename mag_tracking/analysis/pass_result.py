@@ -7,7 +7,7 @@ import numpy as np
 from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import heading_of, propagated_path, speed_of
-from mag_tracking.physics.anderson import closest_approach
+from mag_tracking.physics.passes import closest_approach
 
 RIVAL_CHI2 = 9.2
 """Maximum chi-square difference between a rival and the best fit (probability 0.01)."""

@@ -11,7 +11,7 @@ import numpy as np
 from mag_tracking.analysis.signature import Signature, features
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import LabelsError, MissingDependencyError
-from mag_tracking.inference.log_normal_classes import UNKNOWN
+from mag_tracking.inference.identification import UNKNOWN
 from mag_tracking.quantities import quantity
 
 VERSION = 1

@@ -20,7 +20,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.crlb import Observability, observability, path_bound, snr_range
 from mag_tracking.inference.detection_theory import energy_threshold, missed_detection_probability
 from mag_tracking.network import SensorNetwork
-from mag_tracking.physics.motion import constant_velocity, integrator_noise
+from mag_tracking.physics.sources import constant_velocity, integrator_noise
 from mag_tracking.pipeline import Settings
 from mag_tracking.stages.track.settings import acceleration_density
 

@@ -29,7 +29,7 @@ from mag_tracking.cli.options import (
 from mag_tracking.cli.vehicle_rows import HEADER, UNKNOWN, time_of, vehicle_row
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.detection_theory import energy_threshold
-from mag_tracking.inference.iron import Iron, hard_and_soft_iron
+from mag_tracking.inference.identification import Iron, hard_and_soft_iron
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0

@@ -16,7 +16,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.drivers.configuration import read_drivers
 from mag_tracking.drivers.driver import IGNORED, Driver, serve
-from mag_tracking.drivers.field_strength import WEAK_FIELD
+from mag_tracking.drivers.sensor_checks import WEAK_FIELD
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import read_network

@@ -14,8 +14,7 @@ from mag_tracking.apps.traffic import CountedVehicle, TrafficResult, TrafficSink
 from mag_tracking.cli.options import check_writable
 from mag_tracking.cli.vehicle_rows import time_of
 from mag_tracking.errors import SettingsError
-from mag_tracking.inference.identification import Identification
-from mag_tracking.inference.log_normal_classes import UNKNOWN
+from mag_tracking.inference.identification import UNKNOWN, Identification
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline
 from mag_tracking.quantities import quantity

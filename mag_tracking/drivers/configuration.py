@@ -21,12 +21,11 @@ import importlib
 import re
 from collections.abc import Collection, Iterable, Mapping
 from os import PathLike
-from typing import Any, TypeVar
+from typing import Any
 
 from mag_tracking.drivers.device_clock import ClockSettings
 from mag_tracking.drivers.driver import IGNORED, Driver
-from mag_tracking.drivers.framed_device import FramedDevice
-from mag_tracking.drivers.reading import Device
+from mag_tracking.drivers.reading import Device, FramedDevice
 from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.sensor_network import SensorNetwork
@@ -46,22 +45,16 @@ KINDS = {
                'simulator': f'{_PACKAGE}.simulated_device:SimulatedDevice'},
 }
 """Class of each kind of transport, framing and device."""
-
 REQUIRED_MEMBERS = {'transport': ('is_message_oriented', 'open', 'read', 'close'),
                     'framing': ('parse',), 'device': ('open', 'read', 'close')}
 """Members that the class of a transport, framing or device must have besides `SETTINGS`."""
 _ENTRY_KEYS = frozenset(('clock', 'sensor', 'sensors', *KINDS))
 """Keys of a device other than the driver settings and the groups of its kinds."""
 _NAME_PATTERN = re.compile(r'[A-Za-z][A-Za-z0-9_/]*')
-Settings = TypeVar('Settings', ClockSettings, DriverSettings)
 
 
 def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None) -> list[Driver]:
-    """Read a drivers file; all drivers are closed.
-
-    Raises SettingsError, which names file and device, for an invalid entry or a sensor that is not
-    in `network`.
-    """
+    """Read a drivers file; the SettingsError of an invalid entry names file and device."""
     content = read_yaml(path, SettingsError)
     if not isinstance(content, Mapping) or not content:
         raise SettingsError(f'{path}: expected a mapping of devices, got {short_repr(content)}')
@@ -75,11 +68,8 @@ def read_drivers(path: str | PathLike[str], network: SensorNetwork | None = None
 
 
 def load_class(role: str, name: object) -> Any:
-    """Import the class of a 'transport', 'framing' or 'device' (`role`).
-
-    `name` is a key of `KINDS[role]` or package.module:Class. Raises SettingsError if the class
-    cannot be loaded, or lacks `SETTINGS` or another required member.
-    """
+    """Import the class of a 'transport', 'framing' or 'device' (`role`), whose `name` is a key of
+    `KINDS[role]` or package.module:Class."""
     target = KINDS[role].get(name, name) if isinstance(name, str) else ''
     module, colon, class_name = target.partition(':')
     if not colon:
@@ -99,8 +89,7 @@ def load_class(role: str, name: object) -> Any:
 
 
 def driver_of(name: object, entry: object) -> Driver:
-    """Create a driver from an entry of a drivers file; raises SettingsError, which names the
-    device."""
+    """Create a driver from an entry of a drivers file."""
     if not isinstance(name, str) or not isinstance(entry, Mapping):
         raise SettingsError(f'{name}: expected a mapping of settings, got {short_repr(entry)}')
     if not is_utf8_encodable(name):
@@ -110,21 +99,16 @@ def driver_of(name: object, entry: object) -> Driver:
         kinds = [kind for role in KINDS if isinstance(kind := options.get(role), str)]
         _check_places(options, {*_ENTRY_KEYS, *_names(DriverSettings())}, kinds)
         device = _device(options, kinds)
-        clock = _with_group(_class_defaults(ClockSettings(), device, 'CLOCK'), options, 'clock',
-                            kinds)
+        clock = _with_group(replace(ClockSettings(), getattr(device, 'CLOCK', {})), options,
+                            'clock', kinds)
         sensors = _pop_sensors(options)
         for unit in ('unit', 'acceleration_unit'):
             if isinstance(options.get(unit), (int, float)) and not isinstance(options[unit], bool):
                 options[unit] = repr(options[unit])
-        settings = replace(_class_defaults(DriverSettings(), device, 'DRIVER'), options)
+        settings = replace(replace(DriverSettings(), getattr(device, 'DRIVER', {})), options)
         return Driver(name, device, settings, clock, sensors)
     except SettingsError as error:
         raise SettingsError(f'{name}: {error}') from error
-
-
-def _class_defaults(settings: Settings, device: Device, name: str) -> Settings:
-    """Return `settings`, overridden by the device's mapping `name` (CLOCK or DRIVER), if any."""
-    return replace(settings, getattr(device, name, {}))
 
 
 def _device(options: dict[str, Any], kinds: Collection[str]) -> Device:
@@ -144,19 +128,15 @@ def _device(options: dict[str, Any], kinds: Collection[str]) -> Device:
     groups = {role: options[role] if options[role] in KINDS[role] else f'{role}_settings'
               for role in roles}
     _check_groups(options, groups, kinds)
-    parts = [_create_part(classes[role], options, groups[role], kinds) for role in roles]
-    for role in roles:
+    parts: list[Any] = []
+    for role, group in groups.items():
         del options[role]
+        settings = _with_group(classes[role].SETTINGS(), options, group, kinds)
+        try:
+            parts.append(classes[role](settings))
+        except SettingsError as error:
+            raise SettingsError(f'{group}: {error}') from error
     return parts[0] if 'device' in groups else FramedDevice(*parts)
-
-
-def _create_part(cls: Any, options: dict[str, Any], group: str, kinds: Collection[str]) -> Any:
-    """Create a transport, framing or device; remove the `group` of its settings from `options`."""
-    settings = _with_group(cls.SETTINGS(), options, group, kinds)
-    try:
-        return cls(settings)
-    except SettingsError as error:
-        raise SettingsError(f'{group}: {error}') from error
 
 
 def _with_group(settings: Any, options: dict[str, Any], name: str, kinds: Collection[str]) -> Any:

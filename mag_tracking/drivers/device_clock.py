@@ -14,15 +14,55 @@ points above it reduces its likelihood by a factor of e. Slopes within that rang
 about as likely.
 """
 
+import itertools
 import math
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
-from mag_tracking.drivers.lower_line import Point, slope_range
 from mag_tracking.drivers.reading import DeviceDate
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 from mag_tracking.units import NS, TIME_UNITS, unit_since_1970
+
+Point: TypeAlias = tuple[float, float]
+"""Coordinates (x, y) of a point."""
+
+
+def lower_hull(points: Sequence[Point]) -> list[Point]:
+    """Vertices of the lower convex hull; points and vertices ascend in x, then y."""
+    hull: list[Point] = []
+    for x, y in points:
+        while len(hull) > 1:
+            (u, v), (w, z) = hull[-2:]
+            if (w - u) * (y - v) > (z - v) * (x - u):
+                break
+            hull.pop()
+        hull.append((x, y))
+    return hull
+
+
+def slope_range(points: Sequence[Point]) -> tuple[float, float]:
+    """Smallest and largest slope about as likely as that of the best line under the points.
+
+    At least three points ascend in x, then y, with at least two values of x. Both slopes are equal
+    if all points are on the best line.
+    """
+    hull = lower_hull(points)
+    middle = sum(x for x, _ in points) / len(points)
+    for (u, v), (x, y) in itertools.pairwise(hull):
+        if x >= middle:
+            slope = (y - v) / (x - u)
+            height = v + slope * (middle - u)
+            break
+    # Two points are always on the line. The median is insensitive to stalls of the link.
+    heights = sorted(y - height - slope * (x - middle) for x, y in points)[2:]
+    floor = height - heights[len(heights) // 2] / math.log(2.0) / len(points)
+    low = max((y - floor) / (x - middle) for x, y in hull if x < middle)
+    high = min((y - floor) / (x - middle) for x, y in hull if x > middle)
+    return min(low, slope), max(high, slope)
+
 
 NO_TICKS = 'readings without a device time'
 OUT_OF_RANGE = 'device times outside the counter range'
@@ -78,10 +118,7 @@ class ClockSettings:
 
 
 class ArrivalClock:
-    """Clock that timestamps readings by their arrival, with the interface of `DeviceClock`.
-
-    The counters and examples are always empty, the estimates always NaN.
-    """
+    """Clock that timestamps readings by their arrival, with the interface of `DeviceClock`."""
 
     drift_ppm = spread_s = stamp_std = math.nan
 
@@ -92,7 +129,7 @@ class ArrivalClock:
         self._min_delay_ns = round(settings.min_delay_s * 1e9)
 
     def stamp(self, ticks: float | None, arrival_ns: int) -> int:
-        """Monotonic time of arrival minus the minimum delay, ns; `ticks` are not used."""
+        """Monotonic time of arrival minus the minimum delay, ns."""
         return arrival_ns - self._min_delay_ns
 
 
@@ -166,30 +203,18 @@ class DeviceClock:
     tick or with the drift estimated before a restart. A reading that does not fit the clock gets no
     timestamp. A new clock starts when three consecutive different device times agree on it for
     longer than the delivery of queued messages could explain, or when no reading has fitted the old
-    clock for `window_s`. If readings of two clocks alternate, the older clock is kept.
-
-    If the device time hardly advances while readings arrive, as in whole seconds or with a wrong
-    `tick_s`, readings are timestamped by their arrival.
-
-    The rounding error of float64 is below 1 ns for 30 days, and below 0.1 µs for ten years.
-
-    Raises SettingsError if `min_step_s` exceeds `max_delay_s`, or the counter wraps within four
-    times `min_step_s`.
+    clock for `window_s`. If readings of two clocks alternate, the older clock is kept. The rounding
+    error of float64 is below 1 ns for 30 days, and below 0.1 µs for ten years.
 
     Attributes
     ----------
     counts : number of readings without a timestamp, by cause
     restarts : number of clocks started after the first, by cause
     examples : first device time and what to change, by cause; the dict is replaced, never changed
-    drift_ppm : ratio of the true to the nominal tick, minus 1, ppm; positive for a slow device; NaN
-        until estimated
-    spread_s : 95th percentile of the delays of recent messages, relative to the fastest; NaN until
-        estimated
-    stamp_std : error of a timestamp [s] due to delays and changes of the drift: 90th percentile of
-        the
-        height above the line, over the lowest points of all blocks; without an error of
-        `min_delay_s`;
-        NaN until estimated, and again after a restart
+    drift_ppm : ratio of the true to the nominal tick, minus 1, ppm; positive for a slow device
+    spread_s : 95th percentile of the delays of recent messages, relative to the fastest
+    stamp_std : error of a timestamp [s] due to delays and changes of the drift, without that of
+        `min_delay_s`: 90th percentile of the height of the lowest points above the line
     """
 
     def __init__(self, settings: ClockSettings) -> None:
@@ -227,11 +252,7 @@ class DeviceClock:
 
     def stamp(self, ticks: float | None, arrival_ns: int) -> int | None:
         """Update the clock with a reading; return its monotonic measurement time, ns, at most
-        `arrival_ns` minus the minimum delay.
-
-        `ticks` are at least 0 and less than `wrap`; repeated and slightly earlier values are
-        accepted. The cause of an unknown time, None, is counted in `counts`.
-        """
+        `arrival_ns` minus the minimum delay, or None."""
         if ticks is None:
             self.counts[NO_TICKS] += 1
             return None

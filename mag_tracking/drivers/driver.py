@@ -16,11 +16,9 @@ import numpy as np
 
 from mag_tracking.arrays import BoolArray
 from mag_tracking.drivers.device_clock import ArrivalClock, ClockSettings, DeviceClock
-from mag_tracking.drivers.field_strength import FieldStrength
 from mag_tracking.drivers.reading import Arrival, Axes, Device, DeviceDate, Reading
-from mag_tracking.drivers.sequence import SequenceCheck
+from mag_tracking.drivers.sensor_checks import FieldStrength, SequenceCheck, SingleSource, contest
 from mag_tracking.drivers.settings import STAMPED_BY, DriverSettings, acceleration_scale
-from mag_tracking.drivers.single_source import SingleSource, contest
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample, Readings
 from mag_tracking.units import NS, TIME_UNITS, field_scale, unit_since_1970
@@ -48,9 +46,8 @@ class Driver:
     """Keeps one device open and converts its readings to samples.
 
     Keys of `sensors` are the sensor's name at the device, the source of its readings, or '' for the
-    only sensor; values are names in the network. Tests replace the clocks and `sleep`.
-    `driver_counts` are samples by sensor, and losses and faults that the driver itself detects, by
-    cause. Raises SettingsError if a unit or `stamp_by` is not valid.
+    only sensor; values are names in the network. `driver_counts` are samples by sensor, and losses
+    and faults that the driver itself detects, by cause.
     """
 
     def __init__(self, name: str, device: Device, settings: DriverSettings,
@@ -58,11 +55,9 @@ class Driver:
                  monotonic_ns: Callable[[], int] = time.monotonic_ns,
                  wall_ns: Callable[[], int] = time.time_ns,
                  sleep: Callable[[float], object] = time.sleep) -> None:
-        self.name = name
-        self.sensors = dict(sensors)
+        self.name, self.sensors = name, dict(sensors)
+        self.device, self.settings, self.clock_settings = device, settings, clock_settings
         self.driver_counts: Counter[str] = Counter()
-        self._device, self._settings = device, settings
-        self._clock_settings = clock_settings
         self._scale = field_scale(settings.unit)
         self._acceleration_scale = acceleration_scale(settings.acceleration_unit)
         if settings.stamp_by not in STAMPED_BY:
@@ -72,7 +67,7 @@ class Driver:
         self._sequences = {s: SequenceCheck(settings.sequence_wrap) for s in sensors.values()
                            if s != IGNORED}
         self._clocks: dict[str, ArrivalClock | DeviceClock] = {}
-        self._is_open, self._failure, self._contest = False, '', ''
+        self.is_open, self._failure, self._contest = False, '', ''
         self._retry_s, self._last_receipt_ns = settings.retry_s, 0
         self._retry_ns: int | None = None
         self._offset_ns: int | None = None
@@ -89,32 +84,9 @@ class Driver:
         self._sample_counts = {s: f'samples: {s}' for s in sensors.values()}
 
     @property
-    def device(self) -> Device:
-        """Device that the driver keeps open."""
-        return self._device
-
-    @property
-    def settings(self) -> DriverSettings:
-        """Settings of the driver."""
-        return self._settings
-
-    @property
-    def clock_settings(self) -> ClockSettings:
-        """Clock settings, which apply to every source."""
-        return self._clock_settings
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the device is open."""
-        return self._is_open
-
-    @property
     def fault(self) -> str:
-        """Message of the latest failure, such as a lost connection or a silent device.
-
-        If the device has not failed, or data have arrived since, the sensors whose readings are
-        sent by several sources; otherwise empty.
-        """
+        """Message of the latest failure, or, if data have arrived since, the sensors whose readings
+        are sent by several sources."""
         return self._failure or self._contest
 
     def clocks(self) -> dict[str, ArrivalClock | DeviceClock]:
@@ -122,13 +94,12 @@ class Driver:
         return dict(self._clocks)
 
     def counts(self) -> Counter[str]:
-        """Numbers of samples, losses, faults and suspect readings, such as 'samples: mag_1' or
-        'connections lost'."""
+        """Numbers of samples, losses, faults and suspect readings, such as 'samples: mag_1'."""
         # Each counter is copied in one step, because the polling thread may add a cause meanwhile.
         total = self.driver_counts.copy()
         n_changes = sum(claim.changes for claim in list(self._claims.values()))
         total.update({'source changes': n_changes} if n_changes else {})
-        total.update(self._device.counts.copy())
+        total.update(self.device.counts.copy())
         for sensor, check in self._sequences.items():
             total.update({f'{cause}: {sensor}': n for cause, n in check.counts.copy().items() if n})
         for clock in self.clocks().values():
@@ -138,7 +109,7 @@ class Driver:
 
     def examples(self) -> dict[str, str]:
         """First rejected line or device time and the remedy, by cause in `counts`."""
-        found = dict(getattr(self._device, 'examples', {}))
+        found = dict(getattr(self.device, 'examples', {}))
         for clock in self.clocks().values():
             found.update(clock.examples)
         return found
@@ -146,10 +117,10 @@ class Driver:
     def poll(self, timeout_s: float) -> PollResult:
         """Return the samples received since the last call; wait for data for at most `timeout_s`.
 
-        A closed device is opened when the retry interval has elapsed. Device errors are not raised
-        but stored in `fault`. Raises ValueError if a field does not consist of three numbers.
+        Device errors are not raised but stored in `fault`. Raises ValueError if a field does not
+        consist of three numbers.
         """
-        if not self._is_open and not self._try_to_open(timeout_s):
+        if not self.is_open and not self._try_to_open(timeout_s):
             return EMPTY_RESULT
         try:
             arrivals = self._read(timeout_s)
@@ -164,37 +135,35 @@ class Driver:
                 text for (sensor, _), claim in self._claims.items()
                 if (text := contest(sensor, claim.selected, claim.rates_hz(now)))))
         if not arrivals:
-            timeout_s = self._settings.silence_timeout_s
+            timeout_s = self.settings.silence_timeout_s
             if timeout_s and now - self._last_receipt_ns > timeout_s * 1e9:
                 self.driver_counts['reopened after silence'] += 1
                 self._schedule_retry(f'open, but no data received for {timeout_s:g} s')
             return EMPTY_RESULT
-        self._last_receipt_ns, self._retry_s, self._failure = now, self._settings.retry_s, ''
+        self._last_receipt_ns, self._retry_s, self._failure = now, self.settings.retry_s, ''
         return self._samples(arrivals, self._wall_offset(now))
 
     def _read(self, timeout_s: float) -> list[Arrival]:
         """Read the available readings and, if there are any, those that follow within `batch_s`."""
-        arrivals = self._device.read(timeout_s)
-        if not arrivals or not self._settings.batch_s:
+        arrivals = self.device.read(timeout_s)
+        if not arrivals or not self.settings.batch_s:
             return arrivals
-        end = self._monotonic_ns() + round(self._settings.batch_s * 1e9)
+        end = self._monotonic_ns() + round(self.settings.batch_s * 1e9)
         while (left_ns := end - self._monotonic_ns()) > 0:
             try:
-                arrivals += self._device.read(left_ns / 1e9)
+                arrivals += self.device.read(left_ns / 1e9)
             except DeviceError:
                 # Readings received so far are kept; the next read raises the error again.
                 break
         return arrivals
 
     def close(self) -> None:
-        """Close the device; the next `poll` opens it again.
-
-        Readings that the device measures while it is closed are not counted as lost.
-        """
+        """Close the device; the next `poll` opens it again."""
+        # Readings that the device measures while it is closed are not lost.
         for check in self._sequences.values():
             check.pause()
-        self._device.close()
-        self._is_open, self._retry_ns = False, None
+        self.device.close()
+        self.is_open, self._retry_ns = False, None
 
     def fail(self, error: Exception) -> None:
         """Close the device after an unexpected error and schedule its reopening."""
@@ -209,26 +178,26 @@ class Driver:
                 self._sleep(min(timeout_s, wait_s))
                 return False
         try:
-            self._device.open()
+            self.device.open()
         except DeviceError as error:
             self.driver_counts['failed attempts to open'] += 1
             self._schedule_retry(error)
             return False
         # The previous fault remains until data arrive.
-        self._is_open, self._last_receipt_ns = True, self._monotonic_ns()
+        self.is_open, self._last_receipt_ns = True, self._monotonic_ns()
         return True
 
     def _schedule_retry(self, reason: object) -> None:
         """Close the device, schedule its reopening, and double the delay for the next failure."""
-        self._is_open, self._failure = False, str(reason)
+        self.is_open, self._failure = False, str(reason)
         try:
-            self._device.close()
+            self.device.close()
         # A third-party device or a removed port may raise any error; the device is reopened anyway.
         except Exception as error:
             self.driver_counts['failed attempts to close'] += 1
             self._failure += f'; closing failed as well: {type(error).__name__}: {error}'
         self._retry_ns = self._monotonic_ns() + round(self._retry_s * 1e9)
-        self._retry_s = min(2.0 * self._retry_s, self._settings.max_retry_s)
+        self._retry_s = min(2.0 * self._retry_s, self.settings.max_retry_s)
 
     def _wall_offset(self, monotonic_ns: int) -> int:
         """Return wall clock minus monotonic clock [ns]; count steps of the wall clock."""
@@ -239,7 +208,7 @@ class Driver:
         return offset
 
     def _samples(self, arrivals: Sequence[Arrival], offset_ns: int) -> PollResult:
-        """Convert arrivals to samples; raises ValueError if a field does not have three axes."""
+        """Convert arrivals to samples."""
         sensors: list[str] = []
         stamps: list[int] = []
         fields: list[Axes] = []
@@ -276,11 +245,8 @@ class Driver:
         return readings, accelerations
 
     def _resolve(self, reading: Reading, arrival: Arrival) -> tuple[str | None, int | None]:
-        """Return (network name of a reading, monotonic time [ns]).
-
-        The name is None if the sensor is unknown or ignored; the time is None for a duplicate, or
-        if no clock provides it.
-        """
+        """Network name of a reading, None if unknown or ignored, and its monotonic time [ns], None
+        for a duplicate or if no clock provides it."""
         key = reading.sensor, arrival.source
         sensor = self._known_sensors.get(key) or self._sensor_of(*key)
         if sensor is None:
@@ -294,7 +260,7 @@ class Driver:
         return sensor, self._stamp(reading, arrival)
 
     def _sensor_of(self, reported_name: str, source: str) -> str | None:
-        """Return a sensor's network name; None if ignored or unknown. Count unknown sensors."""
+        """Network name of a sensor; None if ignored or unknown."""
         sensor = next((self.sensors[name] for name in (reported_name, source)
                        if name and name in self.sensors), self.sensors.get(''))
         if sensor is None:
@@ -318,7 +284,7 @@ class Driver:
 
     def _stamp(self, reading: Reading, arrival: Arrival) -> int | None:
         """Return the monotonic time of the measurement [ns], or None if no clock provides it."""
-        stamp_by = self._settings.stamp_by
+        stamp_by = self.settings.stamp_by
         ticks = reading.sequence if stamp_by == 'sequence' else reading.ticks
         clock = self._clocks.get(arrival.source)
         if clock is None:
@@ -326,11 +292,8 @@ class Driver:
                 self._drop_clocks()
             uses_arrivals = stamp_by == 'arrival' or stamp_by == 'auto' and ticks is None
             clock = (ArrivalClock if uses_arrivals else DeviceClock)(
-                _clock_settings_for(ticks, self._clock_settings))
+                _clock_settings_for(ticks, self.clock_settings))
             self._clocks[arrival.source] = clock
-        if ticks is None and isinstance(clock, DeviceClock):
-            self.driver_counts['readings without a device time'] += 1
-            return None
         measurement = clock, ticks, arrival.arrival_ns
         if self._measurement != measurement or self._measured_ns is None:
             # The clock counts every reading without a time, so it is called for each of them.
@@ -348,8 +311,7 @@ class Driver:
 
 
 def _clock_settings_for(ticks: float | None, settings: ClockSettings) -> ClockSettings:
-    """Adapt the settings of a clock to a date, or to a number that only a time since 1970 can
-    be."""
+    """Adapt clock settings to a date, or to a number that only a time since 1970 can be."""
     unit = 'us' if isinstance(ticks, DeviceDate) else None
     # A counter of microseconds has no decimals.
     if unit is None and ticks is not None and (
@@ -372,8 +334,7 @@ def serve(driver: Driver, take: Callable[[Readings, Sequence[AccelerationSample]
           stopping: Callable[[], bool]) -> None:
     """Poll a driver and pass its samples to `take` until `stopping()` is true; then close it.
 
-    No error is raised, because `serve` may run in its own thread. Errors of the device are stored
-    in `driver.fault`; errors of `take` are counted in `driver.driver_counts`.
+    No error is raised, because `serve` may run in its own thread.
     """
     while not stopping():
         try:

@@ -8,17 +8,15 @@ framing, the chips on a bus, or the simulator.
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias, TypeVar
 
 Axes: TypeAlias = tuple[float, float, float]
 """Components x, y and z of a vector."""
 
 
 class DeviceDate(float):
-    """Date and time of a device's clock, in microseconds since 1970 UTC.
-
-    The clock settings `tick_s` and `wrap` do not apply to it.
-    """
+    """Date and time of a device's clock, in microseconds since 1970 UTC, whatever the clock
+    settings."""
 
 
 class Reading(NamedTuple):
@@ -85,16 +83,28 @@ class Chunk(NamedTuple):
     """Origin of the bytes, such as an MQTT topic or a UDP address; empty if unknown."""
 
 
-class Transport(Protocol):
-    """Receives bytes over a connection.
+class Arrival(NamedTuple):
+    """Reading with its time of arrival."""
+
+    arrival_ns: int
+    """`time.monotonic_ns()` at arrival."""
+    reading: Reading
+    source: str = ''
+    """Source of the chunk that contains the reading. All readings of one source share a clock."""
+
+
+Item = TypeVar('Item')
+
+
+class Connection(Protocol[Item]):
+    """Receives chunks or readings.
 
     Only `close` may be called before `open`, or while another thread calls a method.
     """
 
-    is_message_oriented: bool
-    """Whether each chunk is a complete message (a datagram), so that no frame spans two chunks."""
-    counts: Counter[str]
-    """Number of losses by cause, such as 'empty datagrams'."""
+    @property
+    def counts(self) -> Counter[str]:
+        """Number of losses by cause, such as 'empty datagrams'."""
 
     def open(self) -> None:
         """Open the connection.
@@ -105,17 +115,17 @@ class Transport(Protocol):
             If opening fails. The message includes the remedy, and nothing remains open.
         """
 
-    def read(self, timeout_s: float) -> list[Chunk]:
-        """Return the data received; wait only if no data is available.
+    def read(self, timeout_s: float) -> list[Item]:
+        """Return what was received; wait only if nothing is available.
 
         Parameters
         ----------
         timeout_s : float, s
-            Maximum time to wait for data.
+            Maximum time to wait.
 
         Returns
         -------
-        list of Chunk
+        list of Chunk or Arrival
             Empty if nothing arrived in time.
 
         Raises
@@ -128,50 +138,59 @@ class Transport(Protocol):
         """Close the connection. May be called twice, and before `open`."""
 
 
-class Arrival(NamedTuple):
-    """Reading with its time of arrival."""
+class Transport(Connection[Chunk], Protocol):
+    """Receives bytes over a connection."""
 
-    arrival_ns: int
-    """`time.monotonic_ns()` at arrival."""
-    reading: Reading
-    source: str = ''
-    """Source of the chunk that contains the reading. All readings of one source share a clock."""
+    is_message_oriented: bool
+    """Whether each chunk is a complete message (a datagram), so that no frame spans two chunks."""
 
 
-class Device(Protocol):
-    """Receives readings of sensors. The calling rules of `Transport` apply."""
+class Device(Connection[Arrival], Protocol):
+    """Receives readings of sensors."""
+
+
+class FramedDevice:
+    """Device that applies a framing to the data of a transport, a `Device`."""
+
+    def __init__(self, transport: Transport, framing: Framing) -> None:
+        self._transport, self._framing = transport, framing
+        self._unconsumed = b''
+        self._rejected: Counter[str] = Counter()
+        # The first rejected line and the remedy, by cause; replaced, never changed.
+        self.examples: dict[str, str] = {}
+        self.CLOCK, self.DRIVER = (getattr(framing, name, {}) for name in ('CLOCK', 'DRIVER'))
 
     @property
     def counts(self) -> Counter[str]:
-        """Number of losses by cause."""
+        """Numbers of losses and rejections, by cause."""
+        # Each counter is copied in one step, because the polling thread may add a cause meanwhile.
+        total = self._rejected.copy()
+        total.update(self._transport.counts.copy())
+        return total
 
     def open(self) -> None:
-        """Open the device.
-
-        Raises
-        ------
-        DeviceError
-            If opening fails. The message includes the remedy, and nothing remains open.
-        """
+        """Open the transport; discard and count unconsumed bytes of the previous connection."""
+        if self._unconsumed:
+            self._rejected['bytes of truncated frames'] += len(self._unconsumed)
+            self._unconsumed = b''
+        self._transport.open()
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """Return the readings received; wait only if no reading is available.
-
-        Parameters
-        ----------
-        timeout_s : float, s
-            Maximum time to wait for a reading.
-
-        Returns
-        -------
-        list of Arrival
-            Empty if nothing arrived in time.
-
-        Raises
-        ------
-        DeviceError
-            If the connection is lost.
-        """
+        """Return the readings received; wait only if no data is available."""
+        out: list[Arrival] = []
+        for chunk in self._transport.read(timeout_s):
+            data = (chunk.data if self._transport.is_message_oriented
+                    else self._unconsumed + chunk.data)
+            parsed = self._framing.parse(data, final=self._transport.is_message_oriented)
+            if not self._transport.is_message_oriented:
+                self._unconsumed = data[parsed.consumed:]
+            self._rejected.update(parsed.rejected)
+            if parsed.examples:
+                self.examples = {**parsed.examples, **self.examples}
+            out += [Arrival(chunk.arrival_ns, reading, chunk.source)
+                    for reading in parsed.readings]
+        return out
 
     def close(self) -> None:
-        """Close the device. May be called twice, and before `open`."""
+        """Close the transport."""
+        self._transport.close()

@@ -1,8 +1,4 @@
-"""Device that simulates vehicles passing the sensors of a network in real time.
-
-It is used to try the complete system without hardware, and to measure the computational cost of
-the system.
-"""
+"""Device that simulates vehicles passing the sensors of a network in real time."""
 
 import bisect
 import math
@@ -57,11 +53,7 @@ class SimulatorSettings:
 
 
 class SimulatedDevice:
-    """Simulates all sensors of a network, in tesla, as a `reading.Device`.
-
-    `counts` are readings dropped because they were not read in time. Raises SettingsError without a
-    network, without its Earth field, or if the path past the sensors has length 0.
-    """
+    """Simulates all sensors of a network, in tesla, as a `reading.Device`."""
 
     SETTINGS = SimulatorSettings
     CLOCK = {'tick_s': TICK_S}

@@ -1,4 +1,4 @@
-// Covariances of the three axes of a sensor, some of which may be missing (axes.py).
+// Covariances of the three axes of a sensor, some of which may be missing (covariances.py).
 
 #pragma once
 

@@ -3,13 +3,13 @@
 from mag_tracking.arrays import FloatArray, IntArray
 
 def energies(y: FloatArray, C: FloatArray, energy: FloatArray, axes: IntArray) -> bool:
-    """Write `axes.whitened_energy` to `energy` and `axes`.
+    """Write `covariances.whitened_energy` to `energy` and `axes`.
 
     Return False if a covariance is not positive definite.
     """
 
 def smallest_pivots(y: FloatArray, C: FloatArray, out: FloatArray) -> None:
-    """Write `axes.smallest_pivots` to `out`."""
+    """Write `covariances.smallest_pivots` to `out`."""
 
 def step_vectors(x: FloatArray, P: FloatArray, log_w: FloatArray, densities: FloatArray,
                  vector: IntArray, H: FloatArray, y: FloatArray, variance: FloatArray, dt: float,

@@ -9,7 +9,6 @@ or not positive (semi)definite raise ValueError.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,10 +23,8 @@ from mag_tracking.inference.matrices import (
 
 RANK_TOLERANCE = 1e-12
 """Eigenvalues at or below this fraction of the largest eigenvalue count as zero."""
-
 _KERNEL_TOLERANCE = 1e-6
 """Component of a kernel along the axis of a state above which the state is unobservable."""
-
 _K_DIPOLE = 1e-7
 """mu0 / (4 pi) [T m/A]; not imported, because `inference` does not depend on `physics`."""
 
@@ -70,9 +67,7 @@ def observability(information: ArrayLike, names: Sequence[str],
     """Local observability of states from the eigenvalues of their Fisher information.
 
     Eigenvalues, condition number and rank refer to the states divided by `scale` (n_x,), their
-    typical magnitudes (default 1), required if the units differ by decades (metres and tesla).
-    Raises ValueError for an invalid matrix, scale or number of names. T10 sections 5.1-5.3 and
-    eq. (5.11); TSP14 section IV.
+    typical magnitudes (default 1). T10 sections 5.1-5.3 and eq. (5.11); TSP14 section IV.
     """
     J = np.asarray(information, dtype=float)
     unit_diagonal('information', J)
@@ -115,7 +110,7 @@ def marginal(information: ArrayLike, keep: ArrayLike) -> FloatArray:
 
     This is the Schur complement J_kk - J_ko J_oo^-1 J_ok (TSP14 eq. (44)); its inverse is the block
     of the bound. It is zero in directions that `bound` finds unobservable; eliminated states need
-    not be observable. Raises ValueError for an index that is out of range or occurs twice.
+    not be observable.
     """
     J = np.asarray(information, dtype=float)
     try:
@@ -141,9 +136,8 @@ def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
     """Fisher information (9, 9) about [r0, v0, m] of a known range at the CPA (closest approach).
 
     `r0` [m] is the position at time zero relative to the sensor, `std` [m] that of the range
-    (zero in TSP14). Raises ValueError if `std` is not positive, `v0` is zero, or `r0` is parallel
-    to `v0`: the path then goes through the sensor. TSP14 eq. (35)-(37); the gradient with respect
-    to v0 printed in the proof of Proposition 2 lacks a minus sign.
+    (zero in TSP14). TSP14 eq. (35)-(37); the gradient with respect to v0 printed in the proof of
+    Proposition 2 lacks a minus sign.
     """
     r0, v0 = np.asarray(r0, dtype=float), np.asarray(v0, dtype=float)
     if r0.shape != (3,) or v0.shape != (3,):
@@ -195,39 +189,28 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
 def snr(h: ArrayLike, C: ArrayLike) -> FloatArray:
     """Signal-to-noise energy ratio h' C^-1 h of a noise-free field (..., n_y), T10 eq. (5.14).
 
-    It is the non-centrality parameter of `detection_theory.detection_probability`. NaN in `h` marks
-    an unmeasured axis; 0 if no axis is measured.
+    It is the non-centrality parameter of `detection_theory.detection_probability`.
     """
     A = whitened(np.asarray(h, dtype=float)[..., None], C)
     energy: FloatArray = np.einsum('...ij,...ij->...', A, A)
     return energy
 
 
-def snr_at_distance(moment: float | FloatArray, noise_std: float | FloatArray,
-                    distance: float | FloatArray) -> FloatArray:
-    """Energy ratio of one sample at a `distance` [m] from a dipole, perpendicular to its axis.
-
-    Along the axis it is four times larger. `moment` is in A m² (300-600 for a car, 1800 for a
-    truck), `noise_std` in T per axis (1.1e-8 in TSP14). T10 eq. (5.20), (5.21); eq. (5.23) prints
-    the squared norm of R instead of the norm. Moment and noise in T10 eq. (5.22) are both too small
-    by a factor of about 450.
-    """
-    return cast(FloatArray, (_K_DIPOLE * moment / (noise_std * distance**3))**2)
-
-
 def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
               ratio: float | FloatArray) -> FloatArray:
-    """Distance [m] at which `snr_at_distance` equals `ratio` (9.2 in T10), T10 eq. (5.24).
+    """Distance [m] across the axis of a dipole at which one sample has the energy `ratio`.
 
-    Along the axis of the dipole it is larger by a factor of 2^(1/3).
+    Along the axis it is larger by a factor of 2^(1/3). `moment` is in A m², `noise_std` in T per
+    axis; `ratio` is 9.2 in T10. T10 eq. (5.20)-(5.24): eq. (5.23) prints the squared norm of R
+    instead of the norm; moment and noise in eq. (5.22) are too small by a factor of about 450.
     """
     distance: FloatArray = np.cbrt(_K_DIPOLE * moment / (noise_std * np.sqrt(ratio)))
     return distance
 
 
 def _inverse_root(J: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scale J to unit diagonal; return the scale (n,), a root G (n, rank) of the pseudo-inverse
-    G G' of the scaled matrix, and an orthonormal basis (n, n - rank) of its kernel."""
+    """Scale of J (n,) to unit diagonal, a root G (n, rank) of the pseudo-inverse G G' of the scaled
+    matrix, and an orthonormal basis (n, n - rank) of its kernel."""
     scale, w, V = unit_diagonal('information', J)
     zero = w <= RANK_TOLERANCE * w.max(initial=0.0)
     return scale, V[:, ~zero] / np.sqrt(w[~zero]), V[:, zero]

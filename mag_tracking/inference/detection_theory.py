@@ -28,11 +28,8 @@ def detection_probability(snr: float | FloatArray, threshold: float | FloatArray
 
 
 def missed_detection_probability(probability: ArrayLike, run: int) -> FloatArray:
-    """Exact probability that a pass contains no `run` consecutive detections.
-
-    `probability` (n, ...) is the detection probability of each frame, in time order and
-    independent.
-    """
+    """Exact probability that a pass contains no `run` consecutive detections, whose independent
+    probabilities in each frame are `probability` (n, ...)."""
     p = np.asarray(probability, dtype=float)
     run_probability = np.zeros((run, *p.shape[1:]))
     run_probability[0] = 1.0

@@ -6,7 +6,7 @@ This is exact for a target at the height of the sensor. A sensor in the lane doe
 direction.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,16 +17,13 @@ from mag_tracking.arrays import FloatArray
 LAG_FRACTION = 0.35
 """Default lag as a fraction of the full width at half maximum of the signal energy; near the
 optimum for passes at constant speed (PHD15 Paper B eq. (19))."""
-
 MIN_SAMPLES = 8
 """Minimum number of samples in a window."""
-
 MAX_CONFIDENCE = 0.98
 """Upper limit of the probability of a direction. The sign of the correlation is exact only for a
 target at the height of the sensor. For 0.6 % of random moments, the field rotates in the opposite
 direction if the target is above the sensor by half its lateral distance, and for 2.2 % if it is
 above by the whole distance."""
-
 MAX_VERTICAL_COSINE = 0.2
 """Maximum direction cosine between a missing axis and a horizontal axis at which the missing axis
 is treated as vertical."""
@@ -62,8 +59,8 @@ def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotati
     """Correlation of the horizontal axes at a lag, with a variance of at least that of noise alone.
 
     `field` (n, 2) [T] is the field in x, y (z up) without the background; its first and last `lag`
-    samples must not contain the target. `noise_std` [T] is per axis. Raises ValueError unless 0 < 2
-    lag < n. PHD15 Paper B eq. (5), (11), (16).
+    samples must not contain the target. `noise_std` [T] is per axis. PHD15 Paper B eq. (5), (11),
+    (16).
     """
     n = len(field) - 2 * lag
     if lag < 1 or n < 1:
@@ -95,11 +92,8 @@ def _squared_lag_differences(field: FloatArray, lag: int) -> float:
 
 
 def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
-    """Lag that matches the width of a pass; 0 if the field does not exceed the noise.
-
-    It is at least 1 and at most `max_lag`, the number of samples of the window before the pass and
-    after it, and a quarter of the window. `field` and `noise_std` are as for `field_rotation`.
-    """
+    """Lag that matches the width of a pass, 0 if the field does not exceed the noise; `max_lag` is
+    the number of samples of the window before the pass and after it."""
     window = 1 + len(field) // 20
     energy = np.convolve(np.sum(field**2, axis=1) - 2.0 * noise_std**2, np.ones(window), 'same')
     # Another target at an end of the window extends the span of strong samples, but hardly their
@@ -110,29 +104,16 @@ def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:
     return int(np.clip(round(LAG_FRACTION * width), 1, max(1, min(max_lag, len(field) // 4))))
 
 
-def best_lag(windows: Iterable[FloatArray], noise_std: float, lags: Sequence[int]) -> int:
-    """Lag of the smallest mean error probability over training windows; PHD15 Paper B eq. (19)."""
-    windows = list(windows)
-    errors = [np.mean([field_rotation(w, noise_std, lag).error_probability for w in windows])
-              for lag in lags]
-    return lags[int(np.argmin(errors))]
-
-
 def fused_log_odds(log_odds: Iterable[float], same_side: Iterable[bool]) -> float:
-    """Sum the log-odds of left to right of sensors, whose errors are treated as independent.
-
-    `same_side` is False for a sensor on the opposite side of the road, where left and right are
-    exchanged. PHD15 Paper B eq. (20)-(23).
-    """
+    """Sum the log-odds of left to right of sensors with independent errors; left and right are
+    exchanged on the other side of the road, PHD15 Paper B eq. (20)-(23)."""
     return float(sum(value if is_same_side else -value
                      for value, is_same_side in zip(log_odds, same_side, strict=True)))
 
 
 def horizontal_field(field: FloatArray, R_ws: FloatArray) -> FloatArray:
-    """Horizontal field (n, 2) in the world frame from readings (n, 3) in the sensor frame.
-
-    A missing axis (NaN) that is nearly vertical is ignored; otherwise the component is NaN.
-    """
+    """Horizontal field (n, 2) in the world frame from readings (n, 3) in the sensor frame; a
+    missing axis (NaN) that is nearly vertical is ignored."""
     out: FloatArray = np.zeros((len(field), 2))
     for a in range(3):
         missing = np.isnan(field[:, a])

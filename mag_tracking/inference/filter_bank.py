@@ -20,16 +20,13 @@ _SINGULAR_TOLERANCE = 1e-15
 `numpy.linalg.pinv`."""
 
 
-def log_sum_exp(a: ArrayLike, axis: int | None = None) -> FloatArray:
-    """log(sum(exp(a))) over `axis` (default: all) without overflow; -inf if all elements are
-    -inf."""
+def log_sum_exp(a: ArrayLike) -> float:
+    """log(sum(exp(a))) without overflow."""
     a = np.asarray(a, dtype=float)
-    top = np.max(a, axis=axis, keepdims=True)
-    top = np.where(np.isfinite(top), top, 0.0)
+    top = float(np.max(a))
+    top = top if np.isfinite(top) else 0.0
     with np.errstate(divide='ignore'):
-        total = np.log(np.sum(np.exp(a - top), axis=axis, keepdims=True)) + top
-    out: FloatArray = total.squeeze() if axis is None else np.squeeze(total, axis=axis)
-    return out
+        return float(np.log(np.sum(np.exp(a - top))) + top)
 
 
 @dataclass
@@ -59,8 +56,7 @@ class FilterBank:
         """Create a bank with equal weights from target states `x` (n_hyp, n_t).
 
         The own states of each sensor, with covariances `own_covariance` (n_sensors, n_own, n_own),
-        then three backgrounds [T] per sensor, are appended; all are zero. `label` and `kind` are
-        (n_hyp,).
+        then three backgrounds [T] per sensor, are appended; all are zero.
         """
         n, n_t = x.shape
         own = np.zeros((n_sensors, 0, 0)) if own_covariance is None else own_covariance
@@ -82,12 +78,9 @@ class FilterBank:
         return len(self.log_w)
 
     def best(self) -> int:
-        """Index of the hypothesis to publish.
-
-        The candidates are the hypotheses of the heaviest label and, within it, of the heaviest
-        kind; the maximum density of their mixture decides, because the heaviest hypothesis would be
-        a random choice if many neighbours share the weight.
-        """
+        """Index of the hypothesis to publish: of the heaviest label and, within it, of the heaviest
+        kind, that of the maximum density of their mixture."""
+        # The heaviest hypothesis would be a random choice if many neighbours share the weight.
         return core.best(self.x, self.P, self.log_w, _class_indices(self.label),
                          _class_indices(self.kind), _NEGLIGIBLE_LOG_RATIO)
 
@@ -135,7 +128,7 @@ class FilterBank:
 
     def is_separated(self, i: int, distance: float = 3.0) -> BoolArray:
         """Flag the hypotheses (n_hyp,) whose position differs from hypothesis `i` by more than the
-        Mahalanobis `distance`, with the sum of both covariances."""
+        Mahalanobis `distance`."""
         difference = self.x[:, :3] - self.x[i, :3]
         C = self.P[:, :3, :3] + self.P[i, :3, :3]
         try:
@@ -152,23 +145,17 @@ class FilterBank:
         return is_separated
 
     def reweight(self, log_likelihood: FloatArray) -> float:
-        """Update the weights with the log-likelihoods of a frame; return the frame's log-evidence.
-
-        A hypothesis whose value is not finite gets zero weight. If no value is finite, the evidence
-        is -inf and the weights do not change.
-        """
+        """Update the weights with the log-likelihoods of a frame; return the frame's log-evidence,
+        -inf if no value is finite, which leaves the weights unchanged."""
         log_likelihood = np.where(np.isfinite(log_likelihood), log_likelihood, -np.inf)
         joint_log_w = self.log_w + log_likelihood
-        evidence = float(log_sum_exp(joint_log_w))
+        evidence = log_sum_exp(joint_log_w)
         if np.isfinite(evidence):
             self.log_w = joint_log_w - evidence
         return evidence
 
     def keep(self, mask: BoolArray) -> int:
-        """Keep the hypotheses of `mask` and normalise the weights; return the number removed.
-
-        The arrays `x` and `P` may be overwritten in place.
-        """
+        """Keep the hypotheses of `mask` and normalise the weights; return the number removed."""
         rows = np.flatnonzero(mask)
         n_removed = len(mask) - len(rows)
         if n_removed:
@@ -214,3 +201,47 @@ def _compacted(a: FloatArray, rows: IntArray) -> FloatArray:
         if target != source:
             a[target] = a[source]
     return a[:len(rows)]
+
+
+@dataclass
+class InitialBank:
+    """Compact copy of a `FilterBank` at its start, before target and sensor states are correlated.
+
+    Smoothing and relinearisation restart at the beginning of a track. Storing the full covariances
+    of all hypotheses would require as much memory as the bank.
+    """
+
+    x: FloatArray
+    """States of the target, then of the sensors, (n_hyp, n_x)."""
+    P: FloatArray
+    """Covariances of the target states, (n_hyp, n_t, n_t)."""
+    P_sensors: FloatArray
+    """Covariance of the sensor states, common to all hypotheses, (n_x - n_t, n_x - n_t)."""
+    label: IntArray
+    kind: IntArray
+    origin: IntArray
+    n_sensors: int
+
+    @classmethod
+    def of(cls, bank: FilterBank, n_target: int) -> 'InitialBank':
+        """Copy a bank before its first update, with `n_target` states of the target."""
+        return cls(bank.x.copy(), bank.P[:, :n_target, :n_target].copy(),
+                   bank.P[0, n_target:, n_target:].copy(), bank.label, bank.kind, bank.origin,
+                   bank.nis.shape[1])
+
+    def __len__(self) -> int:
+        """Number of hypotheses."""
+        return len(self.x)
+
+    def rows(self, rows: IntArray) -> FilterBank:
+        """Restore the hypotheses of the given indices, as copies with equal weights."""
+        n, n_t = len(rows), self.P.shape[1]
+        P = np.zeros((n, self.x.shape[1], self.x.shape[1]))
+        P[:, :n_t, :n_t], P[:, n_t:, n_t:] = self.P[rows], self.P_sensors
+        return FilterBank(self.x[rows], P, np.full(n, -np.log(n)), self.label[rows],
+                          self.kind[rows], self.origin[rows], np.full((n, self.n_sensors), np.nan))
+
+    def keep(self, mask: BoolArray) -> None:
+        """Keep the hypotheses selected by `mask` (n_hyp,)."""
+        for name in ('x', 'P', 'label', 'kind', 'origin'):
+            setattr(self, name, getattr(self, name)[mask])

@@ -14,7 +14,6 @@ from mag_tracking.records import plain
 
 STRENGTHS = np.logspace(-1.5, 4.5, 13)
 """[1/s^1.5] Root spectral densities of the bank, relative to the scale of a component."""
-
 SWITCH_INTERVAL_S = 0.75
 """[s] Mean time between switches of the strength."""
 
@@ -47,8 +46,8 @@ class GaussMarkovVectors:
                     dt: float) -> float:
         """Update with scalar measurements; return their log-density [nats] given the earlier ones.
 
-        Measurement i is H[i] (m,) times vector[i], plus noise of positive variance[i]. `vector` is
-        ascending, and `y` has no NaN. `dt` [s] is the time since the previous measurements.
+        Measurement i is H[i] (m,) times vector[i], plus noise of variance[i]. `vector` ascends, and
+        `y` has no NaN. `dt` [s] is the time since the previous measurements.
         """
         return core.step_vectors(self._x, self._P, self._log_w, self._densities,
                                  plain(vector, np.int64), plain(H), plain(y), plain(variance), dt,

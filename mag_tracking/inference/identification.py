@@ -1,28 +1,135 @@
-"""Identification of enrolled vehicles by their hard and soft iron, at any heading."""
+"""Identity of vehicles: classes, hard and soft iron, and enrolled vehicles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.inference.iron import Iron, hard_and_soft_iron
-from mag_tracking.inference.log_normal_classes import UNKNOWN
+
+UNKNOWN = 'unknown'
+"""Name that is returned for an object that matches no class."""
+SIGNIFICANCE_LEVEL = 0.01
+"""Significance level of the chi-square tests; what is rejected for every class, or for every
+enrolled vehicle, is `UNKNOWN`."""
+
+
+class Feature(NamedTuple):
+    """A measured positive feature and its distribution in each class."""
+
+    value: float
+    std: float
+    medians: Sequence[float]
+    spreads: Sequence[float]
+    """Standard deviation of the natural logarithm of the feature in each class."""
+
+
+class ClassPosterior(NamedTuple):
+    """Most probable class of an object, and the probabilities of all classes."""
+
+    name: str
+    """Most probable class; `UNKNOWN` if the object matches no class."""
+    probabilities: FloatArray
+    """Posterior probabilities, (n_classes,), in the order of the class names."""
+
+
+def class_posterior(names: Sequence[str], shares: Sequence[float],
+                    features: Sequence[Feature]) -> ClassPosterior:
+    """Classify an object by independent features; `shares` are the prior weights of the classes."""
+    measured = np.log([f.value for f in features])
+    relative = np.array([f.std / f.value for f in features])
+    variance = np.square(np.array([f.spreads for f in features])) + np.square(relative)[:, None]
+    centres = np.log(np.array([f.medians for f in features]))
+    distance = (np.square(measured[:, None] - centres) / variance).sum(axis=0)
+    log_p = np.log(np.array(shares)) - 0.5 * distance - 0.5 * np.log(variance).sum(axis=0)
+    p = np.exp(log_p - log_p.max())
+    best = int(np.argmax(p))
+    is_known = distance.min() <= chdtri(len(features), SIGNIFICANCE_LEVEL)
+    return ClassPosterior(names[best] if is_known else UNKNOWN, p / p.sum())
+
+
+@dataclass(frozen=True)
+class Iron:
+    """Hard and soft iron of a vehicle, with covariance."""
+
+    hard: FloatArray
+    """Hard iron moment m0, (3,) A m², vehicle frame (x forward, z up)."""
+    soft: float
+    """Soft iron D, m³."""
+    covariance: FloatArray
+    """Covariance of [m0, D], (4, 4), in the squared units of m0 [A m²] and D [m³]."""
+    residuals: FloatArray
+    """Measured minus predicted moments, (n, 3) A m², world frame."""
+    normalised_cost: float
+    """Chi-square of the residuals per degree of freedom; about 1 if the model and the covariances
+    are correct. NaN without covariances."""
+
+
+def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, field_strength: ArrayLike,
+                       covariances: ArrayLike | None = None) -> Iron:
+    """Estimate m0 and D in m = Rz(heading) m0 + D field_strength by least squares.
+
+    `moments` (n, 3) [A m²] and `field_strength` = B0/mu0 [A/m] are in the world frame; with 3
+    B0/mu0, D is as defined in T10. Without `covariances`, moments have equal weight and the
+    residuals determine the covariance. TSP14 section VI.E; T10 eq. (6.16).
+    """
+    moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
+    field_strength = np.asarray(field_strength, dtype=float)
+    n = len(headings)
+    if moments.shape != (n, 3) or headings.shape != (n,) or field_strength.shape != (3,):
+        raise ValueError(f'expected moments (n, 3), headings (n,) and field_strength (3,), got '
+                         f'{moments.shape}, {headings.shape}, {field_strength.shape}')
+    if not (np.isfinite(moments).all() and np.isfinite(headings).all()
+            and np.isfinite(field_strength).all()):
+        raise ValueError('moments, headings and field_strength must be finite')
+    A = np.zeros((n, 3, 4))
+    c, s = np.cos(headings), np.sin(headings)
+    A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = c, -s, s, c
+    A[:, 2, 2] = 1.0
+    A[:, :, 3] = field_strength
+    W = _whitening_matrices(covariances, n)
+    whitened = (W @ A).reshape(3 * n, 4)
+    # The units of m0 and D differ, so the columns are normalised first.
+    scale = np.linalg.norm(whitened, axis=0)
+    # Headings a hundredth of a degree apart are treated as equal.
+    if (n < 2 or not (scale > 0.0).all()
+            or np.linalg.svd(whitened / scale, compute_uv=False)[-1] < 1e-4):
+        raise ValueError('hard and soft iron cannot be separated: headings must differ and the '
+                         'earth field must have a horizontal component')
+    y = (W @ moments[:, :, None]).ravel()
+    theta = np.linalg.lstsq(whitened / scale, y, rcond=None)[0] / scale
+    covariance = np.linalg.inv((whitened / scale).T @ (whitened / scale)) / np.outer(scale, scale)
+    residual = y - whitened @ theta
+    cost = float(residual @ residual) / (3 * n - 4)
+    if covariances is None:
+        covariance, cost = covariance * cost, float('nan')
+    return Iron(theta[:3], float(theta[3]), covariance, moments - A @ theta, cost)
+
+
+def _whitening_matrices(covariances: ArrayLike | None, n: int) -> FloatArray:
+    """Inverse Cholesky factors (n, 3, 3) of `n` covariances, identity matrices if None."""
+    if covariances is None:
+        return np.tile(np.eye(3), (n, 1, 1))
+    covariances = np.asarray(covariances, dtype=float)
+    if covariances.shape != (n, 3, 3):
+        raise ValueError(f'expected covariances ({n}, 3, 3), got {covariances.shape}')
+    try:
+        return np.linalg.inv(np.linalg.cholesky(covariances))
+    except np.linalg.LinAlgError:
+        raise ValueError('a covariance is not positive definite') from None
+
 
 PASS_TO_PASS_STD = 20.0
 """Standard deviation of the moment of one vehicle between passes [A m²], in addition to the
 covariance of the fits (T10 Table 6.9: 14, 18 and 21 on the three axes)."""
-
 MIN_HEADING_SEPARATION = np.deg2rad(45.0)
 """Minimum difference of headings that separates hard from soft iron [rad]."""
-
 HEADING_TOLERANCE = np.deg2rad(10.0)
 """[rad] Maximum difference of headings at which a pass is compared with a vehicle that is enrolled
 at a single heading."""
-
-SIGNIFICANCE_LEVEL = 0.01
-"""Significance level of the chi-square test; a moment rejected for every vehicle is unknown."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +137,6 @@ class EnrolledVehicle:
     """A vehicle with its hard and soft iron, or with its moment at a single heading."""
 
     name: str
-    """Name of the vehicle."""
     iron: Iron | None
     """Hard and soft iron; None if all passes have about the same heading."""
     heading: float
@@ -42,10 +148,11 @@ class EnrolledVehicle:
 
     def moment_at(self, heading: float, heading_std: float, field_strength: FloatArray
                   ) -> tuple[FloatArray, FloatArray] | None:
-        """Predict the moment (3,) [A m², world frame] of a pass at a heading, and its covariance.
+        """Predict the moment (3,) [A m², world frame] of a pass at a heading, and its covariance
+        without measurement noise.
 
-        `field_strength` is B0/mu0 [A/m, world frame]. The measurement noise is not included. None
-        if the vehicle was enrolled at another heading only. T10 eq. (6.16); TSP14 eq. (15), (16).
+        None if the vehicle was enrolled at another heading only. `field_strength` is B0/mu0 [A/m,
+        world frame]. T10 eq. (6.16); TSP14 eq. (15), (16).
         """
         pass_to_pass = PASS_TO_PASS_STD**2 * np.eye(3)
         if self.iron is None:
@@ -78,12 +185,8 @@ class Identification:
 
 def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: FloatArray,
           field_strength: FloatArray) -> EnrolledVehicle:
-    """Enrol a vehicle from fitted moments (n, 3) [A m², world frame] of passes at known headings.
-
-    The variance between passes is added to `covariances`; `field_strength` is B0/mu0 [A/m, world].
-    Raises ValueError if there is no pass, a value is not finite, or the headings neither agree nor
-    differ by at least `MIN_HEADING_SEPARATION`.
-    """
+    """Enrol a vehicle from fitted moments (n, 3) [A m², world frame] of passes at headings that
+    agree, or differ by at least `MIN_HEADING_SEPARATION`."""
     moments, headings = np.asarray(moments, dtype=float), np.asarray(headings, dtype=float)
     if not len(moments):
         raise ValueError(f'{name}: enrolment requires at least one pass')
@@ -105,10 +208,7 @@ def enrol(name: str, moments: FloatArray, covariances: FloatArray, headings: Flo
 
 def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance: FloatArray,
              heading: float, heading_std: float, field_strength: FloatArray) -> Identification:
-    """Identify the enrolled vehicle of a pass by its fitted moment (3,) [A m², world frame].
-
-    `heading` is in the world frame; `field_strength` is B0/mu0 [A/m, world frame].
-    """
+    """Identify the enrolled vehicle of a pass by its fitted moment (3,) [A m², world frame]."""
     log_p, distances, skipped = {}, {}, []
     for vehicle in vehicles:
         predicted = vehicle.moment_at(heading, heading_std, field_strength)

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri
 
-from mag_tracking.arrays import BoolArray, FloatArray
+from mag_tracking.arrays import FloatArray
+from mag_tracking.inference.matrices import raise_for_invalid
 
 _BAND_EDGE_TOLERANCE = 1e-9
 """Relative tolerance by which a band is extended, so that the band includes its edges."""
@@ -30,10 +31,10 @@ def noise_spectrum(frequency: ArrayLike, background: float, resolution: float,
     is the frequency in Hz as a pure number.
     """
     f = np.abs(np.asarray(frequency, dtype=float))
-    _raise_for_invalid('frequency', 'a number', f, np.isnan(f))
+    raise_for_invalid('frequency', 'a number', f, np.isnan(f))
     for name, value in (('background', background), ('resolution', resolution)):
-        _raise_for_invalid(name, 'at least 0 and finite', value, not 0.0 <= value < np.inf)
-    _raise_for_invalid('bandwidth', 'above 0 and finite', bandwidth, not 0.0 < bandwidth < np.inf)
+        raise_for_invalid(name, 'at least 0 and finite', value, not 0.0 <= value < np.inf)
+    raise_for_invalid('bandwidth', 'above 0 and finite', bandwidth, not 0.0 < bandwidth < np.inf)
     steps = resolution**2 / (24.0 * bandwidth)
     if background == 0.0:
         return np.full(f.shape, steps)
@@ -49,8 +50,7 @@ def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArra
     `B` (..., n, n_axes) [T] is the noise-free signal; an axis that is all NaN is not measured. The
     result combines the axes; NaN if none is measured. `spectrum` maps frequencies [Hz] in the
     `band` (both edges included, inf allowed) to the two-sided noise density [T²/Hz], equal and
-    independent on all axes; an infinite density does not contribute. Raises ValueError if no
-    frequency of n samples is in the band.
+    independent on all axes; an infinite density does not contribute.
 
     MITRE12 eq. (B.11)-(B.13). The DFT is divided by the sampling rate to approximate the continuous
     transform; the plain DFT, as printed, is too large by that factor. The sum includes both signs
@@ -62,12 +62,12 @@ def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArra
     if B.ndim < 2 or 0 in B.shape[-2:]:
         raise ValueError(f'B must have shape (..., n, n_axes), got {B.shape}')
     missing = np.isnan(B).all(axis=-2)
-    _raise_for_invalid('B', 'finite, or NaN on a whole axis', B,
+    raise_for_invalid('B', 'finite, or NaN on a whole axis', B,
                        ~np.isfinite(B) & ~missing[..., None, :])
-    _raise_for_invalid('sampling_rate', 'above 0 and finite', sampling_rate,
+    raise_for_invalid('sampling_rate', 'above 0 and finite', sampling_rate,
                        not 0.0 < sampling_rate < np.inf)
     low, high = band
-    _raise_for_invalid('band', 'two ascending frequencies, the first at least 0', list(band),
+    raise_for_invalid('band', 'two ascending frequencies, the first at least 0', list(band),
                        not 0.0 <= low < high)
     n = B.shape[-2]
     f = np.arange(n // 2 + 1) * sampling_rate / n
@@ -76,7 +76,7 @@ def deflection(B: ArrayLike, sampling_rate: float, spectrum: Callable[[FloatArra
         raise ValueError(f'{n} samples at {sampling_rate} Hz have no frequency in the band '
                          f'{list(band)} Hz: the frequency spacing is {sampling_rate / n} Hz')
     S = np.broadcast_to(np.asarray(spectrum(f[in_band]), dtype=float), f[in_band].shape)
-    _raise_for_invalid('spectrum', 'above 0', S, ~(S > 0.0))
+    raise_for_invalid('spectrum', 'above 0', S, ~(S > 0.0))
     # Negative frequencies mirror the positive ones; zero and half the rate have no counterpart.
     signs = np.where((f == 0.0) | (2 * np.arange(len(f)) == n), 1.0, 2.0)[in_band]
     F = np.fft.rfft(np.where(missing[..., None, :], 0.0, B), axis=-2)[..., in_band, :]
@@ -94,8 +94,8 @@ def detection_probability(deflection: ArrayLike, false_alarm_probability: ArrayL
     """
     deflection = np.asarray(deflection, dtype=float)
     p_fa = np.asarray(false_alarm_probability, dtype=float)
-    _raise_for_invalid('deflection', 'at least 0', deflection, deflection < 0.0)
-    _raise_for_invalid('false_alarm_probability', 'above 0 and below 1', p_fa,
+    raise_for_invalid('deflection', 'at least 0', deflection, deflection < 0.0)
+    raise_for_invalid('false_alarm_probability', 'above 0 and below 1', p_fa,
                        ~((p_fa > 0.0) & (p_fa < 1.0)))
     return ndtr(deflection + ndtri(p_fa))
 
@@ -110,18 +110,8 @@ def any_detection_probability(probability: ArrayLike,
     independent.
     """
     p = np.asarray(probability, dtype=float)
-    _raise_for_invalid('probability', 'from 0 to 1', p, (p < 0.0) | (p > 1.0))
+    raise_for_invalid('probability', 'from 0 to 1', p, (p < 0.0) | (p > 1.0))
     with np.errstate(divide='ignore'):
         log_missed = np.sum(np.log1p(-np.where(np.isnan(p), 0.0, p)), axis=axis)
     detected: FloatArray = -np.expm1(log_missed)
     return detected
-
-
-def _raise_for_invalid(name: str, requirement: str, value: ArrayLike,
-                       is_invalid: bool | BoolArray) -> None:
-    """Raise ValueError for the first entry of `value` that is flagged in `is_invalid`, if any."""
-    if np.any(is_invalid):
-        index = np.argwhere(is_invalid)[0].tolist() if np.ndim(is_invalid) else []
-        position = index if index else ''
-        actual = np.asarray(value)[tuple(index)].tolist()
-        raise ValueError(f'{name}{position} must be {requirement}, got {actual}')

@@ -14,7 +14,7 @@ def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
     """Whiten the rows of matrices `H` (..., n_y, n_x) to uncorrelated noise of variance 1.
 
     A row of NaN is not measured and becomes zero. `C` (..., n_y, n_y) broadcasts against `H`; None
-    if `H` is whitened already. Raises ValueError if `C` is not symmetric positive definite.
+    if `H` is whitened already.
     """
     H = np.asarray(H, dtype=float)
     if H.ndim < 2:
@@ -35,8 +35,7 @@ def whitened(H: ArrayLike, C: ArrayLike | None) -> FloatArray:
 
 
 def leading_broadcast(name: str, A: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """Broadcast `A` read-only over leading axes to `shape`; raises ValueError naming `name` if the
-    last two lengths differ."""
+    """Broadcast `A` read-only over leading axes to `shape`."""
     A = np.asarray(A, dtype=float)
     try:
         if A.shape[-2:] == shape[-2:]:
@@ -46,20 +45,19 @@ def leading_broadcast(name: str, A: ArrayLike, shape: tuple[int, ...]) -> FloatA
     raise ValueError(f'{name} has shape {A.shape}, expected {shape}')
 
 
-def raise_for_invalid(name: str, requirement: str, A: FloatArray,
-                      is_invalid: BoolArray | np.bool_) -> None:
-    """Raise ValueError for the first matrix flagged in `is_invalid`; `requirement` is a property
-    such as 'symmetric'."""
+def raise_for_invalid(name: str, requirement: str, value: ArrayLike,
+                      is_invalid: BoolArray | np.bool_ | bool) -> None:
+    """Raise ValueError for the first entry of `value` that is flagged in `is_invalid`, if any."""
     for index in np.argwhere(is_invalid).tolist():
-        raise ValueError(f'{name}{index or ""} is not {requirement}: {A[tuple(index)].tolist()}')
+        actual = np.asarray(value)[tuple(index)].tolist()
+        raise ValueError(f'{name}{index or ""} must be {requirement}, got {actual}')
 
 
 def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Scale symmetric matrices `A` (..., n, n) to unit diagonal and decompose them.
 
     Returns the scale, the roots of the diagonal (1 where it is not positive); the ascending
-    eigenvalues of A / (scale scale'); and the eigenvectors in columns. Raises ValueError if a
-    matrix is not finite, symmetric and positive semidefinite.
+    eigenvalues of A / (scale scale'); and the eigenvectors in columns.
     """
     if A.ndim < 2 or A.shape[-1] != A.shape[-2]:
         raise ValueError(f'{name} must be square, got shape {A.shape}')
@@ -118,3 +116,28 @@ def pseudo_inverse(A: FloatArray, tolerance: float = PSEUDO_INVERSE_TOLERANCE) -
 
 MIN_PIVOT_ROOT = 1e-3
 """Minimum root of the pivots, at unit diagonal, for an inversion by the Cholesky factor."""
+
+
+class MarginalWhitener:
+    """Whitening of measurements y = C c + e, with standard normal c and e, by the inverse root of
+    their covariance I + C C'.
+
+    It is cheap, because the root is the identity outside the few directions spanned by C. `columns`
+    (n_y, q) are C, the linear nuisance terms, each times the std of its coefficient.
+    """
+
+    def __init__(self, columns: FloatArray) -> None:
+        self._U, singular_values, _ = np.linalg.svd(columns, full_matrices=False)
+        self._singular_values = singular_values
+        self._attenuation: FloatArray = 1.0 - 1.0 / np.sqrt(1.0 + singular_values**2)
+
+    def __call__(self, A: FloatArray) -> FloatArray:
+        """Return `A`, (..., n_y, k) or (n_y,), multiplied by the inverse root of I + C C'."""
+        whitened: FloatArray = A - (self._U * self._attenuation) @ (self._U.T @ A)
+        return whitened
+
+    def correction_factor(self, A: FloatArray) -> FloatArray:
+        """Factor F(A) (q, k) of the low-rank correction in A' inv(I + C C') B = A'B - F(A)'
+        F(B)."""
+        gain: FloatArray = self._singular_values / np.sqrt(1.0 + self._singular_values**2)
+        return gain[:, None] * (self._U.T @ A)

@@ -11,7 +11,7 @@ from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes
 from mag_tracking.errors import RecordingError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
-from mag_tracking.inference.axes import MIN_PIVOT, smallest_pivots
+from mag_tracking.inference.covariances import MIN_PIVOT, smallest_pivots
 from mag_tracking.messages.schema import (
     CalibrationState,
     NetworkFrame,

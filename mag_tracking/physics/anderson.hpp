@@ -1,4 +1,4 @@
-// Anderson functions of one pass, as defined in anderson.py.
+// Anderson functions of one pass, as defined in passes.py.
 
 #pragma once
 

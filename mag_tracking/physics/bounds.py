@@ -10,26 +10,21 @@ from mag_tracking.arrays import BoolArray, FloatArray
 
 MAX_SPEED = 200.0
 """[m/s] The fastest train has reached 167 m/s."""
-
 MAX_MOMENT = 1e5
 """[A m^2] A car has 300 to 600, a truck 1800, a wagon of a train 5000."""
-
 MAX_MOUNTING = 0.5 * np.pi
 """[rad] The mounting angles of a track are small rotations, which are linearised."""
-
 TOO_FAST = f'a speed above {MAX_SPEED:g} m/s is impossible'
 TOO_STRONG = f'a moment above {MAX_MOMENT:g} A m^2 is impossible'
 TOO_ROTATED = f'mounting angles above {np.degrees(MAX_MOUNTING):.0f} degrees are impossible'
 REASONS = (TOO_FAST, TOO_STRONG, TOO_ROTATED)
 """Reasons why a result is not reported."""
-
 ADVICE = 'check the unit of the readings, their timestamps, and the positions in the network file'
 """Remedy for an impossible result."""
 
 
 def are_possible(velocities: FloatArray, moments: FloatArray) -> BoolArray:
-    """Whether velocities (..., 3) [m/s] and moments (..., 3) [A m²] are within the bounds; False
-    for NaN."""
+    """Whether velocities (..., 3) [m/s] and moments (..., 3) [A m²] are within the bounds."""
     # A comparison with NaN is false.
     are_within: BoolArray = (np.linalg.norm(velocities, axis=-1) <= MAX_SPEED) \
         & (np.linalg.norm(moments, axis=-1) <= MAX_MOMENT)
@@ -38,11 +33,8 @@ def are_possible(velocities: FloatArray, moments: FloatArray) -> BoolArray:
 
 def impossible_reason(velocity: FloatArray, moment: FloatArray,
                       mounting: FloatArray | None = None) -> str:
-    """Element of `REASONS` why the state of a target is impossible; empty if it is possible.
-
-    `velocity` is in m/s, `moment` in A m², `mounting` (n_sensors, 3) in rad with NaN for an unused
-    sensor.
-    """
+    """Element of `REASONS` why the state of a target is impossible, or ''; `mounting`
+    (n_sensors, 3) [rad] is NaN for an unused sensor."""
     if not np.linalg.norm(velocity) <= MAX_SPEED:
         return TOO_FAST
     if not np.linalg.norm(moment) <= MAX_MOMENT:

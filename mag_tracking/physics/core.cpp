@@ -7,7 +7,6 @@
 #include "dipole.hpp"
 #include "motion.hpp"
 #include "mounting.hpp"
-#include "multipole.hpp"
 #include "passes.hpp"
 #include "sensor_fields.hpp"
 #include "steady_pass.hpp"
@@ -25,6 +24,18 @@ Shape rows_of(const Array& array, const char* name) {
     return {array.shape(), array.shape() + array.ndim()};
 }
 
+// Array of a shape whose elements `set` writes without the interpreter lock.
+template <class Set>
+Array filled(const Shape& shape, Set set) {
+    Array array(shape);
+    double* out = array.mutable_data();
+    {
+        py::gil_scoped_release release;
+        set(out);
+    }
+    return array;
+}
+
 Shape with(Shape shape, Size last) {
     shape.push_back(last);
     return shape;
@@ -33,17 +44,13 @@ Shape with(Shape shape, Size last) {
 Array dipole_field(const Array& d, const Array& m) {
     const Shape shape = rows_of(d, "d");
     const double *d_ = input_of(d, "d", shape), *m_ = input_of(m, "m", shape);
-    Array B(shape);
-    double* out = B.mutable_data();
     const Size n = d.size();
-    {
-        py::gil_scoped_release release;
+    return filled(shape, [&](double* B) {
         for (Size i = 0; i < n; i += 3) {
-            for (int a = 0; a < 3; ++a) out[i + a] = 0.0;
-            Dipole({d_[i], d_[i + 1], d_[i + 2]}, {m_[i], m_[i + 1], m_[i + 2]}).add_field(out + i);
+            for (int a = 0; a < 3; ++a) B[i + a] = 0.0;
+            Dipole({d_[i], d_[i + 1], d_[i + 2]}, {m_[i], m_[i + 1], m_[i + 2]}).add_field(B + i);
         }
-    }
-    return B;
+    });
 }
 
 py::tuple dipole_jacobians(const Array& d, const Array& m) {
@@ -80,25 +87,6 @@ py::tuple sensor_fields(const Array& positions, const Array& R_sw, const Array& 
                           positions_, R_, std::size_t(n_sensors), h_, H_, size);
     }
     return py::make_tuple(h, H, gradient);
-}
-
-py::tuple multipoles(const Array& d, const Array& moments) {
-    Shape shape = rows_of(d, "d");
-    const Size k = moments.ndim() ? moments.shape(moments.ndim() - 1) : 0;
-    if (k != 3 && k != 8 && k != 15)
-        throw py::value_error("moments: needs a last axis of length 3, 8 or 15");
-    const double* d_ = input_of(d, "d", shape);
-    Array B(shape), dB_dd(with(shape, 3)), dB_dm(with(shape, k));
-    shape.back() = k;
-    const double* m = input_of(moments, "moments", shape);
-    double *B_ = B.mutable_data(), *by_place = dB_dd.mutable_data();
-    double* by_moment = dB_dm.mutable_data();
-    const Size n = d.size() / 3;
-    {
-        py::gil_scoped_release release;
-        set_multipoles(d_, m, std::size_t(n), int(k), B_, by_place, by_moment);
-    }
-    return py::make_tuple(B, dB_dd, dB_dm);
 }
 
 py::tuple mounted_fields(const Array& h, const Array& H, const Array& angles) {
@@ -140,16 +128,10 @@ py::tuple propagate_turn(const Array& x, double dt, double mean_factor, double f
     return py::make_tuple(moved, F);
 }
 
-// Raises ValueError if the states `x` (n, n_x) are too few for `n_dipoles` dipoles.
-void check_vehicles(const Array& x, int n_dipoles) {
-    length_of(x, "x", 2);
-    if (n_dipoles < 1 || x.shape(1) < 9 + 3 * Size(n_dipoles) + (n_dipoles > 1))
-        throw py::value_error("x: too few states for " + std::to_string(n_dipoles) + " dipoles");
-}
-
 py::tuple row_dipoles(const Array& x, int n_dipoles, const Array& field_strength) {
-    check_vehicles(x, n_dipoles);
-    const Size n = x.shape(0), n_x = x.shape(1), d = n_dipoles;
+    const Size n = length_of(x, "x", 2), n_x = x.shape(1), d = n_dipoles;
+    if (d < 1 || n_x < 9 + 3 * d + (d > 1))
+        throw py::value_error("x: too few states for " + std::to_string(d) + " dipoles");
     const double* x_ = input_of(x, "x", {n, n_x});
     const double* h = input_of(field_strength, "field_strength", {3});
     RowVehicle vehicle{};
@@ -165,22 +147,6 @@ py::tuple row_dipoles(const Array& x, int n_dipoles, const Array& field_strength
         vehicle.dipoles(x_ + p * n_x, r_ + 3 * d * p, m_ + 3 * d * p, dr + 3 * d * n_x * p,
                         dm + 3 * d * n_x * p);
     return py::make_tuple(r, m, dr_dx, dm_dx);
-}
-
-// Writes the process noise of the hard iron moments to Q (n, n_x, n_x): `walk` (3 d, 3 d) times
-// the squared magnitude of the iron.
-void set_moment_noise(const Array& x, const Array& walk, double field_strength2, Array Q) {
-    const Size k = length_of(walk, "walk", 2);
-    if (k % 3) throw py::value_error("walk: length must be a multiple of 3");
-    check_vehicles(x, int(k / 3));
-    const Size n = x.shape(0), n_x = x.shape(1);
-    const double *x_ = input_of(x, "x", {n, n_x}), *walk_ = input_of(walk, "walk", {k, k});
-    double* out = data_of(Q, "Q", {n, n_x, n_x});
-    for (Size p = 0; p < n; ++p, x_ += n_x, out += n_x * n_x) {
-        const double size2 = iron_size2(x_, int(k / 3), field_strength2);
-        for (Size i = 0; i < k; ++i)
-            for (Size j = 0; j < k; ++j) out[(6 + i) * n_x + 6 + j] = size2 * walk_[i * k + j];
-    }
 }
 
 Samples samples_of(const Array& t, const Array& positions, const Array& M) {
@@ -200,13 +166,8 @@ Array row_bases(const Array& theta, const Array& offsets, const Array& t, const 
     const Row row = row_of(offsets);
     const Size n = length_of(theta, "theta", 2), n_theta = row.n > 1 ? 7 : 6;
     const double* theta_ = input_of(theta, "theta", {n, n_theta});
-    Array A({n, 3 * samples.n, Size(3 * row.n)});
-    double* out = A.mutable_data();
-    {
-        py::gil_scoped_release release;
-        set_row_bases(theta_, n, int(n_theta), row, samples, out);
-    }
-    return A;
+    return filled({n, 3 * samples.n, Size(3 * row.n)},
+                  [&](double* A) { set_row_bases(theta_, n, int(n_theta), row, samples, A); });
 }
 
 Array row_derivatives(const Array& theta, const Array& moments, const Array& offsets,
@@ -216,13 +177,9 @@ Array row_derivatives(const Array& theta, const Array& moments, const Array& off
     const Size n = length_of(theta, "theta", 2), n_theta = row.n > 1 ? 7 : 6;
     const double* theta_ = input_of(theta, "theta", {n, n_theta});
     const double* m = input_of(moments, "moments", {n, 3 * row.n});
-    Array D({n, 3 * samples.n, n_theta});
-    double* out = D.mutable_data();
-    {
-        py::gil_scoped_release release;
-        set_row_derivatives(theta_, m, n, int(n_theta), row, samples, out);
-    }
-    return D;
+    return filled({n, 3 * samples.n, n_theta}, [&](double* D) {
+        set_row_derivatives(theta_, m, n, int(n_theta), row, samples, D);
+    });
 }
 
 // Clock of each of `n` samples; raises ValueError for a clock that is not in `theta`.
@@ -243,13 +200,9 @@ Array steady_bases(const Array& theta, const Array& offsets, const Array& t, con
     const std::int64_t* clocks = clocks_of(clock, samples.n, theta);
     const Size n = theta.shape(0), n_theta = theta.shape(1);
     const double* theta_ = input_of(theta, "theta", {n, n_theta});
-    Array A({n, 3 * samples.n, Size(3 * row.n)});
-    double* out = A.mutable_data();
-    {
-        py::gil_scoped_release release;
-        set_steady_bases(theta_, n, int(n_theta), row, samples, clocks, out);
-    }
-    return A;
+    return filled({n, 3 * samples.n, Size(3 * row.n)}, [&](double* A) {
+        set_steady_bases(theta_, n, int(n_theta), row, samples, clocks, A);
+    });
 }
 
 Array steady_derivatives(const Array& theta, const Array& moments, const Array& offsets,
@@ -261,13 +214,9 @@ Array steady_derivatives(const Array& theta, const Array& moments, const Array& 
     const Size n = theta.shape(0), n_theta = theta.shape(1);
     const double* theta_ = input_of(theta, "theta", {n, n_theta});
     const double* m = input_of(moments, "moments", {n, 3 * row.n});
-    Array D({n, 3 * samples.n, n_theta});
-    double* out = D.mutable_data();
-    {
-        py::gil_scoped_release release;
-        set_steady_derivatives(theta_, m, n, int(n_theta), row, samples, clocks, out);
-    }
-    return D;
+    return filled({n, 3 * samples.n, n_theta}, [&](double* D) {
+        set_steady_derivatives(theta_, m, n, int(n_theta), row, samples, clocks, D);
+    });
 }
 
 double residual(const Array& t, const Array& y, double time, double scale) {
@@ -290,13 +239,10 @@ PYBIND11_MODULE(core, module) {
     module.def("dipole_jacobians", &dipole_jacobians, IN(d), IN(m));
     module.def("sensor_fields", &sensor_fields, IN(positions), IN(R_sw), IN(r), IN(m), IN(dr_dx),
                IN(dm_dx));
-    module.def("multipoles", &multipoles, IN(d), IN(moments));
     module.def("rotated_fields", &mounted_fields, IN(h), IN(H), IN(angles));
     module.def("propagate_turn", &propagate_turn, IN(x), py::arg("dt"), py::arg("mean_factor"),
                py::arg("final_factor"));
     module.def("row_dipoles", &row_dipoles, IN(x), IN(n_dipoles), IN(field_strength));
-    module.def("set_moment_noise", &set_moment_noise, IN(x), IN(walk), py::arg("field_strength2"),
-               IN(Q));
     module.def("row_bases", &row_bases, IN(theta), IN(offsets), IN(t), IN(positions), IN(M));
     module.def("row_derivatives", &row_derivatives, IN(theta), IN(moments), IN(offsets), IN(t),
                IN(positions), IN(M));

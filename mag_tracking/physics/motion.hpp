@@ -1,4 +1,4 @@
-// Motion models; motion.py cites the references.
+// Motion models; sources.py cites the references.
 
 #pragma once
 

@@ -1,4 +1,4 @@
-// Sensors with small mounting errors, as defined in mounting.py.
+// Sensors with small mounting errors, as defined in dipole.py.
 
 #pragma once
 

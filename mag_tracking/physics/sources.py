@@ -1,14 +1,18 @@
-"""Source models of targets: states, motion and dipoles.
+"""Source models of targets: states, exactly discretised motion, and dipoles.
 
-A source model maps a batch of target states to dipoles and their derivatives.
-`dipole.sensor_fields` computes the field at the sensors from the dipoles alone. A new type of
-target therefore requires only one new class, here or (for vehicles) in `vehicles.py`.
+A source model maps a batch of target states to dipoles and their derivatives, from which
+`dipole.sensor_fields` computes the field at the sensors.
+
+The process noise is the exact discretisation of continuous white noise in the highest derivative.
+T10 eq. (4.2) and ICASSP11 eq. (2) instead assume noise that is constant over a sample. PHD15 Paper
+A eq. (18) is misprinted.
 """
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.geometry import (
@@ -17,7 +21,40 @@ from mag_tracking.geometry import (
     quaternion_from_rotation_vector,
     rotation_from_quaternion,
 )
-from mag_tracking.physics.motion import constant_velocity, integrator_noise
+from mag_tracking.physics import core
+
+_INTEGRAL, _RATE = np.arange(3), np.arange(3, 6)
+
+
+def integrator_noise(dt: float, density: ArrayLike) -> FloatArray:
+    """Process noise covariance (6, 6) of positions, then rates, driven by white noise over `dt`.
+
+    For each axis it is density * [[dt^3/3, dt^2/2], [dt^2/2, dt]]; `density` (3,) is the spectral
+    density of the second derivative. PHD15 Paper A eq. (24), the correct form of eq. (18).
+    """
+    Q, density = np.zeros((6, 6)), np.asarray(density, dtype=float)
+    Q[_INTEGRAL, _INTEGRAL] = density * (dt**3 / 3.0)
+    Q[_INTEGRAL, _RATE] = Q[_RATE, _INTEGRAL] = density * (dt**2 / 2.0)
+    Q[_RATE, _RATE] = density * dt
+    return Q
+
+
+def constant_velocity(dt: float) -> FloatArray:
+    """Transition matrix (6, 6) of x, y, z, vx, vy, vz at constant velocity."""
+    F = np.eye(6)
+    F[_INTEGRAL, _RATE] = dt
+    return F
+
+
+def decaying_turn(x: FloatArray, dt: float, mean_factor: float, final_factor: float
+                  ) -> tuple[FloatArray, FloatArray]:
+    """Propagate states (n, n_x) along an arc; return also the Jacobians. [BarShalom01]_ 11.7.
+
+    The first six states are position and velocity, the last is the turn rate [rad/s], anticlockwise
+    from above, whose mean over `dt` and final value are the given factors of the initial rate. A
+    negative `dt` propagates backwards.
+    """
+    return core.propagate_turn(np.ascontiguousarray(x, dtype=float), dt, mean_factor, final_factor)
 
 
 class Dipoles(NamedTuple):
@@ -93,7 +130,6 @@ class Magnet:
     """Power spectral density of the angular acceleration, rad²/s³."""
 
     state_names = ('x', 'y', 'z', 'vx', 'vy', 'vz', 'mx', 'my', 'mz', 'wx', 'wy', 'wz')
-    """Names of the states in their order."""
 
     def dipoles(self, x: FloatArray) -> Dipoles:
         """Compute the dipole of each target state (n_hyp, 12)."""
@@ -107,11 +143,10 @@ class Magnet:
                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Predict target states at constant velocity and constant angular velocity.
 
-        The process noise of a double integrator is mapped to the moment by w -> w x m; with `P`,
-        the second-order noise of the rotation is added. The moment is rotated by the full angle w
-        dt: the first-order m + dt (w x m) of PHD15 Paper A eq. (24) lengthens it by half the
-        squared angle in each step, and a filter with a known moment magnitude would overestimate
-        the distance.
+        The process noise of a double integrator is mapped to the moment by w -> w x m. The moment
+        is rotated by the full angle w dt: the first-order m + dt (w x m) of PHD15 Paper A eq. (24)
+        lengthens it by half the squared angle in each step, and a filter with a known moment
+        magnitude would overestimate the distance.
         """
         n, rotation_vector = len(x), dt * x[:, 9:12]
         R = rotation_from_quaternion(quaternion_from_rotation_vector(rotation_vector))

@@ -1,4 +1,4 @@
-// Passes with constant acceleration and turn acceleration; steady_pass.py defines the parameters.
+// Passes with constant acceleration and turn acceleration; passes.py defines the parameters.
 
 #pragma once
 

@@ -17,7 +17,7 @@ from mag_tracking.analysis.joint_fit import (
 from mag_tracking.analysis.pass_description import SensorErrors, assignment, fits_at_minimum
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_trust import FittedRow, residual_elsewhere
-from mag_tracking.inference.separable_fit import Minimum
+from mag_tracking.inference.least_squares import Minimum
 from mag_tracking.physics.passes import RowPass, SuperposedPasses
 from support.passes import ROAD, measured, network_of, random_moments, superposed
 

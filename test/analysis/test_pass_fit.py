@@ -13,7 +13,7 @@ from mag_tracking.analysis.pass_description import SensorErrors
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.pass_result import MIN_CPA_FRACTION, PassFit, scaled_to_range
 from mag_tracking.apps.fit import fit
-from mag_tracking.inference.iron import hard_and_soft_iron
+from mag_tracking.inference.identification import hard_and_soft_iron
 from mag_tracking.inference.least_squares import refine, score_sum_covariance
 from mag_tracking.physics.dipole import MU0, dipole_field
 from mag_tracking.physics.passes import RowPass

@@ -13,7 +13,7 @@ from mag_tracking.analysis.signature_classifier import (
 )
 from mag_tracking.apps.classes import examples_of
 from mag_tracking.errors import LabelsError
-from mag_tracking.inference.log_normal_classes import UNKNOWN
+from mag_tracking.inference.identification import UNKNOWN
 from mag_tracking.recording.signature_tables import read_model, write_model
 from support.labelled_passes import signatures
 

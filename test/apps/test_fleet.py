@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mag_tracking.cli import main
-from mag_tracking.inference.log_normal_classes import UNKNOWN
+from mag_tracking.inference.identification import UNKNOWN
 from support.bundled import DATA, NETWORK_FILE, vehicle_path
 from support.iron_passes import HARD, recorded
 

@@ -7,7 +7,7 @@ import pytest
 
 from mag_tracking.cli import main
 from mag_tracking.cli.fit import iron_warnings
-from mag_tracking.inference.iron import Iron
+from mag_tracking.inference.identification import Iron
 from support.bundled import NETWORK_FILE
 from support.iron_passes import HARD, SOFT, recorded
 

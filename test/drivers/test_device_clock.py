@@ -21,8 +21,9 @@ from mag_tracking.drivers.device_clock import (
     ArrivalClock,
     ClockSettings,
     DeviceClock,
+    lower_hull,
+    slope_range,
 )
-from mag_tracking.drivers.lower_line import lower_hull, slope_range
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import replace
 

@@ -8,9 +8,8 @@ import pytest
 
 from mag_tracking.drivers.device_clock import ClockSettings
 from mag_tracking.drivers.driver import Driver, serve
-from mag_tracking.drivers.framed_device import FramedDevice
-from mag_tracking.drivers.reading import Arrival, Chunk, DeviceDate, Parsed, Reading
-from mag_tracking.drivers.sequence import MAX_REMEMBERED, SequenceCheck
+from mag_tracking.drivers.reading import Arrival, Chunk, DeviceDate, FramedDevice, Parsed, Reading
+from mag_tracking.drivers.sensor_checks import MAX_REMEMBERED, SequenceCheck
 from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.records import AccelerationSample

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from mag_tracking.drivers.configuration import KINDS, load_class, read_drivers
-from mag_tracking.drivers.framed_device import FramedDevice
+from mag_tracking.drivers.reading import FramedDevice
 from mag_tracking.drivers.transports.i2c import I2cDevice
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.file import read_network

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mag_tracking.drivers.field_strength import WEAK_S, FieldStrength
+from mag_tracking.drivers.sensor_checks import WEAK_S, FieldStrength
 from mag_tracking.records import Readings
 
 EARTH = np.array([15e-6, 2e-6, -48e-6])

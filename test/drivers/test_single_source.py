@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mag_tracking.drivers.single_source import (
+from mag_tracking.drivers.sensor_checks import (
     MAX_SENDERS,
     MIN_SECONDS,
     RELEASE_TIMEOUT_S,

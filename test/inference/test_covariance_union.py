@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mag_tracking.inference.covariance_union import inflated_to_cover
+from mag_tracking.inference.covariances import inflated_to_cover
 
 
 def test_a_covariance_is_inflated_just_enough_to_cover_a_difference():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mag_tracking.inference.axes import whitened_energy
+from mag_tracking.inference.covariances import whitened_energy
 from mag_tracking.inference.crlb import (
     bound,
     cpa_information,
@@ -13,7 +13,6 @@ from mag_tracking.inference.crlb import (
     observability,
     path_bound,
     snr,
-    snr_at_distance,
     snr_range,
 )
 from mag_tracking.physics.dipole import K_DIPOLE, dipole_field, dipole_jacobians
@@ -307,7 +306,7 @@ def test_snr_is_the_energy_of_the_field_and_minimal_abeam():
     r *= 12.0 / np.linalg.norm(r, axis=1, keepdims=True)
     r[0] = [12.0, 0.0, 0.0]
     exact = snr(dipole_field(r, [0.0, 0.0, 450.0]), NOISE * np.eye(3))
-    exact /= snr_at_distance(450.0, np.sqrt(NOISE), 12.0)
+    exact /= (K_DIPOLE * 450.0 / 12.0**3)**2 / NOISE
     assert exact[0] == pytest.approx(1.0, rel=1e-12)
     assert exact.min() > 1.0 - 1e-12 and 3.9 < exact.max() <= 4.0
 
@@ -319,8 +318,8 @@ def test_range_of_a_magnetometer_is_about_ten_metres():
     print(f'range: {t10:.2f} m; cars and truck {cars}')
     assert t10 == pytest.approx((1e7 / 9.2) ** (1 / 6), rel=1e-12)
     assert cars == pytest.approx([9.54, 12.02, 17.33], abs=0.01)
-    assert snr_at_distance(1.0, np.sqrt(1e-21), 4.5) == pytest.approx(1200, abs=10)
-    assert snr_at_distance(300.0, np.sqrt(NOISE), cars[0]) == pytest.approx(9.2, rel=1e-12)
+    at_range = dipole_field([cars[0], 0.0, 0.0], [0.0, 0.0, 300.0])
+    assert snr(at_range, NOISE * np.eye(3)) == pytest.approx(9.2, rel=1e-12)
 
 
 H9, I9, SKEW = np.ones((4, 3, 9)), np.eye(9), np.eye(3) + 0.5 * np.eye(3, k=1)

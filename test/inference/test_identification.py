@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mag_tracking.inference.identification import PASS_TO_PASS_STD, enrol, identify
-from mag_tracking.inference.log_normal_classes import UNKNOWN
+from mag_tracking.inference.identification import PASS_TO_PASS_STD, UNKNOWN, enrol, identify
 from mag_tracking.physics.dipole import MU0
 from support.vehicle_5 import TABLE
 

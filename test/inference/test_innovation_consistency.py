@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.inference.innovation_consistency import (
+from mag_tracking.inference.sequential_tests import (
     FALSE_ALARM_PROBABILITY,
     WINDOW_S,
     InnovationConsistency,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mag_tracking.inference.iron import hard_and_soft_iron
+from mag_tracking.inference.identification import hard_and_soft_iron
 from mag_tracking.physics.dipole import MU0
 from support.vehicle_5 import TABLE
 

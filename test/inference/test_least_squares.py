@@ -5,8 +5,7 @@ import warnings
 import numpy as np
 from scipy.optimize import least_squares
 
-from mag_tracking.inference.least_squares import project_out_linear, refine
-from mag_tracking.inference.separable_fit import SeparableProblem
+from mag_tracking.inference.least_squares import SeparableProblem, project_out_linear, refine
 
 
 class ExponentialModel:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from mag_tracking.inference.log_normal_classes import UNKNOWN, Feature, class_posterior
+from mag_tracking.inference.identification import UNKNOWN, Feature, class_posterior
 from mag_tracking.stages.traffic.settings import TrafficSettings
 
 NAMES, SHARES, MOMENTS, MOMENT_SPREADS, LENGTHS, LENGTH_SPREADS = zip(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mag_tracking.inference.marginal_whitener import MarginalWhitener
+from mag_tracking.inference.matrices import MarginalWhitener
 
 
 @pytest.mark.parametrize('n, q', [(12, 3), (6, 6), (5, 9)])

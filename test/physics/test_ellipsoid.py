@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
 from mag_tracking.physics.dipole import MU0
-from mag_tracking.physics.ellipsoid import demagnetisation_factors, ellipsoid_moment
+from mag_tracking.physics.vehicles import demagnetisation_factors, ellipsoid_moment
 
 settings.register_profile('ci', derandomize=True, deadline=None, max_examples=60)
 settings.load_profile('ci')

@@ -9,10 +9,8 @@ from scipy.linalg import expm
 from mag_tracking.geometry import cross_matrix, left_jacobian, rotation_about_z
 from mag_tracking.physics import sources, vehicles
 from mag_tracking.physics.dipole import MU0, sensor_fields
-from mag_tracking.physics.ellipsoid import ellipsoid_moment
-from mag_tracking.physics.motion import constant_velocity, coordinated_turn, integrator_noise
-from mag_tracking.physics.sources import Magnet
-from mag_tracking.physics.vehicles import MAX_TURN_RATE, RowVehicle
+from mag_tracking.physics.sources import Magnet, constant_velocity, decaying_turn, integrator_noise
+from mag_tracking.physics.vehicles import MAX_TURN_RATE, RowVehicle, ellipsoid_moment
 
 EARTH, ACCELERATION = np.array([2e-6, 1.5e-5, -4.9e-5]), np.array([1.0, 1.0, 0.1])
 EXAMPLES = {
@@ -99,9 +97,9 @@ def test_a_coordinated_turn_is_a_circular_arc(rate):
     A = np.zeros((6, 6))
     A[:3, 3:] = np.eye(3)
     A[3, 4], A[4, 3] = -rate, rate
-    predicted, _ = coordinated_turn(x, dt)
+    predicted, _ = decaying_turn(x, dt, 1.0, 1.0)
     np.testing.assert_allclose(predicted[0, :6], expm(A * dt) @ x[0, :6], rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(coordinated_turn(predicted, -dt)[0], x, atol=1e-12)
+    np.testing.assert_allclose(decaying_turn(predicted, -dt, 1.0, 1.0)[0], x, atol=1e-12)
     if rate:
         centre = x[0, :2] + np.array([3.0, 6.0]) / rate
         np.testing.assert_allclose(np.hypot(*(predicted[0, :2] - centre)), np.hypot(6.0, 3.0)

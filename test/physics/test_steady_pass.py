@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from mag_tracking.physics.passes import RowPass
-from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, PATH, SteadyPass
+from mag_tracking.physics.passes import N_PATH, N_STRAIGHT, PATH, RowPass, SteadyPass
 
 RNG = np.random.default_rng(4)
 T, POSITIONS, M = RNG.uniform(-1.0, 1.0, 6), RNG.uniform(-5.0, 5.0, (6, 3)), RNG.standard_normal(

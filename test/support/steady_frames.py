@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mag_tracking.physics.steady_pass import N_PATH, SteadyPass
+from mag_tracking.physics.passes import N_PATH, SteadyPass
 from mag_tracking.records import FieldFrame
 from mag_tracking.units import NS
 from support.passes import NOISE, network_of

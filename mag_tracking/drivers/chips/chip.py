@@ -1,88 +1,23 @@
-"""Interface of a magnetometer chip, and access to its registers.
+"""Base class of a magnetometer chip, and access to its registers.
 
-To add a chip, write one file with a frozen dataclass of its settings and a class that implements
-`Chip`, and add one line each to `_CLASSES` and `I2cSettings` in `transports/i2c.py`.
+To add a chip, write one file with a frozen dataclass of its settings and a subclass of `Chip`, and
+add one line each to `_CLASSES` and `I2cSettings` in `transports/i2c.py`.
 """
 
 import errno
 import math
-from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
-from smbus2 import i2c_msg
+from smbus2 import SMBus, i2c_msg
 
 from mag_tracking.drivers.reading import Axes
 from mag_tracking.errors import DeviceError, SettingsError
 
 CONVERSION_MARGIN = 1.1
 """Ratio of the waiting time to the typical conversion time of the data sheet."""
-Identity: TypeAlias = tuple[tuple[int, int], ...]
-"""((register, expected value), ...) by which a chip is identified."""
 Value = TypeVar('Value', int, float)
 Choice = TypeVar('Choice')
-
-
-class SmBus(Protocol):
-    """Subset of the interface of `smbus2.SMBus`. All methods raise OSError if they fail."""
-
-    def write_byte(self, i2c_addr: int, value: int, /) -> object:
-        """Write one byte without a register number.
-
-        Parameters
-        ----------
-        i2c_addr : int
-        value : int
-        """
-
-    def read_byte_data(self, i2c_addr: int, register: int, /) -> int:
-        """Read one register.
-
-        Parameters
-        ----------
-        i2c_addr : int
-        register : int
-
-        Returns
-        -------
-        int
-        """
-
-    def write_byte_data(self, i2c_addr: int, register: int, value: int, /) -> object:
-        """Write one register.
-
-        Parameters
-        ----------
-        i2c_addr : int
-        register : int
-        value : int
-        """
-
-    def read_i2c_block_data(self, i2c_addr: int, register: int, length: int, /) -> Sequence[int]:
-        """Read successive registers.
-
-        Parameters
-        ----------
-        i2c_addr : int
-        register : int
-            First register.
-        length : int
-            Number of registers.
-
-        Returns
-        -------
-        sequence of int
-        """
-
-    def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> object:
-        """Transfer several messages in one transaction.
-
-        Parameters
-        ----------
-        *i2c_msgs : i2c_msg
-        """
-
-    def close(self) -> object:
-        """Close the bus."""
 
 
 class ChipLocation(NamedTuple):
@@ -106,11 +41,10 @@ class Bus:
 
     No channel is open during a transfer to a chip directly on the bus. The only register of a
     multiplexer has one bit for each channel and is written without a register number (TCA9548A data
-    sheet, SCPS207, section 8.5). Transfers raise OSError if `smbus` is None, a bus that is not
-    open.
+    sheet, SCPS207, section 8.5). `smbus` is None for a bus that is not open.
     """
 
-    def __init__(self, smbus: SmBus | None, monotonic_ns: Callable[[], int],
+    def __init__(self, smbus: SMBus | None, monotonic_ns: Callable[[], int],
                  sleep: Callable[[float], object], multiplexers: Collection[int] = ()) -> None:
         self._smbus = smbus
         self.monotonic_ns, self.sleep = monotonic_ns, sleep
@@ -118,8 +52,8 @@ class Bus:
         self._selected: tuple[int | None, int | None] | None = None
 
     @property
-    def smbus(self) -> SmBus:
-        """Interface to the open bus; raises OSError if none is open."""
+    def smbus(self) -> SMBus:
+        """Interface to the open bus."""
         if self._smbus is None:
             raise OSError(errno.ENODEV, 'the bus is not open')
         return self._smbus
@@ -157,8 +91,7 @@ class Registers:
         return self._bus.smbus.read_byte_data(self._location.address, register)
 
     def read_block(self, register: int, length: int) -> bytes:
-        """Read up to 32 successive registers; raises OSError if the block is shorter than
-        requested."""
+        """Read up to 32 successive registers."""
         self._bus.select(self._location)
         block = bytes(self._bus.smbus.read_i2c_block_data(self._location.address, register, length))
         if len(block) != length:
@@ -190,77 +123,46 @@ Measurement: TypeAlias = Generator[float, None, Conversion | None]
 """Return type of `Chip.measure`: yields waiting times [s], returns a `Conversion` or None."""
 
 
-class Identified(Protocol):
-    """Interface of a chip, or of a chip class, that declares its identity registers."""
+class Chip:
+    """Magnetometer chip.
 
-    @property
-    def IDENTITY(self) -> Identity:
-        """Registers and values that identify the chip; empty if the chip is not identified."""
-
-
-class Chip(Identified, Protocol):
-    """Interface of a magnetometer chip."""
-
-    def set_up(self) -> None:
-        """Configure the chip, regardless of its previous state.
-
-        Raises
-        ------
-        OSError
-            If the chip does not answer.
-        DeviceError
-            If the chip cannot be configured. The message gives the reason.
-        """
-
-    def measure(self) -> Measurement:
-        """Measure the field once.
-
-        The chips of a bus measure concurrently. While another chip uses the bus, the generator may
-        be resumed later than requested.
-
-        Returns
-        -------
-        Conversion or None
-            None if no new conversion is available.
-
-        Yields
-        ------
-        float, s
-            Time to wait before the generator is resumed.
-
-        Raises
-        ------
-        OSError
-            If the chip fails.
-        """
-
-
-class ChipClass(Identified, Protocol):
-    """Interface of a chip class, which creates instances of `Chip`.
-
-    Creating an instance must not access the bus. The instance calls `count` for each loss, with the
-    cause as a plural noun phrase.
+    Creating an instance does not access the bus. `count` is called for each loss, with the cause as
+    a plural noun phrase.
     """
 
-    NAME: str
+    NAME = ''
     """Name of the chip in the settings, and name of its settings group."""
+    IDENTITY: tuple[tuple[int, int], ...] = ()
+    """((register, expected value), ...); empty if the chip is not identified."""
 
-    def __call__(self, registers: Registers, settings: Any,
-                 count: Callable[[str], None]) -> Chip:
-        """Create a chip that is accessed through `registers`."""
+    def __init__(self, registers: Registers, settings: Any, count: Callable[[str], None]) -> None:
+        self._registers, self._count = registers, count
 
+    @classmethod
+    def check_identity(cls, registers: Registers) -> None:
+        """Raise DeviceError if another chip answers, OSError if none does."""
+        for register, expected in cls.IDENTITY:
+            value = registers.read(register)
+            if value != expected:
+                raise DeviceError(f'identity register {register:#04x} reads {value:#04x} instead '
+                                  f'of {expected:#04x}')
 
-def check_identity(chip: Identified, registers: Registers) -> None:
-    """Raise DeviceError if another chip answers, OSError if none does."""
-    for register, expected in chip.IDENTITY:
-        value = registers.read(register)
-        if value != expected:
-            raise DeviceError(f'identity register {register:#04x} reads {value:#04x} instead of '
-                              f'{expected:#04x}')
+    def set_up(self) -> None:
+        """Configure the chip, regardless of its previous state; raises OSError if it does not
+        answer, or DeviceError, with the reason, if it cannot be configured."""
+        raise NotImplementedError
+
+    def measure(self) -> Measurement:
+        """Measure the field once, None without a new conversion; yield the times to wait [s].
+
+        The chips of a bus measure concurrently. While another chip uses the bus, the generator may
+        be resumed later than requested. Raises OSError if the chip fails.
+        """
+        raise NotImplementedError
 
 
 def look_up_choice(name: str, value: Value, choices: Mapping[Value, Choice]) -> Choice:
-    """Look up the value of a setting in `choices`; raises SettingsError if it is not permitted."""
+    """Look up the value of a setting in `choices`."""
     if value not in choices:
         raise SettingsError(f'{name}: expected one of {", ".join(map(str, choices))}, got {value}')
     return choices[value]

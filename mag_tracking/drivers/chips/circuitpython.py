@@ -24,7 +24,7 @@ from typing import Any
 
 from smbus2 import i2c_msg
 
-from mag_tracking.drivers.chips.chip import Conversion, Measurement, Registers
+from mag_tracking.drivers.chips.chip import Chip, Conversion, Measurement, Registers
 from mag_tracking.errors import DeviceError
 
 TIMEOUT_NS = 250_000_000
@@ -108,7 +108,7 @@ class BusioI2c:
         in_buffer[in_start:in_end] = bytes(message)
 
     def _transfer(self, *messages: i2c_msg) -> None:
-        """Make one transaction; raise DeviceError if the deadline has passed."""
+        """Make one transaction."""
         self._check_deadline()
         self.addresses.update(message.addr for message in messages)
         self._registers.transfer(*messages)
@@ -119,10 +119,8 @@ class BusioI2c:
             raise DeviceError('timeout while the driver waited for its chip')
 
 
-class CircuitpythonChip:
-    """Chip read through a CircuitPython driver `module.Class` in units of `scale` [T], a `Chip`."""
-
-    IDENTITY = ()
+class CircuitpythonChip(Chip):
+    """Chip read through a CircuitPython driver `module.Class` in units of `scale` [T]."""
 
     def __init__(self, registers: Registers, name: str, address: int, scale: float) -> None:
         self._registers, self._name, self._address = registers, name, address
@@ -133,11 +131,7 @@ class CircuitpythonChip:
         self._property = ''
 
     def set_up(self) -> None:
-        """Load the driver and create its instance.
-
-        Raises DeviceError if it is not installed, does not find the chip, uses another address, or
-        has no property that reads the field.
-        """
+        """Load the driver and create its instance."""
         cls = load(self._name)
         self._i2c.addresses.clear()
         self._i2c.begin(10 * TIMEOUT_NS)
@@ -158,7 +152,7 @@ class CircuitpythonChip:
                               'correct the address')
 
     def _property_name(self) -> str:
-        """Name of the property that reads the field; raises DeviceError if there is none."""
+        """Name of the property that reads the field."""
         # A look at the property of the instance would start a measurement.
         members = {*dir(type(self._driver)), *getattr(self._driver, '__dict__', ())}
         for name in PROPERTIES:
@@ -202,8 +196,7 @@ def _text(error: Exception) -> str:
 
 
 def load(name: str) -> Any:
-    """Load a driver class `module.Class`; the DeviceError of a failed import names the package to
-    install."""
+    """Load a driver class `module.Class`."""
     module_name, _, class_name = name.rpartition('.')
     try:
         module = importlib.import_module(module_name)

@@ -29,6 +29,7 @@ from dataclasses import dataclass
 
 from mag_tracking.drivers.chips.chip import (
     CONVERSION_MARGIN,
+    Chip,
     Conversion,
     Measurement,
     Registers,
@@ -54,7 +55,7 @@ class Hmc5883lSettings:
         (88.0, 810.0))
 
 
-class Hmc5883l:
+class Hmc5883l(Chip):
     """HMC5883L magnetometer; the module describes its timing, axes and scale."""
 
     IDENTITY = ((0x0A, ord('H')), (0x0B, ord('4')), (0x0C, ord('3')))
@@ -65,7 +66,7 @@ class Hmc5883l:
 
     def __init__(self, registers: Registers, settings: Hmc5883lSettings,
                  count: Callable[[str], None]) -> None:
-        self._registers = registers
+        super().__init__(registers, settings, count)
         self._gain = look_up_choice(f'{self.NAME}.range_ut', settings.range_ut, GAINS)
         self._gain_bits = list(GAINS).index(settings.range_ut) << 5
 
@@ -78,10 +79,7 @@ class Hmc5883l:
         self._registers.sleep(CONVERSION_S * CONVERSION_MARGIN)
 
     def measure(self) -> Measurement:
-        """Make a single measurement, None if it is not finished in time; yields times to wait, s.
-
-        Raises OSError if the chip has lost its configuration.
-        """
+        """Make a single measurement, None if it is not finished in time."""
         self._registers.write(MODE, SINGLE_MEASUREMENT)
         start_ns = self._registers.monotonic_ns()
         yield CONVERSION_S * CONVERSION_MARGIN

@@ -31,6 +31,7 @@ from dataclasses import dataclass
 
 from mag_tracking.drivers.chips.chip import (
     CONVERSION_MARGIN,
+    Chip,
     Conversion,
     Measurement,
     Registers,
@@ -67,7 +68,7 @@ class Mmc5603Settings(Mmc5983maSettings):
         'ms', (1.2, 6.6))
 
 
-class Mmc5983ma:
+class Mmc5983ma(Chip):
     """MMC5983MA magnetometer; the module describes its timing, axes and scale."""
 
     IDENTITY = ((0x2F, 0x30),)
@@ -81,7 +82,7 @@ class Mmc5983ma:
 
     def __init__(self, registers: Registers, settings: Mmc5983maSettings,
                  count: Callable[[str], None]) -> None:
-        self._registers = registers
+        super().__init__(registers, settings, count)
         self._bandwidth = look_up_choice(f'{self.NAME}.conversion_ms', settings.conversion_ms,
                                          self.BANDWIDTHS)
         self._conversion_ns = round(settings.conversion_ms * 1e6)
@@ -96,10 +97,7 @@ class Mmc5983ma:
         self._registers.write(self.CONTROL_1, self._bandwidth)
 
     def measure(self) -> Measurement:
-        """Make one measurement if the stored offset is recent enough, otherwise a SET/RESET pair.
-
-        Yields times to wait [s]; the result is None if a conversion is not finished in time.
-        """
+        """Make one measurement if the stored offset is recent, otherwise a SET/RESET pair."""
         if self._offset is None or (
                 self._registers.monotonic_ns() - self._offset_ns >= self._set_reset_ns):
             return (yield from self._measure_pair())
@@ -111,10 +109,7 @@ class Mmc5983ma:
         return _conversion(middle_ns, (x, y, z))
 
     def _measure_pair(self) -> Measurement:
-        """Measure after SET and after RESET, store the offset, and return the corrected conversion.
-
-        The result is None if a conversion is not finished in time.
-        """
+        """Measure after SET and after RESET, and store the offset."""
         conversions = []
         for pulse in (SET, RESET):
             self._registers.write(self.CONTROL_0, pulse)

@@ -1,12 +1,15 @@
 """Framing of fixed-length binary frames, which consist of sync, payload, checksum and tail."""
 
+import binascii
 import struct
+import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from functools import reduce
+from operator import xor
+from typing import Any, Literal, NamedTuple, TypeAlias
 
-from mag_tracking.drivers.framings.checksums import CHECKSUMS, Checksum
 from mag_tracking.drivers.framings.fields import (
     AXES,
     SKIP,
@@ -21,6 +24,62 @@ from mag_tracking.drivers.reading import Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
 
+
+class Checksum(NamedTuple):
+    """Checksum algorithm.
+
+    Source of the names and polynomials: "Catalogue of parametrised CRC algorithms" (G. Cook).
+    """
+
+    size: int
+    """Length in bytes."""
+    compute: Callable[[bytes], int]
+    """Function that computes the checksum of the covered bytes."""
+
+
+def xor8(data: bytes) -> int:
+    """Exclusive or of the bytes, as in NMEA 0183."""
+    return reduce(xor, data, 0)
+
+
+def _table(step: Callable[[int], int]) -> list[int]:
+    """CRC of each byte value; `step` processes one bit."""
+    table = list(range(256))
+    for _ in range(8):
+        table = list(map(step, table))
+    return table
+
+
+_CRC8_TABLE = _table(lambda crc: crc << 1 ^ (0x107 if crc & 0x80 else 0))
+_MODBUS_TABLE = _table(lambda crc: crc >> 1 ^ (0xA001 if crc & 1 else 0))
+
+
+def crc8(data: bytes) -> int:
+    """CRC-8/SMBUS: polynomial 0x07, initial value 0."""
+    crc, table = 0, _CRC8_TABLE
+    for byte in data:
+        crc = table[crc ^ byte]
+    return crc
+
+
+def crc16_modbus(data: bytes) -> int:
+    """CRC-16/MODBUS: polynomial 0x8005, reflected, initial value 0xFFFF."""
+    crc, table = 0xFFFF, _MODBUS_TABLE
+    for byte in data:
+        crc = crc >> 8 ^ table[(crc ^ byte) & 0xFF]
+    return crc
+
+
+CHECKSUMS = {
+    'sum8': Checksum(1, lambda data: sum(data) & 0xFF),
+    'xor8': Checksum(1, xor8),
+    'crc8': Checksum(1, crc8),
+    # CRC-16/CCITT-FALSE (IBM-3740): polynomial 0x1021.
+    'crc16_ccitt': Checksum(2, lambda data: binascii.crc_hqx(data, 0xFFFF)),
+    'crc16_modbus': Checksum(2, crc16_modbus),
+    # CRC-32 (ISO-HDLC), as in Ethernet and zip.
+    'crc32': Checksum(4, zlib.crc32)}
+"""Checksums by their names in the settings."""
 _STRUCT_CODES = {'u8': 'B', 'i8': 'b', 'u16': 'H', 'i16': 'h', 'u24': '3s', 'i24': '3s', 'u32': 'I',
                  'i32': 'i', 'u64': 'Q', 'i64': 'q', 'f32': 'f', 'f64': 'd'}
 _ByteOrder: TypeAlias = Literal['little', 'big']
@@ -55,13 +114,10 @@ class BinaryFraming:
     If a frame is not valid, the search continues one byte after the beginning of its sync. If the
     frames have an n-bit checksum, every true frame is found, with one exception: a sync in garbage
     or in a payload begins a false frame, which is accepted with probability 2^-n and hides the true
-    frames that begin within it. If the frames have no checksum, every sync is accepted; a tail is a
-    weak checksum. True frames are then found if they follow each other without a gap, or if the gap
+    frames that begin within it. Without a checksum, every sync is accepted; a tail is a weak
+    checksum. True frames are then found if they follow each other without a gap, or if the gap
     contains no sync. After any other gap, readings may be false or lost until the search is aligned
     again.
-
-    No standard defines this format, but many sensor boards use it. `CLOCK` has `wrap` from the type
-    of `ticks`, `DRIVER` has `sequence_wrap` from that of `sequence`, if sent.
     """
 
     SETTINGS = BinarySettings
@@ -73,7 +129,7 @@ class BinaryFraming:
         self._tail = _parse_bytes('tail', settings.tail)
         self._order: _ByteOrder = check_choice('byte_order', settings.byte_order, ('little', 'big'))
         name = check_choice('checksum', settings.checksum, ('none', *CHECKSUMS))
-        self._checksum = CHECKSUMS.get(name, Checksum(0, _empty_checksum))
+        self._checksum = CHECKSUMS.get(name, Checksum(0, lambda data: 0))
         first_part = check_choice('checksum_from', settings.checksum_from, ('sync', 'payload'))
         fields, each = (_parse_fields('fields', settings.fields),
                         _parse_fields('each', settings.each))
@@ -149,13 +205,8 @@ class BinaryFraming:
             [convert(value) for convert, value in zip(self._converters, values, strict=True)])
 
 
-def _empty_checksum(data: bytes) -> int:
-    """Value of the checksum `none`, which has no bytes."""
-    return 0
-
-
 def _parse_bytes(setting: str, text: str) -> bytes:
-    """Parse hexadecimal bytes; raises SettingsError if `text` is not hexadecimal."""
+    """Parse hexadecimal bytes."""
     try:
         return bytes.fromhex(text)
     except ValueError:
@@ -164,7 +215,7 @@ def _parse_bytes(setting: str, text: str) -> bytes:
 
 
 def _parse_fields(setting: str, fields: Sequence[str]) -> list[tuple[str, str]]:
-    """Parse fields such as x:i16 into [(name, type)]; raises SettingsError for an invalid type."""
+    """Parse fields such as x:i16 into [(name, type)]."""
     out = []
     for text in fields:
         name, _, kind = text.rpartition(':')

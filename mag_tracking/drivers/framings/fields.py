@@ -30,10 +30,8 @@ _Choice = TypeVar('_Choice', bound=str)
 
 
 class Rejected(ValueError):
-    """Rejection of a line or frame, with a cause such as 'with a wrong checksum' and a remedy.
-
-    The remedy may have values of the line; the cause has none, because causes are counted.
-    """
+    """Rejection of a line or frame, with a remedy, and a cause such as 'with a wrong checksum',
+    which has no values of the line, because causes are counted."""
 
     def __init__(self, cause: str, remedy: str = '') -> None:
         super().__init__(cause)
@@ -45,9 +43,7 @@ class FieldLayout:
 
     `fields` are in the order in which they are sent. For identical sensors '0', '1', ..., `each`
     (axes and skipped values of one sensor, without its name) follows `count` times. `quantities`
-    are the fields of all values without the names of sensors. Raises SettingsError if a field is
-    unknown or appears twice, no field is an axis, only some axes name a sensor, or only one of
-    `each` and `count` is given.
+    are the fields of all values without the names of sensors.
     """
 
     def __init__(self, fields: Sequence[str], each: Sequence[str] = (), count: int = 0) -> None:
@@ -77,21 +73,17 @@ class FieldLayout:
                          for sensor, axes in sensors.items()]
 
     def readings(self, values: Values) -> list[Reading]:
-        """Readings of one frame, in the order in which the sensors first appear, from a value for
-        each of `quantities`.
+        """Readings of one frame, in the order in which the sensors first appear.
 
-        Values are float for an axis (NaN if missing) and `ticks`, str for `sensor`, int for
-        `sequence`. If both the field `sensor` and axes name sensors, a dot joins the names
-        ('board.A').
+        `values` has for each of `quantities` a float for an axis (NaN if missing) or `ticks`, a str
+        for `sensor`, an int for `sequence`. If both the field `sensor` and axes name sensors, a dot
+        joins the names ('board.A').
         """
         v = [*values, math.nan, None]
         ticks, sequence = v[self._ticks], v[self._sequence]
-        if self._device is None:
-            return [Reading(name, field(v), acceleration(v), ticks, sequence)
-                    for name, field, acceleration in self._sensors]
-        device = v[self._device]
-        return [Reading(f'{device}.{name}' if name else device, field(v), acceleration(v),
-                        ticks, sequence)
+        device = '' if self._device is None else v[self._device]
+        return [Reading(f'{device}.{name}' if device and name else device or name, field(v),
+                        acceleration(v), ticks, sequence)
                 for name, field, acceleration in self._sensors]
 
 
@@ -102,17 +94,14 @@ def _split(name: str) -> tuple[str, str]:
 
 
 def _axes_getter(axes: Mapping[str, int], names: Sequence[str]) -> Callable[[Values], Any]:
-    """Create a function that selects three axes from the values of a frame.
-
-    It expects NaN and None after the values, and returns None if the frame has none of the axes.
-    """
+    """Function that selects three axes from the values of a frame, followed by NaN and None."""
     if not any(name in axes for name in names):
         return itemgetter(-1)
     return itemgetter(*(axes.get(name, -2) for name in names))
 
 
 def _expand(fields: tuple[str, ...], each: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """Return `fields`, then `each` for every sensor; raises SettingsError for invalid arguments."""
+    """Return `fields`, then `each` for every sensor."""
     for name in fields:
         quantity, sensor = _split(name)
         if quantity not in (AXES if '.' in name else (*FRAME_QUANTITIES, *AXES, SKIP)):
@@ -137,8 +126,7 @@ def _is_valid_name(name: str) -> bool:
 
 
 def axis_value(value: float | bytes) -> float:
-    """Convert a number or its text to float, NaN if the axis is missing; raises Rejected if
-    infinite."""
+    """Convert a number or its text to float; raises Rejected if it is infinite."""
     try:
         value = float(value)
     except OverflowError:
@@ -168,19 +156,16 @@ def text_number(text: str, decimal: str) -> float:
 
 
 def text_ticks(text: str, decimal: str) -> float:
-    """Convert the text of a device time: a finite number, a date and time, or a time of day; raises
-    Rejected."""
+    """Convert the text of a device time: a finite number, a date and time, or a time of day."""
     try:
         value = text_number(text, decimal)
     except ValueError:
-        pass
-    else:
-        return ticks_value(value)
-    try:
-        return DeviceDate(parse_time(text)[0] // 1000)
-    except ValueError:
-        raise Rejected('with a time that is neither a number nor a date',
-                       f'accepted are numbers and {FORMS}') from None
+        try:
+            return DeviceDate(parse_time(text)[0] // 1000)
+        except ValueError:
+            raise Rejected('with a time that is neither a number nor a date',
+                           f'accepted are numbers and {FORMS}') from None
+    return ticks_value(value)
 
 
 def decimal_remedy(text: str) -> str:
@@ -210,12 +195,8 @@ def ignore_value(value: object) -> None:
 
 
 def decode_escapes(setting: str, text: str) -> bytes:
-    r"""Replace the escape sequences \n, \r, \t, \0, \\ and \xhh of a string, and encode it as
-    UTF-8.
-
-    Both kinds of YAML quotes thus have the same effect. Raises SettingsError for another escape
-    sequence or invalid Unicode.
-    """
+    r"""Encode a string, with the escape sequences \n, \r, \t, \0, \\ and \xhh, as UTF-8, so that
+    both kinds of YAML quotes have the same effect."""
     def character(match: re.Match[str]) -> str:
         code = match[1]
         if code in _ESCAPED_CHARACTERS:
@@ -232,7 +213,7 @@ def decode_escapes(setting: str, text: str) -> bytes:
 
 
 def check_choice(setting: str, value: str, choices: Sequence[_Choice]) -> _Choice:
-    """Return a setting if it is one of the permitted values; raises SettingsError."""
+    """Return a setting if it is one of the permitted values."""
     if value not in choices:
         raise SettingsError(f'{setting}: expected one of {", ".join(choices)}, got {value!r}')
     return choices[choices.index(value)]

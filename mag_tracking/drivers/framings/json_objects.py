@@ -37,6 +37,7 @@ MAX_LOOSE = 1024
 """Maximum length of an object that is not JSON."""
 _CONSTANTS = {'nan': 'NaN', 'None': 'null', 'True': 'true', 'False': 'false'}
 
+
 @dataclass(frozen=True)
 class JsonSettings:
     """Settings of the framing of JSON objects.
@@ -63,12 +64,10 @@ class JsonSettings:
 class JsonFraming:
     """Extracts readings from JSON objects (RFC 8259), one reading per object, a `Framing`.
 
-    An axis is missing if it is null or NaN; an object that lacks a configured path is rejected, as
-    is an infinite axis. An object that spans several lines is parsed only if the data are `final`
-    and contain only this object; otherwise each line is parsed separately. The parser also accepts
-    what many libraries and devices write: NaN and Infinity, keys without quotes or in single
-    quotes, and numbers in quotes. The device time may be a date and time. Raises SettingsError if a
-    path is not valid, or neither field nor acceleration has one.
+    An axis is missing if it is null or NaN; an object that lacks a configured path is rejected. An
+    object that spans several lines is parsed only if the data are `final` and contain only this
+    object. The parser also accepts what many libraries and devices write: NaN and Infinity, keys
+    without quotes or in single quotes, and numbers in quotes.
     """
 
     SETTINGS = JsonSettings
@@ -95,10 +94,7 @@ class JsonFraming:
         self._layout = FieldLayout(names)
 
     def _axis_paths(self, name: str, paths: tuple[str, ...]) -> tuple[str, ...]:
-        """Paths of the three axes of setting `name`; raises SettingsError if invalid.
-
-        The path of a list is expanded to the paths of its values, and added to `_lists`.
-        """
+        """Paths of the three axes of setting `name`; the path of a list is added to `_lists`."""
         if len(paths) == 1 and paths[0]:
             self._lists.append((paths[0], _split_path(name, paths[0])))
             return tuple(f'{paths[0]}.{i}' for i in range(3))
@@ -144,7 +140,7 @@ class JsonFraming:
                            'text'[:200]) from None
 
     def _read(self, line: bytes) -> list[Reading]:
-        """Extract the reading of one object; raises Rejected if the object is not valid."""
+        """Extract the reading of one object."""
         content = self._decode_document(line)
         if not isinstance(content, dict):
             raise Rejected('that are not a JSON object',
@@ -169,7 +165,7 @@ def _strict(match: re.Match[str]) -> str:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Create the dict of a JSON object; raises Rejected for a duplicate key."""
+    """Dict of a JSON object, whose keys must differ."""
     content = dict(pairs)
     if len(content) != len(pairs):
         raise Rejected('with a duplicate key')
@@ -177,7 +173,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _split_path(name: str, path: str) -> _Keys:
-    """Split a path into ((key, list index or None), ...); raises SettingsError for an empty key."""
+    """Split a path into ((key, list index or None), ...)."""
     keys = path.split('.')
     if not all(keys):
         raise SettingsError(f'{name}: {path!r} has an empty key')
@@ -185,7 +181,7 @@ def _split_path(name: str, path: str) -> _Keys:
 
 
 def _lookup(value: Any, path: str, keys: _Keys) -> Any:
-    """Value at a path; raises Rejected if the path is missing."""
+    """Value at a path."""
     content = value
     for key, index in keys:
         if isinstance(value, dict) and key in value:
@@ -206,7 +202,7 @@ def _paths(value: Any, prefix: str = '', depth: int = 3) -> list[str]:
 
 
 def _number(value: object, path: str, decimal: str) -> int | float:
-    """Return a number, or the number in its quotes; raises Rejected otherwise, also for a bool."""
+    """Return a number, or the number in its quotes."""
     if isinstance(value, str):
         try:
             return text_number(value, decimal)
@@ -218,18 +214,18 @@ def _number(value: object, path: str, decimal: str) -> int | float:
 
 
 def _axis(value: object, path: str, decimal: str) -> float:
-    """Convert an axis to float, null to NaN; raises Rejected for an infinite or other value."""
+    """Convert an axis to float, null to NaN."""
     return float('nan') if value in (None, '') else axis_value(_number(value, path, decimal))
 
 
 def _ticks(value: object, path: str, decimal: str) -> float:
-    """Convert a device time; raises Rejected if it is neither a finite number nor a date."""
+    """Convert a device time, a number or a date."""
     return text_ticks(value, decimal) if isinstance(value, str) else ticks_value(
         _number(value, path, decimal))
 
 
 def _sequence(value: object, path: str, decimal: str) -> int:
-    """Convert a sequence number, such as 12 or 12.0, to int; raises Rejected beyond 64 bits."""
+    """Convert a sequence number, such as 12 or 12.0, to int."""
     value = _number(value, path, decimal)
     if isinstance(value, float):
         if not value.is_integer():
@@ -239,7 +235,7 @@ def _sequence(value: object, path: str, decimal: str) -> int:
 
 
 def _sensor(value: object, path: str, decimal: str) -> str:
-    """Convert a name (string or integer) to str; raises Rejected if it is not a sensor name."""
+    """Convert a name (string or integer) to str."""
     if isinstance(value, int) and not isinstance(value, bool):
         value = str(value)
     if not isinstance(value, str):

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from mag_tracking.drivers.framings.checksums import xor8
+from mag_tracking.drivers.framings.binary import xor8
 from mag_tracking.drivers.framings.fields import (
     AXES,
     SKIP,
@@ -63,8 +63,7 @@ class TextSettings:
 
 
 class Lines:
-    """Splits bytes into lines of at most `max_length` bytes and counts invalid lines, without
-    state."""
+    """Splits bytes into lines of at most `max_length` bytes and counts invalid lines."""
 
     def __init__(self, end: str, max_length: int) -> None:
         self.end = decode_escapes('end', end)
@@ -73,11 +72,8 @@ class Lines:
         self.max_length = max_length
 
     def parse(self, data: bytes, final: bool, read: Callable[[bytes], list[Reading]]) -> Parsed:
-        """Parse all lines; see `Framing.parse`.
-
-        `read` returns the readings of a line, valid UTF-8 that is neither empty nor too long, or
-        raises Rejected. `final` tells that the bytes after the last terminator are a complete line.
-        """
+        """Parse all lines, as `Framing.parse`; `read` returns the readings of a line, valid UTF-8
+        that is neither empty nor too long, or raises Rejected."""
         *lines, rest = data.split(self.end)
         if final:
             lines += [rest] if rest else []
@@ -103,7 +99,7 @@ class Lines:
         return Parsed(tuple(readings), consumed, rejected, examples)
 
     def _clean(self, line: bytes) -> bytes:
-        """Remove the carriage return; raises Rejected if a line is too long, empty or not UTF-8."""
+        """Remove the carriage return of a line that is neither too long, empty nor not UTF-8."""
         if len(line) > self.max_length:
             raise Rejected('longer than max_length')
         if not line.isascii():
@@ -121,11 +117,10 @@ class TextFraming:
     """Extracts readings from lines of text, one frame per line, a `Framing`.
 
     An axis is missing if it is `nan` or empty; all other numbers are decimal, with or without
-    quotation marks. The device time may also be a date and time. A line that does not match the
-    settings is rejected as a whole. Without a prefix or a checksum (NMEA 0183, section "Checksum
-    field"), part of a line may be mistaken for a complete line: '12.5,3,4' is also the end of
-    '-12.5,3,4'. If the data end within a line and `final` is set, '1,2,3' may be the beginning of
-    '1,2,34'.
+    quotation marks. A line that does not match the settings is rejected as a whole. Without a
+    prefix or a checksum (NMEA 0183, section "Checksum field"), part of a line may be mistaken for a
+    complete line: '12.5,3,4' is also the end of '-12.5,3,4'. If the data end within a line and
+    `final` is set, '1,2,3' may be the beginning of '1,2,34'.
     """
 
     SETTINGS = TextSettings
@@ -169,7 +164,7 @@ class TextFraming:
         return self._lines.parse(data, final, self._read)
 
     def _read(self, line: bytes) -> list[Reading]:
-        """Extract the readings of one line; raises Rejected if the line is not valid."""
+        """Extract the readings of one line."""
         if self._comment and line.startswith(self._comment):
             raise Rejected('that are comments')
         if not line.startswith(self._prefix):
@@ -185,7 +180,6 @@ class TextFraming:
         return self._layout.readings(
             [convert(text) for convert, text in zip(self._converters, values, strict=True)])
 
-
     def _width_remedy(self, line: bytes, values: list[bytes]) -> str:
         """Explain a line with an unexpected number of values."""
         n = len(self._converters)
@@ -197,7 +191,7 @@ class TextFraming:
 
 
 def _strip_checksum(line: bytes) -> bytes:
-    """Verify and remove the checksum `*hh`; raises Rejected if it is missing or wrong."""
+    """Verify and remove the checksum `*hh`."""
     if line[-3:-2] != b'*':
         raise Rejected('without a checksum')
     line, digits = line[:-3], line[-2:]
@@ -217,7 +211,7 @@ def _converter(quantity: str, decimal: str) -> Callable[[bytes], object]:
 
 
 def _axis(text: bytes) -> float:
-    """Parse an axis, NaN if missing; raises Rejected if it is not a finite number."""
+    """Parse an axis, NaN if missing."""
     text = text.strip(b' \t"')
     if _NUMBER(text):
         return axis_value(text)
@@ -229,13 +223,13 @@ def _axis(text: bytes) -> float:
 
 
 def _ticks(text: bytes, decimal: str) -> float:
-    """Parse a device time; raises Rejected if it is missing, or neither a number nor a date."""
+    """Parse a device time, a number or a date."""
     text = text.strip(b' \t"')
     return ticks_value(math.nan) if _MISSING(text) else text_ticks(text.decode(), decimal)
 
 
 def _sequence(text: bytes) -> int:
-    """Parse a sequence number; raises Rejected if it is not an integer of at most 64 bits."""
+    """Parse a sequence number of at most 64 bits."""
     text = text.strip(b' \t"')
     if not _INTEGER(text):
         raise Rejected('with a sequence number that is not an integer')
@@ -243,5 +237,5 @@ def _sequence(text: bytes) -> int:
 
 
 def _sensor(text: bytes) -> str:
-    """Parse the name of a sensor; raises Rejected if it is not valid."""
+    """Parse the name of a sensor."""
     return sensor_name(text.strip(b' \t"').decode())

@@ -17,24 +17,172 @@ both together are longer than the longest frame, or it has lost one byte for whi
 the next message takes its place. One that overlaps no true message may be accepted. After a
 rejected message, the search continues at the byte after its preamble.
 
+Field and acceleration are in the sensor frame: the coordinate bits of a data identifier (0x4 NED,
+0x8 NWU) apply to the orientation only (MT0101P, note to revision W) and are ignored.
+
 Sources: Xsens, "MT Low Level Communication Protocol Documentation", MT0101P, revision 2019.A:
-message structure and message listing; Xsens, "MTi User Manual", MT0605P, section 5.3.2:
-acknowledgements.
+message structure, message listing, MTData2 with its data identifiers and fixed point formats;
+Xsens, "MTi User Manual", MT0605P, section 5.3.2: acknowledgements; Xsens, "MTi and MTx User Manual
+and Technical Documentation", MT0100P.N, section 5.3: SetOutputSettings and MTData.
 """
 
+import struct
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from mag_tracking.drivers.framings.xsens_data import (
-    TICK_S,
-    DecodedMessage,
-    MTDataLayout,
-    read_mtdata2,
-)
-from mag_tracking.drivers.reading import Parsed, Reading
+from mag_tracking.drivers.reading import Axes, Parsed, Reading
 from mag_tracking.errors import SettingsError
 from mag_tracking.settings import param
+
+TICK_S = 1e-4
+"""[s] Tick of SampleTimeFine. The counter wraps at 2^32 (MTi 1 and 600 series), or at 864 000 000
+ticks, which is one day (MTi 10 and 100 series)."""
+
+_PACKET_COUNTER = 0x1020
+_SAMPLE_TIME_FINE = 0x1060
+_ACCELERATION = 0x4020
+_MAGNETIC_FIELD = 0xC020
+_RAW_VALUE_GROUP = 0xA000
+"""Identifier group of the raw sensor values."""
+_MAGNETIC_GROUP = 0xC000
+_TYPE_MASK = 0xFFF0
+_GROUP_MASK = 0xFE00
+
+_FLOAT, _FIXED_12_20, _FIXED_16_32 = 0, 1, 2
+_TRIPLE_FORMATS = (struct.Struct('>3f'), struct.Struct('>3i'), struct.Struct('>IhIhIh'),
+                   struct.Struct('>3d'))
+"""Formats of three real numbers, indexed by the two precision bits of the identifier."""
+
+_BLOCK_LENGTHS = {
+    'temp': 4, 'acc': 12, 'gyr': 12, 'mag': 12, 'quaternion': 16, 'euler': 12, 'matrix': 36,
+    'analog_1': 2, 'analog_2': 2, 'status': 1, 'counter': 2}
+"""Length in bytes of the blocks of MTData, in the order of the protocol."""
+_ORIENTATIONS = {'quaternion', 'euler', 'matrix'}
+_FORMATS = {'float': _FLOAT, 'fp12.20': _FIXED_12_20}
+
+
+class DecodedMessage(NamedTuple):
+    """Reading of a data message, and the causes for which data were ignored."""
+
+    reading: Reading | None
+    """None if the message has neither field nor acceleration."""
+    causes: tuple[str, ...]
+    """One cause for each occurrence of ignored data."""
+
+
+def _three_reals(data: bytes, precision: int) -> Axes | None:
+    """Decode three real numbers; None if the length of `data` does not match `precision`."""
+    layout = _TRIPLE_FORMATS[precision]
+    if len(data) != layout.size:
+        return None
+    values = layout.unpack(data)
+    if precision == _FIXED_12_20:
+        return tuple(v / 2**20 for v in values)
+    if precision == _FIXED_16_32:
+        # The fraction is sent first, then the signed integer part.
+        return tuple(whole + fraction / 2**32
+                     for fraction, whole in zip(values[::2], values[1::2], strict=True))
+    return values
+
+
+def _decode_packet(identifier: int, data: bytes) -> tuple[str, float | Axes | None] | None:
+    """Decode a packet into (attribute of `Reading`, value), None if it is not used; the value is
+    None if the length of the packet is wrong."""
+    if identifier == _PACKET_COUNTER:
+        return 'sequence', int.from_bytes(data, 'big') if len(data) == 2 else None
+    if identifier == _SAMPLE_TIME_FINE:
+        return 'ticks', float(int.from_bytes(data, 'big')) if len(data) == 4 else None
+    kind = identifier & _TYPE_MASK
+    if kind == _MAGNETIC_FIELD:
+        return 'field', _three_reals(data, identifier & 3)
+    if kind == _ACCELERATION:
+        return 'acceleration', _three_reals(data, identifier & 3)
+    return None
+
+
+def read_mtdata2(data: bytes) -> DecodedMessage | None:
+    """Decode DATA of an MTData2 message; None if the packets do not fill it, or a used one has an
+    invalid length.
+
+    A packet is an identifier (u16), the length of its data (u8), and the data. SampleTimeCoarse
+    (0x1070) is too coarse for a clock.
+    """
+    values: dict[str, Any] = {}
+    causes: list[str] = []
+    position, end = 0, len(data)
+    while position < end:
+        begin = position + 3
+        if begin > end:
+            return None
+        identifier = data[position] << 8 | data[position + 1]
+        position = begin + data[begin - 1]
+        if position > end:
+            return None
+        decoded = _decode_packet(identifier, data[begin:position])
+        if decoded is None:
+            if identifier & _GROUP_MASK in (_RAW_VALUE_GROUP, _MAGNETIC_GROUP):
+                causes.append(f'packets not used: 0x{identifier:04X}')
+            continue
+        name, value = decoded
+        if value is None:
+            return None
+        if name in values:
+            causes.append(f'duplicate packets in a message: 0x{identifier:04X}')
+            continue
+        values[name] = value
+    return _decoded_message(values, causes)
+
+
+def _decoded_message(values: Mapping[str, Any], causes: Sequence[str]) -> DecodedMessage:
+    """Message from {attribute of `Reading`: value}."""
+    if 'field' in values or 'acceleration' in values:
+        return DecodedMessage(Reading(**values), tuple(causes))
+    return DecodedMessage(None, (*causes, 'messages without field or acceleration'))
+
+
+class MTDataLayout:
+    """Layout of MTData messages, which do not describe it, so that it must be configured.
+
+    `blocks` are keys of `_BLOCK_LENGTHS` in its order, at most one of them an orientation;
+    `number_format` is a key of `_FORMATS`. `size` is the length of DATA in bytes.
+    """
+
+    def __init__(self, blocks: Sequence[str], number_format: str) -> None:
+        for name in blocks:
+            if name not in _BLOCK_LENGTHS:
+                raise SettingsError(f'mtdata: unknown block {name!r}; known: '
+                                    f'{", ".join(_BLOCK_LENGTHS)}')
+        if list(blocks) != [name for name in _BLOCK_LENGTHS if name in blocks]:
+            raise SettingsError(f'mtdata: expected blocks in protocol order, each at most once '
+                                f'({", ".join(_BLOCK_LENGTHS)}), got {", ".join(blocks)}')
+        if len(_ORIENTATIONS.intersection(blocks)) > 1:
+            raise SettingsError(
+                'mtdata: expected at most one of ' + ', '.join(sorted(_ORIENTATIONS)))
+        if not {'acc', 'mag'}.intersection(blocks):
+            raise SettingsError(f'mtdata: acc or mag is required, got {", ".join(blocks)}')
+        if number_format not in _FORMATS:
+            raise SettingsError(f'mtdata_format: expected one of {", ".join(_FORMATS)}, got '
+                                f'{number_format!r}')
+        self._precision = _FORMATS[number_format]
+        self._begin: dict[str, int] = {}
+        self.size = 0
+        for name in blocks:
+            self._begin[name] = self.size
+            self.size += _BLOCK_LENGTHS[name]
+
+    def read(self, data: bytes) -> DecodedMessage:
+        """Decode DATA of `size` bytes of an MTData message."""
+        values: dict[str, Any] = {}
+        for block, name in (('mag', 'field'), ('acc', 'acceleration')):
+            if block in self._begin:
+                begin = self._begin[block]
+                values[name] = _three_reals(data[begin:begin + 12], self._precision)
+        if 'counter' in self._begin:
+            values['sequence'] = int.from_bytes(data[self._begin['counter']:], 'big')
+        return _decoded_message(values, ())
+
 
 _PREAMBLE = b'\xfa'
 _START = b'\xfa\xff'
@@ -74,15 +222,13 @@ class _ParseStep(NamedTuple):
     """Result of parsing a possible message at the beginning of a window."""
 
     length: int
-    """Number of bytes consumed; 0 if more bytes are needed."""
-    is_accepted: bool
-    """Whether the message is accepted."""
+    """Number of bytes consumed: 0 if more bytes are needed, 1 if the message is rejected."""
     causes: tuple[str, ...] = ()
     reading: Reading | None = None
 
 
-_WAIT_STEP = _ParseStep(0, False)
-_REJECT_STEP = _ParseStep(1, False)
+_WAIT_STEP = _ParseStep(0)
+_REJECT_STEP = _ParseStep(1)
 
 
 def _is_from_device(mid: int) -> bool:
@@ -156,15 +302,15 @@ class XsensFraming:
             if step.length == 0:
                 break
             position += step.length
-            if not step.is_accepted:
-                rejected['bytes between frames'] += step.length
+            if step.length == 1:
+                rejected['bytes between frames'] += 1
             rejected.update(step.causes)
             if step.reading is not None:
                 readings.append(step.reading)
         return Parsed(tuple(readings), position, {c: n for c, n in rejected.items() if n})
 
     def _parse_step(self, window: bytes, more: bool) -> _ParseStep:
-        """Parse the message at the beginning of `window`; `more` is true if bytes may follow."""
+        """Parse the message at the beginning of `window`; `more` bytes may follow."""
         message = _message_at(window, 0, self._longest)
         if message is None:
             return _REJECT_STEP
@@ -179,13 +325,13 @@ class XsensFraming:
         if step is not None:
             return step
         if decoded is None:
-            return _ParseStep(message.end, True, (self._cause(window, message),))
-        return _ParseStep(message.end, True, decoded.causes, decoded.reading)
+            return _ParseStep(message.end, (self._cause(window, message),))
+        return _ParseStep(message.end, decoded.causes, decoded.reading)
 
     def _search_inside(self, window: bytes, outer: _Message, outer_is_data: bool,
                        more: bool) -> _ParseStep | None:
-        """Search `outer` for another data message; return a step that rejects `outer` or waits for
-        more bytes, or None without a message."""
+        """Step that rejects `outer` for another data message in it, or waits for more bytes; None
+        without a message."""
         rejection = _REJECT_STEP._replace(causes=('messages that contain the start of another',))
         index = 0
         while True:
@@ -208,10 +354,8 @@ class XsensFraming:
 
     @staticmethod
     def _next_start(window: bytes, index: int, end: int, complete: bool) -> int:
-        """Index of the next message start from `index` on; -1 if no message starts before `end`.
-
-        Both bytes of the start must be before `end` if `complete` is set, otherwise only the first.
-        """
+        """Index of the next message start from `index` on, of which both bytes (if `complete`) or
+        the first are before `end`; -1 if there is none."""
         found = window.find(_START, index, end if complete else end + 1)
         if found < 0 and not complete and end == len(window) and window.endswith(_PREAMBLE, index):
             return end - 1

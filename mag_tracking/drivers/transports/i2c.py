@@ -14,45 +14,101 @@ Sources: i2c-dev of Linux (Documentation/i2c/dev-interface.rst) and its error co
 
 import errno
 import math
+import re
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
-import smbus2
+from smbus2 import SMBus
 
-from mag_tracking.drivers.chips.chip import (
-    Bus,
-    Chip,
-    ChipClass,
-    Conversion,
-    Registers,
-    SmBus,
-    check_identity,
-)
-from mag_tracking.drivers.chips.circuitpython import CircuitpythonChip
-from mag_tracking.drivers.chips.entry import parse_sensors
+from mag_tracking.drivers.chips.chip import Bus, Chip, ChipLocation, Conversion, Registers
+from mag_tracking.drivers.chips.circuitpython import UNITS, CircuitpythonChip
+from mag_tracking.drivers.chips.continuous import Lis3mdl, Lis3mdlSettings, Rm3100, Rm3100Settings
 from mag_tracking.drivers.chips.honeywell import Hmc5883l, Hmc5883lSettings, Hmc5983
-from mag_tracking.drivers.chips.lis3mdl import Lis3mdl, Lis3mdlSettings
-from mag_tracking.drivers.chips.memsic import (
-    Mmc5603,
-    Mmc5603Settings,
-    Mmc5983ma,
-    Mmc5983maSettings,
-)
-from mag_tracking.drivers.chips.rm3100 import Rm3100, Rm3100Settings
+from mag_tracking.drivers.chips.memsic import Mmc5603, Mmc5603Settings, Mmc5983ma, Mmc5983maSettings
 from mag_tracking.drivers.reading import Arrival, Reading
 from mag_tracking.drivers.transports.polled import Closable
 from mag_tracking.errors import DeviceError, SettingsError
 from mag_tracking.settings import param
+from mag_tracking.units import field_scale
 
 CLOSE_WAIT_S = 0.1
 """[s] Maximum time that `close` waits for a `read` in another thread, in addition to one cycle."""
-_CLASSES: tuple[ChipClass, ...] = (Mmc5983ma, Mmc5603, Hmc5883l, Hmc5983, Rm3100, Lis3mdl)
+_CLASSES: tuple[type[Chip], ...] = (Mmc5983ma, Mmc5603, Hmc5883l, Hmc5983, Rm3100, Lis3mdl)
 CHIPS = {cls.NAME: cls for cls in _CLASSES}
 """Supported chips by name."""
 NO_ANSWER_ERRNOS = (errno.EREMOTEIO, errno.ENXIO)
+ENTRY = re.compile(r'(?P<name>[^:]+):(?P<chip>[^:]+):0x(?P<address>[0-9a-fA-F]{2})'
+                   r'(@0x(?P<multiplexer>[0-9a-fA-F]{2})\.(?P<channel>[0-7]))?(:(?P<unit>[^:]+))?')
+
+
+class Sensor(NamedTuple):
+    """Name, chip and location of a sensor on a bus."""
+
+    name: str
+    chip: str
+    location: ChipLocation
+    scale: float = 1.0
+    """[T] Unit of the driver of the chip."""
+
+
+def _parse_sensors(entries: Sequence[str]) -> list[Sensor]:
+    """Parse the entries name:chip:address[@multiplexer.channel][:unit] of a bus."""
+    sensors = [_parse_sensor(entry) for entry in entries]
+    multiplexers = {s.location.multiplexer for s in sensors} - {None}
+    for i, sensor in enumerate(sensors):
+        if sensor.location.address in multiplexers:
+            raise SettingsError(f'sensors: {sensor.name}: address {sensor.location.address:#04x} '
+                                'is used by a multiplexer')
+        for other in sensors[:i]:
+            if other.name == sensor.name:
+                raise SettingsError(f'sensors: {sensor.name} appears twice')
+            # A chip directly on the bus always answers.
+            if sensor.location == other.location or (
+                    sensor.location.address == other.location.address
+                    and None in (sensor.location.multiplexer, other.location.multiplexer)):
+                raise SettingsError(f'sensors: {other.name} and {sensor.name} both answer at '
+                                    f'{sensor.location}')
+    return sensors
+
+
+def _parse_sensor(entry: str) -> Sensor:
+    """Parse one entry; the chip is one of `CHIPS` or a module.Class."""
+    match = ENTRY.fullmatch(entry)
+    if match is None:
+        raise SettingsError('sensors: expected name:chip:0xNN or name:chip:0xNN@0xNN.channel, '
+                            f'followed by :unit for a CircuitPython driver, got {entry!r}')
+    name, chip = match['name'], match['chip']
+    if chip not in CHIPS and '.' not in chip:
+        raise SettingsError(f'sensors: {name}: chip {chip} is neither one of '
+                            f'{", ".join(CHIPS)} nor a module.Class')
+    address = _parse_address(name, 'address', match['address'], 0x08)
+    location = ChipLocation(address)
+    if match['multiplexer'] is not None:
+        location = ChipLocation(address, _parse_address(
+            name, 'multiplexer', match['multiplexer'], 0x70), int(match['channel']))
+    if chip in CHIPS:
+        if match['unit'] is not None:
+            raise SettingsError(f'sensors: {name}: the unit of {chip} is known; remove '
+                                f':{match["unit"]}')
+        return Sensor(name, chip, location)
+    unit = match['unit'] or UNITS.get(chip)
+    if unit is None:
+        raise SettingsError(f'sensors: {name}: the unit of {chip} is not known; add it to the '
+                            f'entry, as in {entry}:uT')
+    return Sensor(name, chip, location, field_scale(unit, f'sensors: {name}: unit'))
+
+
+def _parse_address(name: str, role: str, digits: str, lowest: int) -> int:
+    """Parse the digits of an address from `lowest` to 0x77."""
+    address = int(digits, 16)
+    if not lowest <= address <= 0x77:
+        raise SettingsError(f'sensors: {name}: {role} {address:#04x} is outside '
+                            f'{lowest:#04x} .. 0x77')
+    return address
 
 
 @dataclass(frozen=True)
@@ -83,24 +139,19 @@ class I2cSettings:
 
 
 class I2cDevice(Closable):
-    """Chips on one I2C bus, read in tesla, a `reading.Device`.
-
-    `open_bus` opens the bus with a given number as an `smbus2.SMBus` or equivalent. `counts` are
-    missed polling cycles and, for each sensor, failed readings, cycles without a new conversion,
-    and overwritten conversions. Raises SettingsError if no sensor is configured or a setting is not
-    valid.
-    """
+    """Chips on one I2C bus, read in tesla, a `reading.Device`."""
 
     SETTINGS = I2cSettings
 
-    def __init__(self, settings: I2cSettings, open_bus: Callable[[int], SmBus] = smbus2.SMBus,
+    def __init__(self, settings: I2cSettings, open_bus: Callable[[int], SMBus] = SMBus,
                  monotonic_ns: Callable[[], int] = time.monotonic_ns,
                  sleep: Callable[[float], object] = time.sleep) -> None:
         if settings.sensors == ('',):
             raise SettingsError('sensors: at least one is required, such as A:lis3mdl:0x1c')
-        self._sensors = {s.name: s for s in parse_sensors(settings.sensors, CHIPS)}
+        self._sensors = {s.name: s for s in _parse_sensors(settings.sensors)}
         self.counts: Counter[str] = Counter()
         self._settings, self._open_bus = settings, open_bus
+        self._name = f'/dev/i2c-{settings.bus}'
         self._monotonic_ns, self._sleep = monotonic_ns, sleep
         self._period_ns = round(1e9 / settings.rate_hz)
         super().__init__()
@@ -113,8 +164,7 @@ class I2cDevice(Closable):
         self._chips = self._create_chips(Bus(None, monotonic_ns, sleep))
 
     def open(self) -> None:
-        """Open the bus, identify the chips and configure them; raises DeviceError if one is missing
-        or of another type."""
+        """Open the bus, identify the chips and configure them."""
         with self._lock:
             self._release()
             try:
@@ -135,11 +185,6 @@ class I2cDevice(Closable):
             self._n_failed.clear()
             self._n_silent.clear()
 
-    @property
-    def _name(self) -> str:
-        """Path of the bus, for messages."""
-        return f'/dev/i2c-{self._settings.bus}'
-
     def _create_chips(self, bus: Bus) -> dict[str, Chip]:
         """Create the chips {sensor name: chip} without access to the bus."""
         chips: dict[str, Chip] = {}
@@ -158,30 +203,18 @@ class I2cDevice(Closable):
         self.counts[f'{cause}: {name}'] += 1
 
     def _set_up(self, name: str, chip: Chip, bus: Bus) -> None:
-        """Identify and configure a chip; raises DeviceError if this fails."""
+        """Identify and configure a chip."""
         sensor = self._sensors[name]
         label = f'{self._name}: {name} ({sensor.chip}, {sensor.location})'
         registers = Registers(bus, sensor.location)
         try:
-            check_identity(chip, registers)
+            chip.check_identity(registers)
             chip.set_up()
         except DeviceError as error:
-            matching = [] if sensor.chip not in CHIPS else self._matching_chips(registers)
-            hint = f'; it is identified as {matching[0]}' if matching else ''
+            hint = _identity_hint(registers) if sensor.chip in CHIPS else ''
             raise DeviceError(f'{label}: {error}{hint}') from error
         except OSError as error:
             raise DeviceError(f'{label}: {self._fault(error)}') from error
-
-    def _matching_chips(self, registers: Registers) -> list[str]:
-        """Names of the supported chips whose identity matches the registers."""
-        names = []
-        for name, cls in CHIPS.items():
-            try:
-                check_identity(cls, registers)
-            except (DeviceError, OSError):
-                continue
-            names.append(name)
-        return names
 
     def _fault(self, error: OSError) -> str:
         """Explanation of a bus error, with the remedy."""
@@ -195,8 +228,7 @@ class I2cDevice(Closable):
         return f'cannot be read: {error.strerror or error}'
 
     def read(self, timeout_s: float) -> list[Arrival]:
-        """Return the readings of the next polling cycle with at least one reading; none after
-        `close`."""
+        """Readings of the next polling cycle with at least one reading; none after `close`."""
         with self._lock:
             end_ns = self._monotonic_ns() + round(timeout_s * 1e9)
             while True:
@@ -212,10 +244,7 @@ class I2cDevice(Closable):
                     return sorted(arrivals, key=lambda a: a.arrival_ns)
 
     def _wait(self, end_ns: int) -> bool:
-        """Wait for the next polling cycle, at most until `end_ns`; return whether it is due.
-
-        Missed cycles are counted.
-        """
+        """Wait for the next polling cycle, at most until `end_ns`; return whether it is due."""
         while not self._closing:
             now_ns = self._monotonic_ns()
             n_missed = (now_ns - self._due_ns) // self._period_ns
@@ -258,10 +287,7 @@ class I2cDevice(Closable):
         return arrivals
 
     def _arrivals(self, name: str, conversion: Conversion | None) -> list[Arrival]:
-        """Return a list with the arrival of a conversion; empty if the conversion is missing.
-
-        A missing conversion is counted; too many in succession mark the device as lost.
-        """
+        """List with the arrival of a conversion; too many missing ones mark the device as lost."""
         self._n_failed[name] = 0
         if conversion is None:
             self._count('polling cycles without a new conversion', name)
@@ -289,6 +315,17 @@ class I2cDevice(Closable):
         if self._bus is not None:
             self._bus.smbus.close()
             self._bus = None
+
+
+def _identity_hint(registers: Registers) -> str:
+    """Name the first supported chip whose identity matches the registers, if any."""
+    for name, chip in CHIPS.items():
+        try:
+            chip.check_identity(registers)
+        except (DeviceError, OSError):
+            continue
+        return f'; it is identified as {name}'
+    return ''
 
 
 def _open_error(error: OSError) -> str:

@@ -78,12 +78,7 @@ class _TlsContext(ssl.SSLContext):
 
 
 class MqttTopics:
-    """Messages of MQTT topics as a `reading.Transport`.
-
-    `counts` are dropped messages by cause; messages that the broker has delivered again are
-    accepted and counted as 'messages with the dup flag'. Raises SettingsError if a topic filter is
-    empty, a password has no user name, or `ca_file` is set without TLS.
-    """
+    """Messages of MQTT topics as a `reading.Transport`."""
 
     SETTINGS = MqttSettings
     is_message_oriented = True
@@ -97,7 +92,7 @@ class MqttTopics:
         if s.ca_file and not s.tls:
             raise SettingsError('ca_file: certificates have no effect while tls is false')
         self.counts: Counter[str] = Counter()
-        self._settings = s
+        self.settings = s
         self._name = f'MQTT broker {s.host}:{s.port}'
         # Guards all attributes below; notifies the reader of messages and of a lost connection.
         self._changed = threading.Condition()
@@ -107,17 +102,8 @@ class MqttTopics:
         self._is_ready = self._closing = False
         self._loss = f'{self._name}: not open'
 
-    @property
-    def settings(self) -> MqttSettings:
-        """Settings of the connection."""
-        return self._settings
-
     def open(self) -> None:
-        """Connect and subscribe.
-
-        Raises DeviceError if the broker cannot be reached or refuses the connection or a
-        subscription, or a configured file cannot be read.
-        """
+        """Connect and subscribe."""
         self.close()
         client = self._client()
         with self._changed:
@@ -128,20 +114,20 @@ class MqttTopics:
             # A `close` during the connection attempt has priority.
             self._loss = self._loss if self._closing else ''
         self._thread = threading.Thread(target=self._run, args=(client,), daemon=True,
-                                        name=f'mqtt {self._settings.host}')
+                                        name=f'mqtt {self.settings.host}')
         self._thread.start()
         with self._changed:
             answered = self._changed.wait_for(lambda: self._is_ready or self._loss,
-                                              self._settings.connect_timeout_s)
+                                              self.settings.connect_timeout_s)
             lost = self._loss
         if not answered or lost:
             self.close()
             raise DeviceError(lost or f'{self._name}: no answer within '
-                              f'{self._settings.connect_timeout_s:g} s; is it an MQTT broker?')
+                              f'{self.settings.connect_timeout_s:g} s; is it an MQTT broker?')
 
     def _client(self) -> paho.Client:
-        """Create a client; raises DeviceError if a configured file cannot be read."""
-        s = self._settings
+        """Create a client."""
+        s = self.settings
         client = paho.Client(
             CallbackAPIVersion.VERSION2, s.client_id or f'mag_tracking_{secrets.token_hex(4)}',
             clean_session=True, protocol=paho.MQTTv311, reconnect_on_failure=False)
@@ -155,8 +141,8 @@ class MqttTopics:
         return client
 
     def _tls_context(self) -> ssl.SSLContext:
-        """Load the trusted CA certificates into a TLS context; raises DeviceError if this fails."""
-        path = self._settings.ca_file
+        """TLS context with the trusted CA certificates."""
+        path = self.settings.ca_file
         # A context of this type requires a certificate that matches the host name.
         context = _TlsContext(ssl.PROTOCOL_TLS_CLIENT)
         try:
@@ -170,8 +156,8 @@ class MqttTopics:
         return context
 
     def _password(self) -> str | None:
-        """Read the password, None if no file is configured; raises DeviceError if this fails."""
-        path = self._settings.password_file
+        """Read the password; None if no file is configured."""
+        path = self.settings.password_file
         if not path:
             return None
         try:
@@ -185,8 +171,8 @@ class MqttTopics:
         return password
 
     def _connect(self, client: paho.Client) -> None:
-        """Connect the client, with TLS if configured; raises DeviceError if this fails."""
-        s = self._settings
+        """Connect the client, with TLS if configured."""
+        s = self.settings
         try:
             client.connect(s.host, s.port, s.keepalive_s)
         except ssl.SSLError as error:
@@ -210,7 +196,7 @@ class MqttTopics:
             reason = f'{type(error).__name__}: {error}'
         self._set_lost(reason if self._is_ready else
                        f'{reason} Check that it is an MQTT broker and that it expects tls: '
-                       f'{str(self._settings.tls).lower()}')
+                       f'{str(self.settings.tls).lower()}')
 
     def _set_lost(self, reason: str) -> None:
         """Mark the connection as lost and wake the reader; only the first reason is stored."""
@@ -225,14 +211,14 @@ class MqttTopics:
             self._set_lost(f'connection refused: {reason_code}')
             return
         try:
-            client.subscribe([(topic, self._settings.qos) for topic in self._settings.topics])
+            client.subscribe([(topic, self.settings.qos) for topic in self.settings.topics])
         except ValueError as error:
-            self._set_lost(f'topics {self._settings.topics}: {error}')
+            self._set_lost(f'topics {self.settings.topics}: {error}')
 
     def _on_subscribe(self, client: paho.Client, _: Any, mid: int,
                       reason_codes: list[ReasonCode], properties: Properties | None) -> None:
         """Report that the broker has granted all subscriptions, or refused one of them."""
-        refused = [topic for topic, code in zip(self._settings.topics, reason_codes, strict=True)
+        refused = [topic for topic, code in zip(self.settings.topics, reason_codes, strict=True)
                    if code.is_failure]
         if refused:
             self._set_lost(f'subscription refused: {", ".join(refused)}')
@@ -251,7 +237,7 @@ class MqttTopics:
             if cause:
                 self._thread_counts[cause] += 1
                 return
-            if len(self._queue) == self._settings.queue:
+            if len(self._queue) == self.settings.queue:
                 self._queue.popleft()
                 self._thread_counts['messages dropped (queue full)'] += 1
             self._queue.append(Chunk(arrival_ns, bytes(message.payload), topic))
@@ -263,9 +249,9 @@ class MqttTopics:
             topic = message.topic
         except UnicodeDecodeError:
             return 'messages whose topic is not UTF-8', ''
-        if message.retain and not self._settings.retained:
+        if message.retain and not self.settings.retained:
             return 'retained messages skipped', topic
-        if len(message.payload) > self._settings.max_length:
+        if len(message.payload) > self.settings.max_length:
             return 'messages longer than max_length', topic
         return ('' if message.payload else 'empty messages'), topic
 
@@ -273,12 +259,12 @@ class MqttTopics:
                        reason_code: ReasonCode, properties: Properties | None) -> None:
         """Report a keep-alive timeout; `_run` reports all other causes in more detail."""
         if reason_code.getName() == 'Keep alive timeout':
-            self._set_lost(f'no answer for {2 * self._settings.keepalive_s} s')
+            self._set_lost(f'no answer for {2 * self.settings.keepalive_s} s')
 
     def read(self, timeout_s: float) -> list[Chunk]:
         """Return the queued messages; wait only if the queue is empty.
 
-        Raises DeviceError if the connection is lost and all messages have been returned.
+        A lost connection is raised when all messages have been returned.
         """
         with self._changed:
             if self._loss and not self._queue:

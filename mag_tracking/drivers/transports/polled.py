@@ -1,30 +1,15 @@
 """Base classes of transports that wait for data and may be closed by another thread."""
 
+import io
 import select
+import socket
 import threading
 import time
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 CLOSE_WAIT_S = 0.1
 """[s] Maximum time that `close` waits for a `read` in another thread."""
-
-
-class Handle(Protocol):
-    """Object with a file descriptor."""
-
-    def fileno(self) -> int:
-        """Return the file descriptor.
-
-        Returns
-        -------
-        int
-        """
-
-    def close(self) -> None:
-        """Close the descriptor."""
-
-
-H = TypeVar('H', bound=Handle)
+H = TypeVar('H', bound=io.RawIOBase | socket.socket)
 
 
 class Closable:

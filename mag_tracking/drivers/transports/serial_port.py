@@ -49,11 +49,7 @@ class SerialSettings:
 
 
 class SerialPort(Polled[serial.Serial]):
-    """Bytes of a serial line as a `reading.Transport`.
-
-    `counts` are line errors by cause, if the driver of the port counts them. Raises SettingsError
-    if no port is configured or the parity is not valid.
-    """
+    """Bytes of a serial line as a `reading.Transport`."""
 
     SETTINGS = SerialSettings
     is_message_oriented = False
@@ -69,8 +65,7 @@ class SerialPort(Polled[serial.Serial]):
         self._line_errors: tuple[int, ...] | None = None
 
     def open(self) -> None:
-        """Open the port; raises DeviceError if it does not exist, is in use, or access is not
-        permitted."""
+        """Open the port."""
         s = self._settings
         with self._lock:
             self._release()
@@ -105,10 +100,7 @@ class SerialPort(Polled[serial.Serial]):
         return f'cannot be opened at {self._settings.baud} bit/s: {error}'
 
     def read(self, timeout_s: float) -> list[Chunk]:
-        """Return the available bytes as one chunk; wait only if no byte is available.
-
-        Its arrival is the time at which the thread woke up.
-        """
+        """Return the available bytes as one chunk, whose arrival is the time of the wake-up."""
         with self._lock:
             if self._handle is None:
                 raise DeviceError(f'serial port {self._settings.port}: not open')
@@ -133,5 +125,5 @@ class SerialPort(Polled[serial.Serial]):
 
 
 def _line_errors_of(port: serial.Serial) -> tuple[int, ...]:
-    """Read the kernel's error counters; raises OSError if the port's driver has no counters."""
+    """Read the kernel's error counters; raises OSError if the driver has none."""
     return ICOUNTER.unpack(fcntl.ioctl(port.fileno(), TIOCGICOUNT, bytes(ICOUNTER.size)))

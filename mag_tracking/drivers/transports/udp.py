@@ -66,8 +66,7 @@ class UdpSettings:
 
 
 def clock_difference() -> int | None:
-    """Wall clock minus monotonic clock, ns, from the fastest of three measurements; None if even
-    that was too slow to be accurate."""
+    """Wall clock minus monotonic clock, ns; None if the measurement was too slow."""
     measurements = []
     for _ in range(3):
         before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
@@ -77,12 +76,9 @@ def clock_difference() -> int | None:
 
 
 class UdpSocket(Polled[socket.socket]):
-    """Datagrams as chunks of a `reading.Transport`.
+    """Datagrams as chunks of a `reading.Transport`, whose source is the address of the sender.
 
-    The source of a chunk is the address of its sender, with the port if `source_port` is set.
-    `report` is called if the kernel limits the receive buffer. `counts` are dropped datagrams and
-    wake-up times used as arrival times. Raises SettingsError if an address or the port is not
-    valid.
+    `report` is called if the kernel limits the receive buffer.
     """
 
     SETTINGS = UdpSettings
@@ -101,15 +97,12 @@ class UdpSocket(Polled[socket.socket]):
                 raise SettingsError(
                     f'{name}: expected an IPv4 address, got {address!r}') from None
         self.counts: Counter[str] = Counter()
-        self._settings, self._report = settings, report
+        self.settings, self._report = settings, report
         self._any_source = '' in settings.sources
+        self._name = f'UDP {settings.address}:{settings.port}' + (
+            f', group {settings.group}' if settings.group else '')
         self._difference: int | None = None
         self._drops = 0
-
-    @property
-    def settings(self) -> UdpSettings:
-        """Settings of the socket."""
-        return self._settings
 
     def open(self) -> None:
         """Bind the socket, and join the group if one is configured."""
@@ -120,21 +113,20 @@ class UdpSocket(Polled[socket.socket]):
                 self._set_up(opened)
             except OSError as error:
                 opened.close()
-                raise DeviceError(
-                    f'UDP {self._socket_name()}: {self._open_error(error)}') from error
+                raise DeviceError(f'{self._name}: {self._open_error(error)}') from error
             self._drops, self._difference = 0, clock_difference()
             self._attach(opened)
 
     def _set_up(self, opened: socket.socket) -> None:
         """Set the options and bind. Binding is last, because a bound socket receives datagrams."""
-        s = self._settings
+        s = self.settings
         opened.setblocking(False)
         opened.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, s.receive_buffer)
         # The kernel doubles the requested size for its overhead, and returns the doubled size.
         buffer_size = opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
         if buffer_size < s.receive_buffer:
-            self._report(f'UDP {self._socket_name()}: the kernel limits the receive buffer to '
+            self._report(f'{self._name}: the kernel limits the receive buffer to '
                          f'{buffer_size} bytes instead of {s.receive_buffer}; increase '
                          'net.core.rmem_max')
         if s.group:
@@ -144,14 +136,9 @@ class UdpSocket(Polled[socket.socket]):
                               socket.inet_aton(s.group) + socket.inet_aton(s.address))
         opened.bind((s.group or s.address, s.port))
 
-    def _socket_name(self) -> str:
-        """Local address, port and group, for messages."""
-        s = self._settings
-        return f'{s.address}:{s.port}' + (f', group {s.group}' if s.group else '')
-
     def _open_error(self, error: OSError) -> str:
         """Reason why the socket cannot be opened, with the remedy."""
-        s = self._settings
+        s = self.settings
         if error.errno == errno.EADDRINUSE:
             return 'the port is in use by another program; choose another port'
         if error.errno == errno.EACCES:
@@ -167,13 +154,13 @@ class UdpSocket(Polled[socket.socket]):
         """Return up to `MAX_DATAGRAMS_PER_READ` available datagrams; wait for the first one."""
         with self._lock:
             if self._handle is None:
-                raise DeviceError(f'UDP {self._socket_name()}: not open')
+                raise DeviceError(f'{self._name}: not open')
             try:
                 woken_ns = self._wait(timeout_s)
                 chunks = [] if woken_ns is None else self._drain(self._handle, woken_ns)
                 self._count_drops(self._handle)
             except OSError as error:
-                raise DeviceError(f'UDP {self._socket_name()}: {error}') from error
+                raise DeviceError(f'{self._name}: {error}') from error
         return chunks
 
     def _drain(self, opened: socket.socket, woken_ns: int) -> list[Chunk]:
@@ -183,7 +170,7 @@ class UdpSocket(Polled[socket.socket]):
         ancillary_size = socket.CMSG_SPACE(TIMESPEC.size)
         while len(datagrams) < MAX_DATAGRAMS_PER_READ and not is_empty:
             try:
-                datagrams.append(opened.recvmsg(self._settings.max_length, ancillary_size))
+                datagrams.append(opened.recvmsg(self.settings.max_length, ancillary_size))
             except BlockingIOError:
                 is_empty = True
         difference = clock_difference()
@@ -193,7 +180,7 @@ class UdpSocket(Polled[socket.socket]):
             # Queued datagrams have the old difference, which is kept until the queue is empty.
             self._difference = difference
         return [Chunk(self._arrival(ancillary, difference if is_usable else None, woken_ns), data,
-                      f'{ip}:{port}' if self._settings.source_port else ip)
+                      f'{ip}:{port}' if self.settings.source_port else ip)
                 for data, ancillary, flags, (ip, port) in datagrams
                 if self._accept(data, flags, ip)]
 
@@ -210,10 +197,8 @@ class UdpSocket(Polled[socket.socket]):
         return False
 
     def _arrival(self, ancillary: list[Ancillary], difference: int | None, woken_ns: int) -> int:
-        """Monotonic arrival time of a datagram, ns, from the timestamp in `ancillary`.
-
-        If there is no timestamp or `difference` is None, count the datagram and return `woken_ns`.
-        """
+        """Monotonic arrival time of a datagram, ns, from the timestamp in `ancillary`; `woken_ns`
+        without a timestamp or `difference`."""
         if difference is not None:
             for level, kind, data in ancillary:
                 if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):

@@ -7,7 +7,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.calibration import core
-from mag_tracking.inference.axes import are_valid_covariances
+from mag_tracking.inference.covariances import are_valid_covariances
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.health.diagnosis import Cause
 

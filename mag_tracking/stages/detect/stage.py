@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.inference.axes import whitened_energy
+from mag_tracking.inference.covariances import whitened_energy
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Detection, FieldFrame

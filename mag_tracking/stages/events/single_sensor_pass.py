@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.physics.anderson import anderson_residual
+from mag_tracking.physics.passes import anderson_residual
 from mag_tracking.records import plain
 
 MAX_SAMPLES = 200

@@ -3,7 +3,7 @@
 import numpy as np
 
 from mag_tracking.calibration.level_change import growth_of
-from mag_tracking.inference.axes import whitened_energy
+from mag_tracking.inference.covariances import whitened_energy
 from mag_tracking.records import FieldFrame
 from mag_tracking.units import NS
 

@@ -7,7 +7,7 @@ from scipy.special import chdtri
 
 from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.event_records import Disturbance
-from mag_tracking.inference.axes import whitened_energy
+from mag_tracking.inference.covariances import whitened_energy
 from mag_tracking.records import FieldFrame
 
 FALSE_ALARM_PROBABILITY = 1e-6

@@ -5,9 +5,8 @@ from scipy.special import chdtri
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, are_doubtful, updated
-from mag_tracking.inference.axes import whitened_energy
-from mag_tracking.inference.bayes_factor import TargetBayesFactor
-from mag_tracking.inference.innovation_consistency import InnovationConsistency
+from mag_tracking.inference.covariances import whitened_energy
+from mag_tracking.inference.sequential_tests import InnovationConsistency, TargetBayesFactor
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track import doubts

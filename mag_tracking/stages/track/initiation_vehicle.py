@@ -7,7 +7,7 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import SettingsError
 from mag_tracking.geometry import rotation_about_z
-from mag_tracking.inference.axes import whitened_energy
+from mag_tracking.inference.covariances import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0, dipole_jacobians

@@ -11,7 +11,7 @@ import numpy as np
 from mag_tracking.arrays import BoolArray
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, InputDoubts, are_doubtful
 from mag_tracking.errors import NetworkError
-from mag_tracking.inference.axes import whitened_energy
+from mag_tracking.inference.covariances import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.special import chdtrc
 
-from mag_tracking.inference.sliding_sum import SlidingSum
+from mag_tracking.inference.sequential_tests import SlidingSum
 from mag_tracking.units import NS
 
 FALSE_ALARM_PROBABILITY = 1e-3

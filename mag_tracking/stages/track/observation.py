@@ -6,8 +6,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
-from mag_tracking.physics.dipole import sensor_fields
-from mag_tracking.physics.mounting import rotated_fields
+from mag_tracking.physics.dipole import rotated_fields, sensor_fields
 from mag_tracking.physics.sources import SourceModel
 
 MAX_ROTATION = np.deg2rad(15.0)

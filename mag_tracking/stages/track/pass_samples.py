@@ -10,7 +10,7 @@ from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.least_squares import LINEAR_RANK_TOLERANCE, MAX_DAMPING
 from mag_tracking.inference.matrices import MIN_PIVOT_ROOT, PSEUDO_INVERSE_TOLERANCE
 from mag_tracking.network import SensorNetwork
-from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, SteadyPass
+from mag_tracking.physics.passes import N_PATH, N_STRAIGHT, SteadyPass
 from mag_tracking.records import FieldFrame, plain
 from mag_tracking.stages.track import core
 from mag_tracking.stages.track.bank_filter import known_covariance

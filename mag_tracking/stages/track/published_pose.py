@@ -13,9 +13,8 @@ from mag_tracking.geometry import (
     quaternions_from_yaw,
     rotation_vectors_between,
 )
-from mag_tracking.inference.covariance_union import inflated_to_cover
+from mag_tracking.inference.covariances import inflated_to_cover, second_moment
 from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.inference.mixture import second_moment
 from mag_tracking.physics.bounds import are_possible
 from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import Hypotheses, PoseUncertainty, SmoothedPose, Track

@@ -27,8 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.inference.initial_bank import InitialBank
+from mag_tracking.inference.filter_bank import FilterBank, InitialBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter, PathResult
 from mag_tracking.units import NS

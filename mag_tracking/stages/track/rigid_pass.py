@@ -18,7 +18,7 @@ from scipy.special import chdtri
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
-from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, PATH
+from mag_tracking.physics.passes import N_PATH, N_STRAIGHT, PATH
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.pass_samples import PassSamples
 from mag_tracking.units import NS

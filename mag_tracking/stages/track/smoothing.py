@@ -16,8 +16,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.inference.initial_bank import InitialBank
+from mag_tracking.inference.filter_bank import FilterBank, InitialBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.relinearisation import Window

@@ -10,7 +10,7 @@
 
 namespace mag_tracking {
 
-// Model of `physics.steady_pass.SteadyPass` for `SeparableFit`.
+// Model of `physics.passes.SteadyPass` for `SeparableFit`.
 class SteadyModel {
   public:
     // The moments of the dipoles are `combinations` (d, d) times the linear parameters.

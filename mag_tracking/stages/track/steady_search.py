@@ -14,12 +14,10 @@ from functools import cached_property
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.inference.least_squares import refine
-from mag_tracking.inference.marginal_whitener import MarginalWhitener
-from mag_tracking.inference.matrices import ignoring_overflow, pseudo_inverse
-from mag_tracking.inference.separable_fit import distinct
+from mag_tracking.inference.least_squares import distinct, refine
+from mag_tracking.inference.matrices import MarginalWhitener, ignoring_overflow, pseudo_inverse
 from mag_tracking.network import SensorNetwork
-from mag_tracking.physics.steady_pass import N_STRAIGHT, PATH, SteadyPass
+from mag_tracking.physics.passes import N_STRAIGHT, PATH, SteadyPass
 from mag_tracking.stages.track.initiation_vehicle import (
     CLIMB_STD,
     CROSS_SPEED_STD,

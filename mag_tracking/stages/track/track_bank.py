@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.inference.initial_bank import InitialBank
+from mag_tracking.inference.filter_bank import FilterBank, InitialBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.bank_size import MIN_WEIGHT, max_hypotheses, max_sensors

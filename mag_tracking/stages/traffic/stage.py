@@ -10,7 +10,7 @@ import numpy as np
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import Disturbance, TrafficSummary, VehiclePassage
 from mag_tracking.geometry import heading_of, speed_of
-from mag_tracking.inference.log_normal_classes import (
+from mag_tracking.inference.identification import (
     UNKNOWN,
     ClassPosterior,
     Feature,

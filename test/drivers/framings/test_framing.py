@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mag_tracking.drivers.framings.binary import BinaryFraming, BinarySettings
-from mag_tracking.drivers.framings.checksums import CHECKSUMS
+from mag_tracking.drivers.framings.binary import CHECKSUMS, BinaryFraming, BinarySettings
 from mag_tracking.drivers.framings.fields import FieldLayout, decode_escapes
 from mag_tracking.drivers.framings.json_objects import JsonFraming, JsonSettings
 from mag_tracking.drivers.framings.text import TextFraming, TextSettings

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2, ncx2
 
-from mag_tracking.inference.axes import smallest_pivots, whitened_energy
+from mag_tracking.inference.covariances import smallest_pivots, whitened_energy
 from mag_tracking.inference.detection_theory import (
     detection_probability,
     energy_threshold,

@@ -8,8 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from_quaternion
-from mag_tracking.physics.dipole import dipole_field
-from mag_tracking.physics.mounting import rotated_fields
+from mag_tracking.physics.dipole import dipole_field, rotated_fields
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.simulation.scenario import Path, SensorErrorModel, point_body

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from mag_tracking.inference.least_squares import LINEAR_RANK_TOLERANCE, refine
+from mag_tracking.inference.least_squares import LINEAR_RANK_TOLERANCE, SeparableProblem, refine
 from mag_tracking.inference.matrices import PSEUDO_INVERSE_TOLERANCE, pseudo_inverse
-from mag_tracking.inference.separable_fit import SeparableProblem
-from mag_tracking.physics.steady_pass import N_PATH, N_STRAIGHT, PATH, SteadyPass
+from mag_tracking.physics.passes import N_PATH, N_STRAIGHT, PATH, SteadyPass
 from mag_tracking.stages.track import core
 from mag_tracking.stages.track.pass_samples import N_STEPS, TOLERANCE, PassSamples
 from support.steady_frames import FOUR, ROAD, STRAIGHT, TURNS, steady_frames

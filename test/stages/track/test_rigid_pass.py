@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mag_tracking.physics.steady_pass import N_PATH
+from mag_tracking.physics.passes import N_PATH
 from mag_tracking.stages.track import rigid_pass
 from mag_tracking.stages.track.pass_samples import MODEL_ERROR
 from mag_tracking.stages.track.rigid_pass import fit_rigid_pass

@@ -13,8 +13,8 @@ from mag_tracking.geometry import (
     rotation_from_quaternion,
     rotation_vectors_between,
 )
+from mag_tracking.inference.covariances import second_moment
 from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.inference.mixture import second_moment
 from mag_tracking.messages.schema import odometry_dict, pose_covariance, pose_message_dict
 from mag_tracking.physics.vehicles import RowVehicle
 from mag_tracking.stages.track.published_pose import VehicleOrientation, published_track

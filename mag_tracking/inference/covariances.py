@@ -1,4 +1,4 @@
-"""Covariances of the three axes of a sensor, any of which may be missing."""
+"""Covariances of sensor axes, any of which may be missing, of mixtures and of two estimates."""
 
 import numpy as np
 
@@ -13,9 +13,8 @@ MIN_PIVOT = 1e-12
 def whitened_energy(y: FloatArray, C: FloatArray) -> tuple[FloatArray, IntArray]:
     """Whitened energy y' C^-1 y (n,) over the measured axes, and their number (n,), T10 eq. (5.16).
 
-    Chi-square distributed for noise alone; 0 if no axis is measured. NaN in `y` (n, 3) marks a
-    missing axis, whose entries in `C` (n, 3, 3) are not read. Raises numpy.linalg.LinAlgError if a
-    covariance is not positive definite.
+    NaN in `y` (n, 3) marks a missing axis, whose entries in `C` (n, 3, 3) are not read. Raises
+    LinAlgError if a covariance is not positive definite.
     """
     y, C = _contiguous(y, C)
     energy, axes = np.empty(len(y)), np.empty(len(y), dtype=np.int64)
@@ -27,9 +26,8 @@ def whitened_energy(y: FloatArray, C: FloatArray) -> tuple[FloatArray, IntArray]
 def smallest_pivots(y: FloatArray, C: FloatArray) -> FloatArray:
     """Smallest pivot (n,) of each correlation matrix of `C` (n, 3, 3), over the measured axes.
 
-    A pivot is the fraction of an axis's variance that the preceding axes do not explain: 1 for
-    uncorrelated axes; NaN or at most 0 if the covariance is not positive definite. NaN in `y`
-    (n, 3) marks a missing axis.
+    A pivot is the fraction of an axis's variance that the preceding axes do not explain; NaN or at
+    most 0 if the covariance is not positive definite.
     """
     y, C = _contiguous(y, C)
     out = np.empty(len(y))
@@ -53,8 +51,34 @@ def are_valid_covariances(y: FloatArray, C: FloatArray) -> BoolArray:
 
 
 def _contiguous(y: FloatArray, C: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Convert `y` and `C` to contiguous arrays; raise ValueError if the shapes do not match."""
+    """Check the shapes of `y` and `C`, and convert them to contiguous arrays."""
     if y.shape != (len(y), 3) or C.shape != (len(y), 3, 3):
         raise ValueError('expected measurements (n, 3) and covariances (n, 3, 3), got '
                          f'{y.shape} and {C.shape}')
     return plain(y), plain(C)
+
+
+def second_moment(weights: FloatArray, differences: FloatArray,
+                  covariances: FloatArray) -> FloatArray:
+    """Second moment (d, d) of a Gaussian mixture about an estimate ([BarShalom01]_ section 1.4.16),
+    from the `differences` (n, d) of the component means."""
+    w = weights / weights.sum()
+    moment: FloatArray = (np.einsum('n,nij->ij', w, covariances)
+                          + np.einsum('n,ni,nj->ij', w, differences, differences))
+    return moment
+
+
+def inflated_to_cover(P: FloatArray, difference: FloatArray) -> FloatArray:
+    """Inflate `P`, whose state begins with x and y, to cover another estimate ([Uhlmann03]_).
+
+    `difference` is the other estimate minus this one, for the first components. The std along its
+    horizontal part becomes at least the length of that part; the other components are inflated in
+    proportion to their differences, fully correlated.
+    """
+    d = difference[:2]
+    square, variance = float(d @ d), float(d @ P[:2, :2] @ d)
+    if not square > 0.0 or square**2 <= variance:
+        return P
+    padded_difference = np.zeros(len(P))
+    padded_difference[:len(difference)] = difference
+    return P + (1.0 - variance / square**2) * np.outer(padded_difference, padded_difference)

@@ -1,11 +1,89 @@
-"""Selection of one source of a sensor's readings, if several sources claim to be the sensor."""
+"""Checks of the readings of each sensor: lost readings, several sources, a weak field."""
 
 import math
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Mapping
 from typing import TypeAlias
 
+import numpy as np
+
+from mag_tracking.records import Readings
 from mag_tracking.units import NS
+
+MAX_REMEMBERED = 1000
+"""Maximum number of stored sequence numbers. An older number indicates a restarted sequence."""
+MAX_GAP = 1_000_000
+"""Largest gap counted as loss. A larger gap is counted as a jump of the sequence."""
+
+
+class SequenceCheck:
+    """Checks the sequence numbers of one sensor, which return to 0 at `wrap` (0: never)."""
+
+    def __init__(self, wrap: int) -> None:
+        self._wrap = wrap
+        self.counts: Counter[str] = Counter()
+        self.pause()
+
+    def pause(self) -> None:
+        """Start a new sequence, so that numbers skipped during a pause are not counted as lost."""
+        self._newest_number: int | None = None
+        self._values: dict[int, bytes] = {}
+        self._lost_numbers: dict[int, bool] = {}
+
+    def is_new(self, sequence: int, values: bytes) -> bool:
+        """Record a reading; return whether it is not a duplicate (the same number and values).
+
+        Skipped numbers are counted as lost; the count is corrected if they arrive late. An older
+        number that is neither lost nor a duplicate restarts the sequence.
+        """
+        if sequence < 0 or self._wrap and sequence >= self._wrap:
+            self.counts['sequence numbers out of range'] += 1
+            return True
+        distance = (1 if self._newest_number is None
+                    else self._distance(sequence, self._newest_number))
+        if distance > MAX_GAP:
+            self.counts['sequence jumps'] += 1
+            self.pause()
+        elif distance > 0:
+            self._record_gap(sequence, distance - 1)
+        elif sequence in self._lost_numbers:
+            del self._lost_numbers[sequence]
+            self.counts['lost'] -= 1
+            self.counts['late arrivals'] += 1
+        elif self._values.get(sequence) == values:
+            self.counts['duplicates'] += 1
+            return False
+        else:
+            self.counts['sequence restarts'] += 1
+            self.pause()
+            distance = 1
+        if distance > 0:
+            self._newest_number = sequence
+        self._values[sequence] = values
+        _trim(self._values)
+        return True
+
+    def _distance(self, sequence: int, last: int) -> int:
+        """Signed distance from `last` to `sequence`; negative if `sequence` is older."""
+        distance = sequence - last
+        if self._wrap:
+            distance = (distance + self._wrap // 2) % self._wrap - self._wrap // 2
+        return distance
+
+    def _record_gap(self, sequence: int, n: int) -> None:
+        """Count the `n` skipped numbers before `sequence` as lost."""
+        if n:
+            self.counts['lost'] += n
+        for number in range(sequence - min(n, MAX_REMEMBERED), sequence):
+            self._lost_numbers[number % self._wrap if self._wrap else number] = True
+        _trim(self._lost_numbers)
+
+
+def _trim(memory: dict[int, bytes] | dict[int, bool]) -> None:
+    """Remove the oldest entries beyond `MAX_REMEMBERED`."""
+    while len(memory) > MAX_REMEMBERED:
+        del memory[next(iter(memory))]
+
 
 RELEASE_TIMEOUT_S = 5.0
 """[s] Silence after which a source is forgotten, unless its readings are further apart."""
@@ -23,7 +101,6 @@ ROUNDING_VARIANCE = 0.25
 """Variance of the readings in a second of a regular source, whose period is no part of a second."""
 MARGIN = 0.2
 """Difference of steadiness above which another source is selected."""
-
 Source: TypeAlias = tuple[str, str]
 """(name of the sensor at the device, source of the arrival)."""
 
@@ -78,57 +155,45 @@ class _Sender:
 class SingleSource:
     """Selects the steadiest source of a sensor's readings and counts `changes`.
 
-    The first source is selected. It remains selected until it has been silent for
-    `RELEASE_TIMEOUT_S` and for `MAX_INTERVALS` of its intervals, or another source is steadier by
-    `MARGIN`. Stray messages, whether before the start of the device or later, therefore do not
-    block the device, and two equal sources do not alternate.
+    The first source remains selected until it has been silent for `RELEASE_TIMEOUT_S` and for
+    `MAX_INTERVALS` of its intervals, or another source is steadier by `MARGIN`. Stray messages
+    therefore do not block the device, and two equal sources do not alternate.
     """
 
     def __init__(self) -> None:
         self.changes = 0
-        self._selected: Source | None = None
+        self.selected: Source | None = None
         # In the order of the latest readings, except for the selected source.
         self._senders: OrderedDict[Source, _Sender] = OrderedDict()
-
-    @property
-    def selected(self) -> Source | None:
-        """Selected source; None before the first reading."""
-        return self._selected
 
     def accepts(self, source: Source, now_ns: int) -> bool:
         """Update the selection at a monotonic time; return whether `source` is selected."""
         sender = self._senders.get(source)
         if sender is None:
             sender = self._senders[source] = _Sender(now_ns)
-            self._drop_oldest()
+            if len(self._senders) > MAX_SENDERS:
+                del self._senders[next(s for s in self._senders if s != self.selected)]
         sender.add(now_ns)
-        if source == self._selected:
+        if source == self.selected:
             return True
         self._senders.move_to_end(source)
         if self._is_better(sender, now_ns):
-            self.changes += self._selected is not None
-            self._selected = source
-        return source == self._selected
+            self.changes += self.selected is not None
+            self.selected = source
+        return source == self.selected
 
     def _is_better(self, sender: _Sender, now_ns: int) -> bool:
         """Whether a source is preferable to the selected one."""
-        if self._selected is None or self._selected not in self._senders:
+        if self.selected is None or self.selected not in self._senders:
             return True
-        selected = self._senders[self._selected]
+        selected = self._senders[self.selected]
         selected.advance(now_ns)
         return selected.is_silent(now_ns) or sender.unsteadiness + MARGIN < selected.unsteadiness
 
-    def _drop_oldest(self) -> None:
-        """Drop the source that was silent longest, except the selected one, if there are too
-        many."""
-        if len(self._senders) > MAX_SENDERS:
-            del self._senders[next(s for s in self._senders if s != self._selected)]
-
     def rates_hz(self, now_ns: int) -> dict[Source, float]:
-        """Forget silent sources other than the selected one; return the rates of the others, 0 for
-        a single reading."""
+        """Forget silent sources other than the selected one; return the rates of the others."""
         silent = {s for s, sender in self._senders.items() if sender.is_silent(now_ns)}
-        for source in silent - {self._selected}:
+        for source in silent - {self.selected}:
             del self._senders[source]
         return {source: sender.rate_hz() for source, sender in self._senders.items()
                 if source not in silent}
@@ -155,3 +220,36 @@ def contest(sensor: str, selected: Source | None, rates_hz: Mapping[Source, floa
 def _label(source: Source) -> str:
     """Name and origin of the readings of a source."""
     return ' from '.join(part for part in source if part) or 'a source without a name'
+
+
+WEAK_FIELD = 10e-6
+"""[T] Largest field of a weak sensor. The Earth's field is 22 to 67 uT; a smaller field suggests a
+wrong unit, such as gauss instead of microtesla."""
+WEAK_S = 5.0
+"""[s] Time for which the field of a weak sensor stays below `WEAK_FIELD`."""
+
+
+class FieldStrength:
+    """Finds sensors whose field stays below `WEAK_FIELD`, and judges each once."""
+
+    def __init__(self) -> None:
+        self._judged: set[str] = set()
+        self._since_ns: dict[str, int] = {}
+
+    def add(self, readings: Readings) -> list[str]:
+        """Return the sensors that are judged as weak; readings with a missing axis are skipped."""
+        if self._judged.issuperset(readings.names):
+            return []
+        weak = []
+        strength = np.linalg.norm(readings.field, axis=1)
+        for j in np.unique(readings.sensor[~np.isnan(strength)]).tolist():
+            name, own = readings.names[j], readings.sensor == j
+            if name in self._judged:
+                continue
+            since_ns = self._since_ns.setdefault(name, int(readings.stamp_ns[own].min()))
+            is_weak = bool(np.nanmax(strength[own]) < WEAK_FIELD)
+            if is_weak and readings.stamp_ns[own].max() - since_ns >= WEAK_S * NS:
+                weak.append(name)
+            if not is_weak or name in weak:
+                self._judged.add(name)
+        return weak
