@@ -16,8 +16,11 @@ from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.prescan import Prescan, prescan
 from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding, ranked
-from mag_tracking.stages.health.input_findings import sensor_findings, source_findings
-from mag_tracking.stages.health.no_detection import no_detection_reason
+from mag_tracking.stages.health.findings import (
+    no_detection_reason,
+    sensor_findings,
+    source_findings,
+)
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.manager import NO_SCALE, NO_SCALE_FRAMES
 

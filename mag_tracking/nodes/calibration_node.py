@@ -6,6 +6,9 @@ if __name__ == '__main__':
 
     calibration_node()
 
+import datetime
+import time
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,9 +16,11 @@ from typing import Any
 from mag_tracking_msgs.msg import CalibrationState, FieldReadings, SensorCalibration
 from mag_tracking_msgs.srv import Calibrate as CalibrateService
 from mag_tracking_msgs.srv import Survey as SurveyMessage
+from rclpy.node import Node
 from sensor_msgs.msg import Imu, MagneticField
+from tf2_msgs.msg import TFMessage
 
-from mag_tracking.errors import NetworkError, SettingsError
+from mag_tracking.errors import NetworkError, OutputError, SettingsError
 from mag_tracking.files import checked_path
 from mag_tracking.messages.schema import (
     acceleration_of,
@@ -23,18 +28,18 @@ from mag_tracking.messages.schema import (
     reading_of,
     readings_dict,
 )
+from mag_tracking.messages.standard import sensor_transform_dicts
 from mag_tracking.messages.types import CALIBRATED_READINGS, CALIBRATION_STATE, RAW_READINGS
-from mag_tracking.nodes import stage_node
-from mag_tracking.nodes.background_store import BackgroundStore
+from mag_tracking.network import SensorNetwork
+from mag_tracking.network.file import write_network
+from mag_tracking.nodes import middleware
+from mag_tracking.nodes.connections import shortened
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.deferred import Deferred
 from mag_tracking.nodes.detection_node import DetectionNode
-from mag_tracking.nodes.paced_service import paced_service
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
-from mag_tracking.nodes.sensor_graph import shortened
+from mag_tracking.nodes.scheduling import Deferred, paced_service, steady_timer
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
-from mag_tracking.nodes.sensor_rounds import SensorRounds
-from mag_tracking.nodes.sensor_transforms import SensorTransforms
+from mag_tracking.nodes.sensor_rounds import BackgroundStore, SensorRounds
 from mag_tracking.nodes.stage_node import (
     LATCHED_QOS,
     PUBLISHER_QOS,
@@ -43,8 +48,6 @@ from mag_tracking.nodes.stage_node import (
     StageNode,
     has_subscribers,
 )
-from mag_tracking.nodes.steady_timer import steady_timer
-from mag_tracking.nodes.survey_service import SurveyService
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.recording.background_file import (
     default_path,
@@ -54,7 +57,87 @@ from mag_tracking.recording.background_file import (
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.stage import Stage
-from mag_tracking.stages.survey.stage import Survey
+from mag_tracking.stages.survey.stage import Survey, with_measured_noise
+
+MIN_INTERVAL_S = 0.5
+"""[s] Minimum interval between surveys, each of which delays the readings."""
+
+
+class SurveyService:
+    """Solves a survey and saves the resulting network to `save_as` on request.
+
+    `imu_topics` are absolute names, for messages.
+    """
+
+    def __init__(self, survey: Survey, stage: Calibrate, save_as: Path,
+                 imu_topics: Sequence[str]) -> None:
+        self._survey, self._stage, self._save_as = survey, stage, save_as
+        self._imu_topics = imu_topics
+        self._end_time = -MIN_INTERVAL_S
+
+    def solve(self, network: SensorNetwork, save: bool,
+              response: SurveyMessage.Response) -> SensorNetwork | None:
+        """Solve a survey, save it on request and fill in the `response`; None if it failed.
+
+        It also fails if a survey has just ended.
+        """
+        if time.monotonic() - self._end_time < MIN_INTERVAL_S:
+            response.message = f'a survey has just been run; try again in {MIN_INTERVAL_S:g} s'
+            return None
+        try:
+            return self._solve_now(network, save, response)
+        finally:
+            self._end_time = time.monotonic()
+
+    def _solve_now(self, network: SensorNetwork, save: bool,
+                   response: SurveyMessage.Response) -> SensorNetwork | None:
+        """Solve a survey without checking the interval; see `solve`."""
+        # If a target is near a sensor, the background was measured before its arrival.
+        fields = {name: self._stage.background(name)
+                  for name, background in self._stage.backgrounds().items()
+                  if background.certain and self._stage.last_stamp_ns(name) is not None}
+        if not fields or not self._survey.counts['accelerations']:
+            response.message = 'no background has been learnt yet; keep targets away for a while' \
+                if not fields else 'no acceleration received on ' \
+                f'{", ".join(filter(None, self._imu_topics))}'
+            return None
+        date = datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds')
+        solution = self._survey.solve(fields, date)
+        surveyed = with_measured_noise(solution.network, self._stage)
+        if save:
+            try:
+                write_network(self._save_as, surveyed, 'Written by calibration_node.')
+            except OutputError as error:
+                response.message = str(error)
+                return None
+        response.success = True
+        response.message = (
+            'the result is in use'
+            + (f' and saved to {self._save_as}; use that file at the next start' if save else '')
+            + f'; clock reference: {solution.reference or "none, because no knock was detected"}')
+        response.warnings = solution.warnings()
+        response.warnings += [f'{name}: no background has been learnt; its heading remains as '
+                              'in the network file'
+                              for name in surveyed.names if name not in fields]
+        return surveyed
+
+
+class SensorTransforms:
+    """Publishes a static transform for each sensor; the child frame has the name of the sensor.
+
+    The `frame_id` of the sensor messages is not used: it may name a robot link that another node
+    publishes, and a frame with two parents would break the transform tree.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._publisher = node.create_publisher(TFMessage, '/tf_static', LATCHED_QOS)
+
+    def publish(self, network: SensorNetwork) -> None:
+        """Publish the transforms of a network."""
+        self._publisher.publish(to_message(TFMessage, {'transforms': sensor_transform_dicts(
+            network, self._node.get_clock().now().nanoseconds)}))
+
 
 MIN_STEP_S = 0.01
 """[s] Minimum interval between the steps of a round over the sensors. A round takes one second, or
@@ -277,6 +360,5 @@ class CalibrationNode(StageNode):
         return response
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process; return its exit status."""
-    return stage_node.main(CalibrationNode, arguments)
+
+main = partial(middleware.main, CalibrationNode)

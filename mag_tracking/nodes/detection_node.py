@@ -19,9 +19,10 @@ from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.messages.frame import frame_dict
 from mag_tracking.messages.schema import detection_dict, pass_event_dict, reading_of
 from mag_tracking.messages.types import CALIBRATED_READINGS, NETWORK_FRAME, TRACK_ARRAY
-from mag_tracking.nodes import stage_node
+from mag_tracking.nodes import middleware
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.ros_params import declare_settings
+from mag_tracking.nodes.scheduling import steady_timer
 from mag_tracking.nodes.stage_node import (
     PUBLISHER_QOS,
     RESULT_QOS,
@@ -29,11 +30,9 @@ from mag_tracking.nodes.stage_node import (
     StageNode,
     has_subscribers,
 )
-from mag_tracking.nodes.steady_timer import steady_timer
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.records import Detection, FieldFrame, Readings
-from mag_tracking.stages.align.frame_period import frame_period_warning
-from mag_tracking.stages.align.stage import Align
+from mag_tracking.stages.align.stage import Align, frame_period_warning
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.events.stage import Events
 from mag_tracking.stages.stage import Stage
@@ -159,6 +158,5 @@ class DetectionNode(StageNode):
         self._frame_publisher.publish(to_message(NetworkFrame, frame_dict(frame, self.network)))
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process; return its exit status."""
-    return stage_node.main(DetectionNode, arguments)
+
+main = partial(middleware.main, DetectionNode)

@@ -19,10 +19,9 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import reading_of, readings_of
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
-from mag_tracking.nodes.middleware import init_ros
-from mag_tracking.nodes.sensor_graph import no_message_finding, topic_findings
-from mag_tracking.nodes.shutdown import shut_down
-from mag_tracking.nodes.stage_node import SENSOR_QOS, STREAM_QOS, make_executor, spin
+from mag_tracking.nodes.connections import no_message_finding, topic_findings
+from mag_tracking.nodes.middleware import init_ros, make_executor, shut_down, spin
+from mag_tracking.nodes.stage_node import SENSOR_QOS, STREAM_QOS
 from mag_tracking.pipeline import Pipeline, Settings
 from mag_tracking.quantities import quantity
 from mag_tracking.stages.health.diagnosis import Cause, Finding

@@ -12,11 +12,14 @@ if __name__ == '__main__':
 
 import threading
 import time
+from collections.abc import Collection, Sequence
+from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from mag_tracking_msgs.msg import FieldReadings
 from rclpy.lifecycle import State, TransitionCallbackReturn
+from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import Imu, MagneticField
 
@@ -27,14 +30,68 @@ from mag_tracking.messages.schema import acceleration_dict, magnetic_field_dicts
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
-from mag_tracking.nodes import stage_node
+from mag_tracking.nodes import middleware
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.driver_health import DriverDiagnostics
-from mag_tracking.nodes.managed_node import ManagedNode
+from mag_tracking.nodes.diagnostics import StatusLog
+from mag_tracking.nodes.middleware import ManagedNode
 from mag_tracking.nodes.ros_params import fixed_parameter
-from mag_tracking.nodes.stage_node import PUBLISHER_QOS, RESULT_QOS
-from mag_tracking.nodes.steady_timer import steady_timer
+from mag_tracking.nodes.scheduling import steady_timer
+from mag_tracking.nodes.stage_node import PUBLISHER_QOS, RESULT_QOS, title_of
 from mag_tracking.records import AccelerationSample, Readings
+
+EXPECTED_COUNTS = ('samples: ', 'late arrivals: ', 'other messages: ', 'lines that are comments',
+                   'lines without the prefix', 'lines that are empty', 'retained messages skipped',
+                   'conversions overwritten', 'packets not used')
+"""Prefixes of counts that are reported but do not cause a warning."""
+
+
+class DriverDiagnostics:
+    """Reports the state of each device and logs changes."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._reported_counts: dict[str, dict[str, int]] = {}
+        self._log = StatusLog(node.get_logger())
+
+    def statuses(self, drivers: Sequence[Driver], running: Collection[str],
+                 active: bool) -> list[DiagnosticStatus]:
+        """Return one status per driver and log changes; `running` are those with a live thread."""
+        return [self._status(driver, driver.name in running, active) for driver in drivers]
+
+    def _status(self, driver: Driver, running: bool, active: bool) -> DiagnosticStatus:
+        """Return the diagnostics of one device, and log a change."""
+        counts = driver.counts()
+        previous = self._reported_counts.get(driver.name, {})
+        examples = driver.examples()
+        increases = [f'{count}: {n - previous.get(count, 0)} more'
+                     + (f', such as {examples[count]}' if count in examples else '')
+                     for count, n in sorted(counts.items())
+                     if n > previous.get(count, 0) and not count.startswith(EXPECTED_COUNTS)]
+        self._reported_counts[driver.name] = dict(counts)
+        level, message = DiagnosticStatus.OK, 'open'
+        if not active:
+            message = 'not active'
+        elif not running:
+            level, message = DiagnosticStatus.ERROR, 'the driver thread has ended: restart the node'
+        elif driver.fault:
+            level, message = DiagnosticStatus.ERROR, driver.fault
+        elif not driver.is_open:
+            # No fault has occurred, and opening some devices takes seconds.
+            message = 'opening'
+        elif increases:
+            level, message = DiagnosticStatus.WARN, '; '.join(increases)
+        values = {count: str(n) for count, n in sorted(counts.items())}
+        for source, clock in driver.clocks().items():
+            suffix = f' ({source})' if source else ''
+            values[f'clock drift [ppm]{suffix}'] = f'{clock.drift_ppm:.2f}'
+            values[f'delay above the minimum, 95 % [ms]{suffix}'] = f'{1e3 * clock.spread_s:.3g}'
+            values[f'timestamp std [ms]{suffix}'] = f'{1e3 * clock.stamp_std:.3g}'
+        status = DiagnosticStatus(
+            level=level, name=f'{title_of(self._node)}: {driver.name}', hardware_id=driver.name,
+            message=message, values=[KeyValue(key=k, value=v) for k, v in values.items()])
+        self._log.add(status)
+        return status
+
 
 STOP_TIMEOUT_S = 15.0
 """[s] Maximum time for all drivers to stop. Disconnecting from an MQTT broker that does not answer
@@ -171,6 +228,5 @@ class DriverNode(ManagedNode):
         self._diagnostics_publisher.publish(array)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process; return its exit status."""
-    return stage_node.main(DriverNode, arguments)
+
+main = partial(middleware.main, DriverNode)

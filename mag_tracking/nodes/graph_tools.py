@@ -23,9 +23,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from mag_tracking.errors import GraphError
 from mag_tracking.nodes.convert import message_class
-from mag_tracking.nodes.middleware import RCLError, init_ros
-from mag_tracking.nodes.shutdown import shut_down
-from mag_tracking.nodes.stage_node import make_executor, spin
+from mag_tracking.nodes.middleware import RCLError, init_ros, make_executor, shut_down, spin
 
 DISCOVERY_S = 1.5
 """[s] Time allowed for discovery of the nodes of the graph."""

@@ -1,15 +1,29 @@
-"""Initialisation of ROS, common to all processes."""
+"""Processes with ROS: initialisation, main loop, lifecycle nodes and shutdown."""
 
+import gc
 import os
+import signal
 import sys
 import tempfile
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import Any
 
 import rclpy
+from rclpy.exceptions import ParameterException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 
-from mag_tracking.errors import SettingsError
+from mag_tracking.errors import MagTrackingError, SettingsError
+from mag_tracking.interrupts import recorded_signals
+from mag_tracking.nodes.core import Deadline, end_within
+from mag_tracking.nodes.ros_params import fixed_parameter
 from mag_tracking.settings import as_ros_parameters
 
 RCLError, RMWError, UnknownROSArgsError = (
@@ -71,3 +85,160 @@ def _with_ros_parameter_files(arguments: list[str] | None, folder: Path) -> list
             converted[k + 1] = str(folder / f'{k}.yaml')
             Path(converted[k + 1]).write_text(content, encoding='utf-8')
     return converted
+
+
+SHUTDOWN_TIMEOUT_S = 4.0
+"""[s] Maximum time for the shutdown of the middleware. It usually takes 0.3 s; `ros2 launch` sends
+the next signal 5 s after the first."""
+HUNG_MESSAGE = (f'the middleware did not shut down within {SHUTDOWN_TIMEOUT_S:g} s; '
+                'the process was ended\n')
+
+
+def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: int = 0) -> None:
+    """Close and destroy nodes and shut ROS down; end the process if the middleware hangs.
+
+    Workaround: Fast DDS 2.14 blocks forever, while it holds the interpreter lock, if a participant
+    is destroyed while another one leaves (eProsima/Fast-DDS 6513). This happened to 1 of 1165 nodes
+    when five nodes were signalled at once. The deadline can be removed once Fast DDS is fixed.
+    `status` is the exit status if the deadline ends the process.
+    """
+    try:
+        for node in nodes:
+            if executor is not None:
+                executor.remove_node(node)
+            if isinstance(node, ManagedNode):
+                # Closing devices has its own, longer timeout.
+                node.close()
+    finally:
+        flush()
+        with ExitStack() as stack:
+            stack.callback(Deadline(SHUTDOWN_TIMEOUT_S, status, _final_message()).cancel)
+            stack.callback(rclpy.try_shutdown)
+            if executor is not None:
+                stack.callback(executor.shutdown)
+            for node in reversed(nodes):
+                stack.callback(node.destroy_node)
+
+
+def limit_exit_time(status: int) -> None:
+    """Limit the time until the process ends with `status`, with the same timeout as `shut_down`.
+
+    If the constructor of a node fails, the node is destroyed with the interpreter, which may hang.
+    """
+    flush()
+    end_within(SHUTDOWN_TIMEOUT_S, status, HUNG_MESSAGE.encode())
+
+
+def flush() -> None:
+    """Flush the standard streams; errors are left to Python, which reports them at exit."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            if stream is not None:
+                stream.flush()
+
+
+def _final_message() -> bytes:
+    """Return the pending error, if any, which would otherwise be lost, and the timeout message."""
+    error = sys.exc_info()[1]
+    if error is None or isinstance(error, KeyboardInterrupt):
+        pending = ''
+    elif isinstance(error, MagTrackingError):
+        pending = f'{error}\n'
+    else:
+        pending = ''.join(traceback.format_exception(error))
+    return (pending + HUNG_MESSAGE).encode(errors='backslashreplace')
+
+
+class ManagedNode(LifecycleNode):
+    """Lifecycle node that configures and activates itself unless `autostart` is false."""
+
+    def __init__(self, name: str, **node_arguments: Any) -> None:
+        super().__init__(name, **node_arguments)
+        self._configuration_error: MagTrackingError | None = None
+
+    def start_automatically(self) -> None:
+        """Configure and activate the node if `autostart` is true; raises the error of `prepare`."""
+        if not fixed_parameter(self, 'autostart', True,
+                               'Configure and activate the node at startup.'):
+            return
+        result = self.trigger_configure()
+        if self._configuration_error is not None:
+            raise self._configuration_error
+        if result == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+
+    def prepare(self) -> None:
+        """Read files and advertise topics on configuration; raises MagTrackingError if invalid."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Stop the threads of the node; called before the node is destroyed."""
+
+    def on_configure(self, state: State) -> TransitionCallbackReturn:
+        """Call `prepare`; if it fails, log the error and leave the node unconfigured."""
+        try:
+            self.prepare()
+        except MagTrackingError as error:
+            self._configuration_error = error
+            self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        self._configuration_error = None
+        return TransitionCallbackReturn.SUCCESS
+
+
+def make_executor() -> Executor:
+    """Create the events executor, which has little overhead, or else the single-threaded one."""
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:
+        return SingleThreadedExecutor()
+    return EventsExecutor()
+
+
+def freeze() -> None:
+    """Exclude all existing objects from garbage collection: scans would delay the readings."""
+    gc.collect()
+    gc.freeze()
+
+
+def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
+    """Run an executor until ROS shuts down or `until`, polled a few times per s, is True."""
+    try:
+        while rclpy.ok() and not until():
+            # EventsExecutor.spin() of the Jazzy wheels hangs because a timeout overflows. Waiting
+            # for a future that never completes, with a finite timeout, works.
+            executor.spin_until_future_complete(Future(), 0.2)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+
+
+def main(node_class: Callable[[], Node], arguments: list[str] | None = None) -> int:
+    """Run a node as a process until SIGINT or SIGTERM; return its exit status."""
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
+        return _run_until(signals, node_class, arguments)
+
+
+def _run_until(signals: list[int], node_class: Callable[[], Node],
+               arguments: list[str] | None) -> int:
+    """Run a node until `signals` contains a received signal; return the exit status."""
+    try:
+        init_ros(arguments)
+    except SettingsError as error:
+        rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
+        return 1
+    executor, node, status = make_executor(), None, 1
+    try:
+        node = node_class()
+        executor.add_node(node)
+        freeze()
+        spin(executor, lambda: bool(signals))
+        status = 0
+    except (MagTrackingError, ParameterException) as error:
+        rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
+        # A partly constructed node is destroyed when the error is deleted.
+        limit_exit_time(status)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        status = 0
+    finally:
+        shut_down([] if node is None else [node], executor, status)
+    return status

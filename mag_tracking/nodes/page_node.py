@@ -23,10 +23,9 @@ from mag_tracking.messages.frame import frame_of
 from mag_tracking.messages.markers import SENSOR_NAMESPACES
 from mag_tracking.messages.types import NETWORK_FRAME
 from mag_tracking.nodes.convert import smoothed_path_of, track_of
-from mag_tracking.nodes.middleware import RMWError, init_ros
-from mag_tracking.nodes.shutdown import shut_down
-from mag_tracking.nodes.stage_node import LATCHED_QOS, RESULT_QOS, STREAM_QOS, make_executor, spin
-from mag_tracking.nodes.steady_timer import steady_timer
+from mag_tracking.nodes.middleware import RMWError, init_ros, make_executor, shut_down, spin
+from mag_tracking.nodes.scheduling import steady_timer
+from mag_tracking.nodes.stage_node import LATCHED_QOS, RESULT_QOS, STREAM_QOS
 from mag_tracking.quantities import quantity
 from mag_tracking.report.page import ERROR, WARNING, Note, Table
 from mag_tracking.web.live_scene import LiveScene

@@ -14,6 +14,7 @@ if __name__ == '__main__':
 import time
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -25,11 +26,11 @@ from std_srvs.srv import Trigger
 
 from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.messages.types import MAGNETIC_FIELD
-from mag_tracking.nodes import stage_node
+from mag_tracking.nodes import middleware
 from mag_tracking.nodes.convert import message_class
-from mag_tracking.nodes.managed_node import ManagedNode
-from mag_tracking.nodes.paced_service import paced_service
+from mag_tracking.nodes.middleware import ManagedNode
 from mag_tracking.nodes.ros_params import fixed_parameter
+from mag_tracking.nodes.scheduling import paced_service
 from mag_tracking.nodes.stage_node import STREAM_QOS
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
@@ -268,6 +269,5 @@ def _selected_topics(recording: Recording, topics: Sequence[str]) -> set[str] | 
     return set(selected) or None
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process; return its exit status."""
-    return stage_node.main(ReplayNode, arguments)
+
+main = partial(middleware.main, ReplayNode)

@@ -21,10 +21,9 @@ from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.detection_node import DetectionNode
 from mag_tracking.nodes.driver_node import DriverNode
-from mag_tracking.nodes.middleware import init_ros
+from mag_tracking.nodes.middleware import freeze, init_ros, make_executor, shut_down, spin
 from mag_tracking.nodes.replay_node import ReplayNode
-from mag_tracking.nodes.shutdown import shut_down
-from mag_tracking.nodes.stage_node import STREAM_QOS, StageNode, freeze, make_executor, spin
+from mag_tracking.nodes.stage_node import STREAM_QOS, StageNode
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.records import Track

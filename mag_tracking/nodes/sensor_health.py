@@ -13,17 +13,19 @@ from mag_tracking.apps.doctor import network_findings
 from mag_tracking.apps.host_stalls import TIME_CAUSES, HostStalls, load_findings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute
-from mag_tracking.nodes.flow import SILENCE_TIMEOUT_S
-from mag_tracking.nodes.sensor_graph import no_message_finding, topic_findings
+from mag_tracking.nodes.connections import SILENCE_TIMEOUT_S, no_message_finding, topic_findings
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.health.covariances import covariance_findings
 from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding, ranked
-from mag_tracking.stages.health.input_findings import background_findings, rate_findings
-from mag_tracking.stages.health.reading_buffer import ReadingBuffer
-from mag_tracking.stages.health.rejections import driver_findings
+from mag_tracking.stages.health.findings import (
+    background_findings,
+    covariance_findings,
+    driver_findings,
+    rate_findings,
+)
 from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S, WINDOW, SensorHealth
+from mag_tracking.stages.health.window import ReadingBuffer
 
 WINDOW_S = 60.0
 """[s] Length of an evaluation window. A fault is reported for one to two windows after

@@ -1,36 +1,26 @@
 """Base class of nodes that run stages: parameters, network, diagnostics and main loop."""
 
-import gc
-import signal
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from mag_tracking_msgs.msg import FieldReadings
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.exceptions import ParameterException
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
-from rclpy.task import Future
 
-from mag_tracking.errors import MagTrackingError, RecordingError, SettingsError
-from mag_tracking.interrupts import recorded_signals
+from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.messages.schema import readings_of, stamp_ns
 from mag_tracking.network.file import read_network
-from mag_tracking.nodes.flow import Flow, SubscriberMonitor
-from mag_tracking.nodes.middleware import init_ros
+from mag_tracking.nodes.connections import Flow, SubscriberMonitor, node_of, shortened
+from mag_tracking.nodes.diagnostics import StatusLog
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
-from mag_tracking.nodes.sensor_graph import node_of, shortened
-from mag_tracking.nodes.shutdown import limit_exit_time, shut_down
-from mag_tracking.nodes.status_log import StatusLog
-from mag_tracking.nodes.steady_timer import steady_timer
+from mag_tracking.nodes.scheduling import steady_timer
 from mag_tracking.pipeline import settings_for
 from mag_tracking.records import Readings
 from mag_tracking.stages.stage import Stage
@@ -279,61 +269,3 @@ def has_subscribers(publisher: Publisher) -> bool:
 def title_of(node: Node) -> str:
     """Name of a node in diagnostics, including its namespace."""
     return node.get_fully_qualified_name().removeprefix('/')
-
-
-def make_executor() -> Executor:
-    """Create the events executor, which has little overhead, or else the single-threaded one."""
-    try:
-        from rclpy.experimental import EventsExecutor
-    except ImportError:
-        return SingleThreadedExecutor()
-    return EventsExecutor()
-
-
-def freeze() -> None:
-    """Exclude all existing objects from garbage collection: scans would delay the readings."""
-    gc.collect()
-    gc.freeze()
-
-
-def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
-    """Run an executor until ROS shuts down or `until`, polled a few times per s, is True."""
-    try:
-        while rclpy.ok() and not until():
-            # EventsExecutor.spin() of the Jazzy wheels hangs because a timeout overflows. Waiting
-            # for a future that never completes, with a finite timeout, works.
-            executor.spin_until_future_complete(Future(), 0.2)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-
-
-def main(node_class: Callable[[], Node], arguments: list[str] | None = None) -> int:
-    """Run a node as a process until SIGINT or SIGTERM; return its exit status."""
-    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
-        return _run_until(signals, node_class, arguments)
-
-
-def _run_until(signals: list[int], node_class: Callable[[], Node],
-               arguments: list[str] | None) -> int:
-    """Run a node until `signals` contains a received signal; return the exit status."""
-    try:
-        init_ros(arguments)
-    except SettingsError as error:
-        rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
-        return 1
-    executor, node, status = make_executor(), None, 1
-    try:
-        node = node_class()
-        executor.add_node(node)
-        freeze()
-        spin(executor, lambda: bool(signals))
-        status = 0
-    except (MagTrackingError, ParameterException) as error:
-        rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
-        # A partly constructed node is destroyed when the error is deleted.
-        limit_exit_time(status)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        status = 0
-    finally:
-        shut_down([] if node is None else [node], executor, status)
-    return status

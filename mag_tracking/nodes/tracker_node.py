@@ -9,6 +9,7 @@ if __name__ == '__main__':
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ from mag_tracking_msgs.msg import (
     TrackArray,
 )
 from mag_tracking_msgs.msg import Disturbance as DisturbanceMessage
+from mag_tracking_msgs.msg import TrafficSummary as TrafficSummaryMessage
+from mag_tracking_msgs.msg import VehiclePassage as VehiclePassageMessage
 from nav_msgs.msg import Odometry, Path
 from rclpy.publisher import Publisher
 from tf2_msgs.msg import TFMessage
@@ -34,7 +37,7 @@ from mag_tracking.calibration.doubtful_times import (
     merged,
 )
 from mag_tracking.errors import RecordingError
-from mag_tracking.event_records import Disturbance
+from mag_tracking.event_records import Disturbance, VehiclePassage
 from mag_tracking.messages.calibration_state import doubtful_times, with_orientations
 from mag_tracking.messages.frame import frame_of
 from mag_tracking.messages.markers import delete_markers, sensor_markers, track_markers
@@ -47,14 +50,17 @@ from mag_tracking.messages.schema import (
     smoothed_pose_dict,
     smoothed_track_dict,
     track_dict,
+    traffic_summary_dict,
+    vehicle_passage_dict,
 )
 from mag_tracking.messages.shapes import MessageDict
 from mag_tracking.messages.standard import detections_3d_dict, track_transform_dict
 from mag_tracking.messages.types import CALIBRATION_STATE, NETWORK_FRAME
 from mag_tracking.network import SensorNetwork
-from mag_tracking.nodes import stage_node
+from mag_tracking.nodes import middleware
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.ros_params import fixed_parameter, follow_changes
+from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter, follow_changes
+from mag_tracking.nodes.scheduling import steady_timer
 from mag_tracking.nodes.stage_node import (
     LATCHED_QOS,
     PUBLISHER_QOS,
@@ -64,15 +70,38 @@ from mag_tracking.nodes.stage_node import (
     StageNode,
     has_subscribers,
 )
-from mag_tracking.nodes.steady_timer import steady_timer
-from mag_tracking.nodes.traffic_topics import TrafficTopics
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.plausibility import lane_note
 from mag_tracking.stages.track.running_track import TrackRecord
 from mag_tracking.stages.track.settings import BEST
-from mag_tracking.stages.traffic.stage import TrackedFrame
+from mag_tracking.stages.traffic.stage import TrackedFrame, Traffic
+
+
+class TrafficTopics:
+    """Counts the vehicles of a tracker node, and publishes passages and summaries."""
+
+    def __init__(self, node: StageNode) -> None:
+        node.settings = declare_settings(node, node.settings, 'traffic')
+        self.stage = Traffic(node.network, node.settings.traffic,
+                             node.settings.track.target == 'vehicle')
+        self._classes = [c.name for c in node.settings.traffic.classes]
+        self._frame = node.network.frame
+        self._passage_publisher = node.publisher(VehiclePassageMessage, '~/passages', PUBLISHER_QOS)
+        self._summary_publisher = node.publisher(TrafficSummaryMessage, '~/traffic', RESULT_QOS)
+
+    def add(self, item: TrackedFrame) -> None:
+        """Process the records of a frame; publish completed passages and summaries."""
+        for record in self.stage.feed(item):
+            if isinstance(record, VehiclePassage):
+                self._passage_publisher.publish(to_message(
+                    VehiclePassageMessage,
+                    vehicle_passage_dict(record, self._classes, self._frame)))
+            else:
+                self._summary_publisher.publish(to_message(
+                    TrafficSummaryMessage, traffic_summary_dict(record, self._frame)))
+
 
 TRANSPORT_MARGIN_S = 1.0
 """[s] Margin for the transport of a frame, in addition to `track.end_gap_s`."""
@@ -299,6 +328,5 @@ def _same_orientations(one: SensorNetwork, other: SensorNetwork) -> bool:
     return all(is_same_std) and bool(np.abs(one.R_ws - other.R_ws).max() < 1e-9)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process; return its exit status."""
-    return stage_node.main(TrackerNode, arguments)
+
+main = partial(middleware.main, TrackerNode)

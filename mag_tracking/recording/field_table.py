@@ -24,8 +24,7 @@ from mag_tracking.recording.table_text import find_decimal, parse_number
 from mag_tracking.recording.table_times import check_range, read_times, span_text
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Readings
-from mag_tracking.time_text import DAY_NS
-from mag_tracking.units import NS, time_unit
+from mag_tracking.units import DAY_NS, NS, time_unit
 
 SUFFIXES = ('.csv', '.tsv', '.txt')
 """File name extensions of tables."""

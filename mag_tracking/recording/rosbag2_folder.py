@@ -12,8 +12,8 @@ from typing import NamedTuple, TypeAlias
 import yaml
 
 from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.files import parse_yaml
 from mag_tracking.recording.writer import OFFERED_QOS
-from mag_tracking.yaml_file import parse_yaml
 
 Opener: TypeAlias = Callable[[Path], io.FileIO]
 """Creates a file at a path and returns an unbuffered stream."""

@@ -29,7 +29,7 @@ from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics
 from mag_tracking.records import AccelerationSample, Readings
 from mag_tracking.report.metrics import Truth
 from mag_tracking.stages.health.clocks import ClockSpan
-from mag_tracking.stages.health.input_findings import ZERO_STAMP
+from mag_tracking.stages.health.findings import ZERO_STAMP
 
 TRUTH_PREFIX = 'ground_truth/'
 """Prefix of topics with true poses, in the namespace of the sensors. Truth is used for reports,

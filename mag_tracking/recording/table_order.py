@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.quantities import occurrences
 from mag_tracking.recording.table_times import Times, step_of
-from mag_tracking.time_text import DAY_NS
+from mag_tracking.units import DAY_NS
 
 JUMPS = ('split', 'sort')
 """Meanings of a time that runs backwards: the clock restarted, or the rows are out of order."""

@@ -11,9 +11,9 @@ from mag_tracking.calibration.reading_faults import ReadingFaults
 from mag_tracking.calibration.sensor_state import N_WINDOW
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.clocks import ClockSpan
+from mag_tracking.stages.settings import CalibrateSettings
 from mag_tracking.units import NS
 
 LOOK_AHEAD_S = 300.0

@@ -26,12 +26,13 @@ from mag_tracking.calibration.sensor_state import new_sensors
 from mag_tracking.errors import NetworkError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
-from mag_tracking.stages.calibrate.driver_faults import MAX_MARKED, DriverFaults
 from mag_tracking.stages.calibrate.field_comparison import FieldComparison
 from mag_tracking.stages.calibrate.output_buffer import OVERRULED as OVERRULED
 from mag_tracking.stages.calibrate.output_buffer import OutputBuffer
 from mag_tracking.stages.calibrate.rejections import (
+    MAX_MARKED,
     REJECTIONS,
+    DriverFaults,
     Rejections,
     own_covariances,
 )
@@ -40,10 +41,9 @@ from mag_tracking.stages.calibrate.restoration import (
     StoredBackground,
     stored_background,
 )
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
-from mag_tracking.stages.health.clocks import ClockSpan, corrected
+from mag_tracking.stages.health.clocks import ClockSpan, TimestampMonitor, corrected
 from mag_tracking.stages.health.diagnosis import Cause
-from mag_tracking.stages.health.timestamps import TimestampMonitor
+from mag_tracking.stages.settings import CalibrateSettings
 from mag_tracking.stages.stage import MAX_BACKWARD_JUMP_S
 from mag_tracking.stages.survey.settings import SurveySettings
 from mag_tracking.units import NEVER, NS

@@ -15,9 +15,8 @@ from mag_tracking.calibration.resolution import smallest_steps
 from mag_tracking.calibration.saturation import isolated_readings, saturated_readings
 from mag_tracking.calibration.screening import COARSE_FRACTION, MIN_CHANGES
 from mag_tracking.quantities import occurrences
-from mag_tracking.stages.health.clocks import ClockSpan
+from mag_tracking.stages.health.clocks import ClockSpan, timestamp_finding
 from mag_tracking.stages.health.diagnosis import Cause, Finding
-from mag_tracking.stages.health.timestamps import timestamp_finding
 from mag_tracking.stages.health.window import median_field, quantiles, sample_noise_std
 from mag_tracking.units import NEVER, NS
 

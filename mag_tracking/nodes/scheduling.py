@@ -1,14 +1,45 @@
-"""Services that lose no responses when many calls arrive simultaneously."""
+"""Timers on a steady clock, deferred work, and services with paced responses."""
 
 from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
+from rclpy.timer import Timer
 
-from mag_tracking.nodes.steady_timer import steady_timer
+
+def steady_timer(node: Node, seconds: float, call: Callable[[], None],
+                 autostart: bool = True) -> Timer:
+    """Create a timer, with a period in s, that is independent of simulated time."""
+    return node.create_timer(seconds, call, autostart=autostart,
+                             clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+class Deferred:
+    """Calls a function `delay_s` after a request; requests in the meantime have no effect.
+
+    On a computer with few cores, work immediately after publishing would compete with the processes
+    that receive the messages.
+    """
+
+    def __init__(self, node: Node, delay_s: float, call: Callable[[], None]) -> None:
+        self._call = call
+        self._timer = steady_timer(node, delay_s, self._run, autostart=False)
+
+    def request(self) -> None:
+        """Schedule the call, unless it is already scheduled."""
+        if self._timer.is_canceled():
+            self._timer.reset()
+
+    def _run(self) -> None:
+        """Stop the timer and call the function."""
+        self._timer.cancel()
+        self._call()
+
 
 RESPONSE_INTERVAL_S = 0.002
 """[s] Interval between responses."""

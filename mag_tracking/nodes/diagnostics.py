@@ -1,4 +1,4 @@
-"""Log of diagnostics: each fault is logged when it begins and when it ends.
+"""Diagnostics of the nodes: their log, in which each fault appears when it begins and when it ends.
 
 Lasting errors are repeated at intervals.
 """
