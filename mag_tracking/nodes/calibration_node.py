@@ -8,7 +8,6 @@ if __name__ == '__main__':
 
 import datetime
 import time
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from typing import Any
 from mag_tracking_msgs.msg import CalibrationState, FieldReadings, SensorCalibration
 from mag_tracking_msgs.srv import Calibrate as CalibrateService
 from mag_tracking_msgs.srv import Survey as SurveyMessage
-from rclpy.node import Node
 from sensor_msgs.msg import Imu, MagneticField
 from tf2_msgs.msg import TFMessage
 
@@ -34,7 +32,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import write_network
 from mag_tracking.nodes import middleware
 from mag_tracking.nodes.connections import shortened
-from mag_tracking.nodes.convert import to_message
+from mag_tracking.nodes.convert import send
 from mag_tracking.nodes.detection_node import DetectionNode
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.scheduling import Deferred, paced_service, steady_timer
@@ -61,84 +59,6 @@ from mag_tracking.stages.survey.stage import Survey, with_measured_noise
 
 MIN_INTERVAL_S = 0.5
 """[s] Minimum interval between surveys, each of which delays the readings."""
-
-
-class SurveyService:
-    """Solves a survey and saves the resulting network to `save_as` on request.
-
-    `imu_topics` are absolute names, for messages.
-    """
-
-    def __init__(self, survey: Survey, stage: Calibrate, save_as: Path,
-                 imu_topics: Sequence[str]) -> None:
-        self._survey, self._stage, self._save_as = survey, stage, save_as
-        self._imu_topics = imu_topics
-        self._end_time = -MIN_INTERVAL_S
-
-    def solve(self, network: SensorNetwork, save: bool,
-              response: SurveyMessage.Response) -> SensorNetwork | None:
-        """Solve a survey, save it on request and fill in the `response`; None if it failed.
-
-        It also fails if a survey has just ended.
-        """
-        if time.monotonic() - self._end_time < MIN_INTERVAL_S:
-            response.message = f'a survey has just been run; try again in {MIN_INTERVAL_S:g} s'
-            return None
-        try:
-            return self._solve_now(network, save, response)
-        finally:
-            self._end_time = time.monotonic()
-
-    def _solve_now(self, network: SensorNetwork, save: bool,
-                   response: SurveyMessage.Response) -> SensorNetwork | None:
-        """Solve a survey without checking the interval; see `solve`."""
-        # If a target is near a sensor, the background was measured before its arrival.
-        fields = {name: self._stage.background(name)
-                  for name, background in self._stage.backgrounds().items()
-                  if background.certain and self._stage.last_stamp_ns(name) is not None}
-        if not fields or not self._survey.counts['accelerations']:
-            response.message = 'no background has been learnt yet; keep targets away for a while' \
-                if not fields else 'no acceleration received on ' \
-                f'{", ".join(filter(None, self._imu_topics))}'
-            return None
-        date = datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds')
-        solution = self._survey.solve(fields, date)
-        surveyed = with_measured_noise(solution.network, self._stage)
-        if save:
-            try:
-                write_network(self._save_as, surveyed, 'Written by calibration_node.')
-            except OutputError as error:
-                response.message = str(error)
-                return None
-        response.success = True
-        response.message = (
-            'the result is in use'
-            + (f' and saved to {self._save_as}; use that file at the next start' if save else '')
-            + f'; clock reference: {solution.reference or "none, because no knock was detected"}')
-        response.warnings = solution.warnings()
-        response.warnings += [f'{name}: no background has been learnt; its heading remains as '
-                              'in the network file'
-                              for name in surveyed.names if name not in fields]
-        return surveyed
-
-
-class SensorTransforms:
-    """Publishes a static transform for each sensor; the child frame has the name of the sensor.
-
-    The `frame_id` of the sensor messages is not used: it may name a robot link that another node
-    publishes, and a frame with two parents would break the transform tree.
-    """
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._publisher = node.create_publisher(TFMessage, '/tf_static', LATCHED_QOS)
-
-    def publish(self, network: SensorNetwork) -> None:
-        """Publish the transforms of a network."""
-        self._publisher.publish(to_message(TFMessage, {'transforms': sensor_transform_dicts(
-            network, self._node.get_clock().now().nanoseconds)}))
-
-
 MIN_STEP_S = 0.01
 """[s] Minimum interval between the steps of a round over the sensors. A round takes one second, or
 longer if there are many sensors."""
@@ -165,16 +85,18 @@ class CalibrationNode(StageNode):
                                       self.get_logger())
         self._store.restore(self.network)
         self._survey = Survey(self.network, self.settings.survey)
-        self._survey_service = SurveyService(
-            self._survey, self._stage, self._survey_path(),
-            [self.resolve_topic_name(t) for t in self.network.imu_topics if t is not None])
+        self._save_as = self._output_path('save_as', fixed_parameter(
+            self, 'save_as', '', 'Network file to which a survey is saved. If empty, '
+            '<network>_calibrated.yaml is used.') or f'{self.network_path.stem}_calibrated.yaml')
+        self._survey_end_time = -MIN_INTERVAL_S
         self._health = HealthDiagnostics(self.network, self.settings, self, self.is_replayed)
         self._health_backlog: list[tuple[Readings, int]] = []
         self._deferred = Deferred(self, DEFERRAL_S, self._do_deferred_work)
         self._connect()
         self._rounds = SensorRounds(
-            self.title, self.network, self._stage, self._health, self._store, self._is_live,
-            lambda status: self.publish_statuses([status]), self._publish_states)
+            self.diagnostics.title, self.network, self._stage, self._health, self._store,
+            self._is_live, lambda status: self.diagnostics.publish([status]),
+            self._publish_states)
         steady_timer(self, max(1.0 / (2 * len(self.network) + 3), MIN_STEP_S),
                      self._rounds.tick)
         paced_service(self, CalibrateService, '~/calibrate', self._handle_calibrate)
@@ -191,8 +113,8 @@ class CalibrationNode(StageNode):
                               source='sensors')
         for sensor, imu_topic in zip(self.network.names, self.network.imu_topics, strict=True):
             if imu_topic is not None:
-                self.subscription(Imu, imu_topic, partial(self._receive_acceleration, sensor),
-                                  self.input_qos)
+                self.subscription(Imu, imu_topic, lambda message, sensor=sensor: self._survey.feed(
+                    acceleration_of(message, sensor)), self.input_qos)
         self._readings_publisher = self.publisher(FieldReadings, CALIBRATED_READINGS, PUBLISHER_QOS)
         self.subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM_QOS,
                           source='sensors', batches=True)
@@ -200,18 +122,25 @@ class CalibrationNode(StageNode):
             self.monitor_subscriber('detection', CALIBRATED_READINGS,
                                     'mag_tracking_msgs/msg/NetworkFrame')
         self._state_publisher = self.publisher(CalibrationState, CALIBRATION_STATE, LATCHED_QOS)
-        self._sensor_transforms = SensorTransforms(self) if fixed_parameter(
-            self, 'publish_sensor_tf', True, 'Publish static transforms from the world frame to '
-            'each sensor.') else None
+        self._transform_publisher = self.create_publisher(
+            TFMessage, '/tf_static', LATCHED_QOS) if fixed_parameter(
+                self, 'publish_sensor_tf', True, 'Publish static transforms from the world frame '
+                'to each sensor.') else None
         self._publish_transforms()
 
     def _publish_transforms(self) -> None:
-        """Publish the transforms of the sensors if `publish_sensor_tf` is set."""
-        if self._sensor_transforms is not None:
-            self._sensor_transforms.publish(self.network)
+        """Publish a static transform for each sensor, if `publish_sensor_tf` is set.
+
+        The child frame has the name of the sensor and not the `frame_id` of its messages, which may
+        name a robot link that another node publishes: a frame with two parents would break the
+        transform tree.
+        """
+        if self._transform_publisher is not None:
+            send(self._transform_publisher, {'transforms': sensor_transform_dicts(
+                self.network, self.get_clock().now().nanoseconds)})
 
     def _state_path(self) -> Path | None:
-        """Return the path of the background file; None during a replay or if storage is off."""
+        """Path of the background file; None during a replay or if storage is off."""
         name = fixed_parameter(self, 'state_file', '', 'File in which backgrounds are stored for a '
                                'restart. If empty, a file below $ROS_HOME or ~/.ros is used.')
         if self.is_replayed or not self.settings.calibrate.max_resume_gap_s:
@@ -239,13 +168,6 @@ class CalibrationNode(StageNode):
             raise SettingsError(f'{prefix}{path} must be in the folder of the network file, '
                                 f'{network_folder}, or below {state_root}')
         return folder / path.name
-
-    def _survey_path(self) -> Path:
-        """Return the path to which a survey is saved; raise SettingsError for a disallowed path."""
-        save_as = fixed_parameter(self, 'save_as', '', 'Network file to which a survey is saved. '
-                                  'If empty, <network>_calibrated.yaml is used.')
-        path = self.network_path
-        return self._output_path('save_as', save_as or f'{path.stem}_calibrated.yaml')
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """Stages whose counts are published in diagnostics, by name."""
@@ -279,7 +201,7 @@ class CalibrationNode(StageNode):
         for calibrated in self._calibrate_readings(raw):
             if self._next_steps is None or has_subscribers(publisher):
                 for _, content in magnetic_field_dicts(calibrated, message.header.frame_id):
-                    publisher.publish(to_message(MagneticField, content))
+                    send(publisher, content)
         self._health_backlog.append((raw, self.now_ns))
         self._do_deferred_work()
 
@@ -290,8 +212,7 @@ class CalibrationNode(StageNode):
             return
         for calibrated in self._calibrate_readings(raw):
             if self._next_steps is None or has_subscribers(self._readings_publisher):
-                self._readings_publisher.publish(
-                    to_message(FieldReadings, readings_dict(calibrated)))
+                send(self._readings_publisher, readings_dict(calibrated))
         self._health_backlog.append((raw, self.now_ns))
         self._deferred.request()
 
@@ -317,10 +238,6 @@ class CalibrationNode(StageNode):
         self._rounds.step_if_due()
         self._rounds.report_doubts()
 
-    def _receive_acceleration(self, sensor: str, message: Imu) -> None:
-        """Pass an acceleration to the survey."""
-        self._survey.feed(acceleration_of(message, sensor))
-
     def _publish_states(self, states: list[SensorCalibration]) -> None:
         """Publish the calibration of all sensors."""
         message = CalibrationState(sensors=states)
@@ -345,7 +262,11 @@ class CalibrationNode(StageNode):
     def _handle_survey(self, request: SurveyMessage.Request,
                        response: SurveyMessage.Response) -> SurveyMessage.Response:
         """Handle ~/survey: update clock offsets now, and orientations from the next track on."""
-        network = self._survey_service.solve(self.network, request.save, response)
+        if time.monotonic() - self._survey_end_time < MIN_INTERVAL_S:
+            response.message = f'a survey has just been run; try again in {MIN_INTERVAL_S:g} s'
+            return response
+        network = self._solved_survey(request.save, response)
+        self._survey_end_time = time.monotonic()
         if network is None:
             return response
         self.network = network
@@ -359,6 +280,35 @@ class CalibrationNode(StageNode):
             self.get_logger().warning(warning)
         return response
 
+    def _solved_survey(self, save: bool, response: SurveyMessage.Response) -> SensorNetwork | None:
+        """Solve a survey, save it if `save`, and fill in the response; None if it failed."""
+        # If a target is near a sensor, the background was measured before its arrival.
+        fields = {name: self._stage.background(name)
+                  for name, background in self._stage.backgrounds().items()
+                  if background.certain and self._stage.last_stamp_ns(name) is not None}
+        if not fields or not self._survey.counts['accelerations']:
+            response.message = 'no background has been learnt yet; keep targets away for a while' \
+                if not fields else 'no acceleration received on ' + ', '.join(
+                    map(self.resolve_topic_name, filter(None, self.network.imu_topics)))
+            return None
+        date = datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds')
+        solution = self._survey.solve(fields, date)
+        surveyed = with_measured_noise(solution.network, self._stage)
+        if save:
+            try:
+                write_network(self._save_as, surveyed, 'Written by calibration_node.')
+            except OutputError as error:
+                response.message = str(error)
+                return None
+        response.success = True
+        response.message = (
+            'the result is in use'
+            + (f' and saved to {self._save_as}; use that file at the next start' if save else '')
+            + f'; clock reference: {solution.reference or "none, because no knock was detected"}')
+        response.warnings = [*solution.warnings(), *(
+            f'{name}: no background has been learnt; its heading remains as in the network file'
+            for name in surveyed.names if name not in fields)]
+        return surveyed
 
 
 main = partial(middleware.main, CalibrationNode)

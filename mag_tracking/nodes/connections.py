@@ -1,14 +1,16 @@
 """Monitoring of the connections of a node: throughput, latency, missing or faulty peer nodes."""
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.topics import absolute
+from mag_tracking.nodes.diagnostics import ERROR, OK, WARN, status_of
 from mag_tracking.quantities import quantity
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S
@@ -40,6 +42,20 @@ def node_of(endpoint: TopicEndpointInfo) -> str | None:
     """
     namespace = endpoint.node_namespace
     return absolute(endpoint.node_name, namespace) if namespace.startswith('/') else None
+
+
+def is_latched(publisher: TopicEndpointInfo) -> bool:
+    """Whether a publisher also sends its latest messages to subscribers that join later."""
+    return bool(publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def subscriber_qos(depth: int, latched: bool) -> QoSProfile:
+    """QoS that matches every publisher or, if `latched`, receives earlier messages of latched ones.
+    """
+    if latched:
+        return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE,
+                          durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def no_message_finding(node: Node, sensor: str, topic: str, known: Mapping[str, str]) -> Finding:
@@ -136,30 +152,28 @@ class Flow:
         elapsed, self._report_time = max(now - self._report_time, 1e-9), now
         latencies, self._latencies = self._latencies, []
         new_losses, self._n_reported_lost = self.n_lost - self._n_reported_lost, self.n_lost
-        level, message = DiagnosticStatus.OK, 'running'
+        level, message = OK, 'running'
         busy = self._busy_s / elapsed
         median, percentile_99 = quantiles(
             [v for v in latencies if abs(v) < MAX_LIVE_DELAY_S], 0.5, 0.99)
         if self.last_received is None:
             message = f'waiting for {shortened(self.topics)}'
             if now - self._start_time > FIRST_MESSAGE_TIMEOUT_S:
-                level = DiagnosticStatus.WARN
+                level = WARN
                 message = f'no message received on {shortened(self.topics)}' + (
                     '' if has_publisher() else ': no publisher found; start the driver or the '
                     'preceding node')
         elif now - self.last_received > SILENCE_TIMEOUT_S:
-            level = DiagnosticStatus.WARN
+            level = WARN
             message = f'no message from {self.source} for {now - self.last_received:.0f} s'
             if not has_publisher():
-                level = DiagnosticStatus.ERROR
+                level = ERROR
                 message += ', and its topics have no publisher: check that it is running'
         elif new_losses:
-            level = DiagnosticStatus.WARN
-            message = f'{quantity(new_losses, "message")} from {self.source} ' \
-                'lost: the input queue was full; reduce the load of this computer'
+            level, message = WARN, f'{quantity(new_losses, "message")} from {self.source} lost: ' \
+                'the input queue was full; reduce the load of this computer'
         elif busy > MAX_LOAD or median > MAX_LATENCY_S:
-            level = DiagnosticStatus.WARN
-            message = f'input from {self.source}: load {100.0 * busy:.0f} %' + (
+            level, message = WARN, f'input from {self.source}: load {100.0 * busy:.0f} %' + (
                 f', latency {1e3 * median:.0f} ms: this computer is too slow, or its clock differs '
                 'from the clock of the sensors' if median > MAX_LATENCY_S else
                 ': this computer is too slow')
@@ -168,9 +182,7 @@ class Flow:
                   'latency, 99 % [ms]': f'{1e3 * percentile_99:.4g}',
                   'busy [%]': f'{100.0 * busy:.3g}'}
         self._busy_s = 0.0
-        return DiagnosticStatus(
-            level=level, name=f'{node}: from {self.source}', hardware_id='magnetometer network',
-            message=message, values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])
+        return status_of(f'{node}: from {self.source}', message, level, values)
 
 
 class SubscriberMonitor:
@@ -198,13 +210,7 @@ class SubscriberMonitor:
         is_gone = bool(missing_nodes) and not self._known_nodes.intersection(names)
         message = 'running' if self._known_nodes else \
             f'no {self.role} node has subscribed to {self.topic} yet'
-        return DiagnosticStatus(
-            level=DiagnosticStatus.ERROR if is_gone else DiagnosticStatus.OK,
-            name=f'{node}: to {self.role}', hardware_id='magnetometer network',
-            message=_disappeared(missing_nodes) if is_gone else message)
-
-
-def _disappeared(nodes: Sequence[str]) -> str:
-    """Message about nodes that no longer run."""
-    has, it_is = ('has', 'it is') if len(nodes) == 1 else ('have', 'they are')
-    return f'{", ".join(nodes)} {has} disappeared: check that {it_is} running'
+        if is_gone:
+            has, it_is = ('has', 'it is') if len(missing_nodes) == 1 else ('have', 'they are')
+            message = f'{", ".join(missing_nodes)} {has} disappeared: check that {it_is} running'
+        return status_of(f'{node}: to {self.role}', message, ERROR if is_gone else OK)

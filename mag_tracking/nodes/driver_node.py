@@ -12,14 +12,12 @@ if __name__ == '__main__':
 
 import threading
 import time
-from collections.abc import Collection, Sequence
 from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from mag_tracking_msgs.msg import FieldReadings
 from rclpy.lifecycle import State, TransitionCallbackReturn
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import Imu, MagneticField
 
@@ -31,68 +29,24 @@ from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes import middleware
-from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.diagnostics import StatusLog
+from mag_tracking.nodes.convert import send
+from mag_tracking.nodes.diagnostics import (
+    ERROR,
+    OK,
+    WARN,
+    DiagnosticsPublisher,
+    status_of,
+)
 from mag_tracking.nodes.middleware import ManagedNode
 from mag_tracking.nodes.ros_params import fixed_parameter
 from mag_tracking.nodes.scheduling import steady_timer
-from mag_tracking.nodes.stage_node import PUBLISHER_QOS, RESULT_QOS, title_of
+from mag_tracking.nodes.stage_node import PUBLISHER_QOS
 from mag_tracking.records import AccelerationSample, Readings
 
 EXPECTED_COUNTS = ('samples: ', 'late arrivals: ', 'other messages: ', 'lines that are comments',
                    'lines without the prefix', 'lines that are empty', 'retained messages skipped',
                    'conversions overwritten', 'packets not used')
 """Prefixes of counts that are reported but do not cause a warning."""
-
-
-class DriverDiagnostics:
-    """Reports the state of each device and logs changes."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._reported_counts: dict[str, dict[str, int]] = {}
-        self._log = StatusLog(node.get_logger())
-
-    def statuses(self, drivers: Sequence[Driver], running: Collection[str],
-                 active: bool) -> list[DiagnosticStatus]:
-        """Return one status per driver and log changes; `running` are those with a live thread."""
-        return [self._status(driver, driver.name in running, active) for driver in drivers]
-
-    def _status(self, driver: Driver, running: bool, active: bool) -> DiagnosticStatus:
-        """Return the diagnostics of one device, and log a change."""
-        counts = driver.counts()
-        previous = self._reported_counts.get(driver.name, {})
-        examples = driver.examples()
-        increases = [f'{count}: {n - previous.get(count, 0)} more'
-                     + (f', such as {examples[count]}' if count in examples else '')
-                     for count, n in sorted(counts.items())
-                     if n > previous.get(count, 0) and not count.startswith(EXPECTED_COUNTS)]
-        self._reported_counts[driver.name] = dict(counts)
-        level, message = DiagnosticStatus.OK, 'open'
-        if not active:
-            message = 'not active'
-        elif not running:
-            level, message = DiagnosticStatus.ERROR, 'the driver thread has ended: restart the node'
-        elif driver.fault:
-            level, message = DiagnosticStatus.ERROR, driver.fault
-        elif not driver.is_open:
-            # No fault has occurred, and opening some devices takes seconds.
-            message = 'opening'
-        elif increases:
-            level, message = DiagnosticStatus.WARN, '; '.join(increases)
-        values = {count: str(n) for count, n in sorted(counts.items())}
-        for source, clock in driver.clocks().items():
-            suffix = f' ({source})' if source else ''
-            values[f'clock drift [ppm]{suffix}'] = f'{clock.drift_ppm:.2f}'
-            values[f'delay above the minimum, 95 % [ms]{suffix}'] = f'{1e3 * clock.spread_s:.3g}'
-            values[f'timestamp std [ms]{suffix}'] = f'{1e3 * clock.stamp_std:.3g}'
-        status = DiagnosticStatus(
-            level=level, name=f'{title_of(self._node)}: {driver.name}', hardware_id=driver.name,
-            message=message, values=[KeyValue(key=k, value=v) for k, v in values.items()])
-        self._log.add(status)
-        return status
-
-
 STOP_TIMEOUT_S = 15.0
 """[s] Maximum time for all drivers to stop. Disconnecting from an MQTT broker that does not answer
 takes several seconds."""
@@ -116,17 +70,15 @@ class DriverNode(ManagedNode):
         self._threads: list[threading.Thread] = []
         self._publishers_by_sensor: dict[str, tuple[Publisher, Publisher]] = {}
         self._stop_event: threading.Event | None = None
-        self._diagnostics_publisher = self.create_publisher(
-            DiagnosticArray, '/diagnostics', RESULT_QOS)
-        self._health = DriverDiagnostics(self)
+        self._diagnostics = DiagnosticsPublisher(self)
+        self._reported_counts: dict[str, dict[str, int]] = {}
         steady_timer(self, 1.0, self._publish_diagnostics)
         self.start_automatically()
 
     def prepare(self) -> None:
         """Read the drivers file and advertise the topics of the sensors.
 
-        Raises SettingsError if parameter `drivers` is empty or the drivers file is invalid, and
-        NetworkError if the network file is invalid.
+        Raises SettingsError or NetworkError if a file is missing or invalid.
         """
         if not self._path:
             raise SettingsError('driver_node: parameter drivers is empty; set it to the path of a '
@@ -157,16 +109,10 @@ class DriverNode(ManagedNode):
         self._stop()
         return super().on_deactivate(state)
 
-    def on_cleanup(self, state: State) -> TransitionCallbackReturn:
-        """Release the drivers and withdraw the topics."""
-        self._release()
-        return TransitionCallbackReturn.SUCCESS
-
     def on_shutdown(self, state: State) -> TransitionCallbackReturn:
         """Close the devices, release the drivers and withdraw the topics."""
         self._stop()
-        self._release()
-        return TransitionCallbackReturn.SUCCESS
+        return super().on_shutdown(state)
 
     def close(self) -> None:
         """Stop the threads; each closes its device."""
@@ -193,12 +139,12 @@ class DriverNode(ManagedNode):
         """Publish readings, in one message if `batches` is set, and accelerations."""
         if self._readings_publisher is None:
             for sensor, content in magnetic_field_dicts(readings):
-                self._publishers_by_sensor[sensor][0].publish(to_message(MagneticField, content))
+                send(self._publishers_by_sensor[sensor][0], content)
         elif len(readings):
-            self._readings_publisher.publish(to_message(FieldReadings, readings_dict(readings)))
+            send(self._readings_publisher, readings_dict(readings))
         for acceleration in accelerations:
-            self._publishers_by_sensor[acceleration.sensor][1].publish(
-                to_message(Imu, acceleration_dict(acceleration, acceleration.sensor)))
+            send(self._publishers_by_sensor[acceleration.sensor][1],
+                 acceleration_dict(acceleration, acceleration.sensor))
 
     def _stop(self) -> None:
         """Stop the threads and wait, at most `STOP_TIMEOUT_S`, until their devices are closed."""
@@ -212,7 +158,7 @@ class DriverNode(ManagedNode):
                                         f'{STOP_TIMEOUT_S:g} s')
         self._threads = [thread for thread in self._threads if thread.is_alive()]
 
-    def _release(self) -> None:
+    def release(self) -> None:
         """Release the drivers and withdraw the topics."""
         for pair in self._publishers_by_sensor.values():
             for publisher in pair:
@@ -221,11 +167,37 @@ class DriverNode(ManagedNode):
 
     def _publish_diagnostics(self) -> None:
         """Publish the state of the devices."""
-        array = DiagnosticArray(status=self._health.statuses(
-            self._drivers, {thread.name for thread in self._threads if thread.is_alive()},
-            self._stop_event is not None and not self._stop_event.is_set()))
-        array.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics_publisher.publish(array)
+        self._diagnostics.publish([self._status(driver) for driver in self._drivers])
+
+    def _status(self, driver: Driver) -> DiagnosticStatus:
+        """Return the diagnostics of one device."""
+        counts, examples = driver.counts(), driver.examples()
+        previous = self._reported_counts.get(driver.name, {})
+        increases = [f'{count}: {n - previous.get(count, 0)} more'
+                     + (f', such as {examples[count]}' if count in examples else '')
+                     for count, n in sorted(counts.items())
+                     if n > previous.get(count, 0) and not count.startswith(EXPECTED_COUNTS)]
+        self._reported_counts[driver.name] = dict(counts)
+        level, message = OK, 'open'
+        if self._stop_event is None or self._stop_event.is_set():
+            message = 'not active'
+        elif not any(t.name == driver.name and t.is_alive() for t in self._threads):
+            level, message = ERROR, 'the driver thread has ended: restart the node'
+        elif driver.fault:
+            level, message = ERROR, driver.fault
+        elif not driver.is_open:
+            # No fault has occurred, and opening some devices takes seconds.
+            message = 'opening'
+        elif increases:
+            level, message = WARN, '; '.join(increases)
+        values: dict[str, object] = dict(sorted(counts.items()))
+        for source, clock in driver.clocks().items():
+            suffix = f' ({source})' if source else ''
+            values[f'clock drift [ppm]{suffix}'] = f'{clock.drift_ppm:.2f}'
+            values[f'delay above the minimum, 95 % [ms]{suffix}'] = f'{1e3 * clock.spread_s:.3g}'
+            values[f'timestamp std [ms]{suffix}'] = f'{1e3 * clock.stamp_std:.3g}'
+        return status_of(f'{self._diagnostics.title}: {driver.name}', message, level, values,
+                         hardware=driver.name)
 
 
 

@@ -19,9 +19,9 @@ from rclpy.exceptions import NameValidationException
 from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from mag_tracking.errors import GraphError
+from mag_tracking.nodes.connections import is_latched, subscriber_qos
 from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.middleware import RCLError, init_ros, make_executor, shut_down, spin
 
@@ -51,8 +51,7 @@ class Observer:
         """Call a service; raises GraphError if it does not exist or does not respond in time.
 
         A query is repeated, because the response of a server that has not yet discovered the client
-        is lost. With `once`, for a change of the server, it is requested only once, after a wait
-        for discovery.
+        is lost. A change of the server is requested only `once`, after a wait for discovery.
         """
         with valid_names():
             client = self.node.create_client(service_type, name)
@@ -84,11 +83,7 @@ def valid_names() -> Iterator[None]:
 
 @contextmanager
 def observer(ros_arguments: Sequence[str] = ()) -> Iterator[Observer]:
-    """Create an `Observer` that is shut down when the context ends.
-
-    The first of `ros_arguments` is `--ros-args`. If the middleware hangs, `shut_down` ends the
-    process.
-    """
+    """Create an `Observer` that is shut down when the context ends."""
     init_ros(list(ros_arguments))
     executor, node = make_executor(), Node('mag_tracking_observer', start_parameter_services=False)
     executor.add_node(node)
@@ -110,10 +105,10 @@ def topics(graph: Observer) -> list[tuple[str, str, int, int]]:
 
 def receive_messages(graph: Observer, topic: str, handle: Callable[[Any], bool],
                      stopped: Callable[[], bool]) -> None:
-    """Receive messages until `handle` returns False or `stopped` returns True; resolves the name.
+    """Receive messages of a topic, to be resolved, until `handle` returns False or `stopped()`.
 
-    Messages published earlier are received only if all publishers of the topic are latched. Raises
-    GraphError if the name is invalid, the topic has no publisher, or its type is not installed.
+    Messages published earlier are received only if all publishers are latched. Raises GraphError if
+    the name is invalid, the topic has no publisher, or its type is not installed.
     """
     with valid_names():
         name = graph.node.resolve_topic_name(topic)
@@ -127,7 +122,7 @@ def receive_messages(graph: Observer, topic: str, handle: Callable[[Any], bool],
     cls = message_class(infos[0].topic_type)
     if cls is None:
         raise GraphError(f'{name}: message type {infos[0].topic_type} is not installed')
-    latched = all(i.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for i in infos)
+    latched = all(map(is_latched, infos))
     stops: list[bool] = []
 
     def handle_one(message: Any) -> None:
@@ -135,11 +130,7 @@ def receive_messages(graph: Observer, topic: str, handle: Callable[[Any], bool],
         if not stops and not handle(message):
             stops.append(True)
 
-    graph.node.create_subscription(
-        cls, name, handle_one, QoSProfile(
-            depth=100, reliability=ReliabilityPolicy.RELIABLE if latched
-            else ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
+    graph.node.create_subscription(cls, name, handle_one, subscriber_qos(100, latched))
     while rclpy.ok() and not stops and not stopped():
         graph.wait(lambda: bool(stops) or stopped(), 1.0)
 
@@ -209,9 +200,14 @@ def lifecycle_state(graph: Observer, node: str) -> tuple[str, list[str]]:
     Raises GraphError if the node does not exist or is not a lifecycle node.
     """
     state = graph.call(GetState, f'{node}/get_state', GetState.Request()).current_state.label
-    possible = graph.call(GetAvailableTransitions, f'{node}/get_available_transitions',
-                          GetAvailableTransitions.Request()).available_transitions
-    return state, [t.transition.label for t in possible]
+    return state, [t.label for t in _possible_transitions(graph, node)]
+
+
+def _possible_transitions(graph: Observer, node: str) -> list[Any]:
+    """Transitions of a lifecycle node that are now possible."""
+    return [t.transition for t in graph.call(
+        GetAvailableTransitions, f'{node}/get_available_transitions',
+        GetAvailableTransitions.Request()).available_transitions]
 
 
 def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
@@ -219,11 +215,10 @@ def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
 
     Raises GraphError if the node does not exist, or the transition is not possible or fails.
     """
-    possible = graph.call(GetAvailableTransitions, f'{node}/get_available_transitions',
-                          GetAvailableTransitions.Request()).available_transitions
-    matches = [t.transition for t in possible if t.transition.label == transition]
+    possible = _possible_transitions(graph, node)
+    matches = [t for t in possible if t.label == transition]
     if not matches:
-        names = ', '.join(t.transition.label for t in possible)
+        names = ', '.join(t.label for t in possible)
         raise GraphError(f'{node}: transition {transition} is not possible in the current state; '
                          f'possible: {names}')
     request = ChangeState.Request()

@@ -36,7 +36,11 @@ PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 """Environment variable that selects a profile in Fast DDS 2.14 (Jazzy)."""
 WORKING_FOLDER_PROFILE = 'DEFAULT_FASTRTPS_PROFILES.xml'
 """Name of the profile that Fast DDS loads from the working folder by default."""
-ROS_ARGUMENTS, PARAMETER_FILE = '--ros-args', '--params-file'
+SHUTDOWN_TIMEOUT_S = 4.0
+"""[s] Maximum time for the shutdown of the middleware. It usually takes 0.3 s; `ros2 launch` sends
+the next signal 5 s after the first."""
+HUNG_MESSAGE = (f'the middleware did not shut down within {SHUTDOWN_TIMEOUT_S:g} s; '
+                'the process was ended\n')
 
 
 def init_ros(arguments: list[str] | None = None) -> None:
@@ -51,7 +55,12 @@ def init_ros(arguments: list[str] | None = None) -> None:
     if profile is None and not Path(WORKING_FOLDER_PROFILE).exists():
         os.environ[PROFILE_VARIABLE] = str(PROFILE)
     with tempfile.TemporaryDirectory(prefix='mag_tracking_') as folder:
-        _init(_with_ros_parameter_files(arguments, Path(folder)))
+        try:
+            rclpy.init(args=_with_ros_parameter_files(arguments, Path(folder)),
+                       signal_handler_options=SignalHandlerOptions.NO)
+        except (RCLError, UnknownROSArgsError) as error:
+            # The remainder of the message consists of source locations in rcl.
+            raise SettingsError(f'ROS arguments: {str(error).partition(", at /")[0]}') from error
     if profile and not Path(profile).exists():
         rclpy.logging.get_logger('middleware').warning(
             f'{PROFILE_VARIABLE}: file {profile} does not exist: no Fast DDS profile is active, '
@@ -59,39 +68,18 @@ def init_ros(arguments: list[str] | None = None) -> None:
             'the variable')
 
 
-def _init(arguments: list[str] | None) -> None:
-    """Call `rclpy.init`; raise SettingsError for invalid ROS arguments."""
-    try:
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    except (RCLError, UnknownROSArgsError) as error:
-        # The remainder of the message consists of source locations in rcl.
-        raise SettingsError(f'ROS arguments: {str(error).partition(", at /")[0]}') from error
-
-
-def _with_ros_parameter_files(arguments: list[str] | None, folder: Path) -> list[str] | None:
-    """Arguments (None: `sys.argv`), with plain parameter files replaced by copies in `folder`.
-
-    The copies are only needed until `rclpy.init` has returned. Raises SettingsError for an invalid
-    file.
-    """
+def _with_ros_parameter_files(arguments: list[str] | None, folder: Path) -> list[str]:
+    """Arguments (None: `sys.argv`), with plain parameter files replaced by copies in `folder`,
+    which `rclpy.init` reads."""
     converted = list(sys.argv if arguments is None else arguments)
     for k, argument in enumerate(converted[:-1]):
         # rclpy reports missing files and invalid arguments.
-        if argument != PARAMETER_FILE or ROS_ARGUMENTS not in converted[:k] \
-                or not Path(converted[k + 1]).is_file():
-            continue
-        content = as_ros_parameters(converted[k + 1])
-        if content is not None:
+        if argument == '--params-file' and '--ros-args' in converted[:k] \
+                and Path(converted[k + 1]).is_file() \
+                and (content := as_ros_parameters(converted[k + 1])) is not None:
             converted[k + 1] = str(folder / f'{k}.yaml')
             Path(converted[k + 1]).write_text(content, encoding='utf-8')
     return converted
-
-
-SHUTDOWN_TIMEOUT_S = 4.0
-"""[s] Maximum time for the shutdown of the middleware. It usually takes 0.3 s; `ros2 launch` sends
-the next signal 5 s after the first."""
-HUNG_MESSAGE = (f'the middleware did not shut down within {SHUTDOWN_TIMEOUT_S:g} s; '
-                'the process was ended\n')
 
 
 def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: int = 0) -> None:
@@ -140,12 +128,9 @@ def flush() -> None:
 def _final_message() -> bytes:
     """Return the pending error, if any, which would otherwise be lost, and the timeout message."""
     error = sys.exc_info()[1]
-    if error is None or isinstance(error, KeyboardInterrupt):
-        pending = ''
-    elif isinstance(error, MagTrackingError):
-        pending = f'{error}\n'
-    else:
-        pending = ''.join(traceback.format_exception(error))
+    pending = '' if error is None or isinstance(error, KeyboardInterrupt) else \
+        f'{error}\n' if isinstance(error, MagTrackingError) else \
+        ''.join(traceback.format_exception(error))
     return (pending + HUNG_MESSAGE).encode(errors='backslashreplace')
 
 
@@ -173,6 +158,20 @@ class ManagedNode(LifecycleNode):
 
     def close(self) -> None:
         """Stop the threads of the node; called before the node is destroyed."""
+
+    def release(self) -> None:
+        """Undo `prepare`."""
+        raise NotImplementedError
+
+    def on_cleanup(self, state: State) -> TransitionCallbackReturn:
+        """Release the resources of the node."""
+        self.release()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: State) -> TransitionCallbackReturn:
+        """Release the resources of the node."""
+        self.release()
+        return TransitionCallbackReturn.SUCCESS
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
         """Call `prepare`; if it fails, log the error and leave the node unconfigured."""
@@ -214,31 +213,26 @@ def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
 
 def main(node_class: Callable[[], Node], arguments: list[str] | None = None) -> int:
     """Run a node as a process until SIGINT or SIGTERM; return its exit status."""
+    logger = rclpy.logging.get_logger(node_class.__name__)
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
-        return _run_until(signals, node_class, arguments)
-
-
-def _run_until(signals: list[int], node_class: Callable[[], Node],
-               arguments: list[str] | None) -> int:
-    """Run a node until `signals` contains a received signal; return the exit status."""
-    try:
-        init_ros(arguments)
-    except SettingsError as error:
-        rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
-        return 1
-    executor, node, status = make_executor(), None, 1
-    try:
-        node = node_class()
-        executor.add_node(node)
-        freeze()
-        spin(executor, lambda: bool(signals))
-        status = 0
-    except (MagTrackingError, ParameterException) as error:
-        rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
-        # A partly constructed node is destroyed when the error is deleted.
-        limit_exit_time(status)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        status = 0
-    finally:
-        shut_down([] if node is None else [node], executor, status)
-    return status
+        try:
+            init_ros(arguments)
+        except SettingsError as error:
+            logger.fatal(str(error))
+            return 1
+        executor, nodes, status = make_executor(), list[Node](), 1
+        try:
+            nodes.append(node_class())
+            executor.add_node(nodes[0])
+            freeze()
+            spin(executor, lambda: bool(signals))
+            status = 0
+        except (MagTrackingError, ParameterException) as error:
+            logger.fatal(str(error))
+            # A partly constructed node is destroyed when the error is deleted.
+            limit_exit_time(status)
+        except (KeyboardInterrupt, ExternalShutdownException):
+            status = 0
+        finally:
+            shut_down(nodes, executor, status)
+        return status

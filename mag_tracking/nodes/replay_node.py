@@ -118,18 +118,8 @@ class ReplayNode(ManagedNode):
         self._is_active = False
         return super().on_deactivate(state)
 
-    def on_cleanup(self, state: State) -> TransitionCallbackReturn:
-        """Close the recording and withdraw its topics."""
-        self._release()
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_shutdown(self, state: State) -> TransitionCallbackReturn:
+    def release(self) -> None:
         """Stop playback, close the recording and withdraw its topics."""
-        self._release()
-        return TransitionCallbackReturn.SUCCESS
-
-    def _release(self) -> None:
-        """Close the recording and withdraw its topics."""
         self._is_active, self._recording, self.finished = False, None, False
         for publisher in self.publishers_by_topic.values():
             self.destroy_publisher(publisher)

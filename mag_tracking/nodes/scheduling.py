@@ -22,8 +22,7 @@ def steady_timer(node: Node, seconds: float, call: Callable[[], None],
 class Deferred:
     """Calls a function `delay_s` after a request; requests in the meantime have no effect.
 
-    On a computer with few cores, work immediately after publishing would compete with the processes
-    that receive the messages.
+    Immediate work would compete with the processes that receive the published messages.
     """
 
     def __init__(self, node: Node, delay_s: float, call: Callable[[], None]) -> None:
@@ -42,20 +41,19 @@ class Deferred:
 
 
 RESPONSE_INTERVAL_S = 0.002
-"""[s] Interval between responses."""
-SERVICE_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS of the service; the queue is long enough for many simultaneous calls."""
+"""[s] Interval between the responses of a service."""
 
 
 def paced_service(node: Node, service_type: Any, name: str,
                   callback: Callable[[Any, Any], Any]) -> Service:
     """Create a service whose responses do not overflow the queues of its clients.
 
-    Each client of a service receives the responses to all clients and by default stores the latest
-    ten that it has not yet read. Without pacing, about half of forty simultaneous calls would get
-    no response.
+    Each client receives the responses to all clients and by default stores ten of them: without
+    pacing, about half of forty simultaneous calls would get no response.
     """
-    service = node.create_service(service_type, name, callback, qos_profile=SERVICE_QOS)
+    # The queue is long enough for many simultaneous calls.
+    service = node.create_service(service_type, name, callback, qos_profile=QoSProfile(
+        depth=1000, reliability=ReliabilityPolicy.RELIABLE))
     send, queue = service.send_response, deque[tuple[Any, Any]]()
 
     def send_next() -> None:

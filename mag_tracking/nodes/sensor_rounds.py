@@ -33,17 +33,13 @@ class BackgroundStore:
 
     def __init__(self, path: Path | None, stage: Calibrate, settings: CalibrateSettings,
                  logger: RcutilsLogger) -> None:
-        self._path, self._stage, self._settings = path, stage, settings
-        self._logger = logger
+        self._path, self._stage, self._settings, self._logger = path, stage, settings, logger
         self._entries: dict[str, str] = {}
         self._written_sensors: frozenset[str] = frozenset()
         self._next_write = 0.0
 
     def restore(self, network: SensorNetwork) -> None:
-        """Pass the stored backgrounds to the stage, to be used from each sensor's first reading.
-
-        Outdated backgrounds are not restored; invalid backgrounds are logged.
-        """
+        """Pass the stored backgrounds, except outdated ones, to the stage; log invalid ones."""
         if self._path is None:
             return
         try:
@@ -61,10 +57,7 @@ class BackgroundStore:
                 'the backgrounds again')
 
     def update(self, network: SensorNetwork, j: int) -> None:
-        """Update the stored background of sensor `j`; remove it if it is unknown or doubtful.
-
-        The file is not written until the next `write_if_due`.
-        """
+        """Update the entry of sensor `j`; remove it if its background is unknown or doubtful."""
         name = network.names[j]
         background = None if self._path is None else self._stage.stored(name)
         if background is None:
@@ -73,10 +66,7 @@ class BackgroundStore:
             self._entries[name] = background_text(background, network, j, self._settings)
 
     def write_if_due(self, is_live: bool) -> None:
-        """Write the file if the interval has elapsed or it lacks a sensor; log a failure.
-
-        During a replay, nothing is written.
-        """
+        """Write the file, unless during a replay, if it lacks a sensor or the interval is over."""
         now = time.monotonic()
         has_new_sensor = not self._entries.keys() <= self._written_sensors
         if self._path is None or not is_live or now < self._next_write and not has_new_sensor:
@@ -100,9 +90,8 @@ class BackgroundStore:
 class SensorRounds:
     """Processes the sensors of a network one after another, in steps of similar duration.
 
-    `is_live` returns whether the readings are live and not replayed. `publish_status` is called
-    with the status of a sensor, `publish_states` with the list of all sensors' `SensorCalibration`,
-    which is reused.
+    `is_live` returns whether the readings are not replayed. `publish_states` is called with the
+    calibration of all sensors, a list that is reused.
     """
 
     def __init__(self, node: str, network: SensorNetwork, stage: Calibrate,
@@ -124,20 +113,18 @@ class SensorRounds:
 
     def tick(self) -> None:
         """Make the next step due after the next readings; if a step is still due, run it first."""
-        if self._is_step_due:
-            self._step()
+        self.step_if_due()
         self._is_step_due = True
 
     def step_if_due(self) -> None:
         """Run the next step of the round if it is due."""
         if self._is_step_due:
-            self._step()
+            self._is_step_due = False
+            next(self._steps)
 
     def report_doubts(self) -> None:
-        """Publish the calibration at once if a background becomes or ceases to be doubtful.
-
-        The tracker flags tracks as ambiguous only after it has received the new calibration.
-        """
+        """Publish the calibration at once if a background becomes or ceases to be doubtful,
+        because the tracker flags tracks as ambiguous only after it has received it."""
         latest_doubts = {(j, doubt) for j, name in enumerate(self._network.names)
                          if (doubt := self._stage.latest_doubt(name)) is not None}
         if changed := latest_doubts - self._reported_doubts:
@@ -145,11 +132,6 @@ class SensorRounds:
                 self._states[j] = self._state(j)
             self.publish()
         self._reported_doubts = latest_doubts
-
-    def _step(self) -> None:
-        """Run the next step of the round."""
-        self._is_step_due = False
-        next(self._steps)
 
     def publish(self) -> None:
         """Publish the latest calibration of all sensors."""

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from mag_tracking_msgs.msg import FieldReadings
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node, NodeNameNonExistentError
@@ -18,7 +18,13 @@ from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.messages.schema import readings_of, stamp_ns
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.connections import Flow, SubscriberMonitor, node_of, shortened
-from mag_tracking.nodes.diagnostics import StatusLog
+from mag_tracking.nodes.diagnostics import (
+    ERROR,
+    OK,
+    WARN,
+    DiagnosticsPublisher,
+    status_of,
+)
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.scheduling import steady_timer
 from mag_tracking.pipeline import settings_for
@@ -57,7 +63,6 @@ class StageNode(Node):
     Attributes
     ----------
     settings : defaults of the target, overridden by parameters
-    title : name of the node in diagnostics
     input_qos : QoS of subscriptions to sensors
     is_replayed : whether the input is replayed from a recording
     flows : statistics of the inputs, by source
@@ -75,7 +80,6 @@ class StageNode(Node):
         reliable = fixed_parameter(self, 'reliable_input', False, 'Subscribe to the inputs with '
                                    'reliable QoS, for a replay.')
         self.network_path = Path(path).resolve()
-        self.title = title_of(self)
         self.input_qos = STREAM_QOS if reliable else SENSOR_QOS
         self.is_replayed = reliable or self.get_parameter('use_sim_time').value
         self.network = read_network(self.network_path)
@@ -84,13 +88,12 @@ class StageNode(Node):
         if self.settings.track.target != defaults.track.target:
             raise SettingsError(f'{name}: parameter track.target is {self.settings.track.target!r}'
                                 f', but target is {target!r}; set target only')
-        self._diagnostics_publisher = self.create_publisher(
-            DiagnosticArray, '/diagnostics', RESULT_QOS)
+        self.diagnostics = DiagnosticsPublisher(self)
         self._reported_rejections: dict[tuple[str, str], int] = {}
         self.flows: dict[str, Flow] = {}
         self._subscriber_monitors: list[SubscriberMonitor] = []
         self.now_ns = 0
-        self._log, self._reported_state = StatusLog(self.get_logger()), ''
+        self._reported_state = ''
         steady_timer(self, 1.0, self._publish_diagnostics)
 
     def state(self) -> str:
@@ -104,7 +107,7 @@ class StageNode(Node):
         state = self.state()
         if state != self._reported_state:
             self._reported_state = state
-            self._log.info(state)
+            self.diagnostics.log.info(state)
 
     @property
     def sensor_topics(self) -> tuple[str, ...]:
@@ -199,29 +202,28 @@ class StageNode(Node):
 
     def _publish_diagnostics(self) -> None:
         """Publish the state of the stages and connections; log the node's state if it changed."""
-        statuses, queues = [], self.queues()
+        statuses, queues, title = [], self.queues(), self.diagnostics.title
         for name, stage in self.stages().items():
             rejections = {k: n for k, n in stage.counts.items() if k.startswith('rejected: ')}
             increases = {k: n for k, n in rejections.items()
                          if n != self._reported_rejections.get((name, k), 0)}
             self._reported_rejections |= {(name, cause): n for cause, n in increases.items()}
-            statuses.append(DiagnosticStatus(
-                level=DiagnosticStatus.WARN if increases else DiagnosticStatus.OK,
-                name=f'{self.title}: {name}', hardware_id='magnetometer network',
-                message='; '.join(f'{cause}: {n}' for cause, n in increases.items()) or 'running',
-                values=[KeyValue(key=k, value=str(n)) for k, n in sorted(
-                    {**stage.counts, **({'queue': queues[name]} if name in queues else {})}.items()
-                )]))
-        statuses += [flow.status(self.title, partial(self._has_publisher, flow))
+            statuses.append(status_of(
+                f'{title}: {name}',
+                '; '.join(f'{cause}: {n}' for cause, n in increases.items()) or 'running',
+                WARN if increases else OK, dict(sorted({
+                    **stage.counts, **({'queue': queues[name]} if name in queues else {})
+                }.items()))))
+        statuses += [flow.status(title, partial(self._has_publisher, flow))
                      for flow in self.flows.values()]
         for monitor in self._subscriber_monitors:
             endpoints = self.get_subscriptions_info_by_topic(monitor.topic)
-            statuses.append(monitor.status(self.title, {
+            statuses.append(monitor.status(title, {
                 name for name in map(node_of, endpoints) if name}, self._published_types))
-        self.publish_statuses([*statuses, *self._start_statuses()])
+        self.diagnostics.publish([*statuses, self._start_status()])
         self.report_state()
 
-    def _start_statuses(self) -> list[DiagnosticStatus]:
+    def _start_status(self) -> DiagnosticStatus:
         """Return a status that reports startup faults: a duplicate node name or a missing clock."""
         faults = []
         full_name = self.get_name(), self.get_namespace()
@@ -233,10 +235,8 @@ class StageNode(Node):
         if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
             faults.append('use_sim_time is set, but no message was received on /clock: start a '
                           'replay, or unset use_sim_time')
-        return [DiagnosticStatus(
-            level=DiagnosticStatus.ERROR if faults else DiagnosticStatus.OK,
-            name=f'{self.title}: start', hardware_id='magnetometer network',
-            message='; '.join(faults) or self.state())]
+        return status_of(f'{self.diagnostics.title}: start', '; '.join(faults) or self.state(),
+                         ERROR if faults else OK)
 
     def _published_types(self, name: str) -> set[str]:
         """Return the message types that a node publishes; empty if it has not been discovered."""
@@ -251,21 +251,9 @@ class StageNode(Node):
         """Whether any topic of a flow still has a publisher."""
         return any(map(self.count_publishers, (*flow.topics, *flow.batches)))
 
-    def publish_statuses(self, statuses: list[DiagnosticStatus]) -> None:
-        """Publish statuses, unless there are none, on /diagnostics and log faults."""
-        for status in statuses:
-            self._log.add(status)
-        if statuses:
-            array = DiagnosticArray(status=statuses)
-            array.header.stamp = self.get_clock().now().to_msg()
-            self._diagnostics_publisher.publish(array)
-
 
 def has_subscribers(publisher: Publisher) -> bool:
     """Whether a publisher has subscribers."""
     return publisher.get_subscription_count() > 0
 
 
-def title_of(node: Node) -> str:
-    """Name of a node in diagnostics, including its namespace."""
-    return node.get_fully_qualified_name().removeprefix('/')

@@ -32,8 +32,8 @@ MAX_TARGET_SPEED = 20.0
 
 
 def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
-    """Shortest time [s] in which a target at `MAX_TARGET_SPEED` travels between two sensors, and
-    their names; None if all sensors have nearly the same horizontal position."""
+    """Shortest time [s] of a target at `MAX_TARGET_SPEED` between two sensors, and their names;
+    None if all sensors have nearly the same horizontal position."""
     shortest, pair = np.inf, None
     for j, position in enumerate(network.positions):
         distance = np.linalg.norm((network.positions[:j] - position)[:, :2], axis=1)
@@ -48,10 +48,9 @@ def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
     """Frame period [s]: the setting, or a period derived from the geometry if the setting is 0.
 
     A frame that is longer than the delay between two sensors mixes their signals. In a compact
-    network, the derived period is therefore half the shortest delay, within `MIN_AUTO_PERIOD_S` and
-    `DEFAULT_PERIOD_S`. In a larger network, tracking does not use this delay, and the default
-    period saves computing time. In burst mode, the period is the maximum duration of a round.
-    Raises SettingsError if the setting is below `MIN_PERIOD_S`.
+    network, the derived period is therefore half the shortest delay. In a larger network, tracking
+    does not use this delay, and the default period saves computing time. Raises SettingsError if
+    the setting is below `MIN_PERIOD_S`.
     """
     if 0.0 < settings.period_s < MIN_PERIOD_S:
         raise SettingsError(f'align.period_s: {settings.period_s:g} s is shorter than the minimum '
@@ -95,9 +94,7 @@ CAUSES = {
 class Align:
     """Combines calibrated readings into frames; memory is bounded by `max_buffered`.
 
-    The cost of a sample between two frames does not depend on the number of sensors: while one
-    sensor is known to delay the frame, the other sensors are not checked. The rules are in
-    `alignment.hpp`; this class handles the events that the compiled code reports.
+    The rules are in `alignment.hpp`; this class handles the events that compiled code reports.
     """
 
     def __init__(self, network: SensorNetwork, settings: AlignSettings) -> None:
@@ -106,8 +103,7 @@ class Align:
         self._noise = np.array([np.full((3, 3), np.nan) if std is None else np.diag(std ** 2)
                                 for std in network.noise_std]).reshape(-1, 3, 3)
         self._index = {name: i for i, name in enumerate(network.names)}
-        self._names = network.names
-        self._settings = settings
+        self._names, self._settings = network.names, settings
         self._period = int(round(frame_period(settings, network) * NS))
         self._wait = int(round(settings.max_wait_s * NS))
         self._reset()
@@ -126,12 +122,12 @@ class Align:
     @property
     def n_held(self) -> int:
         """Number of samples that wait for their frame or for confirmation of their timestamps."""
-        return self._alignment.n_pending + self._clock_steps.n_held
+        return self._alignment.n_pending + len(self._clock_steps.held)
 
     @property
     def n_held_ahead(self) -> int:
         """Number of samples that are held because their timestamps jumped ahead."""
-        return self._clock_steps.n_held
+        return len(self._clock_steps.held)
 
     def feed(self, readings: Readings) -> list[FieldFrame]:
         """Add calibrated readings, and return the completed frames."""
@@ -147,10 +143,8 @@ class Align:
 
     def _hold(self, rows: IntArray, stamps: IntArray, fields: FloatArray, covariances: FloatArray,
               readings: Readings | None = None) -> list[FieldFrame]:
-        """Queue samples, and return the completed frames.
-
-        `readings` is None if the samples have already passed the clock step filter.
-        """
+        """Queue samples, and return the completed frames; `readings` is None if the samples have
+        already passed the clock step filter."""
         out: list[FieldFrame] = []
         k = 0
         while True:
@@ -167,10 +161,15 @@ class Align:
                 assert readings is not None
                 self._reject(f'unknown sensor {readings.names[readings.sensor[k - 1]]}')
             elif reason == core.CLOCK_STEP:
-                out += self._handle_clock_step(int(rows[k - 1]), HeldSample(
+                released, rejected = self._clock_steps.feed(int(rows[k - 1]), HeldSample(
                     int(stamps[k - 1]), fields[k - 1], covariances[k - 1]))
+                for j, _ in rejected:
+                    self._reject(f'ahead of all other sensors: {self._names[j]}')
+                out += self._hold_passed(released)
             elif reason == core.JUMPED_BACK:
-                out += self._restart()
+                out += self.flush()
+                self._reset()
+                self.counts['time jumped back'] += 1
                 sample = slice(k, k + 1)
                 out += self._hold(rows[sample], stamps[sample], fields[sample], covariances[sample])
                 k += 1
@@ -181,13 +180,6 @@ class Align:
             else:
                 self._reject(CAUSES[reason])
 
-    def _handle_clock_step(self, i: int, sample: HeldSample) -> list[FieldFrame]:
-        """Check a sample of sensor `i` for a clock step; return the completed frames."""
-        passed, rejected = self._clock_steps.feed(i, sample)
-        for j, _ in rejected:
-            self._reject(f'ahead of all other sensors: {self._names[j]}')
-        return self._hold_passed(passed)
-
     def _hold_passed(self, passed: list[tuple[int, HeldSample]]) -> list[FieldFrame]:
         """Queue samples that have passed the clock step filter, and return the completed frames."""
         out: list[FieldFrame] = []
@@ -196,17 +188,9 @@ class Align:
                               s.covariance[None])
         return out
 
-    def _restart(self) -> list[FieldFrame]:
-        """Return the frames of the held and pending samples, and reset after time jumped back."""
-        out = self.flush()
-        self._reset()
-        self.counts['time jumped back'] += 1
-        return out
-
     def flush(self) -> list[FieldFrame]:
         """Return all frames of the held and pending samples at the end of the input."""
-        out = self._hold_passed(self._clock_steps.flush())
-        return out + self._frames(final=True)
+        return self._hold_passed(self._clock_steps.flush()) + self._frames(final=True)
 
     def idle(self) -> None:
         """Do nothing: no work is deferred."""
