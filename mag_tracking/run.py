@@ -317,7 +317,7 @@ def report_of(source: Source, pipeline: Pipeline, first_pass: Prescan,
     not_used = dict(Counter(source.rejected) + Counter(pipeline.rejections()))
     # Of an interrupted run, the rest may contain what is missing.
     reason = None if interrupted or 'detect' not in counts else no_detection_reason(
-        pipeline.network, pipeline.settings, pipeline.calibrate, pipeline.detect, missing, not_used)
+        pipeline.network, pipeline.calibrate, pipeline.detect, missing, not_used)
     found = [*source_findings(source.name, source.lost, source.rejected),
              *sensor_findings(pipeline.network, pipeline.calibrate, pipeline.settings.track,
                               missing, source.clocks)]

@@ -16,20 +16,10 @@ COUNTED = {'held back while learning': 'n_learning',
 
 
 class OutputBuffer:
-    """Arrays to which compiled code appends calibrated readings.
+    """Arrays to which compiled code appends calibrated readings; resets the counters of `batch`.
 
-    Parameters
-    ----------
-    capacity : int
-        Maximum number of readings.
-    batch : Record
-        Counters of the batch that compiled code updates; reset.
-
-    Attributes
-    ----------
-    arrays : tuple of arrays
-        Sensor indices (capacity,), timestamps (capacity,) ns, fields (capacity, 3) T and
-        covariances (capacity, 3, 3) T².
+    `arrays` are sensor indices (capacity,), timestamps (capacity,) [ns], fields (capacity, 3) [T]
+    and covariances (capacity, 3, 3) [T²].
     """
 
     def __init__(self, names: tuple[str, ...], capacity: int, batch: Record) -> None:

@@ -19,20 +19,14 @@ from mag_tracking.units import NS
 LOOK_AHEAD_S = 300.0
 """[s] Duration, from the start of the recording, that is searched for the most frequent level of a
 sensor that is not quiet at the start."""
-
 LEARNING_TOLERANCE_S = 1.0
 """Excess over the nominal learning time above which a target is considered present [s]."""
-
 MIN_BLOCKS = 6.0
 """Minimum learning time [blocks], which applies to slow sensors with long blocks."""
-
 MIN_LEVEL_FRACTION = 1.0 / 3.0
 """Minimum total duration of a background level, as a fraction of the learning time."""
-
 N_READINGS_AT_ONCE = 8
 """Number of readings per batch while the initial background is learnt."""
-
-
 N_BEGINNING = N_WINDOW + 1
 """Number of readings per sensor in which faults of the drivers are searched before the
 backgrounds."""
@@ -68,8 +62,7 @@ def prescan(batches: Iterable[Readings], network: SensorNetwork,
             settings: CalibrateSettings) -> Prescan:
     """Find the backgrounds of sensors if a target is present at the start of the raw readings.
 
-    The batches are consumed up to `LOOK_AHEAD_S`. If the network file contains all backgrounds,
-    there are only faults.
+    If the network file contains all backgrounds, there are only faults.
     """
     without_background = [name for name, level in zip(network.names, network.background,
                                                       strict=True) if level is None]
@@ -121,8 +114,8 @@ def _level_of(recorder: BlockRecorder, departed_at: float | None,
               learnt: tuple[float, FloatArray] | None) -> tuple[MostFrequentLevel | None, bool]:
     """Return (most frequent level or None, whether a target was present at the start).
 
-    A target that was present had left by `departed_at` [s]; only later readings then determine the
-    level. If the field later returns to the level `learnt` at the start, no target was present.
+    Only readings after its departure, at `departed_at` [s], then determine the level. If the field
+    later returns to the level `learnt` at the start, no target was present.
     """
     level = recorder.quiet_level()
     if level is None or departed_at is None or learnt is None \

@@ -1,7 +1,6 @@
-"""Causes and numbers of the readings that the calibration rejects; validity of covariances."""
+"""Causes for which the calibration rejects readings, and faults of drivers."""
 
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +21,11 @@ from mag_tracking.records import Readings, plain
 from mag_tracking.stages.health.diagnosis import Cause
 from mag_tracking.units import NS
 
+MAX_MARKED = 0.2
+"""Fraction of readings with a mark above which a background is learnt again when they are found."""
+MAX_SKIPPED = 3
+"""Maximum number of consecutive windows without a jump that are not searched, to save time. Only a
+repetition could be found there, which lasts."""
 REJECTIONS = {
     core.NO_AXIS: (Cause.NO_AXIS, 'no axis reported (all NaN)'),
     core.INFINITE: (Cause.INFINITE, 'infinite value'),
@@ -36,10 +40,8 @@ REJECTIONS = {
 
 
 def own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
-    """Validity (NONE, VALID or INVALID) and covariance of each reading.
-
-    The covariances are an empty array if the readings have none.
-    """
+    """Validity (NONE, VALID or INVALID) of each reading, and the covariances, empty if there are
+    none."""
     if readings.covariance is None:
         return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
     C = plain(readings.covariance)
@@ -47,40 +49,10 @@ def own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
     return np.where(readings.has_unknown_covariance(), core.NONE, valid), C
 
 
-class Rejections:
-    """Numbers of the rejected readings of several sensors."""
-
-    def __init__(self, names: Iterable[str]) -> None:
-        self._n: dict[str, Counter[tuple[Cause, str]]] = {name: Counter() for name in names}
-
-    def add(self, sensor: str, cause: tuple[Cause, str], n: int) -> None:
-        """Add `n` rejected readings."""
-        self._n[sensor][cause] += n
-
-    def of(self, sensor: str) -> 'Counter[tuple[Cause, str]]':
-        """Numbers of a sensor, by cause and description."""
-        return self._n[sensor].copy()
-
-    def counts_of(self, sensor: str) -> 'Counter[str]':
-        """Numbers of a sensor, in total (`rejected`) and by description (`rejected: ...`)."""
-        counts = {f'rejected: {description}': n for (_, description), n in self._n[sensor].items()}
-        return Counter(counts) + Counter(rejected=self._n[sensor].total())
-
-
-MAX_MARKED = 0.2
-"""Fraction of readings with a mark above which a background is learnt again when they are found."""
-MAX_SKIPPED = 3
-"""Maximum number of consecutive windows without a jump that are not searched, to save time. Only a
-repetition could be found there, which lasts."""
-
-
 class DriverFaults:
-    """Marks for missing readings, and repetitions, in the readings of several sensors.
+    """Marks for missing readings, and repetitions, in the latest raw readings of several sensors.
 
-    Parameters
-    ----------
-    sensors : (n,) SENSOR array
-        State of the sensors. The compiled code leaves out the faults that are stored there.
+    The compiled code leaves out the faults that are stored in `sensors`, a (n,) SENSOR array.
     """
 
     def __init__(self, names: Sequence[str], sensors: StructArray) -> None:
@@ -112,8 +84,7 @@ class DriverFaults:
         s['repeats'] = s['changes'] = s['run'] = 0
 
     def examine(self, sensor: str, stamp_ns: int) -> float:
-        """Search the latest raw readings of a sensor; `stamp_ns` is that of the first reading after
-        them.
+        """Search the latest raw readings of a sensor, before that of `stamp_ns`.
 
         Return the fraction of readings with a mark if a fault was found and stored, otherwise NaN.
         """

@@ -46,7 +46,7 @@ class Detect:
 
     def __init__(self, network: SensorNetwork, settings: DetectSettings) -> None:
         self.counts: Counter[str] = Counter()
-        self._names, self._settings = network.names, settings
+        self._names, self.settings = network.names, settings
         self._thresholds: dict[tuple[float, int], float] = {}
         self._next_id = 1
         self._max_ratio, self._max_ratios = 0.0, np.zeros(len(network))
@@ -95,7 +95,7 @@ class Detect:
         if n:
             if not self._present:
                 self._max_ratio = max(self._max_ratio, statistic / self.threshold(
-                    self._settings.false_alarm_probability, n))
+                    self.settings.false_alarm_probability, n))
                 np.maximum(self._max_ratios, energy / self._single_thresholds[axes],
                            out=self._max_ratios)
             out += self._update_presence(frame.stamp_ns, statistic, n, energy / np.maximum(axes, 1))
@@ -121,13 +121,13 @@ class Detect:
             self._frozen_s = (stamp_ns - self._onset_ns) / NS
         elif self._last_active_ns is not None and stamp_ns - self._last_active_ns > RECOVERY_S * NS:
             self._frozen_s = 0.0
-        s = self._settings
+        s = self.settings
         return (s.background_std + s.background_drift * self._frozen_s) ** 2
 
     def _update_presence(self, stamp_ns: int, statistic: float, n: int,
                          per_axis: FloatArray) -> list[Detection]:
         """Update the detection state, and return the onset or release, if there is one."""
-        s = self._settings
+        s = self.settings
         if statistic > self.threshold(s.false_alarm_probability, n):
             self.counts['frames above the threshold'] += 1
             self._n_above += 1
@@ -164,7 +164,7 @@ class Detect:
     def _detection(self, stamp_ns: int, onset: bool, statistic: float, n: int,
                    strongest: str) -> Detection:
         """Create the onset or release record of the current detection."""
-        p = self._settings.false_alarm_probability
+        p = self.settings.false_alarm_probability
         return Detection(stamp_ns, self._next_id, onset, statistic, n,
                          self.threshold(p, n) if n else float('nan'), p, strongest)
 

@@ -72,11 +72,6 @@ class ClockSpan(NamedTuple):
         return (self.last_received_ns - self.last_ns) / NS
 
     @property
-    def first_delay_s(self) -> float:
-        """Delay from the first timestamp to its receipt [s]."""
-        return (self.first_received_ns - self.first_ns) / NS
-
-    @property
     def rate(self) -> float:
         """Advance of the timestamps relative to the times of receipt; NaN if unknown."""
         received_ns = self.last_received_ns - self.first_received_ns
@@ -90,11 +85,11 @@ class ClockSpan(NamedTuple):
     def ahead_s(self, reference: 'ClockSpan') -> tuple[float, bool]:
         """Time [s] by which this clock is ahead of another, and whether it is too large for delays.
 
-        Clocks that do not advance like the time of receipt, as those of a fast replay, cannot be
-        compared.
+        Clocks that do not advance like the time of receipt (a fast replay) cannot be compared.
         """
         ahead_s = reference.delay_s - self.delay_s
-        first_s = reference.first_delay_s - self.first_delay_s
+        first_s = (reference.first_received_ns - reference.first_ns) / NS \
+            - (self.first_received_ns - self.first_ns) / NS
         if not all(abs(clock.rate - 1.0) <= MAX_RATIO_ERROR for clock in (self, reference)):
             return ahead_s, False
         if abs(first_s - ahead_s) > MAX_CHANGE * abs(ahead_s):
@@ -121,10 +116,7 @@ def corrected(clocks: Mapping[str, ClockSpan], network: SensorNetwork) -> dict[s
 
 
 def clock_differences(clocks: Mapping[str, ClockSpan]) -> dict[str, tuple[float, bool]]:
-    """Compare clocks with the one nearest to the clock of the host, as by `ClockSpan.ahead_s`.
-
-    In a replay, all clocks differ from that of the host by about the same time.
-    """
+    """Compare clocks with the one nearest to the clock of the host, as by `ClockSpan.ahead_s`."""
     reference = min(clocks.values(), key=lambda clock: abs(clock.delay_s), default=None)
     return {} if reference is None else {
         name: clock.ahead_s(reference) for name, clock in clocks.items()}
@@ -143,9 +135,8 @@ def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
             differs = abs(ahead_s) > MAX_BOOT_DIFFERENCE_S
             yield Finding(
                 differs, name, 'its timestamps count from the start of its device (the latest '
-                f'is {clock.last_ns / NS:.4g} s)' + (
-                    f', and differ by {ahead_s:+.4g} s from those of other sensors'
-                    if differs else ''),
+                f'is {clock.last_ns / NS:.4g} s)' + (', and differ by '
+                f'{ahead_s:+.4g} s from those of other sensors' if differs else ''),
                 'let the driver use the time of arrival, or add the time of the start',
                 Cause.BOOT_STAMPS)
         elif differs:
@@ -183,10 +174,7 @@ def timestamp_finding(sensor: str, fault: TimestampFault) -> Finding:
 
 
 class TimestampMonitor:
-    """Examines the timestamps of several sensors while their readings arrive.
-
-    The result does not depend on how the readings are split into batches.
-    """
+    """Examines the timestamps of several sensors while their readings arrive."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         n = len(names)
@@ -227,10 +215,7 @@ class TimestampMonitor:
                                np.append(self._fields[j], fields, axis=0)[-WINDOW:])
 
     def compare_clocks(self, clocks: Mapping[str, ClockSpan]) -> None:
-        """Mark all timestamps of sensors whose clocks differ from those of other sensors.
-
-        The clocks replace those of the previous call.
-        """
+        """Mark all timestamps of sensors whose clocks differ from those of other sensors now."""
         self._differing = {
             name for name, (_, differs) in clock_differences(clocks).items() if differs}
 

@@ -164,8 +164,8 @@ their own subject."""
 def ranked(findings: Iterable[Finding]) -> list[Diagnosis]:
     """Attach each finding to the cause that explains it; serious diagnoses come first.
 
-    A further finding of the same cause and subject is a consequence of the first one. Findings that
-    are artefacts of another finding are omitted.
+    A further finding of the same cause and subject is a consequence of the first one. Artefacts of
+    another finding are omitted.
     """
     same_fault: dict[tuple[str, Cause], list[Finding]] = {}
     for finding in findings:

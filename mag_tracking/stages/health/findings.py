@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Protocol
 
 import numpy as np
 
@@ -19,25 +18,44 @@ from mag_tracking.stages.health.clocks import (
     timestamp_finding,
 )
 from mag_tracking.stages.health.diagnosis import Cause, Finding
-from mag_tracking.stages.settings import CalibrateSettings, DetectSettings
 from mag_tracking.stages.track.low_rate import low_rate_fault
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
 MAX_FROZEN_S = 30.0
 """Time for which a background may be frozen before it is reported [s]."""
-
 ZERO_STAMP = 'message with header.stamp 0'
 """Cause for which a message without a timestamp is rejected."""
+MIN_SERIOUS = 100
+"""Number of readings rejected for one cause above which results are assumed to be wrong."""
+ADVICE = {
+    Cause.NO_AXIS: 'check the sensor and its driver',
+    Cause.INFINITE: 'check the driver',
+    Cause.TOO_LARGE: 'check for gauss or microtesla published as tesla; near a magnet, raise '
+                     'calibrate.max_field',
+    Cause.WRONG_COVARIANCE: 'publish a covariance of zeros if the noise is unknown',
+    Cause.MISSING_AXIS: 'check the sensor and its driver, or remove the correction from the '
+                        'network file',
+    Cause.TOO_FAR_AHEAD: 'check for a clock step or corrupt messages',
+    Cause.DUPLICATE_STAMPS: 'check whether the driver publishes readings twice, or with timestamps '
+                            'that are too coarse',
+    Cause.BACKWARD_STAMPS: 'check for two publishers on one topic, and for a clock step',
+    Cause.STUCK: 'the sensor or its driver is stuck: restart it; for simulated sensors without '
+                 'noise, set calibrate.reject_stuck to false',
+    Cause.SPIKES: 'check connectors, power supply and checksums; if the targets are fast, raise '
+                  'calibrate.spike_std'}
+"""Advice for each cause of rejection by the stage Calibrate, except those of `driver_findings`."""
+MAX_MISMATCH = 3.0
+"""Factor within which a likely cause must explain the ratio of declared to measured noise."""
+_UNITS_PER_TESLA = (('millitesla', 1e3), ('gauss', 1e4), ('microtesla', 1e6), ('nanotesla', 1e9))
+MAX_NOISE_RATIO = 3.0
+"""Ratio to the scatter of readings above which a configured standard deviation is too large."""
 
 
 def sensor_findings(network: SensorNetwork, calibrate: Calibrate, settings: TrackSettings,
                     missing_topics: Sequence[str], clocks: Mapping[str, ClockSpan]
                     ) -> list[Finding]:
-    """Findings about the sensors, without ranking, after all readings.
-
-    `clocks` are the raw timestamps and times of receipt; empty if unknown.
-    """
+    """Findings about the sensors, without ranking, after all readings; `clocks` may be unknown."""
     found = list(clock_findings(corrected(clocks, network)))
     for name, topic in zip(network.names, network.absolute_topics, strict=True):
         if topic in missing_topics:
@@ -112,31 +130,9 @@ def source_findings(name: str, lost: Mapping[str, int],
     return found
 
 
-MIN_SERIOUS = 100
-"""Number of readings rejected for one cause above which results are assumed to be wrong."""
-
-ADVICE = {
-    Cause.NO_AXIS: 'check the sensor and its driver',
-    Cause.INFINITE: 'check the driver',
-    Cause.TOO_LARGE: 'check for gauss or microtesla published as tesla; near a magnet, raise '
-                     'calibrate.max_field',
-    Cause.WRONG_COVARIANCE: 'publish a covariance of zeros if the noise is unknown',
-    Cause.MISSING_AXIS: 'check the sensor and its driver, or remove the correction from the '
-                        'network file',
-    Cause.TOO_FAR_AHEAD: 'check for a clock step or corrupt messages',
-    Cause.DUPLICATE_STAMPS: 'check whether the driver publishes readings twice, or with timestamps '
-                            'that are too coarse',
-    Cause.BACKWARD_STAMPS: 'check for two publishers on one topic, and for a clock step',
-    Cause.STUCK: 'the sensor or its driver is stuck: restart it; for simulated sensors without '
-                 'noise, set calibrate.reject_stuck to false',
-    Cause.SPIKES: 'check connectors, power supply and checksums; if the targets are fast, raise '
-                  'calibrate.spike_std'}
-"""Advice for each cause of rejection by the stage Calibrate, except those of `driver_findings`."""
-
-
 def rejection_findings(name: str, calibrate: Calibrate) -> Iterator[Finding]:
     """Report the rejected readings of one sensor."""
-    for (cause, description), n in calibrate.rejections.of(name).items():
+    for (cause, description), n in calibrate.rejections[name].items():
         if cause in ADVICE:
             yield Finding(n > MIN_SERIOUS, name,
                           f'{quantity(n, "reading")} rejected: {description}', ADVICE[cause], cause)
@@ -158,17 +154,9 @@ def driver_findings(name: str, calibrate: Calibrate) -> Iterator[Finding]:
                       'driver publish each measurement once', Cause.REPEATED)
 
 
-MAX_MISMATCH = 3.0
-"""Factor within which a likely cause must explain the ratio of declared to measured noise."""
-
-_UNITS_PER_TESLA = (('millitesla', 1e3), ('gauss', 1e4), ('microtesla', 1e6), ('nanotesla', 1e9))
-
-
 def likely_cause(declared: float, measured: float) -> str:
-    """Guess why the noise std [T] declared in messages differs from that of quiet readings.
-
-    The result is a probable meaning of the declared covariance, such as 'a placeholder'.
-    """
+    """Probable meaning of a covariance, such as 'a placeholder', if the noise std [T] declared in
+    messages differs from that measured in quiet readings."""
     if abs(np.log(declared**2 / measured)) < np.log(MAX_MISMATCH):
         return 'the standard deviation instead of the variance'
     exponent = 2.0 * np.log10(declared)
@@ -204,44 +192,11 @@ def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator
         advice, Cause.WRONG_COVARIANCE)
 
 
-MAX_NOISE_RATIO = 3.0
-"""Ratio to the scatter of readings above which a configured standard deviation is too large."""
+def no_detection_reason(network: SensorNetwork, calibrate: Calibrate, detect: Detect,
+                        missing_topics: Sequence[str], rejected: Mapping[str, int]) -> str | None:
+    """Explain why nothing was detected in a whole recording; None if a target was detected.
 
-
-class StageSettings(Protocol):
-    """Settings of the stages up to the detection."""
-
-    @property
-    def calibrate(self) -> CalibrateSettings:
-        """Settings of the calibration."""
-
-    @property
-    def detect(self) -> DetectSettings:
-        """Settings of the detection."""
-
-
-def no_detection_reason(network: SensorNetwork, settings: StageSettings, calibrate: Calibrate,
-                        detect: Detect, missing_topics: Sequence[str],
-                        rejected: Mapping[str, int]) -> str | None:
-    """Explain why nothing was detected.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : StageSettings
-    calibrate : Calibrate
-        Calibration stage after the whole recording.
-    detect : Detect
-        Detection stage after the whole recording.
-    missing_topics : sequence of str
-        Topics of the network that were not recorded.
-    rejected : {cause: number}
-        Rejected readings.
-
-    Returns
-    -------
-    str or None
-        One sentence; None if a target was detected.
+    `missing_topics` of the network were not recorded; `rejected` are readings, {cause: number}.
     """
     if detect.counts['onsets']:
         return None
@@ -256,23 +211,19 @@ def no_detection_reason(network: SensorNetwork, settings: StageSettings, calibra
         stuck = [name for name in calibrate.unready() if calibrate.backgrounds()[name].stuck]
         if stuck:
             return f'the readings of {", ".join(stuck)} are constant (run mag-tracking doctor)'
-        unready_names = ', '.join(calibrate.unready())
-        return (f'no background was learnt for {unready_names}: no quiet interval lasted for '
-                f'{settings.calibrate.learn_s:g} s (calibrate.learn_s); set background and '
+        return (f'no background was learnt for {", ".join(calibrate.unready())}: no quiet interval '
+                f'lasted for {calibrate.settings.learn_s:g} s (calibrate.learn_s); set background and '
                 'noise_std in the network file')
-    excursions = detect.largest_excursions()
     by_sensor = ', '.join(f'{name} {ratio:.2g}' for name, ratio in zip(
-        network.names, excursions.tolist(), strict=True))
+        network.names, detect.largest_excursions().tolist(), strict=True))
     return (f'the largest excursion was {detect.largest_excursion:.2g} times the threshold '
-            f'({by_sensor}); {_likely_cause(network, settings, calibrate, detect)}')
+            f'({by_sensor}); {_no_detection_cause(network, calibrate, detect)}')
 
 
-def _likely_cause(network: SensorNetwork, settings: StageSettings, calibrate: Calibrate,
-                  detect: Detect) -> str:
+def _no_detection_cause(network: SensorNetwork, calibrate: Calibrate, detect: Detect) -> str:
     """Describe the probable cause of the missing detection."""
-    unready_sensors = calibrate.unready()
-    if unready_sensors:
-        return f'{", ".join(unready_sensors)} had no background and could not be used'
+    if unready := calibrate.unready():
+        return f'{", ".join(unready)} had no background and could not be used'
     for name, noise in zip(network.names, network.noise_std, strict=True):
         scatter = calibrate.backgrounds()[name].scatter_std
         is_valid = ~np.isnan(scatter)
@@ -281,16 +232,15 @@ def _likely_cause(network: SensorNetwork, settings: StageSettings, calibrate: Ca
             return (f'noise_std of {name} in the network file is '
                     f'{(noise / scatter)[is_valid].max():.2g} times the scatter of its readings')
     if detect.largest_excursion > 1.0:
-        frames = quantity(detect.max_consecutive_above, 'consecutive frame')
-        return (f'it lasted for {frames}, but detect.onset_frames is '
-                f'{settings.detect.onset_frames}')
-    if settings.calibrate.trust_covariances:
+        return (f'it lasted for {quantity(detect.max_consecutive_above, "consecutive frame")}, but '
+                f'detect.onset_frames is {detect.settings.onset_frames}')
+    if calibrate.settings.trust_covariances:
         return ('the covariances in the messages, which may be too large, are used unchecked '
                 '(calibrate.trust_covariances)')
     scatters = np.concatenate([b.scatter_std for b in calibrate.backgrounds().values()])
     min_scatter = float(np.min(scatters, where=~np.isnan(scatters), initial=np.inf))
-    if settings.detect.background_std > MAX_NOISE_RATIO * min_scatter:
-        return (f'detect.background_std ({settings.detect.background_std:.2g} T) is larger than '
+    if detect.settings.background_std > MAX_NOISE_RATIO * min_scatter:
+        return (f'detect.background_std ({detect.settings.background_std:.2g} T) is larger than '
                 f'the noise of a reading ({min_scatter:.2g} T)')
     return ('no target came close enough, or detect.false_alarm_probability '
-            f'({settings.detect.false_alarm_probability:g}) is too low')
+            f'({detect.settings.false_alarm_probability:g}) is too low')

@@ -1,7 +1,4 @@
-"""Health: detect faults in the readings of a sensor, and advise how to fix them.
-
-Readings are monitored without being changed or delayed. Memory is bounded by a window of readings.
-"""
+"""Health: detect faults in the readings of a sensor, and advise how to fix them."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -49,7 +46,7 @@ noise; see `isolated_readings`."""
 
 
 class SensorHealth:
-    """Monitors the readings of one sensor.
+    """Monitors the readings of one sensor, in a window.
 
     Statistics are updated after every `update_interval` readings, before each query, and for each
     batch. The marks and repetitions of `faults` are not evaluated as readings.
@@ -63,11 +60,11 @@ class SensorHealth:
         self._buffered: list[tuple[int, FloatArray, int]] = []
         self._stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._received: IntArray = np.zeros(0, dtype=np.int64)
+        self._field_stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._raw_fields: FloatArray = np.zeros((0, 3))
-        # Latest reading; window of the readings without marks and repetitions, and its timestamps.
+        # Latest reading; window of the readings without marks and repetitions.
         self._latest: FloatArray = np.zeros((0, 3))
         self._fields: FloatArray = np.zeros((0, 3))
-        self._field_stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._is_saturated: BoolArray = np.zeros(0, dtype=bool)
         self._interval_ns, self._jitter = float('nan'), float('inf')
         self._timestamp_fault: timestamps.TimestampFault | None = None
@@ -111,8 +108,7 @@ class SensorHealth:
     def add_batch(self, stamps: IntArray, fields: FloatArray, received: IntArray) -> None:
         """Add at most `WINDOW` readings directly to the window, and update the statistics.
 
-        An unknown time of receipt is `NEVER`. The arrays may be modified afterwards. Readings that
-        `add` has buffered are not added first, so use either `add` or `add_batch`.
+        An unknown time of receipt is `NEVER`. Use either `add` or `add_batch`.
         """
         n, self._cache, self._delays = len(stamps), {}, None
         if not n:
@@ -137,7 +133,7 @@ class SensorHealth:
 
     def _check_timestamps(self, n: int) -> None:
         """Count the faults in the timestamps of the `n` latest readings."""
-        # The first interval starts at the preceding reading, if there is one.
+        # The first interval begins at the preceding reading, if there is one.
         intervals = np.diff(self._stamps[-n - 1:])
         self._counts['duplicates'] += int((intervals == 0).sum())
         self._counts['backward timestamps'] += int((intervals < 0).sum())
@@ -174,10 +170,8 @@ class SensorHealth:
                 / self._interval_ns
 
     def _are_gaps(self, intervals: IntArray) -> BoolArray:
-        """Whether readings are missing in each of the latest intervals [ns].
-
-        The adjacent intervals compensate for a timestamp that is only late.
-        """
+        """Whether readings are missing in each of the latest intervals [ns]; the adjacent ones
+        compensate for a timestamp that is only late."""
         n, dt = len(intervals), self._interval_ns
         nearby = np.concatenate([[dt], np.diff(self._stamps), [dt]])[-n - 2:]
         spans = nearby[:-2] + intervals + nearby[2:]
@@ -223,11 +217,8 @@ class SensorHealth:
 
     def _count_runs(self, is_repeated: BoolArray, unchanged_since: IntArray,
                     stamps: IntArray) -> None:
-        """Count repeated and changed readings.
-
-        `is_repeated` (n,) marks the readings that equal the previous reading. `unchanged_since`
-        (n,) [ns] is the start of the run of identical readings to which each reading belongs.
-        """
+        """Count repeated and changed readings; `unchanged_since` (n,) [ns] is the start of the run
+        of identical readings to which each reading belongs."""
         changed = np.flatnonzero(~is_repeated)
         if not len(changed):
             self._run_length += len(is_repeated)
@@ -262,10 +253,7 @@ class SensorHealth:
 
     @property
     def noise_std(self) -> FloatArray:
-        """Noise std (3,) [T]; NaN for a missing axis or too few readings.
-
-        It is computed from second differences, which suppress targets.
-        """
+        """Noise std (3,) [T], as by `sample_noise_std`."""
         return self._cached('noise', sample_noise_std)
 
     @property
@@ -282,11 +270,8 @@ class SensorHealth:
 
     @property
     def dead_axes(self) -> str:
-        """Axes, such as 'xz', that did not change within the window although another axis changed.
-
-        For a sensor with coarse resolution, these are axes that have never changed although another
-        axis changed by more than `MIN_MOVED_STEPS` quantisation steps.
-        """
+        """Axes, such as 'xz', that did not change within the window although another axis changed,
+        in a sensor with coarse resolution by more than `MIN_MOVED_STEPS` quantisation steps."""
         self.update()
         if len(self._fields) < WINDOW:
             return ''
@@ -319,9 +304,8 @@ class SensorHealth:
                  max_field: float = 1e-3, is_live: bool = True) -> list[Finding]:
         """Faults of the sensor `name`, without ranking.
 
-        `noise_std` (3,) [T] is that of the calibration; readings above `max_field` [T] are
-        rejected. The timestamps of a replay (not `is_live`) may be old or repeat, so clocks are not
-        checked.
+        `noise_std` (3,) [T] is that of the calibration. The timestamps of a replay (not `is_live`)
+        may be old or repeat, so clocks are not checked.
         """
         n = self.counts['readings']
         if not n:

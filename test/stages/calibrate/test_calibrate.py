@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from mag_tracking.errors import NetworkError
-from mag_tracking.stages.calibrate.stage import OVERRULED, Calibrate
+from mag_tracking.stages.calibrate.output_buffer import OVERRULED
+from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.settings import CalibrateSettings
 from mag_tracking.stages.stage import rejected
 from support.calibration_runs import EARTH, SIGMA, feed, running, sample, stage
