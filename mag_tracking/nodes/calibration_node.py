@@ -25,6 +25,7 @@ from mag_tracking.messages.schema import (
     magnetic_field_dicts,
     reading_of,
     readings_dict,
+    readings_of,
 )
 from mag_tracking.messages.standard import sensor_transform_dicts
 from mag_tracking.messages.types import CALIBRATED_READINGS, CALIBRATION_STATE, RAW_READINGS
@@ -207,7 +208,7 @@ class CalibrationNode(StageNode):
 
     def _receive_batch(self, message: FieldReadings) -> None:
         """Calibrate a batch of raw readings and publish the result as one message."""
-        raw = self.readings_of(message, self._stage)
+        raw = self.converted(lambda: readings_of(message), self._stage, 'readings')
         if raw is None:
             return
         for calibrated in self._calibrate_readings(raw):

@@ -16,7 +16,7 @@ from sensor_msgs.msg import MagneticField
 
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.messages.frame import frame_dict
-from mag_tracking.messages.schema import detection_dict, pass_event_dict, reading_of
+from mag_tracking.messages.schema import detection_dict, pass_event_dict, reading_of, readings_of
 from mag_tracking.messages.types import CALIBRATED_READINGS, NETWORK_FRAME, TRACK_ARRAY
 from mag_tracking.nodes import middleware
 from mag_tracking.nodes.convert import send
@@ -101,7 +101,7 @@ class DetectionNode(StageNode):
 
     def _receive_batch(self, message: FieldReadings) -> None:
         """Process calibrated readings of many sensors."""
-        readings = self.readings_of(message, self._align)
+        readings = self.converted(lambda: readings_of(message), self._align, 'readings')
         if readings is not None:
             self._feed(readings)
 

@@ -48,8 +48,7 @@ def _descriptor(p: Parameter) -> ParameterDescriptor:
 def declare_settings(node: Node, settings: Settings, group: str) -> Settings:
     """Declare the settings of a group as parameters of a node; return all, with its overrides.
 
-    A parameter file may contain settings of other groups. Raises SettingsError if an override does
-    not name a setting, or has a wrong type, length or range.
+    A parameter file may contain settings of other groups. Raises SettingsError if one is invalid.
     """
     overrides = node._parameter_overrides  # rclpy has no public accessor
     current = replace(settings, {
@@ -69,25 +68,23 @@ def _without_array(value: Any) -> Any:
 
 def follow_changes(node: Node, settings: Settings, apply: Callable[[Settings], None]) -> None:
     """Reject invalid parameter changes; call `apply` with the settings after valid ones."""
-    state = {'settings': settings}
+    names = {p.name for p in flatten(settings)}
+
+    def changes(parameters: Iterable[RosParameter]) -> dict[str, Any]:
+        return {p.name: _without_array(p.value) for p in parameters if p.name in names}
 
     def reject_invalid(parameters: list[RosParameter]) -> SetParametersResult:
         try:
-            replace(state['settings'], _changes(parameters))
+            replace(settings, changes(parameters))
         except SettingsError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def apply_changes(parameters: list[RosParameter]) -> None:
-        changes = _changes(parameters)
-        if changes:
-            state['settings'] = replace(state['settings'], changes)
-            apply(state['settings'])
-
-    names = {p.name for p in flatten(settings)}
-
-    def _changes(parameters: Iterable[RosParameter]) -> dict[str, Any]:
-        return {p.name: _without_array(p.value) for p in parameters if p.name in names}
+        nonlocal settings
+        if changed := changes(parameters):
+            settings = replace(settings, changed)
+            apply(settings)
 
     node.add_on_set_parameters_callback(reject_invalid)
     node.add_post_set_parameters_callback(apply_changes)

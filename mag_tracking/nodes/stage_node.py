@@ -2,12 +2,10 @@
 
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from mag_tracking_msgs.msg import FieldReadings
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
@@ -15,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from mag_tracking.errors import RecordingError, SettingsError
-from mag_tracking.messages.schema import readings_of, stamp_ns
+from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.connections import Flow, SubscriberMonitor, node_of, shortened
 from mag_tracking.nodes.diagnostics import (
@@ -28,7 +26,6 @@ from mag_tracking.nodes.diagnostics import (
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.scheduling import steady_timer
 from mag_tracking.pipeline import settings_for
-from mag_tracking.records import Readings
 from mag_tracking.stages.stage import Stage
 
 RESULT_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -45,8 +42,6 @@ SENSOR_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                          durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """QoS of topics whose latest message is sent to late subscribers."""
-
-
 TRANSFORM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of /tf, as in tf2."""
 READY = 'ready'
@@ -123,11 +118,8 @@ class StageNode(Node):
         return {}
 
     def monitor_subscriber(self, role: str, topic: str, publishes: str) -> None:
-        """Report in diagnostics if the node of the next step no longer subscribes to a topic.
-
-        Messages call that node by its `role`; it is identified among the subscribers by
-        `publishes`, a message type.
-        """
+        """Report in diagnostics if the node of the next step no longer subscribes to a topic; see
+        `SubscriberMonitor`."""
         self._subscriber_monitors.append(
             SubscriberMonitor(role, self.resolve_topic_name(topic), publishes))
 
@@ -161,15 +153,9 @@ class StageNode(Node):
             if flow is not None:
                 flow.n_lost += event.total_count_change
 
-        def receive(message: Any) -> None:
-            assert flow is not None
-            start_s = time.monotonic()
-            self.now_ns = self.get_clock().now().nanoseconds
-            callback(message)
-            flow.add(stamp_ns(message.header.stamp), self.now_ns, start_s)
-
         return self.create_subscription(
-            message_type, topic, callback if flow is None else receive, qos,
+            message_type, topic, callback if flow is None else self._timed(
+                flow, callback, lambda message: stamp_ns(message.header.stamp)), qos,
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=incompatible, message_lost=lost))
 
@@ -182,7 +168,11 @@ class StageNode(Node):
         """
         flow = self.flows.setdefault(source, Flow(source))
         flow.topics += map(self.resolve_topic_name, topics)
+        return self._timed(flow, callback, stamp_of)
 
+    def _timed(self, flow: Flow, callback: Callable[[_Record], None],
+               stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
+        """Create a function that processes a record and adds it to the statistics of `flow`."""
         def receive(record: _Record) -> None:
             start_s = time.monotonic()
             self.now_ns = self.get_clock().now().nanoseconds
@@ -191,12 +181,13 @@ class StageNode(Node):
 
         return receive
 
-    def readings_of(self, message: FieldReadings, stage: Stage[Any, Any]) -> Readings | None:
-        """Convert a FieldReadings message; log and count an invalid one and return None."""
+    def converted(self, convert: Callable[[], _Record], stage: Stage[Any, Any],
+                  kind: str) -> _Record | None:
+        """Convert a message; log and count an invalid one and return None."""
         try:
-            return readings_of(message)
+            return convert()
         except RecordingError as error:
-            stage.counts['rejected: bad readings'] += 1
+            stage.counts[f'rejected: bad {kind}'] += 1
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return None
 
@@ -214,8 +205,9 @@ class StageNode(Node):
                 WARN if increases else OK, dict(sorted({
                     **stage.counts, **({'queue': queues[name]} if name in queues else {})
                 }.items()))))
-        statuses += [flow.status(title, partial(self._has_publisher, flow))
-                     for flow in self.flows.values()]
+        statuses += [flow.status(title, lambda flow=flow: any(
+            map(self.count_publishers, (*flow.topics, *flow.batches))))
+            for flow in self.flows.values()]
         for monitor in self._subscriber_monitors:
             endpoints = self.get_subscriptions_info_by_topic(monitor.topic)
             statuses.append(monitor.status(title, {
@@ -246,10 +238,6 @@ class StageNode(Node):
         except NodeNameNonExistentError:
             return set()
         return {kind for _, kinds in topics for kind in kinds}
-
-    def _has_publisher(self, flow: Flow) -> bool:
-        """Whether any topic of a flow still has a publisher."""
-        return any(map(self.count_publishers, (*flow.topics, *flow.batches)))
 
 
 def has_subscribers(publisher: Publisher) -> bool:

@@ -27,7 +27,6 @@ from mag_tracking.calibration.doubtful_times import (
     InputDoubts,
     merged,
 )
-from mag_tracking.errors import RecordingError
 from mag_tracking.event_records import Disturbance, VehiclePassage
 from mag_tracking.messages.calibration_state import doubtful_times, with_orientations
 from mag_tracking.messages.frame import frame_of
@@ -157,11 +156,9 @@ class TrackerNode(StageNode):
 
     def _receive_calibration(self, message: CalibrationState) -> None:
         """Apply the orientations of a survey and the doubtful intervals of the backgrounds."""
-        try:
-            network = with_orientations(self.network, message)
-        except RecordingError as error:
-            self._stage.counts['rejected: bad calibration'] += 1
-            self.get_logger().error(str(error), throttle_duration_sec=10.0)
+        network = self.converted(lambda: with_orientations(self.network, message), self._stage,
+                                 'calibration')
+        if network is None:
             return
         if not self._has_direct_input:
             # The message has only the latest interval of each sensor; frames of earlier intervals
@@ -178,14 +175,10 @@ class TrackerNode(StageNode):
 
     def _receive(self, message: NetworkFrame) -> None:
         """Process a network frame."""
-        try:
-            frame = frame_of(message, self.network)
-        except RecordingError as error:
-            self._stage.counts['rejected: bad frame'] += 1
-            self.get_logger().error(str(error), throttle_duration_sec=10.0)
-            return
-        self._feed(frame)
-        self._stage.idle()
+        frame = self.converted(lambda: frame_of(message, self.network), self._stage, 'frame')
+        if frame is not None:
+            self._feed(frame)
+            self._stage.idle()
 
     def set_input_doubts(self, doubts: InputDoubts) -> None:
         """Set the intervals of doubtful readings, in which tracks are ambiguous."""

@@ -212,8 +212,8 @@ def no_detection_reason(network: SensorNetwork, calibrate: Calibrate, detect: De
         if stuck:
             return f'the readings of {", ".join(stuck)} are constant (run mag-tracking doctor)'
         return (f'no background was learnt for {", ".join(calibrate.unready())}: no quiet interval '
-                f'lasted for {calibrate.settings.learn_s:g} s (calibrate.learn_s); set background and '
-                'noise_std in the network file')
+                f'lasted for {calibrate.settings.learn_s:g} s (calibrate.learn_s); set background '
+                'and noise_std in the network file')
     by_sensor = ', '.join(f'{name} {ratio:.2g}' for name, ratio in zip(
         network.names, detect.largest_excursions().tolist(), strict=True))
     return (f'the largest excursion was {detect.largest_excursion:.2g} times the threshold '
