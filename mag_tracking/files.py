@@ -21,8 +21,7 @@ def checked_path(path: str | PathLike[str], error: type[MagTrackingError]) -> Pa
 
 
 def output_folder(path: str | PathLike[str]) -> Path:
-    """Create a folder for results if it does not exist; raises OutputError if it cannot be
-    created."""
+    """Create a folder for results if it does not exist; raises OutputError if this fails."""
     folder = checked_path(path, OutputError)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -32,21 +31,18 @@ def output_folder(path: str | PathLike[str]) -> Path:
 
 
 def new_text_file(path: str | PathLike[str], newline: str | None = None) -> TextIO:
-    """Create an empty UTF-8 file and open it for writing; `newline` as for `open`.
+    """Create an empty UTF-8 file and open it for writing, in place of any file or link.
 
-    An existing file or link with this name is removed first; the target of a link is not modified.
-    Unpaired surrogates, for example from file names that are not UTF-8, are written as escape
-    sequences. Raises OSError if the file cannot be created, OutputError if the path is invalid.
+    The target of a link is not modified. Unpaired surrogates, for example from file names that are
+    not UTF-8, are written as escape sequences. Raises OSError if the file cannot be created,
+    OutputError if the path is invalid.
     """
     return open(_unlinked_path(path), 'x', newline=newline, encoding='utf-8',
                 errors='backslashreplace')
 
 
 def new_binary_file(path: str | PathLike[str]) -> BinaryIO:
-    """Create an empty binary file and open it for writing, with the errors of `new_text_file`.
-
-    An existing file or link with this name is removed first; the target of a link is not modified.
-    """
+    """Create an empty binary file and open it for writing, as `new_text_file`."""
     return open(_unlinked_path(path), 'xb')
 
 
@@ -136,10 +132,8 @@ _UniqueKeyLoader.add_constructor('tag:yaml.org,2002:int', _UniqueKeyLoader.const
 
 
 def _check_size(root: yaml.Node) -> None:
-    """Raise YAMLError if a file is too large, too deep or infinite once aliases are expanded.
-
-    Aliases are not expanded here: a node with several aliases is one object and is visited once.
-    """
+    """Raise YAMLError if a file is too large, too deep or infinite once aliases are expanded; here,
+    a node with several aliases is visited once."""
     # {id of a node: (nodes, depth)}; None while its children are being counted.
     sizes: dict[int, tuple[int, int] | None] = {}
     stack = [root]

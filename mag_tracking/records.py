@@ -195,9 +195,7 @@ class AccelerationSample:
     """One reading of a sensor's accelerometer."""
 
     stamp_ns: int
-    """Time of the measurement, ns since 1970."""
     sensor: str
-    """Name of the sensor."""
     acceleration: FloatArray
     """Specific force, (3,) m/s², sensor frame. Points up at rest."""
 
@@ -215,13 +213,11 @@ class FieldFrame:
     n_samples: IntArray
     """Number of averaged samples per sensor, (n_sensors,). 0 for a missing sensor."""
     time_offset: FloatArray
-    """Mean time of each sensor's samples relative to `stamp_ns`, (n_sensors,) s. 0 for a missing
-    sensor."""
+    """Mean time of each sensor's samples relative to `stamp_ns`, (n_sensors,) s. 0 if missing."""
     target_present: bool = False
     """Whether a target is detected, including the hold time. False before the detection stage."""
     statistic: float = float('nan')
-    """Whitened energy of the frame, chi-square distributed under noise. NaN before the detection
-    stage."""
+    """Whitened energy of the frame, chi-square distributed under noise. NaN before detection."""
     degrees_of_freedom: int = 0
     """Degrees of freedom of `statistic`, the number of measured axes. 0 before detection."""
 
@@ -231,7 +227,6 @@ class Detection:
     """Onset or release of a detection by the network."""
 
     stamp_ns: int
-    """Time of the frame, ns since 1970."""
     id: int
     """Number of the detection. Onset and release have the same number."""
     onset: bool
@@ -239,7 +234,6 @@ class Detection:
     statistic: float
     """Whitened energy of the frame, chi-square distributed under noise."""
     degrees_of_freedom: int
-    """Degrees of freedom of `statistic`."""
     threshold: float
     """Threshold of `statistic` for an onset. NaN if no axis was measured."""
     false_alarm_probability: float
@@ -336,7 +330,6 @@ class Pose:
     """Pose of a target at one time."""
 
     stamp_ns: int
-    """Time of the pose, ns since 1970."""
     id: int
     """Number of the track."""
     position: FloatArray
@@ -354,13 +347,12 @@ class Pose:
     moment: FloatArray
     """Magnetic moment, (3,) A m², world frame."""
     moment_covariance: FloatArray
-    """Covariance of `moment`, (3, 3) (A m²)², world frame."""
+    """(3, 3) (A m²)², world frame."""
     kind: str
     """Kind of vehicle. Empty for a magnet."""
     length: float
     """Length of the row of dipoles that models the target, m. 0 for a point target."""
     length_std: float
-    """Standard deviation of `length`, m. 0 for a point target."""
     ambiguous: bool
     """Whether other hypotheses were still possible, or the pose is doubtful."""
 
@@ -384,7 +376,6 @@ class Track(Pose):
     """
 
     ended: bool
-    """Whether the track has ended. This is the last record of the track."""
     existence: float
     """Probability of a target, as opposed to noise alone."""
     weight: float

@@ -35,10 +35,8 @@ from mag_tracking.recording.writer import offered_qos
 
 @functools.cache
 def definition_of(type_name: str) -> str | None:
-    """Definition of a message type and all nested types, in the format of a `ros2msg` schema.
-
-    None if the .msg file of a type is not installed.
-    """
+    """Definition of a message type and all nested types, in the format of a `ros2msg` schema; None
+    if the .msg file of a type is not installed."""
     try:
         return definition(type_name)
     except RecordingError:
@@ -205,10 +203,8 @@ class RecordNode(Node):
         self._report(f'{topic} is not recorded: {reason}')
 
     def _update_publishers(self, topic: str, infos: list[TopicEndpointInfo]) -> None:
-        """Update a topic's publishers; report other message types; resubscribe if necessary.
-
-        A latched subscription is replaced by a volatile one if a publisher is not latched.
-        """
+        """Update a topic's publishers; report other message types; replace a latched subscription
+        if a publisher is not latched."""
         polled = self._polled_subscriptions[topic]
         other_types = sorted({i.topic_type for i in infos} - {polled.type})
         if other_types and f'{topic} as {other_types[0]}' not in self.refused:

@@ -46,9 +46,8 @@ MAX_MESSAGES_PER_TICK = 200
 class ReplayNode(ManagedNode):
     """Publishes the messages of a recording at the recorded rate or a multiple of it.
 
-    With `autostart`, raises RecordingError if the recording cannot be played, and SettingsError for
-    an invalid parameter. `finished` means that playback has reached the end; `counts` are the
-    messages played and rejected.
+    `finished` means that playback has reached the end; `counts` are the messages played and
+    rejected.
     """
 
     def __init__(self, **node_arguments: Any) -> None:
@@ -81,11 +80,7 @@ class ReplayNode(ManagedNode):
         self.start_automatically()
 
     def prepare(self) -> None:
-        """Open the recording and advertise its topics.
-
-        Raises SettingsError for an invalid parameter, and RecordingError if the recording cannot be
-        read, is empty, or lacks a selected topic.
-        """
+        """Open the recording and advertise its topics; raises SettingsError or RecordingError."""
         if not self._path:
             raise SettingsError('replay_node: parameter recording is empty; set it to the path of '
                                 'a recording')
@@ -95,9 +90,7 @@ class ReplayNode(ManagedNode):
         recording = Recording(self._path)
         self._begin_ns = _first_time_ns(recording)
         self._selected_topics = _selected_topics(recording, self._topics)
-        end_ns = recording.end_ns
-        if not self._start_offset_s >= 0.0 or (
-                end_ns is not None and self._begin_ns + self._start_offset_s * 1e9 > end_ns):
+        if not self._is_inside(recording, self._start_offset_s):
             raise SettingsError(f'replay_node: parameter start_offset: {self._start_offset_s} s '
                                 'is outside the recording')
         self._recording = recording
@@ -105,6 +98,11 @@ class ReplayNode(ManagedNode):
             if self._selected_topics is None or topic in self._selected_topics:
                 self._publisher_for(topic, kind)
         self._seek(self._start_offset_s)
+
+    def _is_inside(self, recording: Recording, offset: float) -> bool:
+        """Whether a recording contains the time of `offset` seconds after the first message."""
+        return offset >= 0.0 and (recording.end_ns is None
+                                  or self._begin_ns + offset * 1e9 <= recording.end_ns)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
         """Start playback at the current position."""
@@ -127,7 +125,7 @@ class ReplayNode(ManagedNode):
         self._not_installed.clear()
 
     def _publisher_for(self, topic: str, kind: str) -> Publisher | None:
-        """Return the publisher of a topic, created if necessary; None if its type is missing."""
+        """Publisher of a topic, within the namespace of this node; None if its type is missing."""
         if topic not in self.publishers_by_topic and topic not in self._not_installed:
             cls = message_class(kind)
             if cls is None:
@@ -135,14 +133,11 @@ class ReplayNode(ManagedNode):
                 self.get_logger().warning(f'{topic} is not played: message type {kind} is not '
                                           'installed')
             else:
+                namespace = self.get_namespace().rstrip('/')
                 self.publishers_by_topic[topic] = self.create_publisher(
-                    cls, self._within_namespace(topic), STREAM_QOS)
+                    cls, topic if topic.startswith(f'{namespace}/') else f'{namespace}{topic}',
+                    STREAM_QOS)
         return self.publishers_by_topic.get(topic)
-
-    def _within_namespace(self, topic: str) -> str:
-        """Prefix a recorded topic with the namespace of this node, unless it has this prefix."""
-        namespace = self.get_namespace().rstrip('/')
-        return topic if topic.startswith(f'{namespace}/') else f'{namespace}{topic}'
 
     def _seek(self, offset: float) -> None:
         """Set the position to `offset` seconds after the first message."""
@@ -200,8 +195,8 @@ class ReplayNode(ManagedNode):
             self._seek(0.0)
             return
         self.finished = True
-        n = self.counts['messages']
-        self.get_logger().info(f'end of the recording: {quantity(n, "message")} played')
+        self.get_logger().info(
+            f'end of the recording: {quantity(self.counts["messages"], "message")} played')
 
     def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Handle ~/pause."""
@@ -223,23 +218,18 @@ class ReplayNode(ManagedNode):
     def _seek_service(self, request: Seek.Request, response: Seek.Response) -> Seek.Response:
         """Handle ~/seek; reject an offset outside the recording."""
         if self._recording is None:
-            response.success, response.message = \
-                False, 'no recording is open: configure the node first'
-            return response
-        end_ns = self._recording.end_ns
-        if not request.offset >= 0.0 or (
-                end_ns is not None and self._begin_ns + request.offset * 1e9 > end_ns):
-            response.success = False
+            response.message = 'no recording is open: configure the node first'
+        elif not self._is_inside(self._recording, request.offset):
             response.message = f'offset: {request.offset} s is outside the recording'
-            return response
-        self._seek(request.offset)
-        self.finished = False
-        response.success, response.message = True, f'position: {request.offset} s'
+        else:
+            self._seek(request.offset)
+            self.finished = False
+            response.success, response.message = True, f'position: {request.offset} s'
         return response
 
 
 def _first_time_ns(recording: Recording) -> int:
-    """Return the time of the first message [ns]; raise RecordingError for an empty recording."""
+    """Time of the first message [ns]; raises RecordingError for an empty recording."""
     if recording.start_ns is not None:
         return recording.start_ns
     # A file that was not closed has no index: read the first message.
@@ -250,7 +240,7 @@ def _first_time_ns(recording: Recording) -> int:
 
 
 def _selected_topics(recording: Recording, topics: Sequence[str]) -> set[str] | None:
-    """Return the topics to play, None for all; raise RecordingError for an unknown topic."""
+    """Topics to play, None for all; raises RecordingError for an unknown topic."""
     selected = [t for t in topics if t]
     unknown_topics = [t for t in selected if t not in recording.types]
     if unknown_topics and recording.message_counts:
