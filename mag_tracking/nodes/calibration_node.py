@@ -20,20 +20,14 @@ from tf2_msgs.msg import TFMessage
 
 from mag_tracking.errors import NetworkError, OutputError, SettingsError
 from mag_tracking.files import checked_path
-from mag_tracking.messages.schema import (
-    acceleration_of,
-    magnetic_field_dicts,
-    reading_of,
-    readings_dict,
-    readings_of,
-)
+from mag_tracking.messages import schema
 from mag_tracking.messages.standard import sensor_transform_dicts
 from mag_tracking.messages.types import CALIBRATED_READINGS, CALIBRATION_STATE, RAW_READINGS
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import write_network
 from mag_tracking.nodes import middleware
 from mag_tracking.nodes.connections import shortened
-from mag_tracking.nodes.convert import send
+from mag_tracking.nodes.convert import has_subscribers, send
 from mag_tracking.nodes.detection_node import DetectionNode
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.scheduling import Deferred, paced_service, steady_timer
@@ -45,14 +39,9 @@ from mag_tracking.nodes.stage_node import (
     READY,
     STREAM_QOS,
     StageNode,
-    has_subscribers,
 )
 from mag_tracking.nodes.tracker_node import TrackerNode
-from mag_tracking.recording.background_file import (
-    default_path,
-    is_background_file,
-    state_folder,
-)
+from mag_tracking.recording import background_file
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.stage import Stage
@@ -115,7 +104,7 @@ class CalibrationNode(StageNode):
         for sensor, imu_topic in zip(self.network.names, self.network.imu_topics, strict=True):
             if imu_topic is not None:
                 self.subscription(Imu, imu_topic, lambda message, sensor=sensor: self._survey.feed(
-                    acceleration_of(message, sensor)), self.input_qos)
+                    schema.acceleration_of(message, sensor)), self.input_qos)
         self._readings_publisher = self.publisher(FieldReadings, CALIBRATED_READINGS, PUBLISHER_QOS)
         self.subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM_QOS,
                           source='sensors', batches=True)
@@ -147,9 +136,9 @@ class CalibrationNode(StageNode):
         if self.is_replayed or not self.settings.calibrate.max_resume_gap_s:
             return None
         if not name:
-            return default_path(self.network_path, self.get_fully_qualified_name())
+            return background_file.default_path(self.network_path, self.get_fully_qualified_name())
         path = self._output_path('state_file', name)
-        if path.exists() and not is_background_file(path):
+        if path.exists() and not background_file.is_background_file(path):
             raise SettingsError(f'calibration_node: parameter state_file: {path} exists and is not '
                                 'a background file; choose another name, or delete it')
         return path
@@ -157,7 +146,8 @@ class CalibrationNode(StageNode):
     def _output_path(self, parameter: str, name: str) -> Path:
         """Resolve `name` in the network file's folder; raise SettingsError if it is disallowed."""
         prefix = f'calibration_node: parameter {parameter}: '
-        network_folder, state_root = self.network_path.parent, state_folder().resolve()
+        network_folder = self.network_path.parent
+        state_root = background_file.state_folder().resolve()
         path = checked_path(network_folder / name, SettingsError)
         folder = path.parent.resolve()
         if not path.name or path.name == '..' or path.is_dir():
@@ -197,23 +187,23 @@ class CalibrationNode(StageNode):
 
     def _receive(self, sensor: str, message: MagneticField) -> None:
         """Calibrate a raw reading and publish the resulting readings, if any."""
-        raw = reading_of(message, sensor)
+        raw = schema.reading_of(message, sensor)
         publisher = self._publishers_by_sensor[sensor]
         for calibrated in self._calibrate_readings(raw):
             if self._next_steps is None or has_subscribers(publisher):
-                for _, content in magnetic_field_dicts(calibrated, message.header.frame_id):
+                for _, content in schema.magnetic_field_dicts(calibrated, message.header.frame_id):
                     send(publisher, content)
         self._health_backlog.append((raw, self.now_ns))
         self._do_deferred_work()
 
     def _receive_batch(self, message: FieldReadings) -> None:
         """Calibrate a batch of raw readings and publish the result as one message."""
-        raw = self.converted(lambda: readings_of(message), self._stage, 'readings')
+        raw = self.converted(lambda: schema.readings_of(message), self._stage, 'readings')
         if raw is None:
             return
         for calibrated in self._calibrate_readings(raw):
             if self._next_steps is None or has_subscribers(self._readings_publisher):
-                send(self._readings_publisher, readings_dict(calibrated))
+                send(self._readings_publisher, schema.readings_dict(calibrated))
         self._health_backlog.append((raw, self.now_ns))
         self._deferred.request()
 

@@ -48,6 +48,11 @@ def to_message(cls: Any, content: Mapping[str, Any]) -> Any:
     return message
 
 
+def has_subscribers(publisher: Publisher) -> bool:
+    """Whether a publisher has subscribers."""
+    return publisher.get_subscription_count() > 0
+
+
 def send(publisher: Publisher, content: Mapping[str, Any] | None) -> None:
     """Publish a message with the given fields; None is not published."""
     if content is not None:

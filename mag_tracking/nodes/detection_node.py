@@ -19,7 +19,7 @@ from mag_tracking.messages.frame import frame_dict
 from mag_tracking.messages.schema import detection_dict, pass_event_dict, reading_of, readings_of
 from mag_tracking.messages.types import CALIBRATED_READINGS, NETWORK_FRAME, TRACK_ARRAY
 from mag_tracking.nodes import middleware
-from mag_tracking.nodes.convert import send
+from mag_tracking.nodes.convert import has_subscribers, send
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.scheduling import steady_timer
 from mag_tracking.nodes.stage_node import (
@@ -27,7 +27,6 @@ from mag_tracking.nodes.stage_node import (
     RESULT_QOS,
     STREAM_QOS,
     StageNode,
-    has_subscribers,
 )
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.records import Detection, FieldFrame, Readings

@@ -24,19 +24,12 @@ from sensor_msgs.msg import Imu, MagneticField
 from mag_tracking.drivers.configuration import read_drivers
 from mag_tracking.drivers.driver import IGNORED, Driver, serve
 from mag_tracking.errors import SettingsError
-from mag_tracking.messages.schema import acceleration_dict, magnetic_field_dicts, readings_dict
+from mag_tracking.messages import schema
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
-from mag_tracking.nodes import middleware
+from mag_tracking.nodes import diagnostics, middleware
 from mag_tracking.nodes.convert import send
-from mag_tracking.nodes.diagnostics import (
-    ERROR,
-    OK,
-    WARN,
-    DiagnosticsPublisher,
-    status_of,
-)
 from mag_tracking.nodes.middleware import ManagedNode
 from mag_tracking.nodes.ros_params import fixed_parameter
 from mag_tracking.nodes.scheduling import steady_timer
@@ -70,7 +63,7 @@ class DriverNode(ManagedNode):
         self._threads: list[threading.Thread] = []
         self._publishers_by_sensor: dict[str, tuple[Publisher, Publisher]] = {}
         self._stop_event: threading.Event | None = None
-        self._diagnostics = DiagnosticsPublisher(self)
+        self._diagnostics = diagnostics.DiagnosticsPublisher(self)
         self._reported_counts: dict[str, dict[str, int]] = {}
         steady_timer(self, 1.0, self._publish_diagnostics)
         self.start_automatically()
@@ -138,13 +131,13 @@ class DriverNode(ManagedNode):
     def _publish(self, readings: Readings, accelerations: list[AccelerationSample]) -> None:
         """Publish readings, in one message if `batches` is set, and accelerations."""
         if self._readings_publisher is None:
-            for sensor, content in magnetic_field_dicts(readings):
+            for sensor, content in schema.magnetic_field_dicts(readings):
                 send(self._publishers_by_sensor[sensor][0], content)
         elif len(readings):
-            send(self._readings_publisher, readings_dict(readings))
+            send(self._readings_publisher, schema.readings_dict(readings))
         for acceleration in accelerations:
             send(self._publishers_by_sensor[acceleration.sensor][1],
-                 acceleration_dict(acceleration, acceleration.sensor))
+                 schema.acceleration_dict(acceleration, acceleration.sensor))
 
     def _stop(self) -> None:
         """Stop the threads and wait, at most `STOP_TIMEOUT_S`, until their devices are closed."""
@@ -178,26 +171,26 @@ class DriverNode(ManagedNode):
                      for count, n in sorted(counts.items())
                      if n > previous.get(count, 0) and not count.startswith(EXPECTED_COUNTS)]
         self._reported_counts[driver.name] = dict(counts)
-        level, message = OK, 'open'
+        level, message = diagnostics.OK, 'open'
         if self._stop_event is None or self._stop_event.is_set():
             message = 'not active'
         elif not any(t.name == driver.name and t.is_alive() for t in self._threads):
-            level, message = ERROR, 'the driver thread has ended: restart the node'
+            level, message = diagnostics.ERROR, 'the driver thread has ended: restart the node'
         elif driver.fault:
-            level, message = ERROR, driver.fault
+            level, message = diagnostics.ERROR, driver.fault
         elif not driver.is_open:
             # No fault has occurred, and opening some devices takes seconds.
             message = 'opening'
         elif increases:
-            level, message = WARN, '; '.join(increases)
+            level, message = diagnostics.WARN, '; '.join(increases)
         values: dict[str, object] = dict(sorted(counts.items()))
         for source, clock in driver.clocks().items():
             suffix = f' ({source})' if source else ''
             values[f'clock drift [ppm]{suffix}'] = f'{clock.drift_ppm:.2f}'
             values[f'delay above the minimum, 95 % [ms]{suffix}'] = f'{1e3 * clock.spread_s:.3g}'
             values[f'timestamp std [ms]{suffix}'] = f'{1e3 * clock.stamp_std:.3g}'
-        return status_of(f'{self._diagnostics.title}: {driver.name}', message, level, values,
-                         hardware=driver.name)
+        return diagnostics.status_of(f'{self._diagnostics.title}: {driver.name}', message, level,
+                                     values, hardware=driver.name)
 
 
 

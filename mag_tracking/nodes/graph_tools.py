@@ -8,13 +8,7 @@ from typing import Any
 import rclpy
 import yaml
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
-from rcl_interfaces.srv import (
-    DescribeParameters,
-    GetParameters,
-    GetParameterTypes,
-    ListParameters,
-    SetParameters,
-)
+from rcl_interfaces import srv
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import Executor
 from rclpy.node import Node
@@ -160,11 +154,11 @@ def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list
     Raises GraphError if the node or the parameter does not exist.
     """
     names = [name] if name is not None else list(graph.call(
-        ListParameters, f'{node}/list_parameters', ListParameters.Request()).result.names)
-    values = graph.call(GetParameters, f'{node}/get_parameters',
-                        GetParameters.Request(names=names)).values
-    descriptors = graph.call(DescribeParameters, f'{node}/describe_parameters',
-                             DescribeParameters.Request(names=names)).descriptors
+        srv.ListParameters, f'{node}/list_parameters', srv.ListParameters.Request()).result.names)
+    values = graph.call(srv.GetParameters, f'{node}/get_parameters',
+                        srv.GetParameters.Request(names=names)).values
+    descriptors = graph.call(srv.DescribeParameters, f'{node}/describe_parameters',
+                             srv.DescribeParameters.Request(names=names)).descriptors
     if name is not None and not (values and values[0].type):
         raise GraphError(f'{node} has no parameter {name}')
     return [f'{n}: {parameter_value_to_python(v)}'
@@ -181,14 +175,14 @@ def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
     """
     try:
         value = yaml.safe_load(text)
-        (kind,) = graph.call(GetParameterTypes, f'{node}/get_parameter_types',
-                             GetParameterTypes.Request(names=[name])).types or (0,)
+        (kind,) = graph.call(srv.GetParameterTypes, f'{node}/get_parameter_types',
+                             srv.GetParameterTypes.Request(names=[name])).types or (0,)
         if kind == Parameter.Type.DOUBLE.value and isinstance(value, int):
             value = float(value)
         parameter = Parameter(name, value=value)
     except (yaml.YAMLError, TypeError, ValueError) as error:
         raise GraphError(f'parameter {name}: {text!r} is not a valid value: {error}') from error
-    result = graph.call(SetParameters, f'{node}/set_parameters', SetParameters.Request(
+    result = graph.call(srv.SetParameters, f'{node}/set_parameters', srv.SetParameters.Request(
         parameters=[parameter.to_parameter_msg()]), once=True).results[0]
     if not result.successful:
         raise GraphError(f'{node} rejects parameter {name}: {result.reason}')

@@ -19,13 +19,7 @@ from tqdm import tqdm
 from mag_tracking.apps.record import Selection, progress_line, summary
 from mag_tracking.errors import RecordingError
 from mag_tracking.interrupts import recorded_signals
-from mag_tracking.messages.types import (
-    FIELD_READINGS,
-    IMU,
-    MAGNETIC_FIELD,
-    definition,
-    referenced_types,
-)
+from mag_tracking.messages import types
 from mag_tracking.nodes.connections import is_latched, subscriber_qos
 from mag_tracking.nodes.convert import message_class
 from mag_tracking.nodes.middleware import init_ros, shut_down
@@ -38,7 +32,7 @@ def definition_of(type_name: str) -> str | None:
     """Definition of a message type and all nested types, in the format of a `ros2msg` schema; None
     if the .msg file of a type is not installed."""
     try:
-        return definition(type_name)
+        return types.definition(type_name)
     except RecordingError:
         pass
     known, queue, schema = [type_name], [type_name], ''
@@ -49,7 +43,7 @@ def definition_of(type_name: str) -> str | None:
             return None
         package, _, leaf = name.split('/')
         schema += content if not schema else f'{"=" * 80}\nMSG: {package}/{leaf}\n{content}'
-        new_types = [t for t in referenced_types(content, package) if t not in known]
+        new_types = [t for t in types.referenced_types(content, package) if t not in known]
         known += new_types
         queue += new_types
     return schema
@@ -74,7 +68,7 @@ DISCOVERY_INTERVAL_S = 0.5
 """[s] Interval between searches for topics."""
 PROGRESS_INTERVAL_S = 10.0
 """[s] Interval between progress lines if the output is not a terminal."""
-DEPTHS = {MAGNETIC_FIELD: 1000, IMU: 1000, FIELD_READINGS: 1000}
+DEPTHS = {types.MAGNETIC_FIELD: 1000, types.IMU: 1000, types.FIELD_READINGS: 1000}
 """Queue length by message type. A disk may stall for a second or more between two fetches."""
 DEFAULT_DEPTH = 100
 """Queue length for other types, such as images, which are large."""
@@ -146,9 +140,9 @@ class RecordNode(Node):
         self._n_lost_before: Counter[str] = Counter()
         # The types of these topics are known, so the subscriptions need not wait for a driver.
         for topic in self.selection.fields:
-            self._subscribe(topic, MAGNETIC_FIELD, [])
+            self._subscribe(topic, types.MAGNETIC_FIELD, [])
         for topic in self.selection.imus:
-            self._subscribe(topic, IMU, [])
+            self._subscribe(topic, types.IMU, [])
 
     @property
     def lost(self) -> 'Counter[str]':

@@ -16,11 +16,7 @@ from mag_tracking.messages.calibration_state import sensor_dict
 from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
-from mag_tracking.recording.background_file import (
-    background_text,
-    read_backgrounds,
-    write_backgrounds,
-)
+from mag_tracking.recording import background_file
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.settings import CalibrateSettings
 
@@ -43,7 +39,8 @@ class BackgroundStore:
         if self._path is None:
             return
         try:
-            restored, rejected = read_backgrounds(self._path, network, self._settings)
+            restored, rejected = background_file.read_backgrounds(
+                self._path, network, self._settings)
         except RecordingError as error:
             self._logger.warning(f'stored backgrounds are not used: {error}')
             return
@@ -63,7 +60,8 @@ class BackgroundStore:
         if background is None:
             self._entries.pop(name, None)
         else:
-            self._entries[name] = background_text(background, network, j, self._settings)
+            self._entries[name] = background_file.background_text(
+                background, network, j, self._settings)
 
     def write_if_due(self, is_live: bool) -> None:
         """Write the file, unless during a replay, if it lacks a sensor or the interval is over."""
@@ -73,7 +71,7 @@ class BackgroundStore:
             return
         self._next_write = now + min(WRITE_INTERVAL_S, self._settings.max_resume_gap_s / 4.0)
         try:
-            write_backgrounds(self._path, self._entries)
+            background_file.write_backgrounds(self._path, self._entries)
             self._written_sensors = frozenset(self._entries)
         except OutputError as error:
             self._logger.warning(f'backgrounds cannot be stored for a restart: {error}',

@@ -15,14 +15,8 @@ from rclpy.subscription import Subscription
 from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.network.file import read_network
+from mag_tracking.nodes import diagnostics
 from mag_tracking.nodes.connections import Flow, SubscriberMonitor, node_of, shortened
-from mag_tracking.nodes.diagnostics import (
-    ERROR,
-    OK,
-    WARN,
-    DiagnosticsPublisher,
-    status_of,
-)
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.scheduling import steady_timer
 from mag_tracking.pipeline import settings_for
@@ -83,7 +77,7 @@ class StageNode(Node):
         if self.settings.track.target != defaults.track.target:
             raise SettingsError(f'{name}: parameter track.target is {self.settings.track.target!r}'
                                 f', but target is {target!r}; set target only')
-        self.diagnostics = DiagnosticsPublisher(self)
+        self.diagnostics = diagnostics.DiagnosticsPublisher(self)
         self._reported_rejections: dict[tuple[str, str], int] = {}
         self.flows: dict[str, Flow] = {}
         self._subscriber_monitors: list[SubscriberMonitor] = []
@@ -199,10 +193,10 @@ class StageNode(Node):
             increases = {k: n for k, n in rejections.items()
                          if n != self._reported_rejections.get((name, k), 0)}
             self._reported_rejections |= {(name, cause): n for cause, n in increases.items()}
-            statuses.append(status_of(
+            statuses.append(diagnostics.status_of(
                 f'{title}: {name}',
                 '; '.join(f'{cause}: {n}' for cause, n in increases.items()) or 'running',
-                WARN if increases else OK, dict(sorted({
+                diagnostics.WARN if increases else diagnostics.OK, dict(sorted({
                     **stage.counts, **({'queue': queues[name]} if name in queues else {})
                 }.items()))))
         statuses += [flow.status(title, lambda flow=flow: any(
@@ -227,8 +221,9 @@ class StageNode(Node):
         if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
             faults.append('use_sim_time is set, but no message was received on /clock: start a '
                           'replay, or unset use_sim_time')
-        return status_of(f'{self.diagnostics.title}: start', '; '.join(faults) or self.state(),
-                         ERROR if faults else OK)
+        return diagnostics.status_of(
+            f'{self.diagnostics.title}: start', '; '.join(faults) or self.state(),
+            diagnostics.ERROR if faults else diagnostics.OK)
 
     def _published_types(self, name: str) -> set[str]:
         """Return the message types that a node publishes; empty if it has not been discovered."""
@@ -238,10 +233,3 @@ class StageNode(Node):
         except NodeNameNonExistentError:
             return set()
         return {kind for _, kinds in topics for kind in kinds}
-
-
-def has_subscribers(publisher: Publisher) -> bool:
-    """Whether a publisher has subscribers."""
-    return publisher.get_subscription_count() > 0
-
-

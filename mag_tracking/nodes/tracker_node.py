@@ -28,38 +28,18 @@ from mag_tracking.calibration.doubtful_times import (
     merged,
 )
 from mag_tracking.event_records import Disturbance, VehiclePassage
+from mag_tracking.messages import schema
 from mag_tracking.messages.calibration_state import doubtful_times, with_orientations
 from mag_tracking.messages.frame import frame_of
 from mag_tracking.messages.markers import delete_markers, sensor_markers, track_markers
-from mag_tracking.messages.schema import (
-    disturbance_dict,
-    hypotheses_dict,
-    odometry_dict,
-    pose_dict,
-    pose_message_dict,
-    smoothed_pose_dict,
-    smoothed_track_dict,
-    track_dict,
-    traffic_summary_dict,
-    vehicle_passage_dict,
-)
 from mag_tracking.messages.shapes import MessageDict
 from mag_tracking.messages.standard import detections_3d_dict, track_transform_dict
 from mag_tracking.messages.types import CALIBRATION_STATE, NETWORK_FRAME
 from mag_tracking.network import SensorNetwork
-from mag_tracking.nodes import middleware
-from mag_tracking.nodes.convert import send, to_message
+from mag_tracking.nodes import middleware, stage_node
+from mag_tracking.nodes.convert import has_subscribers, send, to_message
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter, follow_changes
 from mag_tracking.nodes.scheduling import steady_timer
-from mag_tracking.nodes.stage_node import (
-    LATCHED_QOS,
-    PUBLISHER_QOS,
-    RESULT_QOS,
-    STREAM_QOS,
-    TRANSFORM_QOS,
-    StageNode,
-    has_subscribers,
-)
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.track.manager import TrackManager
@@ -73,25 +53,25 @@ TRANSPORT_MARGIN_S = 1.0
 MAX_PATH_POSES = 2000
 """Maximum number of poses in `~/path`."""
 OUTPUTS = {
-    '/tf': (TFMessage, TRANSFORM_QOS),
-    '~/pose': (PoseWithCovarianceStamped, PUBLISHER_QOS),
-    '~/odometry': (Odometry, RESULT_QOS),
-    '~/tracks': (msg.TrackArray, PUBLISHER_QOS),
-    '~/hypotheses': (msg.HypothesisArray, PUBLISHER_QOS),
-    '~/path': (Path, RESULT_QOS),
-    '~/pose_smoothed': (PoseWithCovarianceStamped, PUBLISHER_QOS),
-    '~/smoothed': (msg.SmoothedTrack, RESULT_QOS),
-    '~/path_smoothed': (Path, RESULT_QOS),
-    '~/disturbances': (msg.Disturbance, PUBLISHER_QOS),
-    '~/markers': (MarkerArray, RESULT_QOS),
-    '~/detections_3d': (Detection3DArray, RESULT_QOS),
-    '~/sensor_markers': (MarkerArray, LATCHED_QOS),
-    '~/passages': (msg.VehiclePassage, PUBLISHER_QOS),
-    '~/traffic': (msg.TrafficSummary, RESULT_QOS)}
+    '/tf': (TFMessage, stage_node.TRANSFORM_QOS),
+    '~/pose': (PoseWithCovarianceStamped, stage_node.PUBLISHER_QOS),
+    '~/odometry': (Odometry, stage_node.RESULT_QOS),
+    '~/tracks': (msg.TrackArray, stage_node.PUBLISHER_QOS),
+    '~/hypotheses': (msg.HypothesisArray, stage_node.PUBLISHER_QOS),
+    '~/path': (Path, stage_node.RESULT_QOS),
+    '~/pose_smoothed': (PoseWithCovarianceStamped, stage_node.PUBLISHER_QOS),
+    '~/smoothed': (msg.SmoothedTrack, stage_node.RESULT_QOS),
+    '~/path_smoothed': (Path, stage_node.RESULT_QOS),
+    '~/disturbances': (msg.Disturbance, stage_node.PUBLISHER_QOS),
+    '~/markers': (MarkerArray, stage_node.RESULT_QOS),
+    '~/detections_3d': (Detection3DArray, stage_node.RESULT_QOS),
+    '~/sensor_markers': (MarkerArray, stage_node.LATCHED_QOS),
+    '~/passages': (msg.VehiclePassage, stage_node.PUBLISHER_QOS),
+    '~/traffic': (msg.TrafficSummary, stage_node.RESULT_QOS)}
 """Message type and QoS of each published topic."""
 
 
-class TrackerNode(StageNode):
+class TrackerNode(stage_node.StageNode):
     """Tracks targets with a bank of filters and publishes the results.
 
     With `has_direct_input`, frames are passed to `receive_frame` and not received on a topic.
@@ -125,10 +105,11 @@ class TrackerNode(StageNode):
             self.receive_frame = self.direct_input('detection', [NETWORK_FRAME], self._feed,
                                                    lambda frame: frame.stamp_ns)
         else:
-            self.subscription(NetworkFrame, NETWORK_FRAME, self._receive, STREAM_QOS, 'detection')
+            self.subscription(NetworkFrame, NETWORK_FRAME, self._receive, stage_node.STREAM_QOS,
+                              'detection')
         steady_timer(self, 0.25, self.end_tracks_on_timeout)
         self.subscription(CalibrationState, CALIBRATION_STATE, self._receive_calibration,
-                          LATCHED_QOS)
+                          stage_node.LATCHED_QOS)
         self.report_state()
         note = lane_note(self.settings.track.vehicle, self.network)
         if note and self.settings.track.target == 'vehicle':
@@ -203,40 +184,40 @@ class TrackerNode(StageNode):
         world, complete_poses = self.network.frame, []
         for record in records:
             if isinstance(record, Disturbance):
-                self._send('~/disturbances', disturbance_dict(record, world))
+                self._send('~/disturbances', schema.disturbance_dict(record, world))
             elif not isinstance(record, SmoothedPose):
                 self._publish(record)
             elif record.complete:
                 complete_poses.append(record)
             # The message has no flag for ambiguity, and other hypotheses are not smoothed.
             elif not record.ambiguous or self.settings.track.ambiguous_poses == BEST:
-                self._send('~/pose_smoothed', smoothed_pose_dict(record, world))
+                self._send('~/pose_smoothed', schema.smoothed_pose_dict(record, world))
         for id in dict.fromkeys(pose.id for pose in complete_poses):
             poses = [pose for pose in complete_poses if pose.id == id]
-            self._send('~/smoothed', smoothed_track_dict(poses, world))
-            messages = [to_message(PoseStamped, pose_dict(
+            self._send('~/smoothed', schema.smoothed_track_dict(poses, world))
+            messages = [to_message(PoseStamped, schema.pose_dict(
                 p.stamp_ns, world, p.position, p.orientation)) for p in poses]
             self._outputs['~/path_smoothed'].publish(
                 Path(header=messages[-1].header, poses=messages))
         classes = [c.name for c in self.settings.traffic.classes]
         for result in self._traffic.feed(TrackedFrame(frame, records)):
             if isinstance(result, VehiclePassage):
-                self._send('~/passages', vehicle_passage_dict(result, classes, world))
+                self._send('~/passages', schema.vehicle_passage_dict(result, classes, world))
             else:
-                self._send('~/traffic', traffic_summary_dict(result, world))
+                self._send('~/traffic', schema.traffic_summary_dict(result, world))
 
     def _publish(self, track: Track) -> None:
         """Publish one record of a track, or the end of the track, on all topics."""
         frame = self.network.frame
         if not track.ended:
             # The pose comes first, because it may be used for control.
-            self._send('~/pose', pose_message_dict(track, frame))
+            self._send('~/pose', schema.pose_message_dict(track, frame))
         if self.after_pose is not None:
             self.after_pose()
         # The hypotheses come before the track, so that its subscribers already have them.
         if not track.ended and has_subscribers(self._outputs['~/hypotheses']):
-            self._send('~/hypotheses', hypotheses_dict(track, frame))
-        content = track_dict(track, frame)
+            self._send('~/hypotheses', schema.hypotheses_dict(track, frame))
+        content = schema.track_dict(track, frame)
         self._send('~/tracks', {'header': content['header'], 'tracks': [content]})
         if has_subscribers(self._outputs['~/detections_3d']):
             self._send('~/detections_3d', detections_3d_dict(track, frame))
@@ -259,12 +240,12 @@ class TrackerNode(StageNode):
     def _publish_views(self, track: Track, frame: str) -> None:
         """Publish odometry, transform, path and markers of a running track."""
         child_frame = self._child_frame or f'track_{track.id}'
-        self._send('~/odometry', odometry_dict(track, frame, child_frame))
+        self._send('~/odometry', schema.odometry_dict(track, frame, child_frame))
         if self._publishes_tf:
             self._send('/tf', track_transform_dict(track, frame, child_frame))
         path = self._poses_by_track.setdefault(track.id, deque(maxlen=MAX_PATH_POSES))
         if track.topic_uncertainty is not None:
-            path.append(to_message(PoseStamped, pose_dict(
+            path.append(to_message(PoseStamped, schema.pose_dict(
                 track.stamp_ns, frame, track.position, track.orientation)))
         # The topic carries the path of the oldest running track only.
         if path and track.id == min(self._poses_by_track) \
