@@ -30,10 +30,8 @@ def quaternion_from_rotation_vector(v: ArrayLike) -> FloatArray:
 
 
 def rotation_vectors_between(q: ArrayLike, other: ArrayLike) -> FloatArray:
-    """Shortest rotations from orientation `q` (4,) to others (..., 4), as rotation vectors.
-
-    The vectors (..., 3) [rad] are in world axes, with a norm of at most pi.
-    """
+    """Shortest rotations from orientation `q` (4,) to others (..., 4), as rotation vectors (..., 3)
+    [rad] in world axes."""
     q, other = np.asarray(q, dtype=float), np.asarray(other, dtype=float)
     v, w = -q[:3], q[3]
     along = other[..., 3:] * v + w * other[..., :3] + np.cross(other[..., :3], v)
@@ -146,10 +144,8 @@ def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, flo
 
 
 def propagated_path(path: FloatArray, seconds: float) -> FloatArray:
-    """Shift the time origin of straight paths by `seconds`.
-
-    A path (..., n) is position [m] and velocity [m/s] at the origin, and n - 6 constant states.
-    """
+    """Shift the time origin of straight paths (..., n) by `seconds`: position [m] and velocity
+    [m/s] at the origin, and n - 6 constant states."""
     propagated: FloatArray = path.copy()
     propagated[..., :3] += seconds * path[..., 3:6]
     return propagated

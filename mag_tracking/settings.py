@@ -1,8 +1,5 @@
-"""Declaration and validation of settings, each with default, description, unit and range.
-
-ROS parameters, the YAML file of defaults and the parameter reference are generated from the
-declarations.
-"""
+"""Declaration and validation of settings, from which ROS parameters, the YAML file of defaults and
+the parameter reference are generated."""
 
 import dataclasses
 import difflib

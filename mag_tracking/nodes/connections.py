@@ -35,11 +35,8 @@ def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
 
 
 def node_of(endpoint: TopicEndpointInfo) -> str | None:
-    """Absolute name of the node of an endpoint; None if the node has not yet been announced.
-
-    The middleware announces endpoints and nodes separately. Until the node is announced, its name
-    is a placeholder.
-    """
+    """Absolute name of the node of an endpoint; None until the middleware, which announces endpoints
+    and nodes separately, has announced the node."""
     namespace = endpoint.node_namespace
     return absolute(endpoint.node_name, namespace) if namespace.startswith('/') else None
 
@@ -59,11 +56,8 @@ def subscriber_qos(depth: int, latched: bool) -> QoSProfile:
 
 
 def no_message_finding(node: Node, sensor: str, topic: str, known: Mapping[str, str]) -> Finding:
-    """Fault of a sensor from which no message has been received.
-
-    If the topic has no publisher, the advice names other topics with magnetic fields, except those
-    of `known`, the topic of each sensor.
-    """
+    """Fault of a sensor from which no message has been received; the advice may name other topics
+    with magnetic fields, except those of `known`, the topic of each sensor."""
     if node.count_publishers(topic):
         return Finding(True, sensor, f'no message received on {topic}, although it has a '
                        'publisher', 'check the sensor and its driver', Cause.NO_MESSAGES)
@@ -100,12 +94,8 @@ MAX_LATENCIES = 10_000
 class Flow:
     """Statistics of the messages that a node receives from one source: the sensors or a node.
 
-    Attributes
-    ----------
-    topics : absolute names, after remapping
-    batches : topics of batches of readings, which may be used instead of `topics`
-    last_received : s, by `time.monotonic()`
-    n_lost : number of messages lost because the input queue was full
+    `batches` are topics of batches of readings, which may be used instead of `topics`;
+    `last_received` is by `time.monotonic()`; `n_lost` messages did not fit into the input queue.
     """
 
     def __init__(self, source: str) -> None:
@@ -121,10 +111,8 @@ class Flow:
         self._busy_s, self._report_time = 0.0, time.monotonic()
 
     def add(self, stamp_ns: int, arrival_ns: int, start_s: float) -> None:
-        """Add a message's latency and processing time, from `start_s` of `time.monotonic()`.
-
-        The arrival time is by the clock of the node.
-        """
+        """Add a message that arrived at `arrival_ns` by the clock of the node, and whose processing
+        began at `start_s` of `time.monotonic()`."""
         self._n_messages += 1
         self.last_received = time.monotonic()
         duration_s = self.last_received - start_s
@@ -144,10 +132,7 @@ class Flow:
         return self._latest_latency_s is not None and abs(self._latest_latency_s) < MAX_LIVE_DELAY_S
 
     def status(self, node: str, has_publisher: Callable[[], bool]) -> DiagnosticStatus:
-        """Diagnostics of the messages received since the last call, under the title of the `node`.
-
-        `has_publisher` returns whether a publisher of the topics still exists.
-        """
+        """Diagnostics of the messages since the last call, under the title of the `node`."""
         now = time.monotonic()
         elapsed, self._report_time = max(now - self._report_time, 1e-9), now
         latencies, self._latencies = self._latencies, []
@@ -188,9 +173,8 @@ class Flow:
 class SubscriberMonitor:
     """Checks that the node of the next processing step still subscribes to an absolute topic.
 
-    The node may have any name; it is identified by `publishes`, the message type that it publishes.
-    Other subscribers, such as recorders, are ignored. Messages call it by its `role`, such as
-    `tracker`.
+    The node, which messages call by its `role`, may have any name: among the subscribers, it is
+    identified by `publishes`, the message type that it publishes.
     """
 
     def __init__(self, role: str, topic: str, publishes: str) -> None:
@@ -199,11 +183,8 @@ class SubscriberMonitor:
 
     def status(self, node: str, names: Collection[str],
                types_of: Callable[[str], Collection[str]]) -> DiagnosticStatus:
-        """Diagnostics of the connection to the next step, under the title of the `node`.
-
-        `names` are the nodes that now subscribe; `types_of` returns the message types that a node
-        publishes.
-        """
+        """Diagnostics of the connection, under the title of the `node`; `names` are the nodes that
+        now subscribe, `types_of` returns the message types that a node publishes."""
         self._known_nodes |= {name for name in set(names) - self._known_nodes
                               if self._publishes in types_of(name)}
         missing_nodes = sorted(self._known_nodes - set(names))

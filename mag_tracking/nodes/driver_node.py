@@ -46,10 +46,7 @@ takes several seconds."""
 
 
 class DriverNode(ManagedNode):
-    """Runs one thread per device, which publishes the readings of the device.
-
-    Raises MagTrackingError if `autostart` is set and the settings are invalid.
-    """
+    """Runs one thread per device, which publishes the readings of the device."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__('driver_node', **node_arguments)
@@ -69,10 +66,7 @@ class DriverNode(ManagedNode):
         self.start_automatically()
 
     def prepare(self) -> None:
-        """Read the drivers file and advertise the topics of the sensors.
-
-        Raises SettingsError or NetworkError if a file is missing or invalid.
-        """
+        """Read the drivers file and advertise the topics; raises SettingsError or NetworkError."""
         if not self._path:
             raise SettingsError('driver_node: parameter drivers is empty; set it to the path of a '
                                 'drivers file')

@@ -149,10 +149,8 @@ def as_text(message: Any) -> str:
 
 
 def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list[str]:
-    """Parameters of a node, or the named one, with values and descriptions.
-
-    Raises GraphError if the node or the parameter does not exist.
-    """
+    """Parameters of a node, or the named one, with values and descriptions; raises GraphError if it
+    does not exist."""
     names = [name] if name is not None else list(graph.call(
         srv.ListParameters, f'{node}/list_parameters', srv.ListParameters.Request()).result.names)
     values = graph.call(srv.GetParameters, f'{node}/get_parameters',
@@ -169,10 +167,8 @@ def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list
 
 
 def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
-    """Set a parameter of a node to a value in YAML; an integer is accepted for a float.
-
-    Raises GraphError if the value is invalid, the node does not exist, or the node rejects it.
-    """
+    """Set a parameter of a node to a value in YAML, also an integer for a float; raises GraphError
+    if it is invalid or rejected."""
     try:
         value = yaml.safe_load(text)
         (kind,) = graph.call(srv.GetParameterTypes, f'{node}/get_parameter_types',
@@ -189,10 +185,7 @@ def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
 
 
 def lifecycle_state(graph: Observer, node: str) -> tuple[str, list[str]]:
-    """Label of a lifecycle node's state, and labels of the transitions that are now possible.
-
-    Raises GraphError if the node does not exist or is not a lifecycle node.
-    """
+    """Label of a lifecycle node's state, and labels of the transitions that are now possible."""
     state = graph.call(GetState, f'{node}/get_state', GetState.Request()).current_state.label
     return state, [t.label for t in _possible_transitions(graph, node)]
 
@@ -205,10 +198,8 @@ def _possible_transitions(graph: Observer, node: str) -> list[Any]:
 
 
 def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
-    """Request a transition of a lifecycle node by its label.
-
-    Raises GraphError if the node does not exist, or the transition is not possible or fails.
-    """
+    """Request a transition of a lifecycle node by its label; raises GraphError if it is not possible
+    or fails."""
     possible = _possible_transitions(graph, node)
     matches = [t for t in possible if t.label == transition]
     if not matches:

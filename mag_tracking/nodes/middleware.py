@@ -46,10 +46,9 @@ HUNG_MESSAGE = (f'the middleware did not shut down within {SHUTDOWN_TIMEOUT_S:g}
 def init_ros(arguments: list[str] | None = None) -> None:
     """Call `rclpy.init` with the Fast DDS profile of this package, unless the user selects another.
 
-    Other middlewares ignore the profile. No signal handlers are installed, because those of rclpy
-    raise KeyboardInterrupt at any point, even within C++ code of rclpy. Parameter files
-    (`--params-file`) may also have the plain format of `--params`. Raises SettingsError if the ROS
-    arguments or a parameter file are invalid.
+    The signal handlers of rclpy are not installed: they raise KeyboardInterrupt at any point, even
+    within C++ code. Parameter files (`--params-file`) may also have the plain format of `--params`.
+    Raises SettingsError if the ROS arguments or a parameter file are invalid.
     """
     profile = os.environ.get(PROFILE_VARIABLE)
     if profile is None and not Path(WORKING_FOLDER_PROFILE).exists():
@@ -109,10 +108,8 @@ def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: i
 
 
 def limit_exit_time(status: int) -> None:
-    """Limit the time until the process ends with `status`, with the same timeout as `shut_down`.
-
-    If the constructor of a node fails, the node is destroyed with the interpreter, which may hang.
-    """
+    """Limit the time until the process ends with `status`, because a node that is destroyed with the
+    interpreter may hang."""
     flush()
     end_within(SHUTDOWN_TIMEOUT_S, status, HUNG_MESSAGE.encode())
 

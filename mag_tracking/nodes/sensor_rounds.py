@@ -1,7 +1,4 @@
-"""Periodic work for each sensor: health, calibration state, stored background.
-
-The sensors are processed one after another. Work on all sensors at once would delay the readings.
-"""
+"""Periodic work, one sensor after another: health, calibration state, stored background."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator

@@ -1,9 +1,8 @@
 """Entry points of the nodes, with signal handling before any slow import.
 
-The imports of a node take a second, or several seconds on a small computer. As soon as this module
-runs, SIGINT and SIGTERM end the process with status 0: immediately during imports, later through
-`middleware.main`, which shuts the node down. Signals during the startup of Python itself cannot be
-handled.
+As soon as this module runs, SIGINT and SIGTERM end the process with status 0: immediately during
+imports, which take seconds on a small computer, later through `middleware.main`. Signals during the
+startup of Python itself cannot be handled.
 """
 
 import signal

@@ -180,10 +180,8 @@ class Calibrate:
         return {reason: by_sensor for reason, by_sensor in out.items() if by_sensor}
 
     def latest_doubt(self, sensor: str) -> tuple[int, int | None] | None:
-        """Latest interval [ns] in which the background or the timestamps of a sensor were doubtful.
-
-        An open interval has the end None and comes first. None if there is no interval.
-        """
+        """Latest interval [ns] in which the background or the timestamps of a sensor were doubtful,
+        if any; an open one, with the end None, comes first."""
         times = [interval for by_sensor in (
             self._background[sensor].doubtful_times, self._comparison.times_of(sensor),
             self.timestamps.doubtful_times().get(sensor, ()))

@@ -35,13 +35,7 @@ RECOVERY_S = 5.0
 class Detect:
     """Decides for each frame whether a target is present, and reports onset and release.
 
-    Attributes
-    ----------
-    max_consecutive_above : largest number of consecutive frames above the threshold
-
-    References
-    ----------
-    [T10]_ eq. (5.14)-(5.19).
+    `max_consecutive_above` is the largest number of consecutive frames above the threshold.
     """
 
     def __init__(self, network: SensorNetwork, settings: DetectSettings) -> None:
@@ -61,11 +55,10 @@ class Detect:
 
     def _reset(self) -> None:
         """Reset to the state without a detection."""
-        self._present, self._n_above = False, 0
+        self._present, self._n_above, self._frozen_s = False, 0, 0.0
         self._last_ns: int | None = None
         self._last_active_ns: int | None = None
         self._onset_ns: int | None = None
-        self._frozen_s = 0.0
 
     def threshold(self, probability: float, degrees_of_freedom: int) -> float:
         """Energy threshold of the measured axes that noise exceeds with `probability`; cached."""

@@ -73,10 +73,8 @@ def sensor_findings(network: SensorNetwork, calibrate: Calibrate, settings: Trac
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
                         n_reported: int = 0) -> Iterator[Finding]:
-    """Diagnose the background of a sensor, frozen since `frozen_since_ns` or not (None).
-
-    `n_reported` is the number of relearnt backgrounds that were reported earlier.
-    """
+    """Diagnose the background of a sensor, frozen since `frozen_since_ns` or not (None), of which
+    `n_reported` were relearnt and reported earlier."""
     background, last = calibrate.backgrounds()[name], calibrate.last_stamp_ns(name)
     if last is not None and not background.ready and background.stuck:
         yield Finding(True, name, 'its readings do not change, and the sensor is not used', 'move '

@@ -88,12 +88,9 @@ class SensorHealth:
 
     @property
     def counts(self) -> 'Counter[str]':
-        """Number of readings, and number of faults of each type.
-
-        The keys are `readings`, `lost`, `duplicates`, `backward timestamps`, `clock steps`,
-        `spikes`, `saturated`, `without any axis` and `stuck readings`; `x`, `y` and `z` count
-        missing axes.
-        """
+        """Numbers of `readings`, of missing axes (`x`, `y`, `z`), and of faults: `lost`,
+        `duplicates`, `backward timestamps`, `clock steps`, `spikes`, `saturated`, `without any
+        axis`, `stuck readings`."""
         self.update()
         return self._counts
 
