@@ -26,14 +26,12 @@ _CONSTANTS = {
     'track.magnet': 'start_margin grid_points starts near_field_length',
     'survey': 'compass_bias_std accelerometer_bias max_clock_offset_s max_accelerations'}
 """{group: settings that are constants now}."""
-
 _COLUMNS = {
     ('track.vehicle.', 'track.vehicle.kinds.car.'): 'length length_std moment moment_std '
     'difference_std height height_std near_field_length',
     ('traffic.line_', 'traffic.lines.road.'): 'offset half_width',
     ('traffic.class_', 'traffic.classes.car.'): 'share moment moment_spread length length_spread'}
 """{(prefix of lists, prefix in a table): names, which had an s as lists}."""
-
 FORMER_SETTINGS = {
     **{f'{group}.{name}': '' for group, names in _CONSTANTS.items() for name in names.split()},
     **{f'{old}{name}s': new + name for (old, new), names in _COLUMNS.items()
@@ -48,14 +46,11 @@ if TYPE_CHECKING:
 Scalar: TypeAlias = bool | int | float | str
 Value: TypeAlias = Scalar | tuple[Scalar, ...]
 """Type of the value of a setting."""
-
 USER, EXPERT = 'user', 'expert'
 """Levels: settings that describe the site, the targets and the wanted results; and settings of the
 methods, which rarely change."""
-
 _ROW_NAME = re.compile(r'(?!names$)\w[\w -]*')
 """Permitted names of the rows of a table."""
-
 _Class: TypeAlias = type[object]
 _Default = TypeVar('_Default')
 _Settings = TypeVar('_Settings', bound='DataclassInstance')

@@ -35,8 +35,8 @@ def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
 
 
 def node_of(endpoint: TopicEndpointInfo) -> str | None:
-    """Absolute name of the node of an endpoint; None until the middleware, which announces endpoints
-    and nodes separately, has announced the node."""
+    """Absolute name of the node of an endpoint; None until the middleware, which announces both
+    separately, has announced the node."""
     namespace = endpoint.node_namespace
     return absolute(endpoint.node_name, namespace) if namespace.startswith('/') else None
 

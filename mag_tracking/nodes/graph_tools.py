@@ -198,7 +198,7 @@ def _possible_transitions(graph: Observer, node: str) -> list[Any]:
 
 
 def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
-    """Request a transition of a lifecycle node by its label; raises GraphError if it is not possible
+    """Request a transition of a lifecycle node by its label; raises GraphError if it is impossible
     or fails."""
     possible = _possible_transitions(graph, node)
     matches = [t for t in possible if t.label == transition]

@@ -29,7 +29,6 @@ from mag_tracking.settings import as_ros_parameters
 RCLError, RMWError, UnknownROSArgsError = (
     rclpy_implementation.RCLError, rclpy_implementation.RMWError,
     rclpy_implementation.UnknownROSArgsError)
-
 PROFILE = Path(__file__).with_name('fastdds.xml')
 """Fast DDS profile for fast discovery, also of nodes that were killed and restarted."""
 PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
@@ -108,7 +107,7 @@ def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: i
 
 
 def limit_exit_time(status: int) -> None:
-    """Limit the time until the process ends with `status`, because a node that is destroyed with the
+    """Limit the time until the process ends with `status`: a node that is destroyed with the
     interpreter may hang."""
     flush()
     end_within(SHUTDOWN_TIMEOUT_S, status, HUNG_MESSAGE.encode())

@@ -30,7 +30,6 @@ from mag_tracking.records import Track
 from mag_tracking.settings import flatten
 
 PathLike = str | OsPathLike[str]
-
 MAX_DISCOVERY_S = 60.0
 """[s] Maximum time for mutual discovery of the nodes; a busy computer needs several seconds."""
 

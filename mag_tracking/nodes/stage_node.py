@@ -40,7 +40,6 @@ TRANSFORM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of /tf, as in tf2."""
 READY = 'ready'
 """State of a node that has received input and operates normally."""
-
 _Record = TypeVar('_Record')
 
 

@@ -6,7 +6,6 @@ from typing import Protocol, TypeVar
 
 In = TypeVar('In', contravariant=True)
 Out = TypeVar('Out')
-
 MAX_BACKWARD_JUMP_S = 1.0
 """[s] Maximum backward jump of a timestamp. After a larger jump (a looped recording), all that was
 learnt is discarded."""

@@ -80,7 +80,6 @@ UNLIMITED_NS = np.iinfo(np.int64).max
 """[ns] Later than any timestamp."""
 MAX_HELD = 16
 """Maximum number of samples per sensor that are held while a clock step is unconfirmed."""
-
 CAUSES = {
     core.NO_FIELD: 'no finite field',
     core.NO_COVARIANCE: 'unknown covariance, and no noise_std in the network',

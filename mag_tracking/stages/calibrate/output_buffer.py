@@ -9,7 +9,6 @@ from mag_tracking.records import Readings
 
 OVERRULED = 'message covariances overruled by the measured noise'
 """Key in the counts for message covariances that were replaced by the measured noise."""
-
 COUNTED = {'held back while learning': 'n_learning',
            'axes held back while learning': 'n_partly_learning', OVERRULED: 'n_overruled'}
 """{key in the counts: counter of a batch}."""

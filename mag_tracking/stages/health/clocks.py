@@ -148,7 +148,6 @@ def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
 
 UPDATE_INTERVAL = 64
 """Number of new readings of a sensor after which its timestamps are examined again."""
-
 CAUSES = {
     TimestampError.ZERO: (Cause.ZERO_STAMPS, 'set the timestamps in the driver'),
     TimestampError.COARSE: (

@@ -104,7 +104,6 @@ _STAMP_SYMPTOMS = ('DUPLICATE_STAMPS BACKWARD_STAMPS TOO_FAR_AHEAD FRAMES_TOO_LO
                    'RATE_TOO_LOW RELEARNT_BACKGROUND ' + _UNUSABLE)
 _STAMP_ARTEFACTS = 'CLOCK_DIFFERS CLOCK_STEPPED DELAY_VARIES DELAYED LOST SPIKES STUCK'
 _WRONG_STAMPS = _explained(_STAMP_SYMPTOMS, _STAMP_ARTEFACTS)
-
 _EXPLAINED = {
     Cause.OVERLOADED: _explained('LOST DELAY_VARIES DELAYED REJECTED', 'CLOCK_STEPPED'),
     Cause.DAMAGED_RECORDING: _explained('UNDECODABLE NO_MESSAGES LOST', 'CLOCK_STEPPED'),
@@ -143,7 +142,6 @@ _EXPLAINED = {
 }
 """{cause: (causes that follow from it and are reported as consequences, causes that are not
 reported because the statement of the finding is then wrong)}."""
-
 _NETWORK_WIDE = frozenset({
     Cause.OVERLOADED, Cause.DAMAGED_RECORDING, Cause.UNDECODABLE,
     Cause.FRAMES_TOO_LONG, Cause.REJECTED, Cause.NO_DETECTION})
