@@ -81,8 +81,8 @@ class PageNode(Node):
         self._subscribe_to_tracker(self.resolve_topic_name('tracker_node/tracks'))
         # Frames are frequent and large, so only displayed frames are deserialised.
         self._frames_topic = self.resolve_topic_name(NETWORK_FRAME)
-        self.create_subscription(NetworkFrame, NETWORK_FRAME, lambda data: self._frames.append(data),
-                                 STREAM_QOS, raw=True)
+        self.create_subscription(NetworkFrame, NETWORK_FRAME,
+                                 lambda data: self._frames.append(data), STREAM_QOS, raw=True)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._receive_diagnostics,
                                  STREAM_QOS)
         steady_timer(self, UPDATE_INTERVAL_S, self._tick)
