@@ -81,7 +81,7 @@ class DetectionNode(StageNode):
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
             self.subscription(
                 MagneticField, f'{topic}_calibrated',
-                lambda message, sensor=sensor: self._feed(reading_of(message, sensor)),
+                partial(lambda sensor, message: self._feed(reading_of(message, sensor)), sensor),
                 STREAM_QOS, source='calibration')
         self.subscription(FieldReadings, CALIBRATED_READINGS, self._receive_batch, STREAM_QOS,
                           source='calibration', batches=True)

@@ -5,6 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 from mag_tracking_msgs.msg import FieldReadings
@@ -37,9 +38,9 @@ class DoctorNode(Node):
         self._topics = dict(zip(network.names, map(self.resolve_topic_name, network.topics),
                                 strict=True))
         for sensor, topic in self._topics.items():
-            self.create_subscription(
-                MagneticField, topic, lambda message, sensor=sensor: self.doctor.feed(
-                    reading_of(message, sensor), time.time_ns()), SENSOR_QOS)
+            self.create_subscription(MagneticField, topic, partial(
+                lambda sensor, message: self.doctor.feed(
+                    reading_of(message, sensor), time.time_ns()), sensor), SENSOR_QOS)
         self._batched_sensors: set[str] = set()
         self._invalid_messages: Counter[str] = Counter()
         self.create_subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM_QOS)

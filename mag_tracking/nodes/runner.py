@@ -119,7 +119,7 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
     `TrackPrinter`. If the middleware hangs at the end, `shut_down` ends the process.
     """
     # The driver node is created last, so that its first messages have subscribers.
-    sources = [partial(DriverNode, parameter_overrides=[
+    sources: Sequence[Callable[[], Node]] = [partial(DriverNode, parameter_overrides=[
         Parameter('drivers', value=str(drivers)), Parameter('network', value=str(network_path)),
         Parameter('batches', value=batches)])] if drivers else []
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:

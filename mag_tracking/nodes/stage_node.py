@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -198,8 +199,8 @@ class StageNode(Node):
                 diagnostics.WARN if increases else diagnostics.OK, dict(sorted({
                     **stage.counts, **({'queue': queues[name]} if name in queues else {})
                 }.items()))))
-        statuses += [flow.status(title, lambda flow=flow: any(
-            map(self.count_publishers, (*flow.topics, *flow.batches))))
+        statuses += [flow.status(title, partial(
+            lambda topics: any(map(self.count_publishers, topics)), flow.topics + flow.batches))
             for flow in self.flows.values()]
         for monitor in self._subscriber_monitors:
             endpoints = self.get_subscriptions_info_by_topic(monitor.topic)
