@@ -104,8 +104,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
                                  f'line {parent.start_mark.line + 1}')
         return super().compose_node(parent, index)
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False
-                          ) -> dict[Hashable, Any]:
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen = set()
         for key_node, _ in node.value:
             if key_node.tag == 'tag:yaml.org,2002:merge':
@@ -202,15 +201,11 @@ def is_utf8_encodable(value: str) -> bool:
     return not any('\ud800' <= c <= '\udfff' for c in value)
 
 
-class _ShortRepr(Repr):
-    """`repr` of limited length."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.maxlevel, self.maxstring, self.maxother, self.maxlong = 3, 200, 200, 200
-        self.maxlist = self.maxtuple = self.maxdict = 20
+_REPR = Repr()
+_REPR.maxlevel, _REPR.maxstring, _REPR.maxother, _REPR.maxlong = 3, 200, 200, 200
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = 20
 
 
 def short_repr(value: object) -> str:
     """`repr` of a value for an error message, shortened if it is long."""
-    return _ShortRepr().repr(value)
+    return _REPR.repr(value)

@@ -1,7 +1,4 @@
-"""Handling of termination signals: record them for a later check, or exit immediately.
-
-Programs import this module first, so it has no slow imports.
-"""
+"""Handling of termination signals. Programs import this module first: it has no slow imports."""
 
 import os
 import signal

@@ -315,14 +315,11 @@ def best_of_arrivals(members: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 @dataclass(frozen=True, slots=True)
 class PoseUncertainty:
-    """Covariances of position, velocity and orientation about a pose."""
+    """Covariances of position, velocity and orientation about a pose, as in `Pose`."""
 
     covariance: FloatArray
-    """Covariance of [position, velocity], (6, 6) m and m/s, world frame."""
     orientation_covariance: FloatArray
-    """Covariance of small rotations about the fixed world axes, (3, 3) rad²."""
     position_orientation_covariance: FloatArray
-    """Cross-covariance of position and orientation, (3, 3) m rad, world frame."""
 
 
 @dataclass(frozen=True, slots=True)

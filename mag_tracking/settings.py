@@ -166,8 +166,7 @@ def _validated(p: Parameter, value: object) -> Value:
                                 f'{p.choices[-1]}, got {short_repr(v)}')
         if isinstance(v, float) and math.isnan(v):
             raise SettingsError(f'{p.name}: NaN is not a valid value')
-        if not isinstance(v, str) and p.range is not None \
-                and not p.range[0] <= v <= p.range[1]:
+        if not isinstance(v, str) and p.range is not None and not p.range[0] <= v <= p.range[1]:
             raise SettingsError(f'{p.name}: {v} is outside {p.range[0]} .. {p.range[1]}'
                                 f'{" " + p.unit if p.unit else ""}')
     if p.name.endswith('.names') and len(set(values)) < len(values):

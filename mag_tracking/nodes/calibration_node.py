@@ -1,7 +1,6 @@
 """calibration_node: converts raw magnetic fields to calibrated fields."""
 
 if __name__ == '__main__':
-    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import calibration_node
 
     calibration_node()
@@ -69,8 +68,7 @@ class CalibrationNode(StageNode):
         super().__init__('calibration_node', 'calibrate', **node_arguments)
         self._next_steps = next_steps
         self.settings = declare_settings(self, self.settings, 'survey')
-        self._stage = Calibrate(self.network, self.settings.calibrate,
-                                survey=self.settings.survey)
+        self._stage = Calibrate(self.network, self.settings.calibrate, survey=self.settings.survey)
         self._store = BackgroundStore(self._state_path(), self._stage, self.settings.calibrate,
                                       self.get_logger())
         self._store.restore(self.network)
@@ -87,8 +85,7 @@ class CalibrationNode(StageNode):
             self.diagnostics.title, self.network, self._stage, self._health, self._store,
             self._is_live, lambda status: self.diagnostics.publish([status]),
             self._publish_states)
-        steady_timer(self, max(1.0 / (2 * len(self.network) + 3), MIN_STEP_S),
-                     self._rounds.tick)
+        steady_timer(self, max(1.0 / (2 * len(self.network) + 3), MIN_STEP_S), self._rounds.tick)
         paced_service(self, CalibrateService, '~/calibrate', self._handle_calibrate)
         paced_service(self, SurveyMessage, '~/survey', self._handle_survey)
         self.report_state()
@@ -168,8 +165,7 @@ class CalibrationNode(StageNode):
         """State of the node: waiting for sensors, learning backgrounds, ready, or a combination."""
         waiting = [topic for name, topic in zip(self.network.names, self.sensor_topics,
                                                 strict=True) if self._health.is_awaited(name)]
-        learning = [name for name in self._stage.unready()
-                    if not self._health.is_awaited(name)]
+        learning = [name for name in self._stage.unready() if not self._health.is_awaited(name)]
         parts = [f'waiting for {shortened(waiting)}'] if waiting else []
         if learning:
             parts.append(f'learning backgrounds, {self.settings.calibrate.learn_s:g} s')

@@ -1,7 +1,6 @@
 """detection_node: combines calibrated fields into network frames and detects targets."""
 
 if __name__ == '__main__':
-    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import detection_node
 
     detection_node()

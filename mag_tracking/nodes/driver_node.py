@@ -5,7 +5,6 @@ A lifecycle node: configuration reads the drivers file, activation opens the dev
 """
 
 if __name__ == '__main__':
-    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import driver_node
 
     driver_node()
@@ -112,8 +111,7 @@ class DriverNode(ManagedNode):
         self.close()
         ManagedNode.destroy_node(self)
 
-    def _advertise(self, sensor: str,
-                   network: SensorNetwork | None) -> tuple[Publisher, Publisher]:
+    def _advertise(self, sensor: str, network: SensorNetwork | None) -> tuple[Publisher, Publisher]:
         """Create the publishers of the field and the acceleration of a sensor."""
         topic, imu_topic = f'{sensor}/imu/mag', f'{sensor}/imu/data_raw'
         if network is not None:

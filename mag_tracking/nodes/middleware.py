@@ -164,10 +164,7 @@ class ManagedNode(LifecycleNode):
         self.release()
         return TransitionCallbackReturn.SUCCESS
 
-    def on_shutdown(self, state: State) -> TransitionCallbackReturn:
-        """Release the resources of the node."""
-        self.release()
-        return TransitionCallbackReturn.SUCCESS
+    on_shutdown = on_cleanup
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
         """Call `prepare`; if it fails, log the error and leave the node unconfigured."""

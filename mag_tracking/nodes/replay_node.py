@@ -6,7 +6,6 @@ itself at startup.
 """
 
 if __name__ == '__main__':
-    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import replay_node
 
     replay_node()
@@ -73,8 +72,8 @@ class ReplayNode(ManagedNode):
         self._clock_publisher = self.create_publisher(Clock, '/clock', STREAM_QOS)
         self.finished, self._is_active, self._start_time = False, False, 0.0
         self._last_tick: float | None = None
-        paced_service(self, Trigger, '~/pause', self._pause)
-        paced_service(self, Trigger, '~/resume', self._resume)
+        paced_service(self, Trigger, '~/pause', partial(self._pause_or_resume, True))
+        paced_service(self, Trigger, '~/resume', partial(self._pause_or_resume, False))
         paced_service(self, Seek, '~/seek', self._seek_service)
         self.create_timer(UPDATE_INTERVAL_S, self._tick)
         self.start_automatically()
@@ -198,16 +197,14 @@ class ReplayNode(ManagedNode):
         self.get_logger().info(
             f'end of the recording: {quantity(self.counts["messages"], "message")} played')
 
-    def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Handle ~/pause."""
-        self._paused, self._last_tick = True, None
-        response.success, response.message = True, 'paused'
-        return response
-
-    def _resume(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Handle ~/resume."""
-        self.resume()
-        response.success, response.message = True, 'playing'
+    def _pause_or_resume(self, paused: bool, _request: Trigger.Request,
+                         response: Trigger.Response) -> Trigger.Response:
+        """Handle ~/pause and ~/resume."""
+        if paused:
+            self._paused, self._last_tick = True, None
+        else:
+            self.resume()
+        response.success, response.message = True, 'paused' if paused else 'playing'
         return response
 
     def resume(self) -> None:

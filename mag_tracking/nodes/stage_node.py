@@ -47,15 +47,9 @@ _Record = TypeVar('_Record')
 class StageNode(Node):
     """Node that reads the network file and the settings of one group of stages.
 
+    `settings` are the defaults of the target, overridden by parameters; `flows` the statistics of
+    the inputs, by source; `now_ns` the arrival time of the current message, by the ROS clock.
     Raises SettingsError for an invalid parameter, and NetworkError for an invalid network file.
-
-    Attributes
-    ----------
-    settings : defaults of the target, overridden by parameters
-    input_qos : QoS of subscriptions to sensors
-    is_replayed : whether the input is replayed from a recording
-    flows : statistics of the inputs, by source
-    now_ns : ns, arrival time of the message being processed, by the ROS clock
     """
 
     def __init__(self, name: str, group: str, **node_arguments: Any) -> None:
@@ -189,9 +183,8 @@ class StageNode(Node):
         """Publish the state of the stages and connections; log the node's state if it changed."""
         statuses, queues, title = [], self.queues(), self.diagnostics.title
         for name, stage in self.stages().items():
-            rejections = {k: n for k, n in stage.counts.items() if k.startswith('rejected: ')}
-            increases = {k: n for k, n in rejections.items()
-                         if n != self._reported_rejections.get((name, k), 0)}
+            increases = {k: n for k, n in stage.counts.items() if k.startswith('rejected: ')
+                         and n != self._reported_rejections.get((name, k), 0)}
             self._reported_rejections |= {(name, cause): n for cause, n in increases.items()}
             statuses.append(diagnostics.status_of(
                 f'{title}: {name}',

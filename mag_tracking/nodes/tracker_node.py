@@ -1,7 +1,6 @@
 """tracker_node: tracks targets from network frames and publishes their poses."""
 
 if __name__ == '__main__':
-    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import tracker_node
 
     tracker_node()

@@ -42,12 +42,13 @@ class Stage(Protocol[In, Out]):
         """Do deferred work after the outputs have been published; this does not change results."""
 
     def flush(self) -> list[Out]:
-        """Return the remaining records at the end of the input.
+        """Return the remaining records at the end of the input; by default, there are none.
 
         Returns
         -------
         list of Out
         """
+        return []
 
 
 def rejected(counts: Mapping[str, int]) -> dict[str, int]:

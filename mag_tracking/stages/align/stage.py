@@ -17,7 +17,7 @@ from mag_tracking.records import FieldFrame, Readings, plain
 from mag_tracking.stages.align import core
 from mag_tracking.stages.align.clock_step import ClockStepFilter, HeldSample
 from mag_tracking.stages.settings import AlignSettings
-from mag_tracking.stages.stage import MAX_BACKWARD_JUMP_S
+from mag_tracking.stages.stage import MAX_BACKWARD_JUMP_S, Stage
 from mag_tracking.units import NS
 
 DEFAULT_PERIOD_S = 0.08
@@ -90,7 +90,7 @@ CAUSES = {
 """Cause of rejection for each reason code, except causes that name a sensor."""
 
 
-class Align:
+class Align(Stage[Readings, FieldFrame]):
     """Combines calibrated readings into frames; memory is bounded by `max_buffered`.
 
     The rules are in `alignment.hpp`; this class handles the events that compiled code reports.
@@ -190,9 +190,6 @@ class Align:
     def flush(self) -> list[FieldFrame]:
         """Return all frames of the held and pending samples at the end of the input."""
         return self._hold_passed(self._clock_steps.flush()) + self._frames(final=True)
-
-    def idle(self) -> None:
-        """Do nothing: no work is deferred."""
 
     def _reject(self, cause: str) -> None:
         """Count a rejected sample by cause."""

@@ -126,8 +126,7 @@ class Calibrate:
                                f'expected {", ".join(self._index)}')
         previous, self._network = self._network if self._background else None, network
         self._comparison.use(network)
-        self._decimators = {name: Decimator(self.settings.decimate_to_hz)
-                            for name in network.names}
+        self._decimators = {name: Decimator(self.settings.decimate_to_hz) for name in network.names}
         for i, name in enumerate(network.names):
             is_unchanged = previous is not None \
                 and are_equal(previous.offset[i], network.offset[i]) \

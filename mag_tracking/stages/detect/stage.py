@@ -15,6 +15,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Detection, FieldFrame, plain
 from mag_tracking.stages.detect import core
 from mag_tracking.stages.settings import DetectSettings
+from mag_tracking.stages.stage import Stage
 from mag_tracking.units import NS
 
 MEMORY_FRAMES = 100
@@ -32,7 +33,7 @@ RECOVERY_S = 5.0
 """[s] Approximate time in which the calibration learns the background again after a target."""
 
 
-class Detect:
+class Detect(Stage[FieldFrame, FieldFrame | Detection]):
     """Decides for each frame whether a target is present, and reports onset and release.
 
     `max_consecutive_above` is the largest number of consecutive frames above the threshold.
@@ -160,10 +161,3 @@ class Detect:
         p = self.settings.false_alarm_probability
         return Detection(stamp_ns, self._next_id, onset, statistic, n,
                          self.threshold(p, n) if n else float('nan'), p, strongest)
-
-    def idle(self) -> None:
-        """Do nothing: no work is deferred."""
-
-    def flush(self) -> list[FieldFrame | Detection]:
-        """Return an empty list: no frame is buffered."""
-        return []

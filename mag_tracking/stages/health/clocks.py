@@ -1,4 +1,4 @@
-"""Findings about the clocks of the timestamps, compared with the times of receipt."""
+"""Faults of timestamps, and clocks of the sensors, compared by the times of receipt."""
 
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
@@ -46,6 +46,20 @@ UNITS = ((1e3, 'the seconds of its timestamps are milliseconds'),
 """Factor by which the timestamps advance too fast, and the reason."""
 MAX_RATIO_ERROR = 0.1
 """Maximum relative error of this factor; of clocks that are compared, it is 1."""
+UPDATE_INTERVAL = 64
+"""Number of new readings of a sensor after which its timestamps are examined again."""
+CAUSES = {
+    TimestampError.ZERO: (Cause.ZERO_STAMPS, 'set the timestamps in the driver'),
+    TimestampError.COARSE: (
+        Cause.COARSE_STAMPS, 'let the driver set timestamps of a finer resolution'),
+    TimestampError.PACKET: (
+        Cause.PACKET_STAMPS, 'let the driver set the timestamp of each reading'),
+    TimestampError.BURST: (
+        Cause.BURST_STAMPS, 'let the driver set the time of measurement instead of the time of '
+        'arrival'),
+    TimestampError.UNIT: (
+        Cause.MILLISECOND_STAMPS, 'correct the unit of the timestamps in the driver')}
+"""Cause and remedy of each error of timestamps."""
 
 
 class ClockSpan(NamedTuple):
@@ -98,11 +112,6 @@ class ClockSpan(NamedTuple):
         return ahead_s, abs(ahead_s) > (MAX_CLOCK_ERROR_S if is_ahead else MAX_LATENCY_S)
 
     @property
-    def is_since_boot(self) -> bool:
-        """Whether the timestamps count from the start of the device."""
-        return 0 < self.last_ns < EARLIEST_DATE_S * NS < self.last_received_ns
-
-    @property
     def wrong_unit(self) -> str | None:
         """Description of a wrong unit of the timestamps; None if it is right, or unknown."""
         return next((text for factor, text in UNITS
@@ -131,7 +140,7 @@ def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
                           'correct the unit of the timestamps in the driver',
                           Cause.MILLISECOND_STAMPS)
             continue
-        if clock.is_since_boot:
+        if 0 < clock.last_ns < EARLIEST_DATE_S * NS < clock.last_received_ns:
             differs = abs(ahead_s) > MAX_BOOT_DIFFERENCE_S
             yield Finding(
                 differs, name, 'its timestamps count from the start of its device (the latest '
@@ -144,22 +153,6 @@ def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
                           'the timestamps of other sensors', 'synchronise its clock (chrony, PTP); '
                           'knocks correct only offsets below half a second',
                           Cause.CLOCK_DIFFERS)
-
-
-UPDATE_INTERVAL = 64
-"""Number of new readings of a sensor after which its timestamps are examined again."""
-CAUSES = {
-    TimestampError.ZERO: (Cause.ZERO_STAMPS, 'set the timestamps in the driver'),
-    TimestampError.COARSE: (
-        Cause.COARSE_STAMPS, 'let the driver set timestamps of a finer resolution'),
-    TimestampError.PACKET: (
-        Cause.PACKET_STAMPS, 'let the driver set the timestamp of each reading'),
-    TimestampError.BURST: (
-        Cause.BURST_STAMPS, 'let the driver set the time of measurement instead of the time of '
-        'arrival'),
-    TimestampError.UNIT: (
-        Cause.MILLISECOND_STAMPS, 'correct the unit of the timestamps in the driver')}
-"""Cause and remedy of each error of timestamps."""
 
 
 def timestamp_finding(sensor: str, fault: TimestampFault) -> Finding:

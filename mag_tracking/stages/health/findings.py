@@ -203,8 +203,7 @@ def no_detection_reason(network: SensorNetwork, calibrate: Calibrate, detect: De
         cause, n = max(rejected.items(), key=lambda item: item[1])
         return f'no reading was usable: {quantity(n, "was", "were")} rejected ({cause})'
     if not n_accepted:
-        return 'there were no readings on ' + ', '.join(
-            missing_topics or network.absolute_topics)
+        return 'there were no readings on ' + ', '.join(missing_topics or network.absolute_topics)
     if not detect.counts['frames']:
         stuck = [name for name in calibrate.unready() if calibrate.backgrounds()[name].stuck]
         if stuck:
