@@ -1,4 +1,4 @@
-"""Path validation, and creation of result files without following links."""
+"""Files: creation without following links, and hand-written YAML with limits on size and depth."""
 
 import os
 import secrets
@@ -11,6 +11,22 @@ from typing import Any, BinaryIO, TextIO
 import yaml
 
 from mag_tracking.errors import MagTrackingError, OutputError
+
+MAX_NODES = 1_000_000
+"""Maximum number of keys, values, lists and mappings in a file after expansion of aliases."""
+MAX_ENTRIES = 1000
+"""Maximum number of entries of a mapping, such as the sensors of a network. The parser needs half a
+minute for 10,000 sensors."""
+MAX_BYTES = 2_000_000
+"""Maximum size of a file [bytes]; a thousand sensors with all calibrations have 1.1 MB."""
+MAX_DEPTH = 64
+"""Maximum depth of lists and mappings after expansion of aliases."""
+MAX_BITS = 14_000
+"""Maximum size of an integer [bits]. Python does not format integers of more than 4300 decimal
+digits."""
+_REPR = Repr()
+_REPR.maxlevel, _REPR.maxstring, _REPR.maxother, _REPR.maxlong = 3, 200, 200, 200
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = 20
 
 
 def checked_path(path: str | PathLike[str], error: type[MagTrackingError]) -> Path:
@@ -71,20 +87,6 @@ def _unlinked_path(path: str | PathLike[str]) -> Path:
     path = checked_path(path, OutputError)
     path.unlink(missing_ok=True)
     return path
-
-
-MAX_NODES = 1_000_000
-"""Maximum number of keys, values, lists and mappings in a file after expansion of aliases."""
-MAX_ENTRIES = 1000
-"""Maximum number of entries of a mapping, such as the sensors of a network. The parser needs half a
-minute for 10,000 sensors."""
-MAX_BYTES = 2_000_000
-"""Maximum size of a file [bytes]; a thousand sensors with all calibrations have 1.1 MB."""
-MAX_DEPTH = 64
-"""Maximum depth of lists and mappings after expansion of aliases."""
-MAX_BITS = 14_000
-"""Maximum size of an integer [bits]. Python does not format integers of more than 4300 decimal
-digits."""
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
@@ -199,11 +201,6 @@ def parse_yaml(text: str | TextIO, name: str, error: type[MagTrackingError]) -> 
 def is_utf8_encodable(value: str) -> bool:
     """Whether a string can be encoded as UTF-8: it has no unpaired surrogate."""
     return not any('\ud800' <= c <= '\udfff' for c in value)
-
-
-_REPR = Repr()
-_REPR.maxlevel, _REPR.maxstring, _REPR.maxother, _REPR.maxlong = 3, 200, 200, 200
-_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = 20
 
 
 def short_repr(value: object) -> str:

@@ -1,6 +1,6 @@
-"""Units and time constants: internal quantities are in SI units, timestamps in integer nanoseconds.
+"""Units, dates and times as text in tables, drivers files and device lines.
 
-Tables, drivers files and device lines use the unit names of this module.
+Internal quantities are in SI units, timestamps in integer nanoseconds.
 """
 
 import datetime

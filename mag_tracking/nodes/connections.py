@@ -19,6 +19,16 @@ from mag_tracking.units import NS
 
 MAX_NAMED = 4
 """Maximum number of names in a message; the remaining names are only counted."""
+SILENCE_TIMEOUT_S = 2.0
+"""[s] A sensor or node that has sent nothing for longer than this is reported as silent."""
+FIRST_MESSAGE_TIMEOUT_S = 8.0
+"""[s] Grace period for the first message; longer than learning a background takes."""
+MAX_LOAD = 0.95
+"""Maximum fraction of the time that a node can spend on messages without falling behind."""
+MAX_LATENCY_S = 1.0
+"""[s] A larger median latency causes a warning, because the poses are then too old for control."""
+MAX_LATENCIES = 10_000
+"""Maximum number of latencies stored between two reports; enough for a thousand sensors."""
 
 
 def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
@@ -77,18 +87,6 @@ def shortened(names: list[str]) -> str:
     """Join names with commas; after `MAX_NAMED` names, only count the remaining names."""
     n_more = len(names) - MAX_NAMED
     return ', '.join(names[:MAX_NAMED]) + (f' and {n_more} more' if n_more > 0 else '')
-
-
-SILENCE_TIMEOUT_S = 2.0
-"""[s] A sensor or node that has sent nothing for longer than this is reported as silent."""
-FIRST_MESSAGE_TIMEOUT_S = 8.0
-"""[s] Grace period for the first message; longer than learning a background takes."""
-MAX_LOAD = 0.95
-"""Maximum fraction of the time that a node can spend on messages without falling behind."""
-MAX_LATENCY_S = 1.0
-"""[s] A larger median latency causes a warning, because the poses are then too old for control."""
-MAX_LATENCIES = 10_000
-"""Maximum number of latencies stored between two reports; enough for a thousand sensors."""
 
 
 class Flow:

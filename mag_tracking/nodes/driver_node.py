@@ -61,7 +61,8 @@ class DriverNode(ManagedNode):
         self._stop_event: threading.Event | None = None
         self._diagnostics = diagnostics.DiagnosticsPublisher(self)
         self._reported_counts: dict[str, dict[str, int]] = {}
-        steady_timer(self, 1.0, self._publish_diagnostics)
+        steady_timer(self, 1.0, lambda: self._diagnostics.publish(
+            [self._status(driver) for driver in self._drivers]))
         self.start_automatically()
 
     def prepare(self) -> None:
@@ -149,10 +150,6 @@ class DriverNode(ManagedNode):
             for publisher in pair:
                 self.destroy_publisher(publisher)
         self._drivers, self._publishers_by_sensor = [], {}
-
-    def _publish_diagnostics(self) -> None:
-        """Publish the state of the devices."""
-        self._diagnostics.publish([self._status(driver) for driver in self._drivers])
 
     def _status(self, driver: Driver) -> DiagnosticStatus:
         """Return the diagnostics of one device."""

@@ -26,6 +26,17 @@ from mag_tracking.nodes.middleware import init_ros, shut_down
 from mag_tracking.recording.recorder import Recorder
 from mag_tracking.recording.writer import offered_qos
 
+POLL_INTERVAL_S = 0.02
+"""[s] Interval between fetches of messages."""
+DISCOVERY_INTERVAL_S = 0.5
+"""[s] Interval between searches for topics."""
+PROGRESS_INTERVAL_S = 10.0
+"""[s] Interval between progress lines if the output is not a terminal."""
+DEPTHS = {types.MAGNETIC_FIELD: 1000, types.IMU: 1000, types.FIELD_READINGS: 1000}
+"""Queue length by message type. A disk may stall for a second or more between two fetches."""
+DEFAULT_DEPTH = 100
+"""Queue length for other types, such as images, which are large."""
+
 
 @functools.cache
 def definition_of(type_name: str) -> str | None:
@@ -60,18 +71,6 @@ def _file_content(type_name: str) -> str | None:
             text = file.read_text(encoding='utf-8', errors='replace')
             return text if text.endswith('\n') else f'{text}\n'
     return None
-
-
-POLL_INTERVAL_S = 0.02
-"""[s] Interval between fetches of messages."""
-DISCOVERY_INTERVAL_S = 0.5
-"""[s] Interval between searches for topics."""
-PROGRESS_INTERVAL_S = 10.0
-"""[s] Interval between progress lines if the output is not a terminal."""
-DEPTHS = {types.MAGNETIC_FIELD: 1000, types.IMU: 1000, types.FIELD_READINGS: 1000}
-"""Queue length by message type. A disk may stall for a second or more between two fetches."""
-DEFAULT_DEPTH = 100
-"""Queue length for other types, such as images, which are large."""
 
 
 class _PolledSubscription:

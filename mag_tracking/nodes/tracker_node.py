@@ -23,7 +23,6 @@ from visualization_msgs.msg import MarkerArray
 from mag_tracking.calibration.doubtful_times import (
     DOUBTFUL_BACKGROUND,
     DoubtfulTimes,
-    InputDoubts,
     merged,
 )
 from mag_tracking.event_records import Disturbance, VehiclePassage
@@ -83,6 +82,8 @@ class TrackerNode(stage_node.StageNode):
         self._has_direct_input = has_direct_input
         self.after_pose: Callable[[], None] | None = None
         self._stage = TrackManager(self.network, self.settings.track)
+        # Called by a calibration node in the same process.
+        self.set_input_doubts, self.idle = self._stage.set_input_doubts, self._stage.idle
         self.settings = declare_settings(self, self.settings, 'traffic')
         self._traffic = Traffic(self.network, self.settings.traffic,
                                 self.settings.track.target == 'vehicle')
@@ -160,14 +161,6 @@ class TrackerNode(stage_node.StageNode):
             self._feed(frame)
             self._stage.idle()
 
-    def set_input_doubts(self, doubts: InputDoubts) -> None:
-        """Set the intervals of doubtful readings, in which tracks are ambiguous."""
-        self._stage.set_input_doubts(doubts)
-
-    def idle(self) -> None:
-        """Run the deferred work of the stage; called by a calibration node in the same process."""
-        self._stage.idle()
-
     def _feed(self, frame: FieldFrame) -> None:
         """Process a frame and publish the results."""
         self._publish_all(self._stage.feed(frame), frame)
@@ -225,10 +218,6 @@ class TrackerNode(stage_node.StageNode):
             self._send('~/markers', delete_markers(track, frame))
         else:
             self._publish_views(track, frame)
-        self._log_lifecycle(track)
-
-    def _log_lifecycle(self, track: Track) -> None:
-        """Log the beginning and the end of a track."""
         if track.id > self._latest_id:
             self._latest_id = track.id
             self.get_logger().info(f'track {track.id} begins' + (

@@ -1,8 +1,7 @@
 """Align: combine the asynchronous samples of many sensors into frames of the whole network.
 
-Samples are sorted by timestamp. A frame is completed only when every active sensor has
-delivered a newer sample or, in burst mode, its sample of the round. Therefore the frames do not
-depend on the order in which the messages of different sensors arrive.
+A frame is completed only when every active sensor has delivered a newer sample or, in burst mode,
+its sample of the round. Therefore frames do not depend on the order in which messages arrive.
 """
 
 from collections import Counter
@@ -29,6 +28,18 @@ MIN_PERIOD_S = 1e-4
 """[s] Minimum configurable frame period; no sensor has a shorter sample interval."""
 MAX_TARGET_SPEED = 20.0
 """[m/s] Frames are designed for targets up to this speed."""
+UNLIMITED_NS = np.iinfo(np.int64).max
+"""[ns] Later than any timestamp."""
+MAX_HELD = 16
+"""Maximum number of samples per sensor that are held while a clock step is unconfirmed."""
+CAUSES = {
+    core.NO_FIELD: 'no finite field',
+    core.NO_COVARIANCE: 'unknown covariance, and no noise_std in the network',
+    core.DUPLICATE: 'duplicate timestamp',
+    core.OUT_OF_ORDER: 'out of order',
+    core.LATE: 'late',
+}
+"""Cause of rejection for each reason code, except causes that name a sensor."""
 
 
 def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
@@ -74,20 +85,6 @@ def frame_period_warning(settings: AlignSettings, network: SensorNetwork) -> str
             f'{1e3 * delay:.0f} ms that a target at {MAX_TARGET_SPEED:.0f} m/s takes from {first} '
             f'to {second}, which makes speed and direction less accurate; set align.period_s to 0 '
             'for an automatic period')
-
-
-UNLIMITED_NS = np.iinfo(np.int64).max
-"""[ns] Later than any timestamp."""
-MAX_HELD = 16
-"""Maximum number of samples per sensor that are held while a clock step is unconfirmed."""
-CAUSES = {
-    core.NO_FIELD: 'no finite field',
-    core.NO_COVARIANCE: 'unknown covariance, and no noise_std in the network',
-    core.DUPLICATE: 'duplicate timestamp',
-    core.OUT_OF_ORDER: 'out of order',
-    core.LATE: 'late',
-}
-"""Cause of rejection for each reason code, except causes that name a sensor."""
 
 
 class Align(Stage[Readings, FieldFrame]):

@@ -308,8 +308,7 @@ class SensorHealth:
         if not n:
             return [Finding(True, name, 'no reading', 'check its cable, its driver and the topic '
                             'in the network file', Cause.NO_MESSAGES)]
-        found = [*(self._clock_findings(name) if is_live else ()),
-                 *self._time_findings(name, n), *self._value_findings(name, n, max_field)]
+        found = [*self._time_findings(name, n, is_live), *self._value_findings(name, n, max_field)]
         if noise_std is not None and not np.nanmax(np.abs(self.field), initial=0.0) > max_field:
             noise_ratio = self.noise_std / noise_std
             if np.nanmax(noise_ratio, initial=0.0) > 3.0:
@@ -320,22 +319,19 @@ class SensorHealth:
                                      Cause.NOISY))
         return found
 
-    def _clock_findings(self, name: str) -> Iterator[Finding]:
-        """Yield findings about clock steps and backward timestamps."""
-        if n := self.counts['clock steps']:
-            yield Finding(True, name, f'its clock stepped {occurrences(n)} relative to the '
-                          f'host, by up to {self._largest_step_s:+.2f} s', 'synchronise the '
+    def _time_findings(self, name: str, n: int, is_live: bool) -> Iterator[Finding]:
+        """Yield findings about timestamps, lost readings and delays."""
+        c, (median, low, high) = self.counts, self.delay_s
+        if c['clock steps'] and is_live:
+            yield Finding(True, name, f'its clock stepped {occurrences(c["clock steps"])} relative '
+                          f'to the host, by up to {self._largest_step_s:+.2f} s', 'synchronise the '
                           'clocks (chrony, PTP), and take timestamps from a monotonic clock',
                           Cause.CLOCK_STEPPED)
-        if n := self.counts['backward timestamps']:
-            yield Finding(True, name, f'timestamps went back {occurrences(n)}', 'check for two '
-                          'publishers on one topic, a clock that was set, or a looped replay',
+        if c['backward timestamps'] and is_live:
+            yield Finding(True, name, 'timestamps went back '
+                          f'{occurrences(c["backward timestamps"])}', 'check for two publishers on '
+                          'one topic, a clock that was set, or a looped replay',
                           Cause.BACKWARD_STAMPS)
-
-    def _time_findings(self, name: str, n: int) -> Iterator[Finding]:
-        """Yield findings about duplicate timestamps, lost readings and delays."""
-        c = self.counts
-        median, low, high = self.delay_s
         if self._timestamp_fault is not None:
             yield timestamp_finding(name, self._timestamp_fault)
         if c['duplicates'] > 0.001 * n:
