@@ -116,12 +116,9 @@ class CalibrationNode(StageNode):
         self._publish_transforms()
 
     def _publish_transforms(self) -> None:
-        """Publish a static transform for each sensor, if `publish_sensor_tf` is set.
-
-        The child frame has the name of the sensor and not the `frame_id` of its messages, which may
-        name a robot link that another node publishes: a frame with two parents would break the
-        transform tree.
-        """
+        """Publish a static transform for each sensor, if `publish_sensor_tf` is set."""
+        # The child frame has the name of the sensor: the `frame_id` of its messages may name a
+        # robot link that another node publishes, and a frame cannot have two parents.
         if self._transform_publisher is not None:
             send(self._transform_publisher, {'transforms': sensor_transform_dicts(
                 self.network, self.get_clock().now().nanoseconds)})

@@ -97,16 +97,14 @@ class Flow:
     """
 
     def __init__(self, source: str) -> None:
-        self.source = source
+        self.source, self.n_lost = source, 0
         self.topics: list[str] = []
         self.batches: list[str] = []
-        self._start_time = time.monotonic()
         self.last_received: float | None = None
-        self.n_lost = 0
-        self._n_messages, self._n_reported_lost = 0, 0
+        self._n_messages, self._n_reported_lost, self._busy_s = 0, 0, 0.0
         self._latencies: list[float] = []
         self._latest_latency_s: float | None = None
-        self._busy_s, self._report_time = 0.0, time.monotonic()
+        self._start_time = self._report_time = time.monotonic()
 
     def add(self, stamp_ns: int, arrival_ns: int, start_s: float) -> None:
         """Add a message that arrived at `arrival_ns` by the clock of the node, and whose processing

@@ -42,11 +42,8 @@ do not, because a search takes as long as the processing of many readings."""
 
 
 class DetectionNode(StageNode):
-    """Aligns the readings of all sensors into frames and tests each frame for a target.
-
-    With a `tracker` in the same process, which receives the frames directly, calibrated readings
-    are passed to `receive_readings`.
-    """
+    """Aligns the readings of all sensors into frames and tests each for a target; with a `tracker`
+    in the same process, readings come to `receive_readings`, and frames go to the tracker."""
 
     def __init__(self, tracker: TrackerNode | None = None, **node_arguments: Any) -> None:
         super().__init__('detection_node', 'align', **node_arguments)

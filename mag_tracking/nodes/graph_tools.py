@@ -7,6 +7,7 @@ from typing import Any
 
 import rclpy
 import yaml
+from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from rcl_interfaces import srv
 from rclpy.exceptions import NameValidationException
@@ -41,7 +42,7 @@ class Observer:
         spin(self._executor, lambda: condition() or time.monotonic() > end)
         return condition()
 
-    def call(self, service_type: Any, name: str, request: Any, once: bool = False) -> Any:
+    def call(self, service_type: Any, name: str, once: bool = False, **fields: Any) -> Any:
         """Call a service; raises GraphError if it does not exist or does not respond in time.
 
         A query is repeated, because the response of a server that has not yet discovered the client
@@ -57,7 +58,7 @@ class Observer:
                 self.wait(lambda: False, DISCOVERY_S)
             futures: list[Any] = []
             for _ in range(1 if once else MAX_ATTEMPTS):
-                futures.append(client.call_async(request))
+                futures.append(client.call_async(service_type.Request(**fields)))
                 if self.wait(lambda: any(f.done() for f in futures),
                              CHANGE_TIMEOUT_S if once else RESPONSE_TIMEOUT_S / MAX_ATTEMPTS):
                     return next(f for f in futures if f.done()).result()
@@ -151,12 +152,11 @@ def as_text(message: Any) -> str:
 def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list[str]:
     """Parameters of a node, or the named one, with values and descriptions; raises GraphError if it
     does not exist."""
-    names = [name] if name is not None else list(graph.call(
-        srv.ListParameters, f'{node}/list_parameters', srv.ListParameters.Request()).result.names)
-    values = graph.call(srv.GetParameters, f'{node}/get_parameters',
-                        srv.GetParameters.Request(names=names)).values
-    descriptors = graph.call(srv.DescribeParameters, f'{node}/describe_parameters',
-                             srv.DescribeParameters.Request(names=names)).descriptors
+    names = [name] if name is not None else list(
+        graph.call(srv.ListParameters, f'{node}/list_parameters').result.names)
+    values = graph.call(srv.GetParameters, f'{node}/get_parameters', names=names).values
+    descriptors = graph.call(
+        srv.DescribeParameters, f'{node}/describe_parameters', names=names).descriptors
     if name is not None and not (values and values[0].type):
         raise GraphError(f'{node} has no parameter {name}')
     return [f'{n}: {parameter_value_to_python(v)}'
@@ -171,30 +171,29 @@ def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
     if it is invalid or rejected."""
     try:
         value = yaml.safe_load(text)
-        (kind,) = graph.call(srv.GetParameterTypes, f'{node}/get_parameter_types',
-                             srv.GetParameterTypes.Request(names=[name])).types or (0,)
+        (kind,) = graph.call(
+            srv.GetParameterTypes, f'{node}/get_parameter_types', names=[name]).types or (0,)
         if kind == Parameter.Type.DOUBLE.value and isinstance(value, int):
             value = float(value)
         parameter = Parameter(name, value=value)
     except (yaml.YAMLError, TypeError, ValueError) as error:
         raise GraphError(f'parameter {name}: {text!r} is not a valid value: {error}') from error
-    result = graph.call(srv.SetParameters, f'{node}/set_parameters', srv.SetParameters.Request(
-        parameters=[parameter.to_parameter_msg()]), once=True).results[0]
+    result = graph.call(srv.SetParameters, f'{node}/set_parameters', once=True,
+                        parameters=[parameter.to_parameter_msg()]).results[0]
     if not result.successful:
         raise GraphError(f'{node} rejects parameter {name}: {result.reason}')
 
 
 def lifecycle_state(graph: Observer, node: str) -> tuple[str, list[str]]:
     """Label of a lifecycle node's state, and labels of the transitions that are now possible."""
-    state = graph.call(GetState, f'{node}/get_state', GetState.Request()).current_state.label
+    state = graph.call(GetState, f'{node}/get_state').current_state.label
     return state, [t.label for t in _possible_transitions(graph, node)]
 
 
 def _possible_transitions(graph: Observer, node: str) -> list[Any]:
     """Transitions of a lifecycle node that are now possible."""
     return [t.transition for t in graph.call(
-        GetAvailableTransitions, f'{node}/get_available_transitions',
-        GetAvailableTransitions.Request()).available_transitions]
+        GetAvailableTransitions, f'{node}/get_available_transitions').available_transitions]
 
 
 def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
@@ -206,7 +205,6 @@ def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
         names = ', '.join(t.label for t in possible)
         raise GraphError(f'{node}: transition {transition} is not possible in the current state; '
                          f'possible: {names}')
-    request = ChangeState.Request()
-    request.transition.id = matches[0].id
-    if not graph.call(ChangeState, f'{node}/change_state', request, once=True).success:
+    if not graph.call(ChangeState, f'{node}/change_state', once=True,
+                      transition=Transition(id=matches[0].id)).success:
         raise GraphError(f'{node}: transition {transition} failed; see the log of the node')

@@ -121,11 +121,10 @@ class _PolledSubscription:
 class RecordNode(Node):
     """Subscribes to the selected topics and passes their messages to a `Recorder`.
 
-    The node is polled instead of being spun by an executor: the events executor of the Jazzy wheels
-    fails in callbacks that request time and sequence number of a message, and the single-threaded
-    executor uses most of a processor core for twenty sensors. `report` is called with lines for the
-    user; `selection` has absolute names after construction, `refused` the topics that are not
-    recorded, with the reason.
+    The node is polled: the events executor of the Jazzy wheels fails in callbacks that request time
+    and sequence number of a message, and the single-threaded executor uses most of a processor core
+    for twenty sensors. `report` is called with lines for the user; `refused` are the topics that
+    are not recorded, with the reason.
     """
 
     def __init__(self, recorder: Recorder, selection: Selection,

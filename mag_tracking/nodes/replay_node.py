@@ -43,11 +43,8 @@ MAX_MESSAGES_PER_TICK = 200
 
 
 class ReplayNode(ManagedNode):
-    """Publishes the messages of a recording at the recorded rate or a multiple of it.
-
-    `finished` means that playback has reached the end; `counts` are the messages played and
-    rejected.
-    """
+    """Publishes the messages of a recording, at a multiple of the recorded rate, until `finished`;
+    `counts` are those played and rejected."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__('replay_node', **node_arguments)

@@ -20,10 +20,8 @@ def steady_timer(node: Node, seconds: float, call: Callable[[], None],
 
 
 class Deferred:
-    """Calls a function `delay_s` after a request; requests in the meantime have no effect.
-
-    Immediate work would compete with the processes that receive the published messages.
-    """
+    """Calls a function `delay_s` after a request, and any further ones in the meantime, so that the
+    processes that receive the published messages come first."""
 
     def __init__(self, node: Node, delay_s: float, call: Callable[[], None]) -> None:
         self._call = call
@@ -46,11 +44,8 @@ RESPONSE_INTERVAL_S = 0.002
 
 def paced_service(node: Node, service_type: Any, name: str,
                   callback: Callable[[Any, Any], Any]) -> Service:
-    """Create a service whose responses do not overflow the queues of its clients.
-
-    Each client receives the responses to all clients and by default stores ten of them: without
-    pacing, about half of forty simultaneous calls would get no response.
-    """
+    """Create a service whose responses do not overflow the queues of its clients: each client
+    receives the responses to all clients, and by default stores ten of them."""
     # The queue is long enough for many simultaneous calls.
     service = node.create_service(service_type, name, callback, qos_profile=QoSProfile(
         depth=1000, reliability=ReliabilityPolicy.RELIABLE))

@@ -151,8 +151,8 @@ class StageNode(Node):
                      stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
         """Create a function that receives records of the preceding step without a topic.
 
-        Diagnostics report throughput and latency of `source`, the step, and the `topics` on which
-        it publishes. `stamp_of` returns the timestamp of a record in ns.
+        Diagnostics report on `source`, the step, and the `topics` on which it publishes. `stamp_of`
+        returns the timestamp of a record in ns.
         """
         flow = self.flows.setdefault(source, Flow(source))
         flow.topics += map(self.resolve_topic_name, topics)

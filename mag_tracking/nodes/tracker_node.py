@@ -72,9 +72,8 @@ OUTPUTS = {
 class TrackerNode(stage_node.StageNode):
     """Tracks targets with a bank of filters and publishes the results.
 
-    With `has_direct_input`, frames are passed to `receive_frame` and not received on a topic.
-    `after_pose` publishes the frame from which a pose was computed; it is called after the pose and
-    before the track are published.
+    With `has_direct_input`, frames are passed to `receive_frame`. `after_pose` is called between
+    the pose and the track, to publish the frame from which they were computed.
     """
 
     def __init__(self, has_direct_input: bool = False, **node_arguments: Any) -> None:
@@ -120,10 +119,7 @@ class TrackerNode(stage_node.StageNode):
         return {'track': self._stage, 'traffic': self._traffic}
 
     def end_tracks_on_timeout(self) -> None:
-        """End the tracks if frames no longer arrive, except during a replay, which may pause.
-
-        The time of arrival is used, because timestamps may be wrong.
-        """
+        """End the tracks if frames no longer arrive, except during a replay, which may pause."""
         if self._stage.bank is None or self.is_replayed:
             return
         last_received = self.flows['detection'].last_received

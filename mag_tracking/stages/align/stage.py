@@ -58,10 +58,9 @@ def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
 def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
     """Frame period [s]: the setting, or a period derived from the geometry if the setting is 0.
 
-    A frame that is longer than the delay between two sensors mixes their signals. In a compact
-    network, the derived period is therefore half the shortest delay. In a larger network, tracking
-    does not use this delay, and the default period saves computing time. Raises SettingsError if
-    the setting is below `MIN_PERIOD_S`.
+    A longer frame than the delay between two sensors mixes their signals, so in a compact network
+    the period is half the shortest delay. In a larger one, tracking does not use this delay. Raises
+    SettingsError if the setting is below `MIN_PERIOD_S`.
     """
     if 0.0 < settings.period_s < MIN_PERIOD_S:
         raise SettingsError(f'align.period_s: {settings.period_s:g} s is shorter than the minimum '

@@ -18,12 +18,8 @@ tracks changes it by about a hundred times as much."""
 
 def compared_with_earth(network: SensorNetwork, survey: SurveySettings,
                         levels: FloatArray) -> list[FieldInconsistency]:
-    """Find the sensors whose `levels` (n, 3) [T] without a target, NaN if unknown, contradict the
-    Earth's field.
-
-    If it is unknown, they are compared with their median; raises ValueError if fewer than three
-    then report all axes.
-    """
+    """Find the sensors whose `levels` (n, 3) [T] without a target contradict the Earth's field, or,
+    if it is unknown, their median; raises ValueError if fewer than three then report all axes."""
     std = np.array([np.full(3, np.deg2rad(survey.nominal_std_deg)) if s is None else s
                     for s in network.orientation_std])
     earth_field = consensus(levels, network.R_ws) if network.earth_field is None \

@@ -60,10 +60,8 @@ class Prescan:
 
 def prescan(batches: Iterable[Readings], network: SensorNetwork,
             settings: CalibrateSettings) -> Prescan:
-    """Find the backgrounds of sensors if a target is present at the start of the raw readings.
-
-    If the network file contains all backgrounds, there are only faults.
-    """
+    """Find the backgrounds of sensors, unless the network file contains all of them, if a target is
+    present at the start of the raw readings."""
     without_background = [name for name, level in zip(network.names, network.background,
                                                       strict=True) if level is None]
     batches = iter(batches)
@@ -114,8 +112,8 @@ def _level_of(recorder: BlockRecorder, departed_at: float | None,
               learnt: tuple[float, FloatArray] | None) -> tuple[MostFrequentLevel | None, bool]:
     """Return (most frequent level or None, whether a target was present at the start).
 
-    Only readings after its departure, at `departed_at` [s], then determine the level. If the field
-    later returns to the level `learnt` at the start, no target was present.
+    Then only readings after its departure at `departed_at` [s] count. If the field later returns to
+    the level `learnt` at the start, no target was present.
     """
     level = recorder.quiet_level()
     if level is None or departed_at is None or learnt is None \
@@ -144,10 +142,8 @@ def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
 
 def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: MostFrequentLevel,
                     recorder: BlockRecorder, settings: CalibrateSettings) -> bool:
-    """Whether the initial background was learnt early and equals the most frequent level.
-
-    If relearning is disabled, any initial background that was learnt early is accepted.
-    """
+    """Whether the initial background was learnt early and, unless relearning is disabled, equals
+    the most frequent level."""
     max_time = LEARNING_TOLERANCE_S + max(settings.learn_s, MIN_BLOCKS * level.block_s)
     if learnt is None or learnt[0] > max_time:
         return False

@@ -79,17 +79,11 @@ class Calibrate:
     The clock offset and the corrections of hard and soft iron in the network file are applied
     first. The field remains in the sensor frame. The covariance is taken from the reading if
     available (unless the measured noise contradicts it), otherwise from the network file; otherwise
-    it is estimated.
+    it is estimated. The rules are in `calibration/readings.hpp`; this class handles the events that
+    the compiled code reports.
 
-    The rules are in `calibration/readings.hpp`; this class handles the events that the compiled
-    code reports. A `background_type` estimates the background of each sensor; `survey` has the
-    settings of the comparison with the Earth's field.
-
-    Attributes
-    ----------
-    rejections : numbers of rejected readings, {sensor: {(cause, description): number}}
-    driver_faults : marks and repetitions, which are left out
-    timestamps : faults of the timestamps, and rates
+    A `background_type` estimates the background of each sensor; `survey` has the settings of the
+    comparison with the Earth's field. `rejections` are {sensor: {(cause, description): number}}.
     """
 
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
