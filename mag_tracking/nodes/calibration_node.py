@@ -32,13 +32,7 @@ from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
 from mag_tracking.nodes.scheduling import Deferred, paced_service, steady_timer
 from mag_tracking.nodes.sensor_health import HealthDiagnostics
 from mag_tracking.nodes.sensor_rounds import BackgroundStore, SensorRounds
-from mag_tracking.nodes.stage_node import (
-    LATCHED_QOS,
-    PUBLISHER_QOS,
-    READY,
-    STREAM_QOS,
-    StageNode,
-)
+from mag_tracking.nodes.stage_node import LATCHED_QOS, PUBLISHER_QOS, READY, STREAM_QOS, StageNode
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.recording import background_file
 from mag_tracking.records import Readings

@@ -21,12 +21,7 @@ from mag_tracking.nodes import middleware
 from mag_tracking.nodes.convert import has_subscribers, send
 from mag_tracking.nodes.ros_params import declare_settings
 from mag_tracking.nodes.scheduling import steady_timer
-from mag_tracking.nodes.stage_node import (
-    PUBLISHER_QOS,
-    RESULT_QOS,
-    STREAM_QOS,
-    StageNode,
-)
+from mag_tracking.nodes.stage_node import PUBLISHER_QOS, RESULT_QOS, STREAM_QOS, StageNode
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.records import Detection, FieldFrame, Readings
 from mag_tracking.stages.align.stage import Align, frame_period_warning

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.stages.align.stage import (
-    frame_period,
-    frame_period_warning,
-    shortest_delay,
-)
+from mag_tracking.stages.align.stage import frame_period, frame_period_warning, shortest_delay
 from mag_tracking.stages.settings import AlignSettings
 from support.passes import ROAD, network_of
 
