@@ -19,7 +19,7 @@ BUDGETS = {
     'cli': 3100, 'nodes': 3750, 'apps': 5800, 'results': 1550, 'drivers': 5400, 'recording': 4850,
     'web': 650, 'stages': 12200, 'analysis': 4050, 'messages': 1750, 'simulation': 250,
     'physics': 2450, 'inference': 3100, 'calibration': 4700, 'network': 850, 'report': 2300,
-    'modules': 2500}
+    'modules': 2650}
 """Maximum lines of each package, and of the modules outside packages, in Python and C++ with
 docstrings. A change may lower a budget; one that raises it says why."""
 

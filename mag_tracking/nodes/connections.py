@@ -57,8 +57,8 @@ def is_latched(publisher: TopicEndpointInfo) -> bool:
 
 
 def subscriber_qos(depth: int, latched: bool) -> QoSProfile:
-    """QoS that matches every publisher or, if `latched`, receives earlier messages of latched ones.
-    """
+    """QoS that matches every publisher or, if `latched`, receives earlier messages of latched
+    ones."""
     if latched:
         return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE,
                           durability=DurabilityPolicy.TRANSIENT_LOCAL)

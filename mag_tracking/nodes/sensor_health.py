@@ -40,7 +40,7 @@ LEARNING_TIMEOUT_FACTOR = 3.0
 
 class HealthDiagnostics:
     """Monitors the raw readings of a network; `node` resolves the sensor topics and examines their
-    publishers. With `is_replayed`, old timestamps are not a fault."""
+    publishers; with `is_replayed`, old timestamps are not a fault."""
 
     def __init__(self, network: SensorNetwork, settings: Settings, node: Node | None = None,
                  is_replayed: bool = False) -> None:

@@ -40,6 +40,7 @@ class Stage(Protocol[In, Out]):
 
     def idle(self) -> None:
         """Do deferred work after the outputs have been published; this does not change results."""
+        return None
 
     def flush(self) -> list[Out]:
         """Return the remaining records at the end of the input; by default, there are none.
