@@ -267,8 +267,10 @@ class SensorHealth:
 
     @property
     def dead_axes(self) -> str:
-        """Axes, such as 'xz', that did not change within the window although another axis changed,
-        in a sensor with coarse resolution by more than `MIN_MOVED_STEPS` quantisation steps."""
+        """Axes, such as 'xz', that did not change within the window although another axis changed.
+
+        With coarse resolution, they have never changed, and the other one by `MIN_MOVED_STEPS`.
+        """
         self.update()
         if len(self._fields) < WINDOW:
             return ''
