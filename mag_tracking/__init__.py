@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from mag_tracking.settings import read_parameter_file
 
 __version__: str
-
 __all__ = [
     'EventsResult', 'FitResult', 'FittedPass', 'MagTrackingError', 'MissingDependencyError',
     'NetworkError', 'Plan', 'PlannedTarget', 'Readings', 'ReadingsError', 'RecordedReadings',

@@ -1,7 +1,4 @@
-"""Exceptions of the package.
-
-A message names the affected object and, where applicable, the invalid value and its bound.
-"""
+"""Exceptions of the package, whose messages name the object, the invalid value and its bound."""
 
 
 class MagTrackingError(Exception):

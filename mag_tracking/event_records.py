@@ -1,4 +1,7 @@
-"""Event records: single-sensor passes, disturbances, vehicle passages and traffic summaries."""
+"""Event records: single-sensor passes, disturbances, vehicle passages and traffic summaries.
+
+Times are in nanoseconds since 1970.
+"""
 
 from dataclasses import dataclass
 
@@ -17,18 +20,14 @@ class PassEvent:
     """
 
     sensor: str
-    """Name of the sensor."""
     number: int
     """Consecutive number of the event, counted from 1 for each sensor."""
     ended: bool
     """True if the target has left the range of the sensor. False if the readings ended earlier."""
     onset_ns: int
-    """Time of the onset, ns since 1970."""
     release_ns: int
-    """End of the detection, ns since 1970: the release minus the hold time, or the last reading if
-    `ended` is false."""
+    """End of the detection: the release minus the hold time, or the last reading if not `ended`."""
     peak_ns: int
-    """Time of `peak`, ns since 1970."""
     peak: FloatArray
     """Reading with the largest field magnitude, (3,) T, sensor frame. NaN for a missing axis."""
     energy: float
@@ -36,11 +35,10 @@ class PassEvent:
     axes: str
     """Measured axes, such as 'xy'."""
     noise_std: FloatArray
-    """Median noise standard deviation of the readings, (3,) T, sensor frame. NaN for a missing
-    axis."""
+    """Median noise standard deviation of the readings, (3,) T. NaN for a missing axis."""
     closest_ns: int
-    """Time of the closest point of approach of a dipole on a straight line, ns since 1970. If this
-    time is unobservable, it is the time of the largest field."""
+    """Time of the closest point of approach of a dipole on a straight line; if it is unobservable,
+    that of the largest field."""
     closest_std: float
     """Standard deviation of `closest_ns`, s. inf if unobservable."""
     time_scale: float
@@ -58,15 +56,12 @@ class Disturbance:
     """A change of the field that no target explains, although it started a track."""
 
     stamp_ns: int
-    """Time at which the disturbance was identified or, if `ended`, at which it ended, ns since
-    1970."""
+    """Time at which the disturbance was identified or, if `ended`, at which it ended."""
     id: int
-    """Number of the disturbance, from 1."""
     ended: bool
     """True if the network is quiet again or the frames have ended. False while the disturbance
     continues."""
     begin_ns: int
-    """Start time of the disturbance, ns since 1970."""
     largest: float
     """Largest magnitude of the field at any sensor, T."""
     sensors: tuple[str, ...]
@@ -87,9 +82,7 @@ class VehiclePassage:
     number: int
     """Number of the passage, from 1, in chronological order over all lines."""
     line: str
-    """Name of the counting line."""
     track_id: int
-    """Number of the track."""
     forward: bool
     """Whether the vehicle moved in the forward direction of the line."""
     direction_error: float
@@ -106,13 +99,11 @@ class VehiclePassage:
     speed: float
     """Horizontal speed, m/s."""
     speed_std: float
-    """Standard deviation of `speed`, m/s."""
     heading_std: float
     """Standard deviation of the heading, rad."""
     length: float
     """Length of the row of dipoles that models the vehicle, m. 0 for a point target."""
     length_std: float
-    """Standard deviation of `length`, m. 0 for a point target."""
     moment: FloatArray
     """Magnetic moment, (3,) A m², world frame."""
     moment_covariance: FloatArray
@@ -125,7 +116,6 @@ class VehiclePassage:
     """Time since the previous passage across this line in this direction, s. NaN for the first
     passage, or if the passages are not in chronological order."""
     ambiguous: bool
-    """Whether the passage is ambiguous: `doubts` is not empty."""
     doubts: tuple[str, ...]
     """Reasons why the passage is ambiguous: names from `stages.traffic.stage`."""
 
@@ -139,7 +129,6 @@ class TrafficCount:
     vehicle_class: str
     """Class of the vehicles, or `unknown`."""
     count: int
-    """Number of passages."""
     ambiguous: int
     """Number of these passages that are ambiguous."""
     mean_speed: float
@@ -153,11 +142,8 @@ class TrafficSummary:
     """Traffic across one line in one interval."""
 
     begin_ns: int
-    """Start of the interval, ns since 1970."""
     end_ns: int
-    """End of the interval, ns since 1970."""
     line: str
-    """Name of the counting line."""
     observed_s: float
     """Duration within the interval that is covered by frames, s."""
     counts: tuple[TrafficCount, ...]

@@ -7,10 +7,8 @@ from mag_tracking.arrays import FloatArray
 
 
 def rotation_from_quaternion(q: ArrayLike) -> FloatArray:
-    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4).
-
-    Raises ValueError if a norm differs from one by more than 1e-3.
-    """
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4); raises ValueError if a norm
+    differs from one by more than 1e-3."""
     q = np.asarray(q, dtype=float)
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
     if not np.all(np.abs(norm - 1.0) <= 1e-3):
@@ -32,10 +30,8 @@ def quaternion_from_rotation_vector(v: ArrayLike) -> FloatArray:
 
 
 def rotation_vectors_between(q: ArrayLike, other: ArrayLike) -> FloatArray:
-    """Shortest rotations from orientation `q` (4,) to others (..., 4), as rotation vectors.
-
-    The vectors (..., 3) [rad] are in world axes, with a norm of at most pi.
-    """
+    """Shortest rotations from orientation `q` (4,) to others (..., 4), as rotation vectors (..., 3)
+    [rad] in world axes."""
     q, other = np.asarray(q, dtype=float), np.asarray(other, dtype=float)
     v, w = -q[:3], q[3]
     along = other[..., 3:] * v + w * other[..., :3] + np.cross(other[..., :3], v)
@@ -90,19 +86,15 @@ def rotation_about_z(angle: float) -> FloatArray:
 
 
 def yaw_between(R: FloatArray, other: FloatArray) -> float:
-    """Rotation about the world z axis from orientation `R` towards `other`, rad in [-pi, pi].
-
-    It brings `R` as close to `other` as a rotation about this axis can.
-    """
+    """Rotation about the world z axis, in [-pi, pi] rad, that brings orientation `R` closest to
+    `other`."""
     M = other @ R.T
     return float(np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))
 
 
 def quaternion_from_rotation(R: FloatArray) -> FloatArray:
-    """Unit quaternion (4,) of a rotation matrix, numerically stable for every rotation.
-
-    The largest component is positive.
-    """
+    """Unit quaternion (4,) of a rotation matrix, numerically stable, with a positive largest
+    component."""
     w2 = np.array([1 + R[0, 0] - R[1, 1] - R[2, 2], 1 - R[0, 0] + R[1, 1] - R[2, 2],
                    1 - R[0, 0] - R[1, 1] + R[2, 2], 1 + R[0, 0] + R[1, 1] + R[2, 2]])
     k = int(np.argmax(w2))
@@ -118,8 +110,7 @@ def quaternion_from_rotation(R: FloatArray) -> FloatArray:
 def quaternion_between(a: ArrayLike, b: ArrayLike) -> FloatArray:
     """Shortest rotation from direction `a` (3,) to direction `b` (3,), as a unit quaternion (4,).
 
-    The norms must not be zero. For opposite directions, the rotation axis is an arbitrary vector
-    perpendicular to `a`.
+    For opposite directions, the rotation axis is an arbitrary vector perpendicular to `a`.
     """
     u: FloatArray = np.asarray(a, dtype=float) / np.linalg.norm(a)
     v: FloatArray = np.asarray(b, dtype=float) / np.linalg.norm(b)
@@ -133,10 +124,8 @@ def quaternion_between(a: ArrayLike, b: ArrayLike) -> FloatArray:
 
 
 def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """Speed and its std, of a velocity (d,) with covariance (d, d).
-
-    At zero speed, the std is the largest one in any direction.
-    """
+    """Speed and its std, at zero the largest in any direction, of a velocity (d,) with covariance
+    (d, d)."""
     speed = float(np.linalg.norm(velocity))
     if speed == 0.0:
         return 0.0, float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
@@ -145,10 +134,8 @@ def speed_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float
 
 
 def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """Heading anticlockwise from x and its std [rad], of a velocity with two or three components.
-
-    At zero speed, the heading is zero and the std infinite.
-    """
+    """Heading anticlockwise from x and its std [rad], at zero speed 0 and inf, of a velocity with
+    two or three components."""
     vx, vy = velocity[:2]
     if vx == vy == 0.0:
         return 0.0, float('inf')
@@ -157,10 +144,8 @@ def heading_of(velocity: FloatArray, covariance: FloatArray) -> tuple[float, flo
 
 
 def propagated_path(path: FloatArray, seconds: float) -> FloatArray:
-    """Shift the time origin of straight paths by `seconds`.
-
-    A path (..., n) is position [m] and velocity [m/s] at the origin, and n - 6 constant states.
-    """
+    """Shift the time origin of straight paths (..., n) by `seconds`: position [m] and velocity
+    [m/s] at the origin, and n - 6 constant states."""
     propagated: FloatArray = path.copy()
     propagated[..., :3] += seconds * path[..., 3:6]
     return propagated

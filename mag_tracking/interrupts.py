@@ -1,7 +1,4 @@
-"""Handling of termination signals: record them for a later check, or exit immediately.
-
-Programs import this module first, so it has no slow imports.
-"""
+"""Handling of termination signals. Programs import this module first: it has no slow imports."""
 
 import os
 import signal
@@ -15,10 +12,9 @@ from types import FrameType
 def recorded_signals(*signals: signal.Signals) -> Iterator[list[int]]:
     """Record termination signals in a growing list, so that a program can stop where it is safe.
 
-    If a signal raised an exception, it could interrupt an update or the writing of a table row, and
-    a library could suppress or convert it. Only the third signal raises KeyboardInterrupt.
-    Ignored signals (SIGINT in a background job) remain ignored. Outside the main thread, no handler
-    can be installed, and the list stays empty.
+    An exception could interrupt the writing of a table row, and a library could suppress it. Only
+    the third signal raises KeyboardInterrupt. Ignored signals (SIGINT in a background job) remain
+    ignored. Outside the main thread, the list stays empty.
     """
     received: list[int] = []
 
@@ -35,10 +31,9 @@ def recorded_signals(*signals: signal.Signals) -> Iterator[list[int]]:
 def exit_on_signals(status: int, *signals: signal.Signals, message: str = '') -> Iterator[None]:
     """Exit immediately with `status` when one of `signals` arrives; write `message` to stderr.
 
-    This is intended for the imports at the start of a program, when there is nothing to clean up:
-    an exception during an import may be suppressed or converted. Buffers are not flushed, and no
-    `finally` block runs. As for `recorded_signals`, ignored signals remain ignored, and a call
-    outside the main thread has no effect.
+    This is intended for the imports at the start of a program: an exception during an import may be
+    suppressed or converted. Buffers are not flushed, and no `finally` block runs. Ignored signals
+    remain ignored, and a call outside the main thread has no effect.
     """
     text = f'{message}\n'.encode() if message else b''
 

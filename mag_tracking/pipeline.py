@@ -12,12 +12,10 @@ from mag_tracking.event_records import Disturbance, TrafficSummary, VehiclePassa
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Detection, FieldFrame, Readings, SmoothedPose, Track
 from mag_tracking.settings import replace
-from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
+from mag_tracking.stages.settings import AlignSettings, CalibrateSettings, DetectSettings
 from mag_tracking.stages.stage import Stage, rejected
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.settings import TrackSettings

@@ -2,10 +2,7 @@
 
 
 def quantity(n: int, singular: str, plural: str = '') -> str:
-    """Format a number and its noun, such as '1 track' or '2 tracks'.
-
-    By default, the plural is the singular with an s.
-    """
+    """Format a number and its noun, such as '1 track' or '2 tracks'; by default, add an s."""
     return f'{n} {singular if n == 1 else plural or singular + "s"}'
 
 

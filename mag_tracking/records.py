@@ -195,9 +195,7 @@ class AccelerationSample:
     """One reading of a sensor's accelerometer."""
 
     stamp_ns: int
-    """Time of the measurement, ns since 1970."""
     sensor: str
-    """Name of the sensor."""
     acceleration: FloatArray
     """Specific force, (3,) m/s², sensor frame. Points up at rest."""
 
@@ -215,13 +213,11 @@ class FieldFrame:
     n_samples: IntArray
     """Number of averaged samples per sensor, (n_sensors,). 0 for a missing sensor."""
     time_offset: FloatArray
-    """Mean time of each sensor's samples relative to `stamp_ns`, (n_sensors,) s. 0 for a missing
-    sensor."""
+    """Mean time of each sensor's samples relative to `stamp_ns`, (n_sensors,) s. 0 if missing."""
     target_present: bool = False
     """Whether a target is detected, including the hold time. False before the detection stage."""
     statistic: float = float('nan')
-    """Whitened energy of the frame, chi-square distributed under noise. NaN before the detection
-    stage."""
+    """Whitened energy of the frame, chi-square distributed under noise. NaN before detection."""
     degrees_of_freedom: int = 0
     """Degrees of freedom of `statistic`, the number of measured axes. 0 before detection."""
 
@@ -231,7 +227,6 @@ class Detection:
     """Onset or release of a detection by the network."""
 
     stamp_ns: int
-    """Time of the frame, ns since 1970."""
     id: int
     """Number of the detection. Onset and release have the same number."""
     onset: bool
@@ -239,7 +234,6 @@ class Detection:
     statistic: float
     """Whitened energy of the frame, chi-square distributed under noise."""
     degrees_of_freedom: int
-    """Degrees of freedom of `statistic`."""
     threshold: float
     """Threshold of `statistic` for an onset. NaN if no axis was measured."""
     false_alarm_probability: float
@@ -272,22 +266,20 @@ class Hypothesis:
 class Hypotheses(Sequence[Hypothesis]):
     """Sequence of the hypotheses of a bank, stored as arrays.
 
-    A track may have hundreds of hypotheses in each frame, so a `Hypothesis` object is created
-    only on access.
+    A track may have hundreds of hypotheses in each frame, so a `Hypothesis` is created only on
+    access. The elements of the arrays are its attributes.
     """
 
     arrivals: tuple[str, ...]
-    """Name of the assumed arrival direction of each hypothesis."""
     weights: FloatArray
-    """Probability of each hypothesis within the bank, (n,)."""
+    """(n,)."""
     states: FloatArray
-    """[Position, velocity] of each hypothesis, (n, 6) m and m/s, world frame."""
+    """[Position, velocity], (n, 6) m and m/s, world frame."""
     covariances: FloatArray
-    """Covariance of each state, (n, 6, 6) m and m/s, world frame."""
+    """(n, 6, 6) m and m/s, world frame."""
     moments: FloatArray
-    """Magnetic moment of each hypothesis, (n, 3) A m², world frame."""
+    """(n, 3) A m², world frame."""
     kinds: tuple[str, ...]
-    """Assumed kind of vehicle of each hypothesis. Empty for a magnet."""
 
     def __len__(self) -> int:
         return len(self.weights)
@@ -306,11 +298,8 @@ class Hypotheses(Sequence[Hypothesis]):
 
 
 def best_of_arrivals(members: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Copies of the most probable hypothesis of each arrival direction, in descending order of
-    weight.
-
-    Their `weight` is the total weight of all hypotheses with the same arrival direction.
-    """
+    """Copies of the most probable hypothesis of each arrival direction, with the total weight of
+    the direction, in descending order."""
     if isinstance(members, Hypotheses):
         arrivals, weights = members.arrivals, members.weights.tolist()
     else:
@@ -326,32 +315,28 @@ def best_of_arrivals(members: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 @dataclass(frozen=True, slots=True)
 class PoseUncertainty:
-    """Covariances of position, velocity and orientation about a pose."""
+    """Covariances of position, velocity and orientation about a pose, as in `Pose`."""
 
     covariance: FloatArray
-    """Covariance of [position, velocity], (6, 6) m and m/s, world frame."""
     orientation_covariance: FloatArray
-    """Covariance of small rotations about the fixed world axes, (3, 3) rad²."""
     position_orientation_covariance: FloatArray
-    """Cross-covariance of position and orientation, (3, 3) m rad, world frame."""
 
 
 @dataclass(frozen=True, slots=True)
-class SmoothedPose:
-    """Pose of a target, smoothed with the measurements before and after it."""
+class Pose:
+    """Pose of a target at one time."""
 
     stamp_ns: int
-    """Time of the pose, ns since 1970."""
     id: int
     """Number of the track."""
     position: FloatArray
-    """Position, (3,) m, world frame."""
+    """(3,) m, world frame."""
     velocity: FloatArray
-    """Velocity, (3,) m/s, world frame."""
+    """(3,) m/s, world frame."""
     covariance: FloatArray
-    """Covariance of [position, velocity], (6, 6) m and m/s, world frame."""
+    """Covariance of [position, velocity] about this pose, (6, 6) m and m/s, world frame."""
     orientation: FloatArray
-    """Orientation, (4,) quaternion xyzw, body to world frame."""
+    """(4,) quaternion xyzw, body to world frame."""
     orientation_covariance: FloatArray
     """Covariance of small rotations about the fixed world axes, (3, 3) rad²."""
     position_orientation_covariance: FloatArray
@@ -359,51 +344,35 @@ class SmoothedPose:
     moment: FloatArray
     """Magnetic moment, (3,) A m², world frame."""
     moment_covariance: FloatArray
-    """Covariance of `moment`, (3, 3) (A m²)², world frame."""
+    """(3, 3) (A m²)², world frame."""
     kind: str
     """Kind of vehicle. Empty for a magnet."""
     length: float
     """Length of the row of dipoles that models the target, m. 0 for a point target."""
     length_std: float
-    """Standard deviation of `length`, m. 0 for a point target."""
     ambiguous: bool
-    """Whether other hypotheses were still possible at the time of smoothing, or the pose is
-    doubtful."""
+    """Whether other hypotheses were still possible, or the pose is doubtful."""
+
+
+@dataclass(frozen=True, slots=True)
+class SmoothedPose(Pose):
+    """Pose of a target, smoothed with the measurements before and after it."""
+
     complete: bool
     """True if the whole track was used, false for fixed-lag smoothing."""
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
-    """State of a track in one frame: the published hypothesis, and a summary of all hypotheses."""
+class Track(Pose):
+    """State of a track in one frame: the published hypothesis, and a summary of all hypotheses.
 
-    stamp_ns: int
-    """Time of the frame, ns since 1970."""
-    id: int
-    """Number of the track."""
+    The covariances cover all hypotheses near the position. For a vehicle, `covariance` also covers
+    the error of the middle due to the part of the vehicle that no sensor has observed yet, and an
+    alternative straight path that explains the whole pass. The covariances in `hypotheses` do not
+    include these two contributions.
+    """
+
     ended: bool
-    """Whether the track has ended. This is the last record of the track."""
-    position: FloatArray
-    """Position, (3,) m, world frame."""
-    velocity: FloatArray
-    """Velocity, (3,) m/s, world frame."""
-    covariance: FloatArray
-    """Covariance of [position, velocity] about this pose, (6, 6) m and m/s, world frame. It covers
-    all hypotheses near this position. For a vehicle, it also covers the error of the middle due to
-    the part of the vehicle that no sensor has observed yet, and an alternative straight path that
-    explains the whole pass. The covariances in `hypotheses` do not include these two
-    contributions."""
-    orientation: FloatArray
-    """Orientation, (4,) quaternion xyzw, body to world frame."""
-    orientation_covariance: FloatArray
-    """Covariance of small rotations about the fixed world axes, (3, 3) rad². This and the following
-    covariances cover all hypotheses near this position."""
-    position_orientation_covariance: FloatArray
-    """Cross-covariance of position and orientation, (3, 3) m rad, world frame."""
-    moment: FloatArray
-    """Magnetic moment, (3,) A m², world frame."""
-    moment_covariance: FloatArray
-    """Covariance of `moment`, (3, 3) (A m²)², world frame."""
     existence: float
     """Probability of a target, as opposed to noise alone."""
     weight: float
@@ -417,16 +386,8 @@ class Track:
     """Degrees of freedom of `nis`: the number of measured axes."""
     arrival: str
     """Arrival direction of the published hypothesis. Empty for a magnet."""
-    kind: str
-    """Kind of vehicle of the published hypothesis. Empty for a magnet."""
     kind_weight: float
-    """Total weight of all hypotheses of that kind, 0 to 1."""
-    length: float
-    """Length of the row of dipoles that models the target, m. 0 for a point target."""
-    length_std: float
-    """Standard deviation of `length`, m. 0 for a point target."""
-    ambiguous: bool
-    """Whether the pose is ambiguous: `doubts` is not empty."""
+    """Total weight of all hypotheses of the same kind, 0 to 1."""
     unobservable: tuple[bool, ...]
     """Whether x, y, z, and the rotations about the body's x, y and z axes are unobservable, (6,).
     An unobservable rotation has variance π² and is not an estimate."""

@@ -16,8 +16,11 @@ from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate.prescan import Prescan, prescan
 from mag_tracking.stages.health.clocks import ClockSpan
 from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding, ranked
-from mag_tracking.stages.health.input_findings import sensor_findings, source_findings
-from mag_tracking.stages.health.no_detection import no_detection_reason
+from mag_tracking.stages.health.findings import (
+    no_detection_reason,
+    sensor_findings,
+    source_findings,
+)
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.manager import NO_SCALE, NO_SCALE_FRAMES
 
@@ -314,7 +317,7 @@ def report_of(source: Source, pipeline: Pipeline, first_pass: Prescan,
     not_used = dict(Counter(source.rejected) + Counter(pipeline.rejections()))
     # Of an interrupted run, the rest may contain what is missing.
     reason = None if interrupted or 'detect' not in counts else no_detection_reason(
-        pipeline.network, pipeline.settings, pipeline.calibrate, pipeline.detect, missing, not_used)
+        pipeline.network, pipeline.calibrate, pipeline.detect, missing, not_used)
     found = [*source_findings(source.name, source.lost, source.rejected),
              *sensor_findings(pipeline.network, pipeline.calibrate, pipeline.settings.track,
                               missing, source.clocks)]

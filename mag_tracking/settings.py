@@ -1,22 +1,44 @@
-"""Declaration and validation of settings, each with default, description, unit and range.
-
-ROS parameters, the YAML file of defaults and the parameter reference are generated from the
-declarations.
-"""
+"""Declaration and validation of settings, from which ROS parameters, the YAML file of defaults and
+the parameter reference are generated."""
 
 import dataclasses
 import difflib
 import math
 import re
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from itertools import groupby
 from os import PathLike
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, TypeVar
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.former_settings import FORMER_SETTINGS
-from mag_tracking.yaml_file import is_utf8_encodable, read_yaml, short_repr
+from mag_tracking.files import is_utf8_encodable, read_yaml, short_repr
+
+_CONSTANTS = {
+    'calibrate': 'look_ahead_s memory_s guard_s block_s freeze_std max_forward_jump_s '
+                 'max_backward_jump_s',
+    'align': 'max_backward_jump_s',
+    'detect': 'release_probability',
+    'events': 'max_sensors',
+    'track': 'prune_ratio max_initial_hypotheses relinearise_interval_s relinearise_max_hypotheses',
+    'track.vehicle': 'lateral_std along_std max_start_distance speed_std cross_speed_std climb_std '
+                     'turn_share',
+    'track.magnet': 'start_margin grid_points starts near_field_length',
+    'survey': 'compass_bias_std accelerometer_bias max_clock_offset_s max_accelerations'}
+"""{group: settings that are constants now}."""
+_COLUMNS = {
+    ('track.vehicle.', 'track.vehicle.kinds.car.'): 'length length_std moment moment_std '
+    'difference_std height height_std near_field_length',
+    ('traffic.line_', 'traffic.lines.road.'): 'offset half_width',
+    ('traffic.class_', 'traffic.classes.car.'): 'share moment moment_spread length length_spread'}
+"""{(prefix of lists, prefix in a table): names, which had an s as lists}."""
+FORMER_SETTINGS = {
+    **{f'{group}.{name}': '' for group, names in _CONSTANTS.items() for name in names.split()},
+    **{f'{old}{name}s': new + name for (old, new), names in _COLUMNS.items()
+       for name in names.split()},
+    'traffic.line_headings_deg': 'traffic.lines.road.heading_deg',
+    'traffic.line_names': 'traffic.lines.names', 'traffic.class_names': 'traffic.classes.names'}
+"""{former setting: its current name, for one row of a table; empty if it is a constant}."""
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -24,14 +46,11 @@ if TYPE_CHECKING:
 Scalar: TypeAlias = bool | int | float | str
 Value: TypeAlias = Scalar | tuple[Scalar, ...]
 """Type of the value of a setting."""
-
 USER, EXPERT = 'user', 'expert'
 """Levels: settings that describe the site, the targets and the wanted results; and settings of the
 methods, which rarely change."""
-
 _ROW_NAME = re.compile(r'(?!names$)\w[\w -]*')
 """Permitted names of the rows of a table."""
-
 _Class: TypeAlias = type[object]
 _Default = TypeVar('_Default')
 _Settings = TypeVar('_Settings', bound='DataclassInstance')
@@ -40,32 +59,11 @@ _Settings = TypeVar('_Settings', bound='DataclassInstance')
 def param(default: _Default, doc: str, unit: str = '', range: tuple[float, float] | None = None,
           live: bool = False, length: int | None = None, choices: tuple[str, ...] = (),
           level: str = EXPERT) -> _Default:
-    """Declare one setting of a frozen dataclass, or a table.
+    """Declare one setting of a frozen dataclass, or a table; see `Parameter`.
 
     A table is a tuple of dataclass instances, its rows, with a `name` and settings as columns. Its
     settings are `<table>.names` and `<table>.<name>.<column>`; a row that is added to the names has
     the defaults of the columns.
-
-    Parameters
-    ----------
-    default : float, int, bool, str, or tuple of float, str or rows
-    doc : str
-        Description for the reference and the ROS descriptor.
-    unit : str, optional
-    range : (low, high), optional
-        Inclusive bounds of a number, or of every element of a tuple.
-    live : bool, optional
-        Whether the setting may change at run time (its ROS parameter is not read-only).
-    length : int, optional
-        Required length of a tuple. None allows any length except zero.
-    choices : tuple of str, optional
-        Permitted values of a string.
-    level : str, optional
-        USER or EXPERT.
-
-    Returns
-    -------
-    dataclass field
     """
     return dataclasses.field(default=default, metadata={
         'doc': doc, 'unit': unit, 'range': range, 'live': live, 'length': length,
@@ -79,37 +77,24 @@ class Parameter:
     name: str
     """Dotted name."""
     value: Value
-    """Current value."""
     type: _Class
-    """Type of the value."""
     element: _Class | None
     """Type of the elements of a tuple, otherwise None."""
     doc: str
-    """Description."""
+    """Description for the reference and the ROS descriptor."""
     unit: str
-    """Unit; empty for a dimensionless setting."""
     range: tuple[float, float] | None
-    """Inclusive bounds, or None."""
+    """Inclusive bounds of a number, or of every element of a tuple."""
     live: bool
-    """Whether the setting may change at run time."""
+    """Whether the setting may change at run time (its ROS parameter is not read-only)."""
     length: int | None
-    """Required length of a tuple, or None."""
+    """Required length of a tuple. None allows any length except zero."""
     choices: tuple[str, ...]
     """Permitted values of a string. Empty if any string is allowed."""
     level: str
     """USER or EXPERT."""
     row: str = ''
     """Name of the row, if the setting is a column of a table."""
-
-
-def _types_of_hint(hint: Any) -> tuple[_Class, _Class | None]:
-    """Type of a setting with annotation `hint`, and type of the elements of a tuple.
-
-    The second type is None if the setting is not a tuple.
-    """
-    if typing.get_origin(hint) is tuple:
-        return tuple, typing.get_args(hint)[0]
-    return hint, None
 
 
 def _is_group(value: object) -> 'TypeGuard[DataclassInstance]':
@@ -123,21 +108,7 @@ def _is_table(value: object) -> 'TypeGuard[tuple[Any, ...]]':
 
 
 def flatten(settings: 'DataclassInstance', prefix: str = '', row: str = '') -> list[Parameter]:
-    """List all settings of a tree.
-
-    Parameters
-    ----------
-    settings : dataclass instance
-    prefix : str, optional
-        Prefix of the names.
-    row : str, optional
-        Name of the row, if `settings` is a row of a table.
-
-    Returns
-    -------
-    list of Parameter
-        In the order of declaration.
-    """
+    """List all settings of a tree, or of the row named `row` of a table, with prefixed names."""
     hints = typing.get_type_hints(type(settings))
     out: list[Parameter] = []
     for f in dataclasses.fields(settings):
@@ -150,7 +121,8 @@ def flatten(settings: 'DataclassInstance', prefix: str = '', row: str = '') -> l
             for r in value:
                 out += flatten(r, f'{name}.{r.name}.', r.name)
         elif f.metadata:
-            kind, element = _types_of_hint(hints[f.name])
+            hint, args = hints[f.name], typing.get_args(hints[f.name])
+            kind, element = (tuple, args[0]) if typing.get_origin(hint) is tuple else (hint, None)
             out.append(Parameter(name, value, kind, element, **f.metadata, row=row))
     return out
 
@@ -173,10 +145,7 @@ def _scalar(name: str, value: object, kind: _Class) -> Scalar:
 
 
 def _validated(p: Parameter, value: object) -> Value:
-    """Convert `value` to the declared type of `p`, and check its length, range and choices.
-
-    Raises SettingsError if the value is invalid.
-    """
+    """Convert `value` to the declared type of `p`; raises SettingsError if it is invalid."""
     if p.element is not None:
         if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
             raise SettingsError(f'{p.name}: expected a list of {p.element.__name__}, '
@@ -188,37 +157,25 @@ def _validated(p: Parameter, value: object) -> Value:
             raise SettingsError(f'{p.name}: expected at least one value, got none')
     else:
         values = (_scalar(p.name, value, p.type),)
-    if p.name.endswith('.names'):
-        _check_rows(p.name, values)
     for v in values:
+        if p.name.endswith('.names') and not _ROW_NAME.fullmatch(str(v)):
+            raise SettingsError(f'{p.name}: {short_repr(v)} is not a valid name: use letters, '
+                                'digits, _, - and spaces')
         if p.choices and v not in p.choices:
             raise SettingsError(f'{p.name}: expected {", ".join(p.choices[:-1])} or '
                                 f'{p.choices[-1]}, got {short_repr(v)}')
         if isinstance(v, float) and math.isnan(v):
             raise SettingsError(f'{p.name}: NaN is not a valid value')
-        if isinstance(v, str) or p.range is None:
-            continue
-        if not p.range[0] <= v <= p.range[1]:
+        if not isinstance(v, str) and p.range is not None and not p.range[0] <= v <= p.range[1]:
             raise SettingsError(f'{p.name}: {v} is outside {p.range[0]} .. {p.range[1]}'
                                 f'{" " + p.unit if p.unit else ""}')
+    if p.name.endswith('.names') and len(set(values)) < len(values):
+        raise SettingsError(f'{p.name}: a name is duplicated in {values}')
     return values if p.element is not None else values[0]
 
 
-def _check_rows(name: str, rows: Sequence[Any]) -> None:
-    """Raise SettingsError if the names of the rows of a table are invalid."""
-    for row in rows:
-        if not _ROW_NAME.fullmatch(row):
-            raise SettingsError(f'{name}: {short_repr(row)} is not a valid name: use letters, '
-                                'digits, _, - and spaces')
-    if len(set(rows)) < len(rows):
-        raise SettingsError(f'{name}: a name is duplicated in {rows}')
-
-
 def _flattened(mapping: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
-    """Flatten nested mappings to one dict with dotted names; empty mappings remain values.
-
-    Raises SettingsError if a setting has two different values.
-    """
+    """Flatten nested mappings to one dict with dotted names; empty mappings remain values."""
     out: dict[str, Any] = {}
     for key, value in mapping.items():
         if isinstance(value, Mapping) and value:
@@ -237,24 +194,10 @@ def _merge(out: dict[str, Any], more: Mapping[str, Any]) -> None:
 
 
 def replace(settings: _Settings, changes: Mapping[str, Any]) -> _Settings:
-    """Copy settings with changes applied.
+    """Copy settings with changes: values by dotted name, or nested mappings of them.
 
-    Parameters
-    ----------
-    settings : dataclass instance
-    changes : mapping of str to setting
-        Values by dotted name, or nested mappings of them.
-
-    Returns
-    -------
-    dataclass instance
-        Same type as `settings`.
-
-    Raises
-    ------
-    SettingsError
-        If a name is unknown (the message suggests the closest known name), or a value has a wrong
-        type, a wrong length, or is out of range.
+    Raises SettingsError if a name is unknown (the message suggests the closest known name), or a
+    value has a wrong type, a wrong length, or is out of range.
     """
     flat = _flattened(changes)
     # The names of rows come first, because they determine which other settings exist.
@@ -282,10 +225,7 @@ def _unknown_message(name: str, value: object, names: Iterable[str]) -> str:
 
 
 def _suggestion(name: str, names: Iterable[str]) -> str:
-    """Suggestion for an unknown setting: its current name or the closest known name.
-
-    Empty if there is no suggestion.
-    """
+    """Suggestion for an unknown setting, its current or the closest known name; may be empty."""
     names = list(names)
     group, _, leaf = name.rpartition('.')
     if name in FORMER_SETTINGS:
@@ -322,18 +262,7 @@ def _group_suggestion(group: str, leaf: str, names: Iterable[str]) -> str:
 
 
 def closest_name(name: str, candidates: Iterable[str]) -> str:
-    """Candidate that is most similar to a name.
-
-    Parameters
-    ----------
-    name : str
-    candidates : iterable of str
-
-    Returns
-    -------
-    str
-        Empty if no candidate is similar.
-    """
+    """Candidate that is most similar to a name; empty if none is similar."""
     return next(iter(difflib.get_close_matches(name, list(candidates), n=1, cutoff=0.75)), '')
 
 
@@ -387,29 +316,17 @@ def read_parameter_file(path: str | PathLike[str]) -> dict[str, Any]:
 
 
 def as_ros_parameters(path: str | PathLike[str]) -> str | None:
-    """Convert a plain parameter file to a ROS parameter file.
+    """Convert a plain parameter file to YAML text with the format of ROS.
 
-    Parameters
-    ----------
-    path : path_like
-
-    Returns
-    -------
-    str or None
-        YAML text. None if the file is already a ROS parameter file or is not a mapping.
-
-    Raises
-    ------
-    SettingsError
-        If the file cannot be read, or contains different values for one setting.
+    None if the file already has this format or is not a mapping. Raises SettingsError if it cannot
+    be read, or contains different values for one setting.
     """
     content = read_yaml(path, SettingsError)
     if not isinstance(content, Mapping) or any(
             isinstance(v, Mapping) and 'ros__parameters' in v for v in content.values()):
         return None
-    values = read_parameter_file(path)
     lines = [f'    {name}: {_yaml_value(tuple(v) if isinstance(v, list) else v)}'
-             for name, v in values.items() if v != {}]
+             for name, v in read_parameter_file(path).items() if v != {}]
     return '\n'.join(['/**:', '  ros__parameters:', *lines, ''])
 
 
@@ -441,24 +358,11 @@ def _yaml_value(value: Value) -> str:
     return str(value) if isinstance(value, int) else f"'{value}'"
 
 
-def to_yaml(settings: 'DataclassInstance', level: str = '', node: str = '/**') -> str:
-    """Format settings as a ROS parameter file with comments.
-
-    Parameters
-    ----------
-    settings : dataclass instance
-    level : str, optional
-        Only settings of this level.
-    node : str, optional
-        Name of the node, or a wildcard.
-
-    Returns
-    -------
-    str
-    """
+def to_yaml(settings: 'DataclassInstance', level: str = '') -> str:
+    """Format settings, or those of one level, as a ROS parameter file with comments."""
     lines = ['# Generated from the settings by `make config`; do not edit.',
              *[f'# The {level} settings; the reference lists all.'] * bool(level),
-             f'{node}:', '  ros__parameters:']
+             '/**:', '  ros__parameters:']
     previous_group = previous_row = ''
     chosen = (p for p in flatten(settings) if level in ('', p.level))
     for (group, row), grouped in groupby(chosen, lambda p: (p.name.rpartition('.')[0], p.row)):
@@ -482,8 +386,6 @@ def to_yaml(settings: 'DataclassInstance', level: str = '', node: str = '/**') -
 
 def _comment(p: Parameter) -> str:
     """Description of a setting with its unit, range and choices."""
-    notes = [p.unit] if p.unit else []
-    notes += [f'{p.range[0]} .. {p.range[1]}'] if p.range else []
-    notes += [', '.join(p.choices)] if p.choices else []
-    notes += ['live'] if p.live else []
-    return p.doc + (f' [{"; ".join(notes)}]' if notes else '')
+    notes = [p.unit, f'{p.range[0]} .. {p.range[1]}' if p.range else '', ', '.join(p.choices),
+             'live' if p.live else '']
+    return p.doc + (f' [{"; ".join(filter(None, notes))}]' if any(notes) else '')

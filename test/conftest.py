@@ -87,8 +87,7 @@ def ros():
     import rclpy
     from rclpy.node import Node
 
-    from mag_tracking.nodes.middleware import init_ros
-    from mag_tracking.nodes.stage_node import make_executor, spin
+    from mag_tracking.nodes.middleware import init_ros, make_executor, spin
     from support.node_processes import MAX_S
     init_ros()
     node, executor = Node('tester'), make_executor()

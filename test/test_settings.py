@@ -8,10 +8,10 @@ import pytest
 import yaml
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.former_settings import FORMER_SETTINGS
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.settings import (
     EXPERT,
+    FORMER_SETTINGS,
     USER,
     flatten,
     read_parameter_file,

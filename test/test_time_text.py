@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.time_text import DAY_NS, date_order, parse_time
-from mag_tracking.units import field_scale, time_scale
+from mag_tracking.units import DAY_NS, date_order, field_scale, parse_time, time_scale
 
 FORMS = ('%Y-%m-%dT%H:%M:%S.%f', '%Y/%m/%d %H:%M:%S.%f', '%Y%m%dT%H%M%S.%f', '%d.%m.%Y %H:%M:%S,%f',
          '%d/%m/%Y %I:%M:%S.%f %p', '%d %b %Y %H:%M:%S.%f', '%A, %d %B %Y %H:%M:%S.%f',

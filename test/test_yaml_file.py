@@ -4,11 +4,11 @@ import pytest
 
 from mag_tracking.drivers.configuration import read_drivers
 from mag_tracking.errors import MagTrackingError, SettingsError
+from mag_tracking.files import MAX_BYTES, MAX_DEPTH, MAX_ENTRIES, MAX_NODES, read_yaml
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Settings
 from mag_tracking.recording.reader import Recording
 from mag_tracking.settings import read_parameter_file, replace
-from mag_tracking.yaml_file import MAX_BYTES, MAX_DEPTH, MAX_ENTRIES, MAX_NODES, read_yaml
 
 
 def nested_aliases(n, form='[{}]', width=9):

@@ -14,21 +14,22 @@ from mag_tracking.record_receiver import Step
 from mag_tracking.recording.message_block import Progress
 from mag_tracking.records import Readings
 from mag_tracking.run import RecordingSource, run
-from mag_tracking.stages.align.frame_period import frame_period_warning
+from mag_tracking.stages.align.stage import frame_period_warning
 from mag_tracking.stages.calibrate.field_comparison import (
     compared_with_earth,
     earth_field_findings,
 )
 from mag_tracking.stages.calibrate.stage import FAULTS_FOUND, Calibrate
 from mag_tracking.stages.health.clocks import clock_findings
-from mag_tracking.stages.health.covariances import covariance_findings
 from mag_tracking.stages.health.diagnosis import Cause, Finding
-from mag_tracking.stages.health.input_findings import (
+from mag_tracking.stages.health.findings import (
     background_findings,
+    covariance_findings,
+    driver_findings,
     rate_findings,
+    rejection_findings,
     source_findings,
 )
-from mag_tracking.stages.health.rejections import driver_findings, rejection_findings
 from mag_tracking.stages.health.sensor_health import SensorHealth
 
 MIN_MISSED_TARGETS = 3

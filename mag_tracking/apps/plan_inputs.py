@@ -14,7 +14,7 @@ from mag_tracking.apps.readings import network_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Settings, settings_for
-from mag_tracking.stages.align.frame_period import frame_period
+from mag_tracking.stages.align.stage import frame_period
 from mag_tracking.stages.track.initiation_vehicle import CLIMB_STD, VehicleSettings
 from mag_tracking.stages.track.settings import TrackSettings
 

@@ -41,7 +41,7 @@ from mag_tracking.run import (
     output_error,
     run,
 )
-from mag_tracking.stages.align.frame_period import frame_period_warning
+from mag_tracking.stages.align.stage import frame_period_warning
 from mag_tracking.stages.track.plausibility import lane_note
 from mag_tracking.stages.track.settings import acceleration_density
 

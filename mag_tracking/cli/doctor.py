@@ -65,7 +65,7 @@ def _doctor(args: argparse.Namespace) -> int:
 
             with listening(network, settings, args.live, lambda: bool(signals),
                            args.ros_arguments) as live:
-                live.status = _report(args, live.doctor, live.findings, bool(signals))
+                live.status = _report(args, live.doctor, live.findings(), bool(signals))
             return live.status
         source = RecordingSource(Recording(args.recording), network, by_message=True)
         with progress_bar(source) as bar:

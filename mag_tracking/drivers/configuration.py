@@ -28,9 +28,9 @@ from mag_tracking.drivers.driver import IGNORED, Driver
 from mag_tracking.drivers.reading import Device, FramedDevice
 from mag_tracking.drivers.settings import DriverSettings
 from mag_tracking.errors import SettingsError
+from mag_tracking.files import is_utf8_encodable, read_yaml, short_repr
 from mag_tracking.network.sensor_network import SensorNetwork
 from mag_tracking.settings import closest_name, replace
-from mag_tracking.yaml_file import is_utf8_encodable, read_yaml, short_repr
 
 _PACKAGE = 'mag_tracking.drivers'
 KINDS = {

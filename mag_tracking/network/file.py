@@ -12,12 +12,11 @@ import yaml
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import NetworkError
-from mag_tracking.files import replace_text
+from mag_tracking.files import is_utf8_encodable, read_yaml, replace_text, short_repr
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 from mag_tracking.network import CalibrationRecord, SensorNetwork
 from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
 from mag_tracking.network.topics import TOPIC_NAME_PATTERN
-from mag_tracking.yaml_file import is_utf8_encodable, read_yaml, short_repr
 
 _SENSOR_NAME_PATTERN = re.compile(r'[A-Za-z0-9_.-]+')
 _KEYS_OF_0_1_0 = {'stated': 'nominal', 'stated_std_deg': 'nominal_std_deg'}

@@ -1,8 +1,7 @@
 """Conversion of records to and from ROS messages.
 
-The content of each message is defined once, in `messages.schema`, as nested dicts, which this
-module converts to message objects. ROS messages have the same attributes as decoded messages of a
-recording, so the functions that read a recording also read ROS messages.
+The content of each message is defined once, in `messages.schema`, as nested dicts. ROS messages
+have the same attributes as decoded messages of a recording, so its functions also read them.
 """
 
 import functools
@@ -12,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from rclpy.publisher import Publisher
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
@@ -33,10 +33,8 @@ def message_class(type_name: str) -> Any:
 
 
 def to_message(cls: Any, content: Mapping[str, Any]) -> Any:
-    """Convert nested dicts to a ROS message; a missing field keeps its default.
-
-    Raises AttributeError if `content` has a field that the message does not have.
-    """
+    """Convert nested dicts to a ROS message; a missing field keeps its default, an unknown one
+    raises AttributeError."""
     message = cls()
     for name, value in content.items():
         if isinstance(value, dict):
@@ -46,6 +44,17 @@ def to_message(cls: Any, content: Mapping[str, Any]) -> Any:
             value = [to_message(element_class, v) for v in value]
         setattr(message, name, value)
     return message
+
+
+def has_subscribers(publisher: Publisher) -> bool:
+    """Whether a publisher has subscribers."""
+    return publisher.get_subscription_count() > 0
+
+
+def send(publisher: Publisher, content: Mapping[str, Any] | None) -> None:
+    """Publish a message with the given fields; None is not published."""
+    if content is not None:
+        publisher.publish(to_message(publisher.msg_type, content))
 
 
 @functools.cache
@@ -64,10 +73,9 @@ def _vector(v: Any) -> FloatArray:
 def track_of(message: Any, hypotheses: Any = None, n_sensors: int | None = None) -> Track:
     """Convert mag_tracking_msgs/Track to a `Track`.
 
-    `hypotheses` is a HypothesisArray; by default the message yields the best hypothesis of each
-    arrival direction. `n_sensors` is by default that of `innovation_by_sensor`. Raises
-    RecordingError if array lengths do not match the number of sensors, a position, velocity or
-    covariance is not finite, or an active track has no hypothesis.
+    Without `hypotheses`, a HypothesisArray, it has the best one of each arrival direction.
+    `n_sensors` is by default that of `innovation_by_sensor`. Raises RecordingError if array lengths
+    do not match it, a number is not finite, or an active track has no hypothesis.
     """
     _check_lengths(message, len(message.innovation_by_sensor) if n_sensors is None else n_sensors)
     pose = np.array(message.pose.covariance).reshape(6, 6)
@@ -79,14 +87,14 @@ def track_of(message: Any, hypotheses: Any = None, n_sensors: int | None = None)
     if not members and message.status != message.ENDED:
         raise RecordingError(f'Track {message.id} has no arrivals; expected at least one')
     track = Track(
-        stamp_ns(message.header.stamp), message.id, message.status == message.ENDED,
+        stamp_ns(message.header.stamp), message.id,
         _vector(message.pose.pose.position), _vector(message.velocity),
         np.array(message.covariance).reshape(6, 6), np.array([q.x, q.y, q.z, q.w]),
         pose[3:, 3:], pose[:3, 3:], _vector(message.moment),
-        np.array(message.moment_covariance).reshape(3, 3), message.existence, message.weight,
-        message.normalised_innovation, np.array(message.innovation_by_sensor),
-        message.degrees_of_freedom, message.arrival,
-        message.kind, message.kind_weight, message.length, message.length_std, message.ambiguous,
+        np.array(message.moment_covariance).reshape(3, 3), message.kind, message.length,
+        message.length_std, message.ambiguous, message.status == message.ENDED, message.existence,
+        message.weight, message.normalised_innovation, np.array(message.innovation_by_sensor),
+        message.degrees_of_freedom, message.arrival, message.kind_weight,
         tuple(message.unobservable),
         np.array(message.predicted_field).reshape(-1, 3), np.array(message.mounting).reshape(-1, 3),
         np.array(message.mounting_covariance).reshape(-1, 3, 3), members,
@@ -115,10 +123,8 @@ def _check_finite(subject: str, **arrays: FloatArray) -> None:
 
 
 def smoothed_path_of(message: Any) -> FloatArray:
-    """Positions (n, 3) of a mag_tracking_msgs/SmoothedTrack, m, world frame.
-
-    Raises RecordingError if it has no pose, its array lengths differ, or a position is not finite.
-    """
+    """Positions (n, 3) of a mag_tracking_msgs/SmoothedTrack, m, world frame; raises RecordingError
+    if there is none, array lengths differ, or one is not finite."""
     lengths = {name: len(getattr(message, name)) for name in (
         'poses', 'velocities', 'pose_ambiguous')}
     n = lengths['poses']

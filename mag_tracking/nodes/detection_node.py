@@ -1,7 +1,6 @@
 """detection_node: combines calibrated fields into network frames and detects targets."""
 
 if __name__ == '__main__':
-    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import detection_node
 
     detection_node()
@@ -10,30 +9,22 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from mag_tracking_msgs.msg import Detection as DetectionMessage
+from mag_tracking_msgs import msg
 from mag_tracking_msgs.msg import FieldReadings, NetworkFrame
-from mag_tracking_msgs.msg import PassEvent as PassEventMessage
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.messages.network import frame_dict
-from mag_tracking.messages.schema import detection_dict, pass_event_dict, reading_of
+from mag_tracking.messages.schema import detection_dict, pass_event_dict, reading_of, readings_of
 from mag_tracking.messages.types import CALIBRATED_READINGS, NETWORK_FRAME, TRACK_ARRAY
-from mag_tracking.nodes import stage_node
-from mag_tracking.nodes.convert import to_message
+from mag_tracking.nodes import middleware
+from mag_tracking.nodes.convert import has_subscribers, send
 from mag_tracking.nodes.ros_params import declare_settings
-from mag_tracking.nodes.stage_node import (
-    PUBLISHER_QOS,
-    RESULT_QOS,
-    STREAM_QOS,
-    StageNode,
-    has_subscribers,
-)
-from mag_tracking.nodes.steady_timer import steady_timer
+from mag_tracking.nodes.scheduling import steady_timer
+from mag_tracking.nodes.stage_node import PUBLISHER_QOS, RESULT_QOS, STREAM_QOS, StageNode
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.records import Detection, FieldFrame, Readings
-from mag_tracking.stages.align.frame_period import frame_period_warning
-from mag_tracking.stages.align.stage import Align
+from mag_tracking.stages.align.stage import Align, frame_period_warning
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.events.stage import Events
 from mag_tracking.stages.stage import Stage
@@ -46,11 +37,8 @@ do not, because a search takes as long as the processing of many readings."""
 
 
 class DetectionNode(StageNode):
-    """Aligns the readings of all sensors into frames and tests each frame for a target.
-
-    A `tracker` in the same process receives the frames directly; calibrated readings are then
-    passed to `receive_readings`.
-    """
+    """Aligns the readings of all sensors into frames and tests each for a target; with a `tracker`
+    in the same process, readings come to `receive_readings`, and frames go to the tracker."""
 
     def __init__(self, tracker: TrackerNode | None = None, **node_arguments: Any) -> None:
         super().__init__('detection_node', 'align', **node_arguments)
@@ -58,8 +46,7 @@ class DetectionNode(StageNode):
         self._pending_frame: FieldFrame | None = None
         self.settings = declare_settings(self, self.settings, 'detect')
         self._align = Align(self.network, self.settings.align)
-        warning = frame_period_warning(self.settings.align, self.network)
-        if warning:
+        if warning := frame_period_warning(self.settings.align, self.network):
             self.get_logger().warning(warning)
         self._events = Events(self.network, self.settings.align, self.settings.detect,
                               self.settings.track) \
@@ -67,10 +54,10 @@ class DetectionNode(StageNode):
         self._event_backlog: list[Readings] = []
         if self._events is not None:
             steady_timer(self, EVENT_INTERVAL_S, self._publish_events)
-        self._event_publisher = self.publisher(PassEventMessage, '~/events', RESULT_QOS)
+        self._event_publisher = self.publisher(msg.PassEvent, '~/events', RESULT_QOS)
         self._detect = Detect(self.network, self.settings.detect)
         self._frame_publisher = self.publisher(NetworkFrame, NETWORK_FRAME, PUBLISHER_QOS)
-        self._detection_publisher = self.publisher(DetectionMessage, '~/detections', RESULT_QOS)
+        self._detection_publisher = self.publisher(msg.Detection, '~/detections', RESULT_QOS)
         if tracker is None:
             self._subscribe()
         else:
@@ -83,8 +70,10 @@ class DetectionNode(StageNode):
     def _subscribe(self) -> None:
         """Subscribe to the calibrated fields; monitor whether a tracker receives the frames."""
         for sensor, topic in zip(self.network.names, self.network.topics, strict=True):
-            self.subscription(MagneticField, f'{topic}_calibrated', partial(self._receive, sensor),
-                              STREAM_QOS, source='calibration')
+            self.subscription(
+                MagneticField, f'{topic}_calibrated',
+                partial(lambda sensor, message: self._feed(reading_of(message, sensor)), sensor),
+                STREAM_QOS, source='calibration')
         self.subscription(FieldReadings, CALIBRATED_READINGS, self._receive_batch, STREAM_QOS,
                           source='calibration', batches=True)
         self.monitor_subscriber('tracker', NETWORK_FRAME, TRACK_ARRAY)
@@ -100,13 +89,9 @@ class DetectionNode(StageNode):
         events = {} if self._events is None else {'events': sum(map(len, self._event_backlog))}
         return {'align': self._align.n_held, **events}
 
-    def _receive(self, sensor: str, message: MagneticField) -> None:
-        """Process a calibrated reading."""
-        self._feed(reading_of(message, sensor))
-
     def _receive_batch(self, message: FieldReadings) -> None:
         """Process calibrated readings of many sensors."""
-        readings = self.readings_of(message, self._align)
+        readings = self.converted(lambda: readings_of(message), self._align, 'readings')
         if readings is not None:
             self._feed(readings)
 
@@ -129,36 +114,27 @@ class DetectionNode(StageNode):
         assert self._events is not None
         readings, self._event_backlog = Readings.joined(self._event_backlog), []
         for event in self._events.feed(readings):
-            self._event_publisher.publish(to_message(PassEventMessage, pass_event_dict(event)))
+            send(self._event_publisher, pass_event_dict(event))
 
     def _publish(self, frames: list[FieldFrame]) -> None:
         """Detect targets in completed frames; publish frames and detections."""
         for frame in frames:
             for record in self._detect.feed(frame):
                 if isinstance(record, Detection):
-                    self._detection_publisher.publish(to_message(
-                        DetectionMessage, detection_dict(record, self.network.frame)))
+                    send(self._detection_publisher, detection_dict(record, self.network.frame))
                 elif self._tracker is None:
-                    self._publish_frame(record)
+                    send(self._frame_publisher, frame_dict(record, self.network))
                 else:
                     self._pending_frame = record
                     self._tracker.receive_frame(record)
                     self._publish_pending_frame()
 
     def _publish_pending_frame(self) -> None:
-        """Publish the pending frame to subscribers, if any.
-
-        Called when the tracker has published a pose or has processed the frame.
-        """
+        """Publish the pending frame, if any, after its pose or when it has been processed."""
         frame, self._pending_frame = self._pending_frame, None
         if frame is not None and has_subscribers(self._frame_publisher):
-            self._publish_frame(frame)
-
-    def _publish_frame(self, frame: FieldFrame) -> None:
-        """Publish a frame with its detection result."""
-        self._frame_publisher.publish(to_message(NetworkFrame, frame_dict(frame, self.network)))
+            send(self._frame_publisher, frame_dict(frame, self.network))
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process; return its exit status."""
-    return stage_node.main(DetectionNode, arguments)
+
+main = partial(middleware.main, DetectionNode)

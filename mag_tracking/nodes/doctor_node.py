@@ -5,7 +5,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -19,33 +18,32 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import reading_of, readings_of
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
-from mag_tracking.nodes.middleware import init_ros
-from mag_tracking.nodes.sensor_graph import no_message_finding, topic_findings
-from mag_tracking.nodes.shutdown import shut_down
-from mag_tracking.nodes.stage_node import SENSOR_QOS, STREAM_QOS, make_executor, spin
+from mag_tracking.nodes.connections import no_message_finding, topic_findings
+from mag_tracking.nodes.middleware import init_ros, make_executor, shut_down, spin
+from mag_tracking.nodes.stage_node import SENSOR_QOS, STREAM_QOS
 from mag_tracking.pipeline import Pipeline, Settings
 from mag_tracking.quantities import quantity
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 
 
 class DoctorNode(Node):
-    """Passes the readings of a network, with their times of arrival, to a `Doctor`."""
+    """Passes the readings of a network, with their times of arrival, to a `Doctor`.
+
+    `status` is the exit status of the process if the middleware hangs.
+    """
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         super().__init__('doctor', namespace=network.namespace)
-        self.doctor = Doctor(Pipeline(network, settings, 'calibrate'))
+        self.doctor, self.status = Doctor(Pipeline(network, settings, 'calibrate')), 1
         self._topics = dict(zip(network.names, map(self.resolve_topic_name, network.topics),
                                 strict=True))
         for sensor, topic in self._topics.items():
-            self.create_subscription(MagneticField, topic, partial(self._receive, sensor),
-                                     SENSOR_QOS)
+            self.create_subscription(MagneticField, topic, partial(
+                lambda sensor, message: self.doctor.feed(
+                    reading_of(message, sensor), time.time_ns()), sensor), SENSOR_QOS)
         self._batched_sensors: set[str] = set()
         self._invalid_messages: Counter[str] = Counter()
         self.create_subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM_QOS)
-
-    def _receive(self, sensor: str, message: MagneticField) -> None:
-        """Pass a reading to the doctor."""
-        self.doctor.feed(reading_of(message, sensor), time.time_ns())
 
     def _receive_batch(self, message: FieldReadings) -> None:
         """Pass the readings of the network's sensors to the doctor; count invalid messages."""
@@ -69,41 +67,22 @@ class DoctorNode(Node):
             found += topic_findings(self, sensor, topic)
             if sensor not in self._batched_sensors and not self.count_publishers(topic):
                 found.append(no_message_finding(self, sensor, topic, self._topics))
-        load, n_processors = os.getloadavg()[0], os.cpu_count() or 1
-        return [*load_findings(self.doctor.findings(), list(self._topics), load,
-                               n_processors), *found]
-
-
-@dataclass
-class DoctorResult:
-    """Readings and faults collected by `listening`."""
-
-    doctor: Doctor
-    """Doctor that has received all readings."""
-    findings: list[Finding]
-    """Faults found by `DoctorNode.findings`; empty until all readings have been received."""
-    status: int = 1
-    """Exit status of the process if the middleware hangs. The caller sets it after the report."""
+        return [*load_findings(self.doctor.findings(), list(self._topics), os.getloadavg()[0],
+                               os.cpu_count() or 1), *found]
 
 
 @contextmanager
 def listening(network: SensorNetwork, settings: Settings, seconds: float,
               stopped: Callable[[], bool], ros_arguments: Sequence[str] = ()
-              ) -> Iterator[DoctorResult]:
-    """Receive readings for at most `seconds`; the node is shut down when the context ends.
-
-    `stopped` returns True to stop earlier; the first of `ros_arguments` is `--ros-args`. If the
-    middleware hangs, `shut_down` ends the process.
-    """
+              ) -> Iterator[DoctorNode]:
+    """Receive readings for at most `seconds`, or until `stopped()`; yield the node, which is shut
+    down when the context ends."""
     init_ros(list(ros_arguments))
-    executor = make_executor()
-    node = DoctorNode(network, settings)
-    result = DoctorResult(node.doctor, [])
+    executor, node = make_executor(), DoctorNode(network, settings)
     try:
         executor.add_node(node)
         end = time.monotonic() + seconds
         spin(executor, lambda: stopped() or time.monotonic() > end)
-        result.findings = node.findings()
-        yield result
+        yield node
     finally:
-        shut_down([node], executor, result.status)
+        shut_down([node], executor, node.status)

@@ -5,16 +5,16 @@ A lifecycle node: configuration reads the drivers file, activation opens the dev
 """
 
 if __name__ == '__main__':
-    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import driver_node
 
     driver_node()
 
 import threading
 import time
+from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticStatus
 from mag_tracking_msgs.msg import FieldReadings
 from rclpy.lifecycle import State, TransitionCallbackReturn
 from rclpy.publisher import Publisher
@@ -23,29 +23,29 @@ from sensor_msgs.msg import Imu, MagneticField
 from mag_tracking.drivers.configuration import read_drivers
 from mag_tracking.drivers.driver import IGNORED, Driver, serve
 from mag_tracking.errors import SettingsError
-from mag_tracking.messages.schema import acceleration_dict, magnetic_field_dicts, readings_dict
+from mag_tracking.messages import schema
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
-from mag_tracking.nodes import stage_node
-from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.driver_health import DriverDiagnostics
-from mag_tracking.nodes.managed_node import ManagedNode
+from mag_tracking.nodes import diagnostics, middleware
+from mag_tracking.nodes.convert import send
+from mag_tracking.nodes.middleware import ManagedNode
 from mag_tracking.nodes.ros_params import fixed_parameter
-from mag_tracking.nodes.stage_node import PUBLISHER_QOS, RESULT_QOS
-from mag_tracking.nodes.steady_timer import steady_timer
+from mag_tracking.nodes.scheduling import steady_timer
+from mag_tracking.nodes.stage_node import PUBLISHER_QOS
 from mag_tracking.records import AccelerationSample, Readings
 
+EXPECTED_COUNTS = ('samples: ', 'late arrivals: ', 'other messages: ', 'lines that are comments',
+                   'lines without the prefix', 'lines that are empty', 'retained messages skipped',
+                   'conversions overwritten', 'packets not used')
+"""Prefixes of counts that are reported but do not cause a warning."""
 STOP_TIMEOUT_S = 15.0
 """[s] Maximum time for all drivers to stop. Disconnecting from an MQTT broker that does not answer
 takes several seconds."""
 
 
 class DriverNode(ManagedNode):
-    """Runs one thread per device, which publishes the readings of the device.
-
-    Raises MagTrackingError if `autostart` is set and the settings are invalid.
-    """
+    """Runs one thread per device, which publishes the readings of the device."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__('driver_node', **node_arguments)
@@ -59,18 +59,14 @@ class DriverNode(ManagedNode):
         self._threads: list[threading.Thread] = []
         self._publishers_by_sensor: dict[str, tuple[Publisher, Publisher]] = {}
         self._stop_event: threading.Event | None = None
-        self._diagnostics_publisher = self.create_publisher(
-            DiagnosticArray, '/diagnostics', RESULT_QOS)
-        self._health = DriverDiagnostics(self)
-        steady_timer(self, 1.0, self._publish_diagnostics)
+        self._diagnostics = diagnostics.DiagnosticsPublisher(self)
+        self._reported_counts: dict[str, dict[str, int]] = {}
+        steady_timer(self, 1.0, lambda: self._diagnostics.publish(
+            [self._status(driver) for driver in self._drivers]))
         self.start_automatically()
 
     def prepare(self) -> None:
-        """Read the drivers file and advertise the topics of the sensors.
-
-        Raises SettingsError if parameter `drivers` is empty or the drivers file is invalid, and
-        NetworkError if the network file is invalid.
-        """
+        """Read the drivers file and advertise the topics; raises SettingsError or NetworkError."""
         if not self._path:
             raise SettingsError('driver_node: parameter drivers is empty; set it to the path of a '
                                 'drivers file')
@@ -100,16 +96,10 @@ class DriverNode(ManagedNode):
         self._stop()
         return super().on_deactivate(state)
 
-    def on_cleanup(self, state: State) -> TransitionCallbackReturn:
-        """Release the drivers and withdraw the topics."""
-        self._release()
-        return TransitionCallbackReturn.SUCCESS
-
     def on_shutdown(self, state: State) -> TransitionCallbackReturn:
         """Close the devices, release the drivers and withdraw the topics."""
         self._stop()
-        self._release()
-        return TransitionCallbackReturn.SUCCESS
+        return super().on_shutdown(state)
 
     def close(self) -> None:
         """Stop the threads; each closes its device."""
@@ -122,8 +112,7 @@ class DriverNode(ManagedNode):
         self.close()
         ManagedNode.destroy_node(self)
 
-    def _advertise(self, sensor: str,
-                   network: SensorNetwork | None) -> tuple[Publisher, Publisher]:
+    def _advertise(self, sensor: str, network: SensorNetwork | None) -> tuple[Publisher, Publisher]:
         """Create the publishers of the field and the acceleration of a sensor."""
         topic, imu_topic = f'{sensor}/imu/mag', f'{sensor}/imu/data_raw'
         if network is not None:
@@ -135,13 +124,13 @@ class DriverNode(ManagedNode):
     def _publish(self, readings: Readings, accelerations: list[AccelerationSample]) -> None:
         """Publish readings, in one message if `batches` is set, and accelerations."""
         if self._readings_publisher is None:
-            for sensor, content in magnetic_field_dicts(readings):
-                self._publishers_by_sensor[sensor][0].publish(to_message(MagneticField, content))
+            for sensor, content in schema.magnetic_field_dicts(readings):
+                send(self._publishers_by_sensor[sensor][0], content)
         elif len(readings):
-            self._readings_publisher.publish(to_message(FieldReadings, readings_dict(readings)))
+            send(self._readings_publisher, schema.readings_dict(readings))
         for acceleration in accelerations:
-            self._publishers_by_sensor[acceleration.sensor][1].publish(
-                to_message(Imu, acceleration_dict(acceleration, acceleration.sensor)))
+            send(self._publishers_by_sensor[acceleration.sensor][1],
+                 schema.acceleration_dict(acceleration, acceleration.sensor))
 
     def _stop(self) -> None:
         """Stop the threads and wait, at most `STOP_TIMEOUT_S`, until their devices are closed."""
@@ -155,22 +144,43 @@ class DriverNode(ManagedNode):
                                         f'{STOP_TIMEOUT_S:g} s')
         self._threads = [thread for thread in self._threads if thread.is_alive()]
 
-    def _release(self) -> None:
+    def release(self) -> None:
         """Release the drivers and withdraw the topics."""
         for pair in self._publishers_by_sensor.values():
             for publisher in pair:
                 self.destroy_publisher(publisher)
         self._drivers, self._publishers_by_sensor = [], {}
 
-    def _publish_diagnostics(self) -> None:
-        """Publish the state of the devices."""
-        array = DiagnosticArray(status=self._health.statuses(
-            self._drivers, {thread.name for thread in self._threads if thread.is_alive()},
-            self._stop_event is not None and not self._stop_event.is_set()))
-        array.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics_publisher.publish(array)
+    def _status(self, driver: Driver) -> DiagnosticStatus:
+        """Return the diagnostics of one device."""
+        counts, examples = driver.counts(), driver.examples()
+        previous = self._reported_counts.get(driver.name, {})
+        increases = [f'{count}: {n - previous.get(count, 0)} more'
+                     + (f', such as {examples[count]}' if count in examples else '')
+                     for count, n in sorted(counts.items())
+                     if n > previous.get(count, 0) and not count.startswith(EXPECTED_COUNTS)]
+        self._reported_counts[driver.name] = dict(counts)
+        level, message = diagnostics.OK, 'open'
+        if self._stop_event is None or self._stop_event.is_set():
+            message = 'not active'
+        elif not any(t.name == driver.name and t.is_alive() for t in self._threads):
+            level, message = diagnostics.ERROR, 'the driver thread has ended: restart the node'
+        elif driver.fault:
+            level, message = diagnostics.ERROR, driver.fault
+        elif not driver.is_open:
+            # No fault has occurred, and opening some devices takes seconds.
+            message = 'opening'
+        elif increases:
+            level, message = diagnostics.WARN, '; '.join(increases)
+        values: dict[str, object] = dict(sorted(counts.items()))
+        for source, clock in driver.clocks().items():
+            suffix = f' ({source})' if source else ''
+            values[f'clock drift [ppm]{suffix}'] = f'{clock.drift_ppm:.2f}'
+            values[f'delay above the minimum, 95 % [ms]{suffix}'] = f'{1e3 * clock.spread_s:.3g}'
+            values[f'timestamp std [ms]{suffix}'] = f'{1e3 * clock.stamp_std:.3g}'
+        return diagnostics.status_of(f'{self._diagnostics.title}: {driver.name}', message, level,
+                                     values, hardware=driver.name)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process; return its exit status."""
-    return stage_node.main(DriverNode, arguments)
+
+main = partial(middleware.main, DriverNode)

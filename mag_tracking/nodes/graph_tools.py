@@ -7,25 +7,18 @@ from typing import Any
 
 import rclpy
 import yaml
+from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
-from rcl_interfaces.srv import (
-    DescribeParameters,
-    GetParameters,
-    GetParameterTypes,
-    ListParameters,
-    SetParameters,
-)
+from rcl_interfaces import srv
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from mag_tracking.errors import GraphError
+from mag_tracking.nodes.connections import is_latched, subscriber_qos
 from mag_tracking.nodes.convert import message_class
-from mag_tracking.nodes.middleware import RCLError, init_ros
-from mag_tracking.nodes.shutdown import shut_down
-from mag_tracking.nodes.stage_node import make_executor, spin
+from mag_tracking.nodes.middleware import RCLError, init_ros, make_executor, shut_down, spin
 
 DISCOVERY_S = 1.5
 """[s] Time allowed for discovery of the nodes of the graph."""
@@ -49,12 +42,11 @@ class Observer:
         spin(self._executor, lambda: condition() or time.monotonic() > end)
         return condition()
 
-    def call(self, service_type: Any, name: str, request: Any, once: bool = False) -> Any:
+    def call(self, service_type: Any, name: str, once: bool = False, **fields: Any) -> Any:
         """Call a service; raises GraphError if it does not exist or does not respond in time.
 
         A query is repeated, because the response of a server that has not yet discovered the client
-        is lost. With `once`, for a change of the server, it is requested only once, after a wait
-        for discovery.
+        is lost. A change of the server is requested only `once`, after a wait for discovery.
         """
         with valid_names():
             client = self.node.create_client(service_type, name)
@@ -66,7 +58,7 @@ class Observer:
                 self.wait(lambda: False, DISCOVERY_S)
             futures: list[Any] = []
             for _ in range(1 if once else MAX_ATTEMPTS):
-                futures.append(client.call_async(request))
+                futures.append(client.call_async(service_type.Request(**fields)))
                 if self.wait(lambda: any(f.done() for f in futures),
                              CHANGE_TIMEOUT_S if once else RESPONSE_TIMEOUT_S / MAX_ATTEMPTS):
                     return next(f for f in futures if f.done()).result()
@@ -86,11 +78,7 @@ def valid_names() -> Iterator[None]:
 
 @contextmanager
 def observer(ros_arguments: Sequence[str] = ()) -> Iterator[Observer]:
-    """Create an `Observer` that is shut down when the context ends.
-
-    The first of `ros_arguments` is `--ros-args`. If the middleware hangs, `shut_down` ends the
-    process.
-    """
+    """Create an `Observer` that is shut down when the context ends."""
     init_ros(list(ros_arguments))
     executor, node = make_executor(), Node('mag_tracking_observer', start_parameter_services=False)
     executor.add_node(node)
@@ -112,10 +100,10 @@ def topics(graph: Observer) -> list[tuple[str, str, int, int]]:
 
 def receive_messages(graph: Observer, topic: str, handle: Callable[[Any], bool],
                      stopped: Callable[[], bool]) -> None:
-    """Receive messages until `handle` returns False or `stopped` returns True; resolves the name.
+    """Receive messages of a topic, to be resolved, until `handle` returns False or `stopped()`.
 
-    Messages published earlier are received only if all publishers of the topic are latched. Raises
-    GraphError if the name is invalid, the topic has no publisher, or its type is not installed.
+    Messages published earlier are received only if all publishers are latched. Raises GraphError if
+    the name is invalid, the topic has no publisher, or its type is not installed.
     """
     with valid_names():
         name = graph.node.resolve_topic_name(topic)
@@ -129,7 +117,7 @@ def receive_messages(graph: Observer, topic: str, handle: Callable[[Any], bool],
     cls = message_class(infos[0].topic_type)
     if cls is None:
         raise GraphError(f'{name}: message type {infos[0].topic_type} is not installed')
-    latched = all(i.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for i in infos)
+    latched = all(map(is_latched, infos))
     stops: list[bool] = []
 
     def handle_one(message: Any) -> None:
@@ -137,11 +125,7 @@ def receive_messages(graph: Observer, topic: str, handle: Callable[[Any], bool],
         if not stops and not handle(message):
             stops.append(True)
 
-    graph.node.create_subscription(
-        cls, name, handle_one, QoSProfile(
-            depth=100, reliability=ReliabilityPolicy.RELIABLE if latched
-            else ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
+    graph.node.create_subscription(cls, name, handle_one, subscriber_qos(100, latched))
     while rclpy.ok() and not stops and not stopped():
         graph.wait(lambda: bool(stops) or stopped(), 1.0)
 
@@ -166,16 +150,13 @@ def as_text(message: Any) -> str:
 
 
 def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list[str]:
-    """Parameters of a node, or the named one, with values and descriptions.
-
-    Raises GraphError if the node or the parameter does not exist.
-    """
-    names = [name] if name is not None else list(graph.call(
-        ListParameters, f'{node}/list_parameters', ListParameters.Request()).result.names)
-    values = graph.call(GetParameters, f'{node}/get_parameters',
-                        GetParameters.Request(names=names)).values
-    descriptors = graph.call(DescribeParameters, f'{node}/describe_parameters',
-                             DescribeParameters.Request(names=names)).descriptors
+    """Parameters of a node, or the named one, with values and descriptions; raises GraphError if it
+    does not exist."""
+    names = [name] if name is not None else list(
+        graph.call(srv.ListParameters, f'{node}/list_parameters').result.names)
+    values = graph.call(srv.GetParameters, f'{node}/get_parameters', names=names).values
+    descriptors = graph.call(
+        srv.DescribeParameters, f'{node}/describe_parameters', names=names).descriptors
     if name is not None and not (values and values[0].type):
         raise GraphError(f'{node} has no parameter {name}')
     return [f'{n}: {parameter_value_to_python(v)}'
@@ -186,49 +167,44 @@ def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list
 
 
 def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
-    """Set a parameter of a node to a value in YAML; an integer is accepted for a float.
-
-    Raises GraphError if the value is invalid, the node does not exist, or the node rejects it.
-    """
+    """Set a parameter of a node to a value in YAML, also an integer for a float; raises GraphError
+    if it is invalid or rejected."""
     try:
         value = yaml.safe_load(text)
-        (kind,) = graph.call(GetParameterTypes, f'{node}/get_parameter_types',
-                             GetParameterTypes.Request(names=[name])).types or (0,)
+        (kind,) = graph.call(
+            srv.GetParameterTypes, f'{node}/get_parameter_types', names=[name]).types or (0,)
         if kind == Parameter.Type.DOUBLE.value and isinstance(value, int):
             value = float(value)
         parameter = Parameter(name, value=value)
     except (yaml.YAMLError, TypeError, ValueError) as error:
         raise GraphError(f'parameter {name}: {text!r} is not a valid value: {error}') from error
-    result = graph.call(SetParameters, f'{node}/set_parameters', SetParameters.Request(
-        parameters=[parameter.to_parameter_msg()]), once=True).results[0]
+    result = graph.call(srv.SetParameters, f'{node}/set_parameters', once=True,
+                        parameters=[parameter.to_parameter_msg()]).results[0]
     if not result.successful:
         raise GraphError(f'{node} rejects parameter {name}: {result.reason}')
 
 
 def lifecycle_state(graph: Observer, node: str) -> tuple[str, list[str]]:
-    """Label of a lifecycle node's state, and labels of the transitions that are now possible.
+    """Label of a lifecycle node's state, and labels of the transitions that are now possible."""
+    state = graph.call(GetState, f'{node}/get_state').current_state.label
+    return state, [t.label for t in _possible_transitions(graph, node)]
 
-    Raises GraphError if the node does not exist or is not a lifecycle node.
-    """
-    state = graph.call(GetState, f'{node}/get_state', GetState.Request()).current_state.label
-    possible = graph.call(GetAvailableTransitions, f'{node}/get_available_transitions',
-                          GetAvailableTransitions.Request()).available_transitions
-    return state, [t.transition.label for t in possible]
+
+def _possible_transitions(graph: Observer, node: str) -> list[Any]:
+    """Transitions of a lifecycle node that are now possible."""
+    return [t.transition for t in graph.call(
+        GetAvailableTransitions, f'{node}/get_available_transitions').available_transitions]
 
 
 def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
-    """Request a transition of a lifecycle node by its label.
-
-    Raises GraphError if the node does not exist, or the transition is not possible or fails.
-    """
-    possible = graph.call(GetAvailableTransitions, f'{node}/get_available_transitions',
-                          GetAvailableTransitions.Request()).available_transitions
-    matches = [t.transition for t in possible if t.transition.label == transition]
+    """Request a transition of a lifecycle node by its label; raises GraphError if it is impossible
+    or fails."""
+    possible = _possible_transitions(graph, node)
+    matches = [t for t in possible if t.label == transition]
     if not matches:
-        names = ', '.join(t.transition.label for t in possible)
+        names = ', '.join(t.label for t in possible)
         raise GraphError(f'{node}: transition {transition} is not possible in the current state; '
                          f'possible: {names}')
-    request = ChangeState.Request()
-    request.transition.id = matches[0].id
-    if not graph.call(ChangeState, f'{node}/change_state', request, once=True).success:
+    if not graph.call(ChangeState, f'{node}/change_state', once=True,
+                      transition=Transition(id=matches[0].id)).success:
         raise GraphError(f'{node}: transition {transition} failed; see the log of the node')

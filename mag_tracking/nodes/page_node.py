@@ -19,12 +19,11 @@ from mag_tracking.errors import RecordingError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.messages.network import frame_of
 from mag_tracking.messages.standard import SENSOR_NAMESPACES
-from mag_tracking.messages.types import NETWORK_FRAME
+from mag_tracking.messages.types import NETWORK_FRAME, TRACK_ARRAY
 from mag_tracking.nodes.convert import smoothed_path_of, track_of
-from mag_tracking.nodes.middleware import RMWError, init_ros
-from mag_tracking.nodes.shutdown import shut_down
-from mag_tracking.nodes.stage_node import LATCHED_QOS, RESULT_QOS, STREAM_QOS, make_executor, spin
-from mag_tracking.nodes.steady_timer import steady_timer
+from mag_tracking.nodes.middleware import RMWError, init_ros, make_executor, shut_down, spin
+from mag_tracking.nodes.scheduling import steady_timer
+from mag_tracking.nodes.stage_node import LATCHED_QOS, RESULT_QOS, STREAM_QOS
 from mag_tracking.quantities import quantity
 from mag_tracking.report.page import ERROR, WARNING, Note, Table
 from mag_tracking.report.page_scene import SensorLayout
@@ -37,7 +36,6 @@ MAX_FRAMES = 64
 """Maximum number of serialised frames stored for the next tick."""
 MAX_TRACKS = 1000
 """Maximum number of track messages stored for the next tick."""
-TRACKS_TYPE = 'mag_tracking_msgs/msg/TrackArray'
 STALE_TIMEOUT_S = 5.0
 """[s] A diagnostic status that has not been repeated for this time is stale."""
 _LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warning',
@@ -49,9 +47,8 @@ EMPTY_LAYOUT = SensorLayout('', (), np.zeros((0, 3)))
 class PageNode(Node):
     """Subscribes to the topics of the tracker and adds their messages to a scene.
 
-    The topics `tracker_node/tracks` and `network_frame` are relative and can be remapped; the other
-    topics of the tracker are in the same namespace as its tracks. A tracker with another name is
-    found by the message type of its tracks, if it is the only tracker in the namespace.
+    The topics `tracker_node/tracks` and `network_frame` are relative and can be remapped. A tracker
+    with another name is found by the message type of its tracks, if it is the only one.
     """
 
     def __init__(self, scene: LiveScene) -> None:
@@ -90,7 +87,7 @@ class PageNode(Node):
         """Return the published track topics in the namespace; subscribe if there is only one."""
         namespace = self.get_namespace().rstrip('/')
         topics = [name for name, kinds in self.get_topic_names_and_types()
-                  if TRACKS_TYPE in kinds and name.startswith(f'{namespace}/')
+                  if TRACK_ARRAY in kinds and name.startswith(f'{namespace}/')
                   and self.count_publishers(name)]
         if topics and self._tracks_topic not in topics and len(topics) == 1:
             self._subscribe_to_tracker(topics[0])
@@ -141,14 +138,10 @@ class PageNode(Node):
 
     def _receive_diagnostics(self, message: DiagnosticArray) -> None:
         """Store the latest diagnostic status of each node and sensor in this namespace."""
-        now = time.monotonic()
-        self._statuses.update({s.name: (now, s) for s in message.status
-                               if self._is_in_namespace(s.name)})
-
-    def _is_in_namespace(self, status: str) -> bool:
-        """Whether the node of the status named `status` is in the namespace of this node."""
-        namespace = status.partition(':')[0].rpartition('/')[0]
-        return namespace == self.get_namespace().strip('/')
+        now, namespace = time.monotonic(), self.get_namespace().strip('/')
+        self._statuses.update({
+            s.name: (now, s) for s in message.status
+            if s.name.partition(':')[0].rpartition('/')[0] == namespace})
 
     def _tick(self) -> None:
         """Add received tracks and frames to the scene; without tracks, only the latest frame."""
@@ -187,7 +180,7 @@ class PageNode(Node):
                                [Table('Health', ['node', 'level', 'message'], rows)])
 
     def _missing_topics(self) -> Iterator[Note]:
-        """Notes on missing topics, positions or tracker selection, and on invalid messages."""
+        """Notes on missing topics, positions or selection, and on invalid messages."""
         topics = self._find_tracker()
         if len(topics) > 1 and self._tracks_topic not in topics:
             yield Note(WARNING, f'several trackers: {", ".join(topics)}; select one (--ros-args -r '
@@ -207,9 +200,8 @@ def watch(host: str, port: int, report: Callable[[str], object],
           ros_arguments: Sequence[str] = (), ended: Callable[[], bool] = lambda: False) -> int:
     """Serve the page of running nodes until SIGINT, SIGTERM or `ended`; return the exit status.
 
-    Host and port are those of `PageServer`. `report` receives a line with the address of the page;
-    the first of `ros_arguments` is `--ros-args`. Raises DeviceError if the port cannot be opened.
-    If the middleware hangs at the end, `shut_down` ends the process.
+    `report` receives a line with the address of the page. Raises DeviceError if the port cannot be
+    opened.
     """
     os.nice(NICENESS)
     scene = LiveScene('mag_tracking', EMPTY_LAYOUT)

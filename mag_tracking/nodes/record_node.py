@@ -1,5 +1,7 @@
 """Recorder node that writes messages without decoding them and counts lost messages."""
 
+import functools
+import os
 import signal
 import sys
 import time
@@ -10,21 +12,17 @@ from pathlib import Path
 
 import rclpy
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from tqdm import tqdm
 
 from mag_tracking.apps.record import Selection, progress_line, summary
+from mag_tracking.errors import RecordingError
 from mag_tracking.interrupts import recorded_signals
-from mag_tracking.messages.types import (
-    FIELD_READINGS,
-    IMU,
-    MAGNETIC_FIELD,
-)
+from mag_tracking.messages import types
+from mag_tracking.nodes.connections import is_latched, subscriber_qos
 from mag_tracking.nodes.convert import message_class
-from mag_tracking.nodes.definitions import definition_of
-from mag_tracking.nodes.middleware import init_ros
-from mag_tracking.nodes.shutdown import shut_down
+from mag_tracking.nodes.middleware import init_ros, shut_down
 from mag_tracking.recording.recorder import Recorder
 from mag_tracking.recording.writer import offered_qos
 
@@ -34,10 +32,45 @@ DISCOVERY_INTERVAL_S = 0.5
 """[s] Interval between searches for topics."""
 PROGRESS_INTERVAL_S = 10.0
 """[s] Interval between progress lines if the output is not a terminal."""
-DEPTHS = {MAGNETIC_FIELD: 1000, IMU: 1000, FIELD_READINGS: 1000}
+DEPTHS = {types.MAGNETIC_FIELD: 1000, types.IMU: 1000, types.FIELD_READINGS: 1000}
 """Queue length by message type. A disk may stall for a second or more between two fetches."""
 DEFAULT_DEPTH = 100
 """Queue length for other types, such as images, which are large."""
+
+
+@functools.cache
+def definition_of(type_name: str) -> str | None:
+    """Definition of a message type and all nested types, in the format of a `ros2msg` schema; None
+    if the .msg file of a type is not installed."""
+    try:
+        return types.definition(type_name)
+    except RecordingError:
+        pass
+    known, queue, schema = [type_name], [type_name], ''
+    while queue:
+        name = queue.pop(0)
+        content = _file_content(name)
+        if content is None:
+            return None
+        package, _, leaf = name.split('/')
+        schema += content if not schema else f'{"=" * 80}\nMSG: {package}/{leaf}\n{content}'
+        new_types = [t for t in types.referenced_types(content, package) if t not in known]
+        known += new_types
+        queue += new_types
+    return schema
+
+
+def _file_content(type_name: str) -> str | None:
+    """Content of the .msg file of a type; None if the file is not installed."""
+    package, kind, leaf = type_name.split('/')
+    # ROS from PyPI leaves AMENT_PREFIX_PATH unset and is installed below sys.prefix.
+    prefixes = [p for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
+    for prefix in (*prefixes, sys.prefix):
+        file = Path(prefix) / 'share' / package / kind / f'{leaf}.msg'
+        if file.is_file():
+            text = file.read_text(encoding='utf-8', errors='replace')
+            return text if text.endswith('\n') else f'{text}\n'
+    return None
 
 
 class _PolledSubscription:
@@ -46,13 +79,9 @@ class _PolledSubscription:
     def __init__(self, node: Node, topic: str, type_name: str, latched: bool) -> None:
         self.node, self.type, self.latched = node, type_name, latched
         self.depth = DEPTHS.get(type_name, DEFAULT_DEPTH)
-        # A best-effort subscription matches every publisher but does not receive latched messages.
         self.subscription = node.create_subscription(
-            message_class(type_name), topic, lambda _: None, QoSProfile(
-                depth=self.depth, reliability=ReliabilityPolicy.RELIABLE if latched
-                else ReliabilityPolicy.BEST_EFFORT,
-                durability=DurabilityPolicy.TRANSIENT_LOCAL if latched
-                else DurabilityPolicy.VOLATILE), raw=True)
+            message_class(type_name), topic, lambda _: None,
+            subscriber_qos(self.depth, latched), raw=True)
         self.publishers: tuple[tuple[int, ...], ...] = ()
         self.last_number: int | None = None
         self.n_lost = 0
@@ -92,10 +121,10 @@ class _PolledSubscription:
 class RecordNode(Node):
     """Subscribes to the selected topics and passes their messages to a `Recorder`.
 
-    The node is polled instead of being spun by an executor: the events executor of the Jazzy wheels
-    fails in callbacks that request time and sequence number of a message, and the single-threaded
-    executor uses most of a processor core for twenty sensors. `report` is called with lines for the
-    user; `selection` has absolute names after construction.
+    The node is polled: the events executor of the Jazzy wheels fails in callbacks that request time
+    and sequence number of a message, and the single-threaded executor uses most of a processor core
+    for twenty sensors. `report` is called with lines for the user; `refused` are the topics that
+    are not recorded, with the reason.
     """
 
     def __init__(self, recorder: Recorder, selection: Selection,
@@ -104,25 +133,20 @@ class RecordNode(Node):
         self.recorder, self._report = recorder, report
         self.selection = selection.resolved(self.resolve_topic_name)
         self._polled_subscriptions: dict[str, _PolledSubscription] = {}
-        self._refused: dict[str, str] = {}
+        self.refused: dict[str, str] = {}
         self._described_topics: set[str] = set()
         self._n_lost_before: Counter[str] = Counter()
         # The types of these topics are known, so the subscriptions need not wait for a driver.
         for topic in self.selection.fields:
-            self._subscribe(topic, MAGNETIC_FIELD, [])
+            self._subscribe(topic, types.MAGNETIC_FIELD, [])
         for topic in self.selection.imus:
-            self._subscribe(topic, IMU, [])
+            self._subscribe(topic, types.IMU, [])
 
     @property
     def lost(self) -> 'Counter[str]':
         """Numbers of lost messages by topic; topics without losses are omitted."""
         current = Counter({topic: s.n_lost for topic, s in self._polled_subscriptions.items()})
         return +(current + self._n_lost_before)
-
-    @property
-    def refused(self) -> dict[str, str]:
-        """Topics that are not recorded: {topic: reason}."""
-        return self._refused
 
     def topic_counts(self) -> tuple[int, int]:
         """Number of subscribed topics that have a publisher, and number of subscribed topics."""
@@ -133,7 +157,7 @@ class RecordNode(Node):
     def discover(self) -> None:
         """Subscribe to new selected topics; update the publishers of subscribed topics."""
         for topic, _ in self.get_topic_names_and_types():
-            if topic in self._refused or not self.selection.includes(topic):
+            if topic in self.refused or not self.selection.includes(topic):
                 continue
             infos = self.get_publishers_info_by_topic(topic)
             if not infos:
@@ -148,7 +172,7 @@ class RecordNode(Node):
         if message_class(type_name) is None:
             self._refuse(topic, f'message type {type_name} is not installed')
             return
-        latched = bool(infos) and all(map(_is_latched, infos))
+        latched = bool(infos) and all(map(is_latched, infos))
         self._polled_subscriptions[topic] = _PolledSubscription(self, topic, type_name, latched)
         self._polled_subscriptions[topic].set_publishers(infos)
 
@@ -167,20 +191,18 @@ class RecordNode(Node):
 
     def _refuse(self, topic: str, reason: str) -> None:
         """Report once that a topic is not recorded."""
-        self._refused[topic] = reason
+        self.refused[topic] = reason
         self._report(f'{topic} is not recorded: {reason}')
 
     def _update_publishers(self, topic: str, infos: list[TopicEndpointInfo]) -> None:
-        """Update a topic's publishers; report other message types; resubscribe if necessary.
-
-        A latched subscription is replaced by a volatile one if a publisher is not latched.
-        """
+        """Update a topic's publishers; report other message types; replace a latched subscription
+        if a publisher is not latched."""
         polled = self._polled_subscriptions[topic]
         other_types = sorted({i.topic_type for i in infos} - {polled.type})
-        if other_types and f'{topic} as {other_types[0]}' not in self._refused:
+        if other_types and f'{topic} as {other_types[0]}' not in self.refused:
             self._refuse(f'{topic} as {other_types[0]}', f'the topic has type {polled.type}')
         polled.set_publishers(infos)
-        if polled.latched and not all(map(_is_latched, infos)):
+        if polled.latched and not all(map(is_latched, infos)):
             # The latched subscription would not match the new publisher, which is not latched.
             self.poll()
             self._n_lost_before[topic] += polled.n_lost
@@ -202,11 +224,6 @@ class RecordNode(Node):
         return len(records)
 
 
-def _is_latched(info: TopicEndpointInfo) -> bool:
-    """Whether a publisher also sends its latest messages to subscribers that join later."""
-    return bool(info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
-
-
 def log(text: str) -> None:
     """Print a line for the user without disturbing a progress bar; a closed terminal is ignored."""
     with suppress(OSError):
@@ -217,9 +234,8 @@ def run(selection: Selection, out: Path, split_bytes: int = 10**9,
         split_ns: int = 3600 * 10**9, ros_arguments: Sequence[str] = ()) -> int:
     """Record into folder `out` until SIGINT, SIGTERM or SIGHUP; return the exit status.
 
-    A new file begins at `split_bytes` or `split_ns`; the first of `ros_arguments` is `--ros-args`.
-    Raises OutputError if the recording cannot be written. If the middleware hangs at the end,
-    `shut_down` ends the process, after the recording has been closed.
+    A new file begins at `split_bytes` or `split_ns`. Raises OutputError if the recording cannot be
+    written.
     """
     node, status = None, 1
     with recorded_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as signals:

@@ -6,7 +6,6 @@ itself at startup.
 """
 
 if __name__ == '__main__':
-    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import replay_node
 
     replay_node()
@@ -14,6 +13,7 @@ if __name__ == '__main__':
 import time
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -25,11 +25,11 @@ from std_srvs.srv import Trigger
 
 from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.messages.types import MAGNETIC_FIELD
-from mag_tracking.nodes import stage_node
+from mag_tracking.nodes import middleware
 from mag_tracking.nodes.convert import message_class
-from mag_tracking.nodes.managed_node import ManagedNode
-from mag_tracking.nodes.paced_service import paced_service
+from mag_tracking.nodes.middleware import ManagedNode
 from mag_tracking.nodes.ros_params import fixed_parameter
+from mag_tracking.nodes.scheduling import paced_service
 from mag_tracking.nodes.stage_node import STREAM_QOS
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
@@ -43,12 +43,8 @@ MAX_MESSAGES_PER_TICK = 200
 
 
 class ReplayNode(ManagedNode):
-    """Publishes the messages of a recording at the recorded rate or a multiple of it.
-
-    With `autostart`, raises RecordingError if the recording cannot be played, and SettingsError for
-    an invalid parameter. `finished` means that playback has reached the end; `counts` are the
-    messages played and rejected.
-    """
+    """Publishes the messages of a recording, at a multiple of the recorded rate, until `finished`;
+    `counts` are those played and rejected."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__('replay_node', **node_arguments)
@@ -73,18 +69,14 @@ class ReplayNode(ManagedNode):
         self._clock_publisher = self.create_publisher(Clock, '/clock', STREAM_QOS)
         self.finished, self._is_active, self._start_time = False, False, 0.0
         self._last_tick: float | None = None
-        paced_service(self, Trigger, '~/pause', self._pause)
-        paced_service(self, Trigger, '~/resume', self._resume)
+        paced_service(self, Trigger, '~/pause', partial(self._pause_or_resume, True))
+        paced_service(self, Trigger, '~/resume', partial(self._pause_or_resume, False))
         paced_service(self, Seek, '~/seek', self._seek_service)
         self.create_timer(UPDATE_INTERVAL_S, self._tick)
         self.start_automatically()
 
     def prepare(self) -> None:
-        """Open the recording and advertise its topics.
-
-        Raises SettingsError for an invalid parameter, and RecordingError if the recording cannot be
-        read, is empty, or lacks a selected topic.
-        """
+        """Open the recording and advertise its topics; raises SettingsError or RecordingError."""
         if not self._path:
             raise SettingsError('replay_node: parameter recording is empty; set it to the path of '
                                 'a recording')
@@ -94,9 +86,7 @@ class ReplayNode(ManagedNode):
         recording = Recording(self._path)
         self._begin_ns = _first_time_ns(recording)
         self._selected_topics = _selected_topics(recording, self._topics)
-        end_ns = recording.end_ns
-        if not self._start_offset_s >= 0.0 or (
-                end_ns is not None and self._begin_ns + self._start_offset_s * 1e9 > end_ns):
+        if not self._is_inside(recording, self._start_offset_s):
             raise SettingsError(f'replay_node: parameter start_offset: {self._start_offset_s} s '
                                 'is outside the recording')
         self._recording = recording
@@ -104,6 +94,11 @@ class ReplayNode(ManagedNode):
             if self._selected_topics is None or topic in self._selected_topics:
                 self._publisher_for(topic, kind)
         self._seek(self._start_offset_s)
+
+    def _is_inside(self, recording: Recording, offset: float) -> bool:
+        """Whether a recording contains the time of `offset` seconds after the first message."""
+        return offset >= 0.0 and (recording.end_ns is None
+                                  or self._begin_ns + offset * 1e9 <= recording.end_ns)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
         """Start playback at the current position."""
@@ -117,18 +112,8 @@ class ReplayNode(ManagedNode):
         self._is_active = False
         return super().on_deactivate(state)
 
-    def on_cleanup(self, state: State) -> TransitionCallbackReturn:
-        """Close the recording and withdraw its topics."""
-        self._release()
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_shutdown(self, state: State) -> TransitionCallbackReturn:
+    def release(self) -> None:
         """Stop playback, close the recording and withdraw its topics."""
-        self._release()
-        return TransitionCallbackReturn.SUCCESS
-
-    def _release(self) -> None:
-        """Close the recording and withdraw its topics."""
         self._is_active, self._recording, self.finished = False, None, False
         for publisher in self.publishers_by_topic.values():
             self.destroy_publisher(publisher)
@@ -136,7 +121,7 @@ class ReplayNode(ManagedNode):
         self._not_installed.clear()
 
     def _publisher_for(self, topic: str, kind: str) -> Publisher | None:
-        """Return the publisher of a topic, created if necessary; None if its type is missing."""
+        """Publisher of a topic, within the namespace of this node; None if its type is missing."""
         if topic not in self.publishers_by_topic and topic not in self._not_installed:
             cls = message_class(kind)
             if cls is None:
@@ -144,14 +129,11 @@ class ReplayNode(ManagedNode):
                 self.get_logger().warning(f'{topic} is not played: message type {kind} is not '
                                           'installed')
             else:
+                namespace = self.get_namespace().rstrip('/')
                 self.publishers_by_topic[topic] = self.create_publisher(
-                    cls, self._within_namespace(topic), STREAM_QOS)
+                    cls, topic if topic.startswith(f'{namespace}/') else f'{namespace}{topic}',
+                    STREAM_QOS)
         return self.publishers_by_topic.get(topic)
-
-    def _within_namespace(self, topic: str) -> str:
-        """Prefix a recorded topic with the namespace of this node, unless it has this prefix."""
-        namespace = self.get_namespace().rstrip('/')
-        return topic if topic.startswith(f'{namespace}/') else f'{namespace}{topic}'
 
     def _seek(self, offset: float) -> None:
         """Set the position to `offset` seconds after the first message."""
@@ -209,19 +191,17 @@ class ReplayNode(ManagedNode):
             self._seek(0.0)
             return
         self.finished = True
-        n = self.counts['messages']
-        self.get_logger().info(f'end of the recording: {quantity(n, "message")} played')
+        self.get_logger().info(
+            f'end of the recording: {quantity(self.counts["messages"], "message")} played')
 
-    def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Handle ~/pause."""
-        self._paused, self._last_tick = True, None
-        response.success, response.message = True, 'paused'
-        return response
-
-    def _resume(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Handle ~/resume."""
-        self.resume()
-        response.success, response.message = True, 'playing'
+    def _pause_or_resume(self, paused: bool, _request: Trigger.Request,
+                         response: Trigger.Response) -> Trigger.Response:
+        """Handle ~/pause and ~/resume."""
+        if paused:
+            self._paused, self._last_tick = True, None
+        else:
+            self.resume()
+        response.success, response.message = True, 'paused' if paused else 'playing'
         return response
 
     def resume(self) -> None:
@@ -232,23 +212,18 @@ class ReplayNode(ManagedNode):
     def _seek_service(self, request: Seek.Request, response: Seek.Response) -> Seek.Response:
         """Handle ~/seek; reject an offset outside the recording."""
         if self._recording is None:
-            response.success, response.message = \
-                False, 'no recording is open: configure the node first'
-            return response
-        end_ns = self._recording.end_ns
-        if not request.offset >= 0.0 or (
-                end_ns is not None and self._begin_ns + request.offset * 1e9 > end_ns):
-            response.success = False
+            response.message = 'no recording is open: configure the node first'
+        elif not self._is_inside(self._recording, request.offset):
             response.message = f'offset: {request.offset} s is outside the recording'
-            return response
-        self._seek(request.offset)
-        self.finished = False
-        response.success, response.message = True, f'position: {request.offset} s'
+        else:
+            self._seek(request.offset)
+            self.finished = False
+            response.success, response.message = True, f'position: {request.offset} s'
         return response
 
 
 def _first_time_ns(recording: Recording) -> int:
-    """Return the time of the first message [ns]; raise RecordingError for an empty recording."""
+    """Time of the first message [ns]; raises RecordingError for an empty recording."""
     if recording.start_ns is not None:
         return recording.start_ns
     # A file that was not closed has no index: read the first message.
@@ -259,7 +234,7 @@ def _first_time_ns(recording: Recording) -> int:
 
 
 def _selected_topics(recording: Recording, topics: Sequence[str]) -> set[str] | None:
-    """Return the topics to play, None for all; raise RecordingError for an unknown topic."""
+    """Topics to play, None for all; raises RecordingError for an unknown topic."""
     selected = [t for t in topics if t]
     unknown_topics = [t for t in selected if t not in recording.types]
     if unknown_topics and recording.message_counts:
@@ -268,6 +243,5 @@ def _selected_topics(recording: Recording, topics: Sequence[str]) -> set[str] | 
     return set(selected) or None
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process; return its exit status."""
-    return stage_node.main(ReplayNode, arguments)
+
+main = partial(middleware.main, ReplayNode)

@@ -3,12 +3,7 @@
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces import msg
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
@@ -28,28 +23,27 @@ a parameter file and the arguments of a process."""
 def fixed_parameter(node: Node, name: str, default: Any, description: str) -> Any:
     """Declare a read-only parameter, one of `NODE_PARAMETERS`; return its value."""
     assert name in NODE_PARAMETERS, name
-    return node.declare_parameter(name, default, ParameterDescriptor(
+    return node.declare_parameter(name, default, msg.ParameterDescriptor(
         description=description, read_only=True)).value
 
 
-def _descriptor(p: Parameter) -> ParameterDescriptor:
+def _descriptor(p: Parameter) -> msg.ParameterDescriptor:
     """Create the descriptor of a setting, with its description, unit and range."""
-    d = ParameterDescriptor(description=p.doc, read_only=not p.live,
-                            additional_constraints=f'unit: {p.unit}' if p.unit else
-                            f'one of {", ".join(p.choices)}' if p.choices else '')
+    d = msg.ParameterDescriptor(
+        description=p.doc, read_only=not p.live, additional_constraints=f'unit: {p.unit}'
+        if p.unit else f'one of {", ".join(p.choices)}' if p.choices else '')
     if p.range and p.type is float:
-        d.floating_point_range = [FloatingPointRange(from_value=float(p.range[0]),
-                                                     to_value=float(p.range[1]))]
+        d.floating_point_range = [msg.FloatingPointRange(
+            from_value=float(p.range[0]), to_value=float(p.range[1]))]
     elif p.range and p.type is int:
-        d.integer_range = [IntegerRange(from_value=p.range[0], to_value=p.range[1])]
+        d.integer_range = [msg.IntegerRange(from_value=p.range[0], to_value=p.range[1])]
     return d
 
 
 def declare_settings(node: Node, settings: Settings, group: str) -> Settings:
     """Declare the settings of a group as parameters of a node; return all, with its overrides.
 
-    A parameter file may contain settings of other groups. Raises SettingsError if an override does
-    not name a setting, or has a wrong type, length or range.
+    A parameter file may contain settings of other groups. Raises SettingsError if one is invalid.
     """
     overrides = node._parameter_overrides  # rclpy has no public accessor
     current = replace(settings, {
@@ -69,25 +63,23 @@ def _without_array(value: Any) -> Any:
 
 def follow_changes(node: Node, settings: Settings, apply: Callable[[Settings], None]) -> None:
     """Reject invalid parameter changes; call `apply` with the settings after valid ones."""
-    state = {'settings': settings}
-
-    def reject_invalid(parameters: list[RosParameter]) -> SetParametersResult:
-        try:
-            replace(state['settings'], _changes(parameters))
-        except SettingsError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
-
-    def apply_changes(parameters: list[RosParameter]) -> None:
-        changes = _changes(parameters)
-        if changes:
-            state['settings'] = replace(state['settings'], changes)
-            apply(state['settings'])
-
     names = {p.name for p in flatten(settings)}
 
-    def _changes(parameters: Iterable[RosParameter]) -> dict[str, Any]:
+    def changes(parameters: Iterable[RosParameter]) -> dict[str, Any]:
         return {p.name: _without_array(p.value) for p in parameters if p.name in names}
+
+    def reject_invalid(parameters: list[RosParameter]) -> msg.SetParametersResult:
+        try:
+            replace(settings, changes(parameters))
+        except SettingsError as error:
+            return msg.SetParametersResult(successful=False, reason=str(error))
+        return msg.SetParametersResult(successful=True)
+
+    def apply_changes(parameters: list[RosParameter]) -> None:
+        nonlocal settings
+        if changed := changes(parameters):
+            settings = replace(settings, changed)
+            apply(settings)
 
     node.add_on_set_parameters_callback(reject_invalid)
     node.add_post_set_parameters_callback(apply_changes)

@@ -21,18 +21,15 @@ from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.detection_node import DetectionNode
 from mag_tracking.nodes.driver_node import DriverNode
-from mag_tracking.nodes.middleware import init_ros
+from mag_tracking.nodes.middleware import freeze, init_ros, make_executor, shut_down, spin
 from mag_tracking.nodes.replay_node import ReplayNode
-from mag_tracking.nodes.shutdown import shut_down
-from mag_tracking.nodes.stage_node import STREAM_QOS, StageNode, freeze, make_executor, spin
+from mag_tracking.nodes.stage_node import STREAM_QOS, StageNode
 from mag_tracking.nodes.tracker_node import TrackerNode
 from mag_tracking.pipeline import Settings, settings_for
 from mag_tracking.records import Track
 from mag_tracking.settings import flatten
 
 PathLike = str | OsPathLike[str]
-
-
 MAX_DISCOVERY_S = 60.0
 """[s] Maximum time for mutual discovery of the nodes; a busy computer needs several seconds."""
 
@@ -72,10 +69,9 @@ def pose_line(track: Track) -> str:
 
 
 def parameters(network_path: PathLike, settings: Settings, reliable: bool) -> list[Parameter]:
-    """ROS parameters of the nodes for the given settings.
+    """ROS parameters of the nodes; `reliable` is the QoS of the sensors, needed for a replay.
 
     Settings with their default values are omitted, so that ROS arguments can change them.
-    `reliable` is the QoS of subscriptions to the sensors, needed for a replay.
     """
     out = [Parameter('network', value=str(network_path)),
            Parameter('target', value=settings.track.target),
@@ -85,22 +81,11 @@ def parameters(network_path: PathLike, settings: Settings, reliable: bool) -> li
                   for p in flatten(settings) if p.value != defaults.get(p.name)]
 
 
-def driver_node(drivers_path: PathLike, network_path: PathLike, batches: bool) -> DriverNode:
-    """Create the driver node, which starts at once; `batches` puts many sensors in one message."""
-    return DriverNode(parameter_overrides=[
-        Parameter('drivers', value=str(drivers_path)),
-        Parameter('network', value=str(network_path)), Parameter('batches', value=batches)])
-
-
 def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike | None = None,
                rate: float = 1.0, loop: bool = False
                ) -> tuple[list[StageNode], ReplayNode | None]:
-    """Create the calibration, detection and tracker nodes, and the replay node of a recording.
-
-    They are ready for an executor; the replay node is None without a recording, else paused, and
-    `loop` restarts it at the end. Each stage passes its results to the next directly and publishes
-    them after the pose.
-    """
+    """Create the calibration, detection and tracker nodes, each of which passes its results to the
+    next directly, and the paused replay node of a recording, if any."""
     overrides = parameters(network_path, settings, reliable=recording is not None)
     tracker = TrackerNode(has_direct_input=True, parameter_overrides=overrides)
     detection = DetectionNode(tracker, parameter_overrides=overrides)
@@ -116,56 +101,44 @@ def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike |
 
 def all_connected(stages: list[StageNode], replay: ReplayNode) -> bool:
     """Whether each sensor topic that is replayed has a subscriber."""
-    sensor_publishers = [p for p in replay.publishers_by_topic.values()
-                         if p.topic_name in stages[0].sensor_topics]
-    return all(p.get_subscription_count() > 0 for p in sensor_publishers)
+    return all(p.get_subscription_count() > 0 for p in replay.publishers_by_topic.values()
+               if p.topic_name in stages[0].sensor_topics)
 
 
 def run(network_path: PathLike, settings: Settings, recording: PathLike | None = None,
         rate: float = 1.0, loop: bool = False,
         observers: Sequence[Callable[[], Node]] | None = None, drivers: PathLike | None = None,
         batches: bool = False, ros_arguments: Sequence[str] = ()) -> int:
-    """Run the nodes until Ctrl-C, or until a recording has been played and processed.
+    """Run the nodes until Ctrl-C, or until a recording has been played; return the exit status.
 
     `drivers` is a drivers file, with which a driver node also runs; `batches` puts many sensors in
     one message. `observers` create additional nodes after `rclpy.init`, by default a
-    `TrackPrinter`. The first of `ros_arguments` is `--ros-args`. Returns the exit status. If the
-    middleware hangs at the end, `shut_down` ends the process.
+    `TrackPrinter`. If the middleware hangs at the end, `shut_down` ends the process.
     """
+    # The driver node is created last, so that its first messages have subscribers.
+    sources: Sequence[Callable[[], Node]] = [partial(DriverNode, parameter_overrides=[
+        Parameter('drivers', value=str(drivers)), Parameter('network', value=str(network_path)),
+        Parameter('batches', value=batches)])] if drivers else []
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
-        # The driver node is created last, so that its first messages have subscribers.
-        sources = [partial(driver_node, drivers, network_path, batches)] if drivers else []
         init_ros(list(ros_arguments))
-        return _run_until(lambda: bool(signals), network_path, settings, recording, rate, loop,
-                          observers, sources)
-
-
-def _run_until(stopped: Callable[[], bool], network_path: PathLike, settings: Settings,
-               recording: PathLike | None, rate: float, loop: bool,
-               observers: Sequence[Callable[[], Node]] | None,
-               sources: Sequence[Callable[[], Node]]) -> int:
-    """Run the nodes until `stopped()`; see `run`. Nodes created by `sources` start last."""
-    executor = make_executor()
-    nodes: list[Node] = []
-    status = 1
-    try:
-        stages, replay = make_nodes(network_path, settings, recording, rate, loop)
-        tracks = stages[-1].resolve_topic_name('~/tracks')
-        if observers is None:
-            observers = [partial(TrackPrinter, tracks)]
-        nodes = [*stages, *(make() for make in (*observers, *sources))]
-        nodes += [replay] if replay else []
-        for node in nodes:
-            executor.add_node(node)
-        freeze()
-        if replay is None:
-            spin(executor, stopped)
-        else:
-            _play(executor, stages, replay, stopped)
-        status = 0
-    finally:
-        shut_down(nodes, executor, status)
-    return status
+        executor, nodes, status = make_executor(), list[Node](), 1
+        try:
+            stages, replay = make_nodes(network_path, settings, recording, rate, loop)
+            if observers is None:
+                observers = [partial(TrackPrinter, stages[-1].resolve_topic_name('~/tracks'))]
+            nodes = [*stages, *(make() for make in (*observers, *sources))]
+            nodes += [replay] if replay else []
+            for node in nodes:
+                executor.add_node(node)
+            freeze()
+            if replay is None:
+                spin(executor, lambda: bool(signals))
+            else:
+                _play(executor, stages, replay, lambda: bool(signals))
+            status = 0
+        finally:
+            shut_down(nodes, executor, status)
+        return status
 
 
 def _play(executor: Executor, stages: list[StageNode], replay: ReplayNode,
@@ -197,9 +170,8 @@ def _check_topics(node: StageNode, replay: ReplayNode) -> None:
                            f'{", ".join(node.sensor_topics)}{hint}')
 
 
-def _drain(executor: Executor, stages: list[StageNode], stopped: Callable[[], bool],
-           quiet_s: float = 1.0) -> None:
-    """Spin until no stage has processed a record for `quiet_s` seconds, or until `stopped()`."""
+def _drain(executor: Executor, stages: list[StageNode], stopped: Callable[[], bool]) -> None:
+    """Spin until no stage has processed a record for a second, or until `stopped()`."""
     def totals() -> list[int]:
         return [sum(s.counts.values()) for node in stages for s in node.stages().values()]
 
@@ -210,6 +182,6 @@ def _drain(executor: Executor, stages: list[StageNode], stopped: Callable[[], bo
         current = totals()
         if current != previous:
             previous, since = current, time.monotonic()
-        return stopped() or time.monotonic() - since > quiet_s
+        return stopped() or time.monotonic() - since > 1.0
 
     spin(executor, is_quiet)

@@ -13,17 +13,19 @@ from mag_tracking.apps.doctor import network_findings
 from mag_tracking.apps.host_stalls import TIME_CAUSES, HostStalls, load_findings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.topics import absolute
-from mag_tracking.nodes.flow import SILENCE_TIMEOUT_S
-from mag_tracking.nodes.sensor_graph import no_message_finding, topic_findings
+from mag_tracking.nodes.connections import SILENCE_TIMEOUT_S, no_message_finding, topic_findings
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.health.covariances import covariance_findings
 from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding, ranked
-from mag_tracking.stages.health.input_findings import background_findings, rate_findings
-from mag_tracking.stages.health.reading_buffer import ReadingBuffer
-from mag_tracking.stages.health.rejections import driver_findings
+from mag_tracking.stages.health.findings import (
+    background_findings,
+    covariance_findings,
+    driver_findings,
+    rate_findings,
+)
 from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S, WINDOW, SensorHealth
+from mag_tracking.stages.health.window import ReadingBuffer
 
 WINDOW_S = 60.0
 """[s] Length of an evaluation window. A fault is reported for one to two windows after
@@ -37,11 +39,8 @@ LEARNING_TIMEOUT_FACTOR = 3.0
 
 
 class HealthDiagnostics:
-    """Monitors the raw readings of a network.
-
-    `node` resolves the sensor topics, and its graph is examined for their publishers. With
-    `is_replayed`, old timestamps are not a fault.
-    """
+    """Monitors the raw readings of a network; `node` resolves the sensor topics and examines their
+    publishers; with `is_replayed`, old timestamps are not a fault."""
 
     def __init__(self, network: SensorNetwork, settings: Settings, node: Node | None = None,
                  is_replayed: bool = False) -> None:
@@ -59,10 +58,10 @@ class HealthDiagnostics:
         self._network_findings: dict[str, list[Finding]] = {}
         # Number of relearnt backgrounds at the start of the previous and the current window.
         self._relearnt_counts: list[dict[str, int]] = [dict.fromkeys(network.names, 0)] * 2
-        self._begin(network)
+        self.use_network(network)
 
-    def _begin(self, network: SensorNetwork) -> None:
-        """Begin the first window with a network, which replaces the previous network."""
+    def use_network(self, network: SensorNetwork) -> None:
+        """Begin the windows with a network, or another calibration of the same sensors."""
         self._network = network
         self._clock_ns = network.clock_offset_ns
         # Earlier timestamps were corrected with the clock offsets of the previous network.
@@ -74,10 +73,6 @@ class HealthDiagnostics:
         self._late_findings: dict[str, list[Finding]] = {}
         self._start_time = time.monotonic()
         self._window_end = self._start_time + WINDOW_S
-
-    def use_network(self, network: SensorNetwork) -> None:
-        """Replace the network by another calibration of the same sensors; restart the windows."""
-        self._begin(network)
 
     def add(self, readings: Readings, now_ns: int) -> None:
         """Add raw readings and their arrival time; sensors outside the network are ignored."""
@@ -101,10 +96,7 @@ class HealthDiagnostics:
         return [self.status(node, j, calibrate) for j in range(len(self._network))]
 
     def begin_round(self, calibrate: Calibrate) -> None:
-        """Compare the sensors with each other; begin a new window if the current window is over.
-
-        Must be called before `status` is called for each sensor.
-        """
+        """Compare the sensors, before `status` is called for each; begin a new window if due."""
         for name, health in self._current_window.items():
             if health.faults != (faults := calibrate.driver_faults.of(name)):
                 # Earlier statistics include the faulty readings.
@@ -187,10 +179,9 @@ class HealthDiagnostics:
         # Nodes that are launched together do not start at the same time.
         if time.monotonic() - self._start_time < STARTUP_S:
             return []
-        if self._node is None:
-            return [Finding(True, name, 'no message received', 'check its cable, its driver and '
-                            f'the topic {topic}', Cause.NO_MESSAGES)]
-        return [no_message_finding(self._node, name, topic, self._topics)]
+        return [no_message_finding(self._node, name, topic, self._topics) if self._node else
+                Finding(True, name, 'no message received', 'check its cable, its driver and '
+                        f'the topic {topic}', Cause.NO_MESSAGES)]
 
     def _clock_findings(self, name: str) -> list[Finding]:
         """Return a fault if a sensor's timestamps differ from the computer's time by over a day."""

@@ -1,38 +1,26 @@
 """Base class of nodes that run stages: parameters, network, diagnostics and main loop."""
 
-import gc
-import signal
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from mag_tracking_msgs.msg import FieldReadings
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.exceptions import ParameterException
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
-from rclpy.task import Future
 
-from mag_tracking.errors import MagTrackingError, RecordingError, SettingsError
-from mag_tracking.interrupts import recorded_signals
-from mag_tracking.messages.schema import readings_of, stamp_ns
+from mag_tracking.errors import RecordingError, SettingsError
+from mag_tracking.messages.schema import stamp_ns
 from mag_tracking.network.file import read_network
-from mag_tracking.nodes.flow import Flow, SubscriberMonitor
-from mag_tracking.nodes.middleware import init_ros
+from mag_tracking.nodes import diagnostics
+from mag_tracking.nodes.connections import Flow, SubscriberMonitor, node_of, shortened
 from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter
-from mag_tracking.nodes.sensor_graph import node_of, shortened
-from mag_tracking.nodes.shutdown import limit_exit_time, shut_down
-from mag_tracking.nodes.status_log import StatusLog
-from mag_tracking.nodes.steady_timer import steady_timer
+from mag_tracking.nodes.scheduling import steady_timer
 from mag_tracking.pipeline import settings_for
-from mag_tracking.records import Readings
 from mag_tracking.stages.stage import Stage
 
 RESULT_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -49,29 +37,19 @@ SENSOR_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                          durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """QoS of topics whose latest message is sent to late subscribers."""
-
-
 TRANSFORM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of /tf, as in tf2."""
 READY = 'ready'
 """State of a node that has received input and operates normally."""
-
 _Record = TypeVar('_Record')
 
 
 class StageNode(Node):
     """Node that reads the network file and the settings of one group of stages.
 
+    `settings` are the defaults of the target, overridden by parameters; `flows` the statistics of
+    the inputs, by source; `now_ns` the arrival time of the current message, by the ROS clock.
     Raises SettingsError for an invalid parameter, and NetworkError for an invalid network file.
-
-    Attributes
-    ----------
-    settings : defaults of the target, overridden by parameters
-    title : name of the node in diagnostics
-    input_qos : QoS of subscriptions to sensors
-    is_replayed : whether the input is replayed from a recording
-    flows : statistics of the inputs, by source
-    now_ns : ns, arrival time of the message being processed, by the ROS clock
     """
 
     def __init__(self, name: str, group: str, **node_arguments: Any) -> None:
@@ -85,7 +63,6 @@ class StageNode(Node):
         reliable = fixed_parameter(self, 'reliable_input', False, 'Subscribe to the inputs with '
                                    'reliable QoS, for a replay.')
         self.network_path = Path(path).resolve()
-        self.title = title_of(self)
         self.input_qos = STREAM_QOS if reliable else SENSOR_QOS
         self.is_replayed = reliable or self.get_parameter('use_sim_time').value
         self.network = read_network(self.network_path)
@@ -94,13 +71,12 @@ class StageNode(Node):
         if self.settings.track.target != defaults.track.target:
             raise SettingsError(f'{name}: parameter track.target is {self.settings.track.target!r}'
                                 f', but target is {target!r}; set target only')
-        self._diagnostics_publisher = self.create_publisher(
-            DiagnosticArray, '/diagnostics', RESULT_QOS)
+        self.diagnostics = diagnostics.DiagnosticsPublisher(self)
         self._reported_rejections: dict[tuple[str, str], int] = {}
         self.flows: dict[str, Flow] = {}
         self._subscriber_monitors: list[SubscriberMonitor] = []
         self.now_ns = 0
-        self._log, self._reported_state = StatusLog(self.get_logger()), ''
+        self._reported_state = ''
         steady_timer(self, 1.0, self._publish_diagnostics)
 
     def state(self) -> str:
@@ -114,7 +90,7 @@ class StageNode(Node):
         state = self.state()
         if state != self._reported_state:
             self._reported_state = state
-            self._log.info(state)
+            self.diagnostics.log.info(state)
 
     @property
     def sensor_topics(self) -> tuple[str, ...]:
@@ -130,11 +106,8 @@ class StageNode(Node):
         return {}
 
     def monitor_subscriber(self, role: str, topic: str, publishes: str) -> None:
-        """Report in diagnostics if the node of the next step no longer subscribes to a topic.
-
-        Messages call that node by its `role`; it is identified among the subscribers by
-        `publishes`, a message type.
-        """
+        """Report in diagnostics if the node of the next step no longer subscribes to a topic; see
+        `SubscriberMonitor`."""
         self._subscriber_monitors.append(
             SubscriberMonitor(role, self.resolve_topic_name(topic), publishes))
 
@@ -168,15 +141,9 @@ class StageNode(Node):
             if flow is not None:
                 flow.n_lost += event.total_count_change
 
-        def receive(message: Any) -> None:
-            assert flow is not None
-            start_s = time.monotonic()
-            self.now_ns = self.get_clock().now().nanoseconds
-            callback(message)
-            flow.add(stamp_ns(message.header.stamp), self.now_ns, start_s)
-
         return self.create_subscription(
-            message_type, topic, callback if flow is None else receive, qos,
+            message_type, topic, callback if flow is None else self._timed(
+                flow, callback, lambda message: stamp_ns(message.header.stamp)), qos,
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=incompatible, message_lost=lost))
 
@@ -184,12 +151,16 @@ class StageNode(Node):
                      stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
         """Create a function that receives records of the preceding step without a topic.
 
-        Diagnostics report throughput and latency of `source`, the step, and the `topics` on which
-        it publishes. `stamp_of` returns the timestamp of a record in ns.
+        Diagnostics report on `source`, the step, and the `topics` on which it publishes. `stamp_of`
+        returns the timestamp of a record in ns.
         """
         flow = self.flows.setdefault(source, Flow(source))
         flow.topics += map(self.resolve_topic_name, topics)
+        return self._timed(flow, callback, stamp_of)
 
+    def _timed(self, flow: Flow, callback: Callable[[_Record], None],
+               stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
+        """Create a function that processes a record and adds it to the statistics of `flow`."""
         def receive(record: _Record) -> None:
             start_s = time.monotonic()
             self.now_ns = self.get_clock().now().nanoseconds
@@ -198,40 +169,40 @@ class StageNode(Node):
 
         return receive
 
-    def readings_of(self, message: FieldReadings, stage: Stage[Any, Any]) -> Readings | None:
-        """Convert a FieldReadings message; log and count an invalid one and return None."""
+    def converted(self, convert: Callable[[], _Record], stage: Stage[Any, Any],
+                  kind: str) -> _Record | None:
+        """Convert a message; log and count an invalid one and return None."""
         try:
-            return readings_of(message)
+            return convert()
         except RecordingError as error:
-            stage.counts['rejected: bad readings'] += 1
+            stage.counts[f'rejected: bad {kind}'] += 1
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return None
 
     def _publish_diagnostics(self) -> None:
         """Publish the state of the stages and connections; log the node's state if it changed."""
-        statuses, queues = [], self.queues()
+        statuses, queues, title = [], self.queues(), self.diagnostics.title
         for name, stage in self.stages().items():
-            rejections = {k: n for k, n in stage.counts.items() if k.startswith('rejected: ')}
-            increases = {k: n for k, n in rejections.items()
-                         if n != self._reported_rejections.get((name, k), 0)}
+            increases = {k: n for k, n in stage.counts.items() if k.startswith('rejected: ')
+                         and n != self._reported_rejections.get((name, k), 0)}
             self._reported_rejections |= {(name, cause): n for cause, n in increases.items()}
-            statuses.append(DiagnosticStatus(
-                level=DiagnosticStatus.WARN if increases else DiagnosticStatus.OK,
-                name=f'{self.title}: {name}', hardware_id='magnetometer network',
-                message='; '.join(f'{cause}: {n}' for cause, n in increases.items()) or 'running',
-                values=[KeyValue(key=k, value=str(n)) for k, n in sorted(
-                    {**stage.counts, **({'queue': queues[name]} if name in queues else {})}.items()
-                )]))
-        statuses += [flow.status(self.title, partial(self._has_publisher, flow))
-                     for flow in self.flows.values()]
+            statuses.append(diagnostics.status_of(
+                f'{title}: {name}',
+                '; '.join(f'{cause}: {n}' for cause, n in increases.items()) or 'running',
+                diagnostics.WARN if increases else diagnostics.OK, dict(sorted({
+                    **stage.counts, **({'queue': queues[name]} if name in queues else {})
+                }.items()))))
+        statuses += [flow.status(title, partial(
+            lambda topics: any(map(self.count_publishers, topics)), flow.topics + flow.batches))
+            for flow in self.flows.values()]
         for monitor in self._subscriber_monitors:
             endpoints = self.get_subscriptions_info_by_topic(monitor.topic)
-            statuses.append(monitor.status(self.title, {
+            statuses.append(monitor.status(title, {
                 name for name in map(node_of, endpoints) if name}, self._published_types))
-        self.publish_statuses([*statuses, *self._start_statuses()])
+        self.diagnostics.publish([*statuses, self._start_status()])
         self.report_state()
 
-    def _start_statuses(self) -> list[DiagnosticStatus]:
+    def _start_status(self) -> DiagnosticStatus:
         """Return a status that reports startup faults: a duplicate node name or a missing clock."""
         faults = []
         full_name = self.get_name(), self.get_namespace()
@@ -243,10 +214,9 @@ class StageNode(Node):
         if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
             faults.append('use_sim_time is set, but no message was received on /clock: start a '
                           'replay, or unset use_sim_time')
-        return [DiagnosticStatus(
-            level=DiagnosticStatus.ERROR if faults else DiagnosticStatus.OK,
-            name=f'{self.title}: start', hardware_id='magnetometer network',
-            message='; '.join(faults) or self.state())]
+        return diagnostics.status_of(
+            f'{self.diagnostics.title}: start', '; '.join(faults) or self.state(),
+            diagnostics.ERROR if faults else diagnostics.OK)
 
     def _published_types(self, name: str) -> set[str]:
         """Return the message types that a node publishes; empty if it has not been discovered."""
@@ -256,84 +226,3 @@ class StageNode(Node):
         except NodeNameNonExistentError:
             return set()
         return {kind for _, kinds in topics for kind in kinds}
-
-    def _has_publisher(self, flow: Flow) -> bool:
-        """Whether any topic of a flow still has a publisher."""
-        return any(map(self.count_publishers, (*flow.topics, *flow.batches)))
-
-    def publish_statuses(self, statuses: list[DiagnosticStatus]) -> None:
-        """Publish statuses, unless there are none, on /diagnostics and log faults."""
-        for status in statuses:
-            self._log.add(status)
-        if statuses:
-            array = DiagnosticArray(status=statuses)
-            array.header.stamp = self.get_clock().now().to_msg()
-            self._diagnostics_publisher.publish(array)
-
-
-def has_subscribers(publisher: Publisher) -> bool:
-    """Whether a publisher has subscribers."""
-    return publisher.get_subscription_count() > 0
-
-
-def title_of(node: Node) -> str:
-    """Name of a node in diagnostics, including its namespace."""
-    return node.get_fully_qualified_name().removeprefix('/')
-
-
-def make_executor() -> Executor:
-    """Create the events executor, which has little overhead, or else the single-threaded one."""
-    try:
-        from rclpy.experimental import EventsExecutor
-    except ImportError:
-        return SingleThreadedExecutor()
-    return EventsExecutor()
-
-
-def freeze() -> None:
-    """Exclude all existing objects from garbage collection: scans would delay the readings."""
-    gc.collect()
-    gc.freeze()
-
-
-def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
-    """Run an executor until ROS shuts down or `until`, polled a few times per s, is True."""
-    try:
-        while rclpy.ok() and not until():
-            # EventsExecutor.spin() of the Jazzy wheels hangs because a timeout overflows. Waiting
-            # for a future that never completes, with a finite timeout, works.
-            executor.spin_until_future_complete(Future(), 0.2)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-
-
-def main(node_class: Callable[[], Node], arguments: list[str] | None = None) -> int:
-    """Run a node as a process until SIGINT or SIGTERM; return its exit status."""
-    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals:
-        return _run_until(signals, node_class, arguments)
-
-
-def _run_until(signals: list[int], node_class: Callable[[], Node],
-               arguments: list[str] | None) -> int:
-    """Run a node until `signals` contains a received signal; return the exit status."""
-    try:
-        init_ros(arguments)
-    except SettingsError as error:
-        rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
-        return 1
-    executor, node, status = make_executor(), None, 1
-    try:
-        node = node_class()
-        executor.add_node(node)
-        freeze()
-        spin(executor, lambda: bool(signals))
-        status = 0
-    except (MagTrackingError, ParameterException) as error:
-        rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
-        # A partly constructed node is destroyed when the error is deleted.
-        limit_exit_time(status)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        status = 0
-    finally:
-        shut_down([] if node is None else [node], executor, status)
-    return status

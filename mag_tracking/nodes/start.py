@@ -1,13 +1,13 @@
 """Entry points of the nodes, with signal handling before any slow import.
 
-The imports of a node take a second, or several seconds on a small computer. As soon as this module
-runs, SIGINT and SIGTERM end the process with status 0: immediately during imports, later through
-`stage_node.main`, which shuts the node down. Signals during the startup of Python itself cannot be
-handled.
+As soon as this module runs, SIGINT and SIGTERM end the process with status 0: immediately during
+imports, which take seconds on a small computer, later through `middleware.main`. A node that is run
+as a module therefore calls its command, which does not return, before its imports.
 """
 
 import signal
 import sys
+from functools import partial
 from importlib import import_module
 from typing import NoReturn
 
@@ -36,29 +36,10 @@ def run_node(name: str) -> NoReturn:
 def limit_exit_time(status: int) -> None:
     """Limit the time until the process ends with `status`, if the process has imported rclpy."""
     if 'rclpy' in sys.modules:
-        import_module('mag_tracking.nodes.shutdown').limit_exit_time(status)
+        import_module('mag_tracking.nodes.middleware').limit_exit_time(status)
 
 
-def driver_node() -> NoReturn:
-    """Run the command driver_node."""
-    run_node('driver_node')
-
-
-def replay_node() -> NoReturn:
-    """Run the command replay_node."""
-    run_node('replay_node')
-
-
-def calibration_node() -> NoReturn:
-    """Run the command calibration_node."""
-    run_node('calibration_node')
-
-
-def detection_node() -> NoReturn:
-    """Run the command detection_node."""
-    run_node('detection_node')
-
-
-def tracker_node() -> NoReturn:
-    """Run the command tracker_node."""
-    run_node('tracker_node')
+driver_node, replay_node, calibration_node, detection_node, tracker_node = (
+    partial(run_node, name) for name in (
+        'driver_node', 'replay_node', 'calibration_node', 'detection_node', 'tracker_node'))
+"""Commands of the same names."""

@@ -1,7 +1,6 @@
 """tracker_node: tracks targets from network frames and publishes their poses."""
 
 if __name__ == '__main__':
-    # Does not return. Without this, a signal during the imports below would cause a traceback.
     from mag_tracking.nodes.start import tracker_node
 
     tracker_node()
@@ -9,20 +8,14 @@ if __name__ == '__main__':
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from mag_tracking_msgs.msg import (
-    CalibrationState,
-    HypothesisArray,
-    NetworkFrame,
-    SmoothedTrack,
-    TrackArray,
-)
-from mag_tracking_msgs.msg import Disturbance as DisturbanceMessage
+from mag_tracking_msgs import msg
+from mag_tracking_msgs.msg import CalibrationState, NetworkFrame
 from nav_msgs.msg import Odometry, Path
-from rclpy.publisher import Publisher
 from tf2_msgs.msg import TFMessage
 from vision_msgs.msg import Detection3DArray
 from visualization_msgs.msg import MarkerArray
@@ -30,22 +23,11 @@ from visualization_msgs.msg import MarkerArray
 from mag_tracking.calibration.doubtful_times import (
     DOUBTFUL_BACKGROUND,
     DoubtfulTimes,
-    InputDoubts,
     merged,
 )
-from mag_tracking.errors import RecordingError
-from mag_tracking.event_records import Disturbance
+from mag_tracking.event_records import Disturbance, VehiclePassage
+from mag_tracking.messages import schema
 from mag_tracking.messages.network import doubtful_times, frame_of, with_orientations
-from mag_tracking.messages.schema import (
-    disturbance_dict,
-    hypotheses_dict,
-    odometry_dict,
-    pose_dict,
-    pose_message_dict,
-    smoothed_pose_dict,
-    smoothed_track_dict,
-    track_dict,
-)
 from mag_tracking.messages.standard import (
     delete_markers,
     detections_3d_dict,
@@ -55,40 +37,46 @@ from mag_tracking.messages.standard import (
 )
 from mag_tracking.messages.types import CALIBRATION_STATE, NETWORK_FRAME, MessageDict
 from mag_tracking.network import SensorNetwork
-from mag_tracking.nodes import stage_node
-from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.ros_params import fixed_parameter, follow_changes
-from mag_tracking.nodes.stage_node import (
-    LATCHED_QOS,
-    PUBLISHER_QOS,
-    RESULT_QOS,
-    STREAM_QOS,
-    TRANSFORM_QOS,
-    StageNode,
-    has_subscribers,
-)
-from mag_tracking.nodes.steady_timer import steady_timer
-from mag_tracking.nodes.traffic_topics import TrafficTopics
+from mag_tracking.nodes import middleware, stage_node
+from mag_tracking.nodes.convert import has_subscribers, send, to_message
+from mag_tracking.nodes.ros_params import declare_settings, fixed_parameter, follow_changes
+from mag_tracking.nodes.scheduling import steady_timer
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.plausibility import lane_note
 from mag_tracking.stages.track.running_track import TrackRecord
 from mag_tracking.stages.track.settings import BEST
-from mag_tracking.stages.traffic.stage import TrackedFrame
+from mag_tracking.stages.traffic.stage import TrackedFrame, Traffic
 
 TRANSPORT_MARGIN_S = 1.0
 """[s] Margin for the transport of a frame, in addition to `track.end_gap_s`."""
 MAX_PATH_POSES = 2000
 """Maximum number of poses in `~/path`."""
+OUTPUTS = {
+    '/tf': (TFMessage, stage_node.TRANSFORM_QOS),
+    '~/pose': (PoseWithCovarianceStamped, stage_node.PUBLISHER_QOS),
+    '~/odometry': (Odometry, stage_node.RESULT_QOS),
+    '~/tracks': (msg.TrackArray, stage_node.PUBLISHER_QOS),
+    '~/hypotheses': (msg.HypothesisArray, stage_node.PUBLISHER_QOS),
+    '~/path': (Path, stage_node.RESULT_QOS),
+    '~/pose_smoothed': (PoseWithCovarianceStamped, stage_node.PUBLISHER_QOS),
+    '~/smoothed': (msg.SmoothedTrack, stage_node.RESULT_QOS),
+    '~/path_smoothed': (Path, stage_node.RESULT_QOS),
+    '~/disturbances': (msg.Disturbance, stage_node.PUBLISHER_QOS),
+    '~/markers': (MarkerArray, stage_node.RESULT_QOS),
+    '~/detections_3d': (Detection3DArray, stage_node.RESULT_QOS),
+    '~/sensor_markers': (MarkerArray, stage_node.LATCHED_QOS),
+    '~/passages': (msg.VehiclePassage, stage_node.PUBLISHER_QOS),
+    '~/traffic': (msg.TrafficSummary, stage_node.RESULT_QOS)}
+"""Message type and QoS of each published topic."""
 
 
-class TrackerNode(StageNode):
+class TrackerNode(stage_node.StageNode):
     """Tracks targets with a bank of filters and publishes the results.
 
-    With `has_direct_input`, frames are passed to `receive_frame` and not received on a topic.
-    `after_pose` publishes the frame from which a pose was computed; it is called after the pose and
-    before the track are published.
+    With `has_direct_input`, frames are passed to `receive_frame`. `after_pose` is called between
+    the pose and the track, to publish the frame from which they were computed.
     """
 
     def __init__(self, has_direct_input: bool = False, **node_arguments: Any) -> None:
@@ -96,29 +84,22 @@ class TrackerNode(StageNode):
         self._has_direct_input = has_direct_input
         self.after_pose: Callable[[], None] | None = None
         self._stage = TrackManager(self.network, self.settings.track)
-        self._traffic = TrafficTopics(self)
+        # Called by a calibration node in the same process.
+        self.set_input_doubts, self.idle = self._stage.set_input_doubts, self._stage.idle
+        self.settings = declare_settings(self, self.settings, 'traffic')
+        self._traffic = Traffic(self.network, self.settings.traffic,
+                                self.settings.track.target == 'vehicle')
         follow_changes(self, self.settings, lambda s: self._stage.configure(s.track))
         self._child_frame = fixed_parameter(
             self, 'child_frame', '', 'Frame of the target in odometry and transforms, for example '
             'for robot_localization. If empty, the frame is track_<id>.')
-        self._tf_publisher = self.publisher(TFMessage, '/tf', TRANSFORM_QOS) if fixed_parameter(
+        self._publishes_tf = fixed_parameter(
             self, 'publish_tf', False, 'Publish the transform from the world frame to the frame '
-            'of the target.') else None
-        self._pose_publisher = self.publisher(PoseWithCovarianceStamped, '~/pose', PUBLISHER_QOS)
-        self._odometry_publisher = self.publisher(Odometry, '~/odometry', RESULT_QOS)
-        self._tracks_publisher = self.publisher(TrackArray, '~/tracks', PUBLISHER_QOS)
-        self._hypotheses_publisher = self.publisher(HypothesisArray, '~/hypotheses', PUBLISHER_QOS)
-        self._path_publisher = self.publisher(Path, '~/path', RESULT_QOS)
-        self._smoothed_pose_publisher = self.publisher(PoseWithCovarianceStamped, '~/pose_smoothed',
-                                                       PUBLISHER_QOS)
-        self._smoothed_publisher = self.publisher(SmoothedTrack, '~/smoothed', RESULT_QOS)
-        self._smoothed_path_publisher = self.publisher(Path, '~/path_smoothed', RESULT_QOS)
-        self._disturbance_publisher = self.publisher(DisturbanceMessage, '~/disturbances',
-                                                     PUBLISHER_QOS)
-        self._marker_publisher = self.publisher(MarkerArray, '~/markers', RESULT_QOS)
-        self._detection_publisher = self.publisher(Detection3DArray, '~/detections_3d', RESULT_QOS)
-        self._sensor_marker_publisher = self.publisher(MarkerArray, '~/sensor_markers', LATCHED_QOS)
-        self._sensor_marker_publisher.publish(to_message(MarkerArray, sensor_markers(self.network)))
+            'of the target.')
+        self._outputs = {topic: self.publisher(message_type, topic, qos)
+                         for topic, (message_type, qos) in OUTPUTS.items()
+                         if topic != '/tf' or self._publishes_tf}
+        self._send('~/sensor_markers', sensor_markers(self.network))
         self._poses_by_track: dict[int, deque[PoseStamped]] = {}
         self._is_silent, self._latest_id = False, -1
         self._doubtful_times: dict[str, DoubtfulTimes] = {}
@@ -126,14 +107,11 @@ class TrackerNode(StageNode):
             self.receive_frame = self.direct_input('detection', [NETWORK_FRAME], self._feed,
                                                    lambda frame: frame.stamp_ns)
         else:
-            self.subscription(NetworkFrame, NETWORK_FRAME, self._receive, STREAM_QOS, 'detection')
+            self.subscription(NetworkFrame, NETWORK_FRAME, self._receive, stage_node.STREAM_QOS,
+                              'detection')
         steady_timer(self, 0.25, self.end_tracks_on_timeout)
         self.subscription(CalibrationState, CALIBRATION_STATE, self._receive_calibration,
-                          LATCHED_QOS)
-        self._report_start()
-
-    def _report_start(self) -> None:
-        """Report the state; log which lanes are covered if the sensors stand beside a road."""
+                          stage_node.LATCHED_QOS)
         self.report_state()
         note = lane_note(self.settings.track.vehicle, self.network)
         if note and self.settings.track.target == 'vehicle':
@@ -141,14 +119,10 @@ class TrackerNode(StageNode):
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """Stages whose counts are published in diagnostics, by name."""
-        return {'track': self._stage, 'traffic': self._traffic.stage}
+        return {'track': self._stage, 'traffic': self._traffic}
 
     def end_tracks_on_timeout(self) -> None:
-        """End the tracks if frames no longer arrive.
-
-        The time of arrival is used, because timestamps may be wrong. Tracks are not ended during a
-        replay, which may be slow or paused.
-        """
+        """End the tracks if frames no longer arrive, except during a replay, which may pause."""
         if self._stage.bank is None or self.is_replayed:
             return
         last_received = self.flows['detection'].last_received
@@ -162,11 +136,9 @@ class TrackerNode(StageNode):
 
     def _receive_calibration(self, message: CalibrationState) -> None:
         """Apply the orientations of a survey and the doubtful intervals of the backgrounds."""
-        try:
-            network = with_orientations(self.network, message)
-        except RecordingError as error:
-            self._stage.counts['rejected: bad calibration'] += 1
-            self.get_logger().error(str(error), throttle_duration_sec=10.0)
+        network = self.converted(lambda: with_orientations(self.network, message), self._stage,
+                                 'calibration')
+        if network is None:
             return
         if not self._has_direct_input:
             # The message has only the latest interval of each sensor; frames of earlier intervals
@@ -178,28 +150,15 @@ class TrackerNode(StageNode):
             return
         self.network = network
         self._stage.use_network(network)
-        self._sensor_marker_publisher.publish(to_message(MarkerArray, sensor_markers(network)))
+        self._send('~/sensor_markers', sensor_markers(network))
         self.get_logger().info('surveyed sensor orientations received; used from the next track on')
 
     def _receive(self, message: NetworkFrame) -> None:
         """Process a network frame."""
-        try:
-            frame = frame_of(message, self.network)
-        except RecordingError as error:
-            self._stage.counts['rejected: bad frame'] += 1
-            self.get_logger().error(str(error), throttle_duration_sec=10.0)
-            return
-        self._feed(frame)
-        self._stage.idle()
-
-    def set_input_doubts(self, doubts: InputDoubts) -> None:
-        """Set the intervals of doubtful readings by reason and sensor; tracks are ambiguous
-        there."""
-        self._stage.set_input_doubts(doubts)
-
-    def idle(self) -> None:
-        """Run the deferred work of the stage; called by a calibration node in the same process."""
-        self._stage.idle()
+        frame = self.converted(lambda: frame_of(message, self.network), self._stage, 'frame')
+        if frame is not None:
+            self._feed(frame)
+            self._stage.idle()
 
     def _feed(self, frame: FieldFrame) -> None:
         """Process a frame and publish the results."""
@@ -207,63 +166,57 @@ class TrackerNode(StageNode):
         if self._stage.clock_warning:
             self.get_logger().warning(self._stage.clock_warning, throttle_duration_sec=60.0)
 
+    def _send(self, topic: str, content: MessageDict | None) -> None:
+        """Publish a message with the given fields unless they are None."""
+        send(self._outputs[topic], content)
+
     def _publish_all(self, records: list[TrackRecord], frame: FieldFrame | None) -> None:
         """Publish the records that result from `frame`, which is None if frames do not arrive."""
-        complete_poses = []
+        world, complete_poses = self.network.frame, []
         for record in records:
             if isinstance(record, Disturbance):
-                self._disturbance_publisher.publish(to_message(
-                    DisturbanceMessage, disturbance_dict(record, self.network.frame)))
+                self._send('~/disturbances', schema.disturbance_dict(record, world))
             elif not isinstance(record, SmoothedPose):
                 self._publish(record)
             elif record.complete:
                 complete_poses.append(record)
             # The message has no flag for ambiguity, and other hypotheses are not smoothed.
             elif not record.ambiguous or self.settings.track.ambiguous_poses == BEST:
-                self._smoothed_pose_publisher.publish(to_message(
-                    PoseWithCovarianceStamped, smoothed_pose_dict(record, self.network.frame)))
+                self._send('~/pose_smoothed', schema.smoothed_pose_dict(record, world))
         for id in dict.fromkeys(pose.id for pose in complete_poses):
             poses = [pose for pose in complete_poses if pose.id == id]
-            self._smoothed_publisher.publish(to_message(
-                SmoothedTrack, smoothed_track_dict(poses, self.network.frame)))
-            self._smoothed_path_publisher.publish(self._path_of(poses))
-        self._traffic.add(TrackedFrame(frame, records))
-
-    def _path_of(self, poses: list[SmoothedPose]) -> Path:
-        """nav_msgs/Path of smoothed poses, with the header of the latest pose."""
-        messages = [to_message(PoseStamped, pose_dict(
-            p.stamp_ns, self.network.frame, p.position, p.orientation)) for p in poses]
-        return Path(header=messages[-1].header, poses=messages)
+            self._send('~/smoothed', schema.smoothed_track_dict(poses, world))
+            messages = [to_message(PoseStamped, schema.pose_dict(
+                p.stamp_ns, world, p.position, p.orientation)) for p in poses]
+            self._outputs['~/path_smoothed'].publish(
+                Path(header=messages[-1].header, poses=messages))
+        classes = [c.name for c in self.settings.traffic.classes]
+        for result in self._traffic.feed(TrackedFrame(frame, records)):
+            if isinstance(result, VehiclePassage):
+                self._send('~/passages', schema.vehicle_passage_dict(result, classes, world))
+            else:
+                self._send('~/traffic', schema.traffic_summary_dict(result, world))
 
     def _publish(self, track: Track) -> None:
         """Publish one record of a track, or the end of the track, on all topics."""
         frame = self.network.frame
         if not track.ended:
             # The pose comes first, because it may be used for control.
-            publish_if_any(self._pose_publisher, PoseWithCovarianceStamped,
-                           pose_message_dict(track, frame))
+            self._send('~/pose', schema.pose_message_dict(track, frame))
         if self.after_pose is not None:
             self.after_pose()
-        if not track.ended:
-            # The hypotheses come before the track, so that its subscribers already have them.
-            if has_subscribers(self._hypotheses_publisher):
-                self._hypotheses_publisher.publish(
-                    to_message(HypothesisArray, hypotheses_dict(track, frame)))
-        content = track_dict(track, frame)
-        self._tracks_publisher.publish(to_message(
-            TrackArray, {'header': content['header'], 'tracks': [content]}))
-        if has_subscribers(self._detection_publisher):
-            self._detection_publisher.publish(to_message(
-                Detection3DArray, detections_3d_dict(track, frame)))
+        # The hypotheses come before the track, so that its subscribers already have them.
+        if not track.ended and has_subscribers(self._outputs['~/hypotheses']):
+            self._send('~/hypotheses', schema.hypotheses_dict(track, frame))
+        content = schema.track_dict(track, frame)
+        self._send('~/tracks', {'header': content['header'], 'tracks': [content]})
+        if has_subscribers(self._outputs['~/detections_3d']):
+            self._send('~/detections_3d', detections_3d_dict(track, frame))
         if track.ended:
             self._poses_by_track.pop(track.id, None)
-            self._marker_publisher.publish(to_message(MarkerArray, delete_markers(track, frame)))
+            self._send('~/markers', delete_markers(track, frame))
         else:
             self._publish_views(track, frame)
-        self._log_lifecycle(track)
-
-    def _log_lifecycle(self, track: Track) -> None:
-        """Log the beginning and the end of a track."""
         if track.id > self._latest_id:
             self._latest_id = track.id
             self.get_logger().info(f'track {track.id} begins' + (
@@ -274,25 +227,19 @@ class TrackerNode(StageNode):
     def _publish_views(self, track: Track, frame: str) -> None:
         """Publish odometry, transform, path and markers of a running track."""
         child_frame = self._child_frame or f'track_{track.id}'
-        publish_if_any(self._odometry_publisher, Odometry, odometry_dict(track, frame, child_frame))
-        if self._tf_publisher is not None:
-            publish_if_any(self._tf_publisher, TFMessage,
-                           track_transform_dict(track, frame, child_frame))
+        self._send('~/odometry', schema.odometry_dict(track, frame, child_frame))
+        if self._publishes_tf:
+            self._send('/tf', track_transform_dict(track, frame, child_frame))
         path = self._poses_by_track.setdefault(track.id, deque(maxlen=MAX_PATH_POSES))
         if track.topic_uncertainty is not None:
-            path.append(to_message(PoseStamped, pose_dict(
+            path.append(to_message(PoseStamped, schema.pose_dict(
                 track.stamp_ns, frame, track.position, track.orientation)))
         # The topic carries the path of the oldest running track only.
-        if path and track.id == min(self._poses_by_track) and has_subscribers(self._path_publisher):
-            self._path_publisher.publish(Path(header=path[-1].header, poses=list(path)))
-        if has_subscribers(self._marker_publisher):
-            self._marker_publisher.publish(to_message(MarkerArray, track_markers(track, frame)))
-
-
-def publish_if_any(publisher: Publisher, cls: Any, content: MessageDict | None) -> None:
-    """Publish a message with the given fields unless they are None."""
-    if content is not None:
-        publisher.publish(to_message(cls, content))
+        if path and track.id == min(self._poses_by_track) \
+                and has_subscribers(self._outputs['~/path']):
+            self._outputs['~/path'].publish(Path(header=path[-1].header, poses=list(path)))
+        if has_subscribers(self._outputs['~/markers']):
+            self._send('~/markers', track_markers(track, frame))
 
 
 def _same_orientations(one: SensorNetwork, other: SensorNetwork) -> bool:
@@ -302,6 +249,5 @@ def _same_orientations(one: SensorNetwork, other: SensorNetwork) -> bool:
     return all(is_same_std) and bool(np.abs(one.R_ws - other.R_ws).max() < 1e-9)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a process; return its exit status."""
-    return stage_node.main(TrackerNode, arguments)
+
+main = partial(middleware.main, TrackerNode)

@@ -17,8 +17,8 @@ import numpy as np
 from mag_tracking.errors import OutputError, RecordingError
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
-from mag_tracking.stages.calibrate.restoration import StoredBackground
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.stages.calibrate.stage import StoredBackground
+from mag_tracking.stages.settings import CalibrateSettings
 
 VERSION = 1
 _HEAD = '{"version": '

@@ -29,8 +29,7 @@ from mag_tracking.recording.table_times import (
 )
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Readings
-from mag_tracking.time_text import DAY_NS
-from mag_tracking.units import NS, time_unit
+from mag_tracking.units import DAY_NS, NS, time_unit
 
 SUFFIXES = ('.csv', '.tsv', '.txt')
 USUAL_FIELD_T = (1e-5, 2e-4)

@@ -10,14 +10,13 @@ from os import PathLike
 from pathlib import Path
 
 from mag_tracking.errors import OutputError, RecordingError
-from mag_tracking.files import checked_path
+from mag_tracking.files import checked_path, read_yaml
 from mag_tracking.messages.types import RawMessage
 from mag_tracking.recording.bag_file import ROS1_MAGIC, SQLITE_MAGIC, BagFile
 from mag_tracking.recording.file_kind import HEAD_SIZE, describe_file
 from mag_tracking.recording.mcap_file import MAGIC as MCAP_MAGIC
 from mag_tracking.recording.mcap_file import McapFile
 from mag_tracking.recording.message_block import MessageBlock, Progress
-from mag_tracking.yaml_file import read_yaml
 
 SUFFIXES = ('.mcap', '.db3', '.bag')
 """Suffixes of the files that are read in a folder. A file that is given itself may have any

@@ -11,8 +11,19 @@ from typing import NamedTuple
 from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.quantities import occurrences
 from mag_tracking.recording.table_text import is_missing, is_number, plain_number
-from mag_tracking.time_text import DATE_ORDERS, DAY_NS, FORMS, date_order, parse_time
-from mag_tracking.units import LATEST_NS, NS, TIME_UNITS, time_scale, time_unit, unit_since_1970
+from mag_tracking.units import (
+    DATE_ORDERS,
+    DAY_NS,
+    FORMS,
+    LATEST_NS,
+    NS,
+    TIME_UNITS,
+    date_order,
+    parse_time,
+    time_scale,
+    time_unit,
+    unit_since_1970,
+)
 
 PLAUSIBLE_STEP_S = (1e-4, 0.67)
 """Range of intervals between readings that need no question about the unit of the time [s]."""

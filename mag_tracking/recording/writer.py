@@ -15,9 +15,8 @@ import yaml
 from mcap.writer import CompressionType, Writer
 
 from mag_tracking.errors import OutputError, RecordingError
-from mag_tracking.files import checked_path
+from mag_tracking.files import checked_path, parse_yaml
 from mag_tracking.messages.types import MessageDict, definition, encoder
-from mag_tracking.yaml_file import parse_yaml
 
 MAX_TOPICS = 2000
 """Maximum number of topics; twice the maximum number of sensors. The time to write and to read

@@ -6,7 +6,6 @@ from typing import Protocol, TypeVar
 
 In = TypeVar('In', contravariant=True)
 Out = TypeVar('Out')
-
 MAX_BACKWARD_JUMP_S = 1.0
 """[s] Maximum backward jump of a timestamp. After a larger jump (a looped recording), all that was
 learnt is discarded."""
@@ -41,14 +40,16 @@ class Stage(Protocol[In, Out]):
 
     def idle(self) -> None:
         """Do deferred work after the outputs have been published; this does not change results."""
+        return None
 
     def flush(self) -> list[Out]:
-        """Return the remaining records at the end of the input.
+        """Return the remaining records at the end of the input; by default, there are none.
 
         Returns
         -------
         list of Out
         """
+        return []
 
 
 def rejected(counts: Mapping[str, int]) -> dict[str, int]:

@@ -10,7 +10,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.stages.calibrate.rejections import REJECTIONS
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.diagnosis import Cause
-from mag_tracking.stages.health.rejections import ADVICE, rejection_findings
+from mag_tracking.stages.health.findings import ADVICE, rejection_findings
 from support.networks import line_network
 from support.samples import MagSample, one
 

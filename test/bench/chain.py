@@ -43,8 +43,8 @@ def run_node(role):
     from mag_tracking_msgs.msg import FieldReadings
 
     from mag_tracking.interrupts import recorded_signals
-    from mag_tracking.nodes.middleware import init_ros
-    from mag_tracking.nodes.stage_node import STREAM_QOS, make_executor, spin
+    from mag_tracking.nodes.middleware import init_ros, make_executor, spin
+    from mag_tracking.nodes.stage_node import STREAM_QOS
     init_ros()
     node, executor, count = rclpy.create_node(f'chain_{role}'), make_executor(), [0]
     out = {'last': 'pose', 'second': 'c', 'first': 'b', 'source': 'a'}[role]
@@ -79,8 +79,8 @@ def main():
     import rclpy
     from geometry_msgs.msg import PoseWithCovarianceStamped
 
-    from mag_tracking.nodes.middleware import init_ros
-    from mag_tracking.nodes.stage_node import STREAM_QOS, make_executor, spin
+    from mag_tracking.nodes.middleware import init_ros, make_executor, spin
+    from mag_tracking.nodes.stage_node import STREAM_QOS
     init_ros()
     node, executor, delays = rclpy.create_node('chain'), make_executor(), []
     executor.add_node(node)

@@ -175,7 +175,7 @@ def parameters_of(folder, lean):
 
 def watch(processes, monitor, executor, minutes):
     """Wait `minutes`; return [(t [s], {node: (CPU [s], memory [MB])})] for every ten seconds."""
-    from mag_tracking.nodes.stage_node import spin
+    from mag_tracking.nodes.middleware import spin
     begin, rows = time.monotonic(), []
     while time.monotonic() - begin < 60.0 * minutes:
         until = begin + 10.0 * (len(rows) + 1)
@@ -258,7 +258,7 @@ def measure(args):
     """Run the nodes; return the result of `report`, or None if interrupted within ten seconds."""
     import rclpy
 
-    from mag_tracking.nodes.stage_node import make_executor, spin
+    from mag_tracking.nodes.middleware import make_executor, spin
     # Initialised as in a user's subscriber, without the middleware profile of the nodes.
     rclpy.init()  # noqa: TID251
     node, executor = rclpy.create_node('load'), make_executor()

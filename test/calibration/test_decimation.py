@@ -6,8 +6,8 @@ from scipy.signal import freqz
 
 from mag_tracking.calibration.decimation import Decimator, lowpass
 from mag_tracking.settings import replace
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.settings import CalibrateSettings
 from support.networks import line_network
 from support.samples import MagSample, fed
 

@@ -17,8 +17,8 @@ from mag_tracking.calibration.doubtful_times import (
     updated,
 )
 from mag_tracking.settings import replace
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.settings import CalibrateSettings
 from support.calibration_runs import EARTH, SIGMA, feed, running
 from support.dense_traffic import traffic
 from support.networks import line_network

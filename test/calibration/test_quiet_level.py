@@ -8,8 +8,8 @@ import pytest
 from mag_tracking.records import Readings
 from mag_tracking.settings import replace
 from mag_tracking.stages.calibrate.prescan import prescan
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.settings import CalibrateSettings
 from support.calibration_runs import EARTH, SIGMA
 from support.networks import line_network
 from support.samples import MagSample, batch

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 from rclpy.logging import get_logger
 
-from mag_tracking.nodes.background_store import BackgroundStore
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
+from mag_tracking.nodes.sensor_rounds import BackgroundStore
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.settings import CalibrateSettings
 from support.networks import line_network
 from support.samples import MagSample, one
 

@@ -9,7 +9,7 @@ from mag_tracking_msgs.msg import FieldReadings
 from mag_tracking.messages.schema import readings_dict
 from mag_tracking.messages.types import RAW_READINGS
 from mag_tracking.nodes.convert import to_message
-from mag_tracking.nodes.deferred import Deferred
+from mag_tracking.nodes.scheduling import Deferred
 from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
 from mag_tracking.records import Readings
 from support.bundled import NETWORK_FILE

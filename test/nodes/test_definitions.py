@@ -4,7 +4,7 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mag_tracking.nodes.convert import message_class
-from mag_tracking.nodes.definitions import definition_of
+from mag_tracking.nodes.record_node import definition_of
 from support.bundled import ROOT
 
 

@@ -7,8 +7,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.time import Time
 from sensor_msgs.msg import MagneticField
 
-from mag_tracking.nodes import flow as module
-from mag_tracking.nodes.flow import MAX_LATENCIES, Flow, SubscriberMonitor
+from mag_tracking.nodes import connections as module
+from mag_tracking.nodes.connections import MAX_LATENCIES, Flow, SubscriberMonitor
 from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
 from mag_tracking.nodes.tracker_node import TRANSPORT_MARGIN_S, TrackerNode
 from mag_tracking.pipeline import settings_for

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from mag_tracking.messages.types import MAGNETIC_FIELD
-from mag_tracking.nodes.sensor_graph import node_of, shortened, topic_findings
+from mag_tracking.nodes.connections import node_of, shortened, topic_findings
 
 
 def endpoint(name, namespace='/', kind=MAGNETIC_FIELD):

@@ -11,7 +11,7 @@ import pytest
 
 from mag_tracking.errors import MagTrackingError
 from mag_tracking.nodes.core import Deadline, end_within
-from mag_tracking.nodes.shutdown import HUNG_MESSAGE, SHUTDOWN_TIMEOUT_S, shut_down
+from mag_tracking.nodes.middleware import HUNG_MESSAGE, SHUTDOWN_TIMEOUT_S, shut_down
 from support.bundled import NETWORK_FILE, ROOT
 from support.node_processes import MAX_S, environment
 
@@ -19,7 +19,7 @@ FAST_DDS = 'rmw_fastrtps_cpp'
 STUCK_NODE = '''
 import re, sys
 from rclpy.node import Node
-from mag_tracking.nodes import stage_node
+from mag_tracking.nodes import middleware
 
 class Stuck(Node):
     def __init__(self):
@@ -40,7 +40,7 @@ class Stuck(Node):
         # This takes years and, as in Fast DDS, never releases the interpreter's lock.
         re.match(r'(a+)+$', 'a' * 64 + 'b')
 
-sys.exit(stage_node.main(Stuck, ['stuck']))
+sys.exit(middleware.main(Stuck, ['stuck']))
 '''
 INCOMPLETE_NODE = '''
 import atexit, re, sys, types

@@ -4,8 +4,8 @@ at intervals."""
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from mag_tracking.nodes import status_log
-from mag_tracking.nodes.status_log import MAX_FAULTS, REPEAT_INTERVAL_S, StatusLog
+from mag_tracking.nodes import diagnostics
+from mag_tracking.nodes.diagnostics import MAX_FAULTS, REPEAT_INTERVAL_S, StatusLog
 
 
 class Logger:
@@ -28,7 +28,7 @@ class Logger:
 def log(monkeypatch):
     """f(seconds, level, message): return the lines logged for a status at a time [s]."""
     now, logger = [0.0], Logger()
-    monkeypatch.setattr(status_log.time, 'monotonic', lambda: now[0])
+    monkeypatch.setattr(diagnostics.time, 'monotonic', lambda: now[0])
     statuses = StatusLog(logger)
 
     def add(seconds, level, message, name='node: mag_1'):
@@ -81,12 +81,12 @@ def test_the_number_of_stored_faults_is_bounded(log):
 def test_a_hundred_sensors_with_one_fault_do_not_fill_the_log(log):
     lines = [line for j in range(100) for line in log(
         0.0, DiagnosticStatus.ERROR, f'no message on /mag_{j}/imu/mag', f'node: mag_{j}')]
-    assert len(lines) == status_log.MAX_SIMILAR_LINES
+    assert len(lines) == diagnostics.MAX_SIMILAR_LINES
     assert lines[0] == ('error', 'mag_0: no message on /mag_0/imu/mag')
     assert lines[-1][1].endswith('/diagnostics)')
     lines = [line for j in range(100) for line in log(
         1.0, DiagnosticStatus.OK, 'running', f'node: mag_{j}')]
-    assert len(lines) == status_log.MAX_SIMILAR_LINES
+    assert len(lines) == diagnostics.MAX_SIMILAR_LINES
     # A different fault is still logged; the first fault is logged again in the next minute.
     assert log(2.0, DiagnosticStatus.WARN, 'noisy', 'node: mag_7') == [('warning', 'mag_7: noisy')]
     assert log(2.0 * REPEAT_INTERVAL_S, DiagnosticStatus.ERROR, 'no message on /mag_7/imu/mag',

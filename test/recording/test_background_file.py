@@ -15,8 +15,8 @@ from mag_tracking.recording.background_file import (
     read_backgrounds,
     write_backgrounds,
 )
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.settings import CalibrateSettings
 from support.counters import count_of
 from support.networks import line_network
 from support.samples import MagSample, fed

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 
 from mag_tracking.settings import replace
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.settings import CalibrateSettings
 from support.fed_background import FedBackground
 from support.networks import line_network
 from support.samples import MagSample

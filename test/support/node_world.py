@@ -16,8 +16,8 @@ from sensor_msgs.msg import MagneticField
 
 from mag_tracking.network.file import read_network
 from mag_tracking.nodes.convert import track_of
-from mag_tracking.nodes.middleware import init_ros
-from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS, make_executor
+from mag_tracking.nodes.middleware import init_ros, make_executor
+from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
 from mag_tracking.simulation.scenario import point_body
 from support.bundled import NETWORK_FILE, POINT
 from support.mqtt_broker import Broker, password_lines

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.stages.align.frame_period import frame_period
-from mag_tracking.stages.align.settings import AlignSettings
+from mag_tracking.stages.align.stage import frame_period
+from mag_tracking.stages.settings import AlignSettings
 from support.close_pairs import PAIR, estimates_of, readings_of
 
 SEEDS = range(40)

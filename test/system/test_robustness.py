@@ -18,10 +18,9 @@ from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Detection, FieldFrame, Track
 from mag_tracking.results import result_folder
 from mag_tracking.simulation.scenario import Path, point_body
-from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.settings import AlignSettings, CalibrateSettings
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.manager import TrackManager
 from support.bundled import NETWORK_FILE, QUICK, vehicle_path

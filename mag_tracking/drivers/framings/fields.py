@@ -13,7 +13,7 @@ from typing import Any, TypeAlias, TypeVar
 
 from mag_tracking.drivers.reading import DeviceDate, Reading
 from mag_tracking.errors import SettingsError
-from mag_tracking.time_text import FORMS, parse_time
+from mag_tracking.units import FORMS, parse_time
 
 FIELD, ACCELERATION = ('x', 'y', 'z'), ('ax', 'ay', 'az')
 AXES = FIELD + ACCELERATION

@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <deque>
 #include <limits>
 #include <vector>
 
@@ -49,36 +50,7 @@ struct Sample {
 };
 
 // The pending samples of a sensor, in chronological order.
-class Queue {
-  public:
-    int64_t size() const { return count_; }
-    const Sample& oldest() const { return ring_[first_]; }
-
-    void push(int64_t stamp, const double* field, const double* covariance) {
-        if (count_ == int64_t(ring_.size())) grow();
-        Sample& sample = ring_[(first_ + count_++) % ring_.size()];
-        sample.stamp = stamp;
-        std::copy(field, field + 3, sample.field);
-        std::copy(covariance, covariance + 9, sample.covariance);
-    }
-
-    void pop() {
-        first_ = (first_ + 1) % ring_.size();
-        --count_;
-    }
-
-  private:
-    void grow() {
-        std::vector<Sample> ring(std::max<std::size_t>(8, 2 * ring_.size()));
-        for (int64_t k = 0; k < count_; ++k) ring[k] = ring_[(first_ + k) % ring_.size()];
-        ring_.swap(ring);
-        first_ = 0;
-    }
-
-    std::vector<Sample> ring_;
-    std::size_t first_ = 0;
-    int64_t count_ = 0;
-};
+using Queue = std::deque<Sample>;
 
 // Samples of a batch: sensor indices (negative for an unknown sensor), timestamps, fields and
 // covariances.
@@ -126,13 +98,13 @@ class Alignment {
 
     int64_t n_pending() const {
         int64_t n = 0;
-        for (const Queue& queue : queues_) n += queue.size();
+        for (const Queue& queue : queues_) n += int64_t(queue.size());
         return n;
     }
 
     // Drop the oldest pending sample of a sensor, if there is one.
     void drop(int64_t i) {
-        if (queues_[i].size()) queues_[i].pop();
+        if (queues_[i].size()) queues_[i].pop_front();
         look_ahead();
     }
 
@@ -156,8 +128,11 @@ class Alignment {
             if (reason == JUMPED_BACK) next = k;
             if (reason != DONE) return reason;
             if (queues_[i].size() == 0) bring_forward(t, taken_[i]);
-            queues_[i].push(t, field, covariance);
-            if (queues_[i].size() > settings_.most) return TOO_MANY;
+            Sample& sample = queues_[i].emplace_back();
+            sample.stamp = t;
+            std::copy(field, field + 3, sample.field);
+            std::copy(covariance, covariance + 9, sample.covariance);
+            if (int64_t(queues_[i].size()) > settings_.most) return TOO_MANY;
             if (!waits()) return COMPLETE;
         }
         return DONE;
@@ -183,7 +158,7 @@ class Alignment {
         int64_t earliest = FAR;
         for (std::size_t i = 0; i < queues_.size(); ++i) {
             if (queues_[i].size() == 0) continue;
-            const int64_t oldest = queues_[i].oldest().stamp;
+            const int64_t oldest = queues_[i].front().stamp;
             if (settings_.is_burst) bring_forward(oldest, taken_[i]);
             earliest = std::min(earliest, oldest);
         }
@@ -202,16 +177,16 @@ class Alignment {
             Queue& queue = queues_[i];
             int64_t& n = out.n_samples[i];
             double n_axis[3] = {0.0, 0.0, 0.0};
-            if (queue.size() && queue.oldest().stamp < end)
-                first = std::min(first, queue.oldest().stamp);
-            while (queue.size() && queue.oldest().stamp < end && !(settings_.is_burst && n)) {
-                const Sample& sample = queue.oldest();
+            if (queue.size() && queue.front().stamp < end)
+                first = std::min(first, queue.front().stamp);
+            while (queue.size() && queue.front().stamp < end && !(settings_.is_burst && n)) {
+                const Sample& sample = queue.front();
                 ++n;
                 since[i] += sample.stamp - end;
                 taken_[i] = sample.stamp;
                 newest = std::max(newest, sample.stamp);
                 add(sample, n_axis, out.field + 3 * i, out.covariance + 9 * i);
-                queue.pop();
+                queue.pop_front();
             }
             average(n, n_axis, out.field + 3 * i, out.covariance + 9 * i);
             n_all += n, since_all += since[i];
@@ -274,7 +249,7 @@ class Alignment {
     bool is_one_missing(bool is_young) const {
         for (std::size_t i = 0; i < queues_.size(); ++i) {
             if (queues_[i].size()) {
-                if (queues_[i].oldest().stamp >= due_) return true;
+                if (queues_[i].front().stamp >= due_) return true;
             } else if (latest_[i] == NEVER) {
                 if (is_young) return true;
                 // All samples of the sensor are in earlier frames. At the start of a round, the latest

@@ -1,8 +1,5 @@
-"""Distinguish a forward step of one clock from a gap in the samples of all sensors.
-
-Lateness is determined from timestamps. Without this filter, a forward step of one clock would make
-the samples of all other sensors appear late.
-"""
+"""Distinguish a forward step of one clock, which would make the samples of all other sensors appear
+late, from a gap in the samples of all sensors."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -30,62 +27,38 @@ SensorSamples = list[tuple[int, HeldSample]]
 class ClockStepFilter:
     """Holds samples whose timestamps jump ahead, until other sensors confirm or refute the jump.
 
-    All other samples pass immediately. A jump is also accepted if its sensor advances by `max_jump`
-    while no sample of another sensor is accepted.
-
-    Parameters
-    ----------
-    max_jump : int, ns
-        Largest forward jump that passes unchecked. A held sample is rejected if it is not confirmed
-        before the timestamps of its own sensor, or of the other sensors, advance by more than this.
-    max_held : int
-        Maximum number of held samples per sensor.
-
-    Attributes
-    ----------
-    latest : (n_sensors,) int array, ns, latest accepted timestamp of each sensor
-    newest : int, ns, newest accepted timestamp of any sensor
+    Jumps of up to `max_jump` [ns] pass unchecked. A jump is also accepted if its sensor advances by
+    `max_jump` while no sample of another sensor is accepted. A held sample is rejected if it is not
+    confirmed before the timestamps of its own sensor, or of the others, advance by more than this,
+    or if its sensor has more than `max_held`. `latest` (n_sensors,) and `newest` [ns] are the
+    latest accepted timestamps of each and of any sensor.
     """
 
     def __init__(self, n_sensors: int, max_jump: int, max_held: int) -> None:
-        self._max_jump = max_jump
-        self._max_held = max_held
-        self.latest = np.full(n_sensors, NEVER)
-        self.newest = NEVER
+        self._max_jump, self._max_held = max_jump, max_held
+        self.latest, self.newest = np.full(n_sensors, NEVER), NEVER
         # (sensor index, sample, newest accepted timestamp at its arrival), in order of arrival.
-        self._held: list[tuple[int, HeldSample, int]] = []
+        self.held: list[tuple[int, HeldSample, int]] = []
         # {index of a sensor that is ahead: (newest accepted timestamp, timestamp of its jump)}
         self._ahead_since: dict[int, tuple[int, int]] = {}
 
     @property
-    def n_held(self) -> int:
-        """Number of held samples."""
-        return len(self._held)
-
-    @property
-    def held(self) -> list[tuple[int, HeldSample, int]]:
-        """Held samples: (sensor index, sample, newest accepted timestamp [ns] at its arrival)."""
-        return list(self._held)
-
-    @property
     def is_calm(self) -> bool:
         """Whether no clock step is suspected: samples that do not jump then bypass the filter."""
-        if not self._held and not self._ahead_since:
+        if not self.held and not self._ahead_since:
             return True
         # The entry of a sensor without held samples expires when a newer timestamp is accepted.
-        return not self._held and all(
+        return not self.held and all(
             newest != self.newest for newest, _ in self._ahead_since.values())
 
     def feed(self, i: int, sample: HeldSample) -> tuple[SensorSamples, SensorSamples]:
-        """Check a sample of sensor `i`; return accepted and rejected samples in order of arrival.
-
-        Besides the sample itself, these are the held samples that it confirms or refutes.
-        """
+        """Check a sample of sensor `i`; return the samples that it causes to be accepted and
+        rejected, in order of arrival."""
         stamp = sample.stamp_ns
         if not self._jumps(i, stamp):
             passed = self._accept([(i, sample)])
         else:
-            self._held.append((i, sample, self.newest))
+            self.held.append((i, sample, self.newest))
             if self._ahead_since.get(i, (NEVER,))[0] != self.newest:
                 self._ahead_since[i] = self.newest, stamp
             if not (self._majority_follows(stamp) or self._advances_alone(i, stamp)):
@@ -96,7 +69,7 @@ class ClockStepFilter:
         # The sensor agrees with the other sensors again, so its held samples had wrong timestamps.
         # Samples that were not confirmed in time also had wrong timestamps. The first held
         # sample is the oldest one.
-        if i in self._ahead_since or self._held and self.newest - self._held[0][2] > self._max_jump:
+        if i in self._ahead_since or self.held and self.newest - self.held[0][2] > self._max_jump:
             self._ahead_since.pop(i, None)
             return passed, self._release(
                 lambda j, _, newest: j == i or self.newest - newest > self._max_jump)
@@ -111,7 +84,7 @@ class ClockStepFilter:
         if self.newest == NEVER or stamp <= self.newest + self._max_jump:
             return False
         # With two sensors, the first sample of one is as credible as the samples of the other.
-        return self.latest[i] != NEVER or bool(self._held) or len(self._active_sensors()) > 1
+        return self.latest[i] != NEVER or bool(self.held) or len(self._active_sensors()) > 1
 
     def _accept(self, samples: SensorSamples) -> SensorSamples:
         """Record samples as accepted, and return them."""
@@ -127,30 +100,26 @@ class ClockStepFilter:
 
     def _majority_follows(self, stamp: int) -> bool:
         """Whether most of the active sensors have a held sample within `max_jump` of `stamp`."""
-        following = {j for j, s, _ in self._held if abs(s.stamp_ns - stamp) <= self._max_jump}
+        following = {j for j, s, _ in self.held if abs(s.stamp_ns - stamp) <= self._max_jump}
         return 2 * len(following) > len(following | self._active_sensors())
 
     def _advances_alone(self, i: int, stamp: int) -> bool:
-        """Whether sensor `i` has advanced by `max_jump` since its jump.
-
-        The time of the jump is reset whenever a newer timestamp is accepted.
-        """
+        """Whether sensor `i` has advanced by `max_jump` since its jump, or since a newer timestamp
+        was accepted."""
         return stamp - self._ahead_since[i][1] >= self._max_jump
 
     def _release_expired(self, i: int, stamp: int) -> SensorSamples:
-        """Remove and return held samples of sensor `i` that precede `stamp` by over `max_jump`.
-
-        The oldest held sample is also removed if the sensor has more than `max_held`.
-        """
-        own_samples = [s for j, s, _ in self._held if j == i]
+        """Remove and return held samples of sensor `i` that precede `stamp` by over `max_jump`,
+        and the oldest one if there are more than `max_held`."""
+        own_samples = [s for j, s, _ in self.held if j == i]
         oldest = own_samples[0] if len(own_samples) > self._max_held else None
         return self._release(lambda j, s, _: j == i and (
             s.stamp_ns < stamp - self._max_jump or s is oldest))
 
     def _release(self, is_released: Callable[[int, HeldSample, int], bool]) -> SensorSamples:
         """Remove and return the held samples for which `is_released` returns True."""
-        if not self._held:
+        if not self.held:
             return []
-        out = [h[:2] for h in self._held if is_released(*h)]
-        self._held = [h for h in self._held if not is_released(*h)]
+        out = [h[:2] for h in self.held if is_released(*h)]
+        self.held = [h for h in self.held if not is_released(*h)]
         return out

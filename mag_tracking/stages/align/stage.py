@@ -1,8 +1,7 @@
 """Align: combine the asynchronous samples of many sensors into frames of the whole network.
 
-Samples are sorted by timestamp. A frame is completed only when every active sensor has
-delivered a newer sample or, in burst mode, its sample of the round. Therefore the frames do not
-depend on the order in which the messages of different sensors arrive.
+A frame is completed only when every active sensor has delivered a newer sample or, in burst mode,
+its sample of the round. Therefore frames do not depend on the order in which messages arrive.
 """
 
 from collections import Counter
@@ -10,20 +9,29 @@ from collections import Counter
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.errors import SettingsError
 from mag_tracking.network import SensorNetwork
+from mag_tracking.network.sensor_network import MIN_DELAY_BASELINE
 from mag_tracking.records import FieldFrame, Readings, plain
 from mag_tracking.stages.align import core
 from mag_tracking.stages.align.clock_step import ClockStepFilter, HeldSample
-from mag_tracking.stages.align.frame_period import frame_period
-from mag_tracking.stages.align.settings import AlignSettings
-from mag_tracking.stages.stage import MAX_BACKWARD_JUMP_S
+from mag_tracking.stages.settings import AlignSettings
+from mag_tracking.stages.stage import MAX_BACKWARD_JUMP_S, Stage
 from mag_tracking.units import NS
 
+DEFAULT_PERIOD_S = 0.08
+"""[s] Default frame period: 12.5 Hz, as in T10 section 6.3 for sensors nine metres apart."""
+MIN_AUTO_PERIOD_S = 0.02
+"""[s] Minimum automatic frame period. Shorter frames add little information, and at 100 frames per
+second tracking occupies a whole core."""
+MIN_PERIOD_S = 1e-4
+"""[s] Minimum configurable frame period; no sensor has a shorter sample interval."""
+MAX_TARGET_SPEED = 20.0
+"""[m/s] Frames are designed for targets up to this speed."""
 UNLIMITED_NS = np.iinfo(np.int64).max
 """[ns] Later than any timestamp."""
 MAX_HELD = 16
 """Maximum number of samples per sensor that are held while a clock step is unconfirmed."""
-
 CAUSES = {
     core.NO_FIELD: 'no finite field',
     core.NO_COVARIANCE: 'unknown covariance, and no noise_std in the network',
@@ -34,12 +42,54 @@ CAUSES = {
 """Cause of rejection for each reason code, except causes that name a sensor."""
 
 
-class Align:
+def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
+    """Shortest time [s] of a target at `MAX_TARGET_SPEED` between two sensors, and their names;
+    None if all sensors have nearly the same horizontal position."""
+    shortest, pair = np.inf, None
+    for j, position in enumerate(network.positions):
+        distance = np.linalg.norm((network.positions[:j] - position)[:, :2], axis=1)
+        distance[distance <= MIN_DELAY_BASELINE] = np.inf
+        if distance.min(initial=np.inf) < shortest:
+            i = int(np.argmin(distance))
+            shortest, pair = float(distance[i]), (network.names[i], network.names[j])
+    return None if pair is None else (shortest / MAX_TARGET_SPEED, *pair)
+
+
+def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
+    """Frame period [s]: the setting, or a period derived from the geometry if the setting is 0.
+
+    A longer frame than the delay between two sensors mixes their signals, so in a compact network
+    the period is half the shortest delay. In a larger one, tracking does not use this delay. Raises
+    SettingsError if the setting is below `MIN_PERIOD_S`.
+    """
+    if 0.0 < settings.period_s < MIN_PERIOD_S:
+        raise SettingsError(f'align.period_s: {settings.period_s:g} s is shorter than the minimum '
+                            f'of {MIN_PERIOD_S:g} s; set it to 0 for an automatic period')
+    if settings.period_s:
+        return settings.period_s
+    shortest = shortest_delay(network)
+    if settings.burst or shortest is None or not network.is_compact:
+        return DEFAULT_PERIOD_S
+    return min(DEFAULT_PERIOD_S, max(MIN_AUTO_PERIOD_S, 0.5 * shortest[0]))
+
+
+def frame_period_warning(settings: AlignSettings, network: SensorNetwork) -> str | None:
+    """Warning if the setting exceeds the travel time of a target between two sensors, except in
+    burst mode, where a frame is one round of the sensors."""
+    shortest, period = shortest_delay(network), frame_period(settings, network)
+    if not settings.period_s or settings.burst or shortest is None or period <= shortest[0]:
+        return None
+    delay, first, second = shortest
+    return (f'align.period_s: a frame of {1e3 * period:.0f} ms is longer than the '
+            f'{1e3 * delay:.0f} ms that a target at {MAX_TARGET_SPEED:.0f} m/s takes from {first} '
+            f'to {second}, which makes speed and direction less accurate; set align.period_s to 0 '
+            'for an automatic period')
+
+
+class Align(Stage[Readings, FieldFrame]):
     """Combines calibrated readings into frames; memory is bounded by `max_buffered`.
 
-    The cost of a sample between two frames does not depend on the number of sensors: while one
-    sensor is known to delay the frame, the other sensors are not checked. The rules are in
-    `alignment.hpp`; this class handles the events that the compiled code reports.
+    The rules are in `alignment.hpp`; this class handles the events that compiled code reports.
     """
 
     def __init__(self, network: SensorNetwork, settings: AlignSettings) -> None:
@@ -48,8 +98,7 @@ class Align:
         self._noise = np.array([np.full((3, 3), np.nan) if std is None else np.diag(std ** 2)
                                 for std in network.noise_std]).reshape(-1, 3, 3)
         self._index = {name: i for i, name in enumerate(network.names)}
-        self._names = network.names
-        self._settings = settings
+        self._names, self._settings = network.names, settings
         self._period = int(round(frame_period(settings, network) * NS))
         self._wait = int(round(settings.max_wait_s * NS))
         self._reset()
@@ -68,12 +117,12 @@ class Align:
     @property
     def n_held(self) -> int:
         """Number of samples that wait for their frame or for confirmation of their timestamps."""
-        return self._alignment.n_pending + self._clock_steps.n_held
+        return self._alignment.n_pending + len(self._clock_steps.held)
 
     @property
     def n_held_ahead(self) -> int:
         """Number of samples that are held because their timestamps jumped ahead."""
-        return self._clock_steps.n_held
+        return len(self._clock_steps.held)
 
     def feed(self, readings: Readings) -> list[FieldFrame]:
         """Add calibrated readings, and return the completed frames."""
@@ -89,10 +138,8 @@ class Align:
 
     def _hold(self, rows: IntArray, stamps: IntArray, fields: FloatArray, covariances: FloatArray,
               readings: Readings | None = None) -> list[FieldFrame]:
-        """Queue samples, and return the completed frames.
-
-        `readings` is None if the samples have already passed the clock step filter.
-        """
+        """Queue samples, and return the completed frames; `readings` is None if the samples have
+        already passed the clock step filter."""
         out: list[FieldFrame] = []
         k = 0
         while True:
@@ -109,10 +156,15 @@ class Align:
                 assert readings is not None
                 self._reject(f'unknown sensor {readings.names[readings.sensor[k - 1]]}')
             elif reason == core.CLOCK_STEP:
-                out += self._handle_clock_step(int(rows[k - 1]), HeldSample(
+                released, rejected = self._clock_steps.feed(int(rows[k - 1]), HeldSample(
                     int(stamps[k - 1]), fields[k - 1], covariances[k - 1]))
+                for j, _ in rejected:
+                    self._reject(f'ahead of all other sensors: {self._names[j]}')
+                out += self._hold_passed(released)
             elif reason == core.JUMPED_BACK:
-                out += self._restart()
+                out += self.flush()
+                self._reset()
+                self.counts['time jumped back'] += 1
                 sample = slice(k, k + 1)
                 out += self._hold(rows[sample], stamps[sample], fields[sample], covariances[sample])
                 k += 1
@@ -123,13 +175,6 @@ class Align:
             else:
                 self._reject(CAUSES[reason])
 
-    def _handle_clock_step(self, i: int, sample: HeldSample) -> list[FieldFrame]:
-        """Check a sample of sensor `i` for a clock step; return the completed frames."""
-        passed, rejected = self._clock_steps.feed(i, sample)
-        for j, _ in rejected:
-            self._reject(f'ahead of all other sensors: {self._names[j]}')
-        return self._hold_passed(passed)
-
     def _hold_passed(self, passed: list[tuple[int, HeldSample]]) -> list[FieldFrame]:
         """Queue samples that have passed the clock step filter, and return the completed frames."""
         out: list[FieldFrame] = []
@@ -138,20 +183,9 @@ class Align:
                               s.covariance[None])
         return out
 
-    def _restart(self) -> list[FieldFrame]:
-        """Return the frames of the held and pending samples, and reset after time jumped back."""
-        out = self.flush()
-        self._reset()
-        self.counts['time jumped back'] += 1
-        return out
-
     def flush(self) -> list[FieldFrame]:
         """Return all frames of the held and pending samples at the end of the input."""
-        out = self._hold_passed(self._clock_steps.flush())
-        return out + self._frames(final=True)
-
-    def idle(self) -> None:
-        """Do nothing: no work is deferred."""
+        return self._hold_passed(self._clock_steps.flush()) + self._frames(final=True)
 
     def _reject(self, cause: str) -> None:
         """Count a rejected sample by cause."""

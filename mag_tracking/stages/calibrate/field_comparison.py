@@ -18,17 +18,12 @@ tracks changes it by about a hundred times as much."""
 
 def compared_with_earth(network: SensorNetwork, survey: SurveySettings,
                         levels: FloatArray) -> list[FieldInconsistency]:
-    """Find the sensors whose field without a target contradicts the Earth's field.
-
-    `levels` (n, 3) [T] are these fields, NaN if unknown. If the Earth's field is unknown, the
-    sensors are compared with their median; raises ValueError if fewer than three then report all
-    axes.
-    """
+    """Find the sensors whose `levels` (n, 3) [T] without a target contradict the Earth's field, or,
+    if it is unknown, their median; raises ValueError if fewer than three then report all axes."""
     std = np.array([np.full(3, np.deg2rad(survey.nominal_std_deg)) if s is None else s
                     for s in network.orientation_std])
-    earth_field = network.earth_field
-    if earth_field is None:
-        earth_field = consensus(levels, network.R_ws)
+    earth_field = consensus(levels, network.R_ws) if network.earth_field is None \
+        else network.earth_field
     return disagreements(network.names, levels, network.R_ws, std, earth_field,
                          COMPASS_BIAS_STD, survey.offset_std)
 
@@ -56,11 +51,8 @@ class FieldComparison:
         self._levels = np.full((len(network), 3), np.nan)
 
     def update(self, j: int, level: FloatArray, first_ns: int, last_ns: int) -> None:
-        """Compare the background (3,) [T] of sensor `j` if it has changed.
-
-        `first_ns` and `last_ns` are the times of its first and latest reading. The first background
-        also holds for the readings before it was learnt.
-        """
+        """Compare the background (3,) [T] of sensor `j`, with readings from `first_ns` to
+        `last_ns`, if it has changed; the first one also holds for the readings before it."""
         previous = self._levels[j]
         if not self._survey.offset_std or (
                 (np.abs(level - previous) <= MIN_CHANGE)

@@ -9,27 +9,16 @@ from mag_tracking.records import Readings
 
 OVERRULED = 'message covariances overruled by the measured noise'
 """Key in the counts for message covariances that were replaced by the measured noise."""
-
 COUNTED = {'held back while learning': 'n_learning',
            'axes held back while learning': 'n_partly_learning', OVERRULED: 'n_overruled'}
 """{key in the counts: counter of a batch}."""
 
 
 class OutputBuffer:
-    """Arrays to which compiled code appends calibrated readings.
+    """Arrays to which compiled code appends calibrated readings; resets the counters of `batch`.
 
-    Parameters
-    ----------
-    capacity : int
-        Maximum number of readings.
-    batch : Record
-        Counters of the batch that compiled code updates; reset.
-
-    Attributes
-    ----------
-    arrays : tuple of arrays
-        Sensor indices (capacity,), timestamps (capacity,) ns, fields (capacity, 3) T and
-        covariances (capacity, 3, 3) T².
+    `arrays` are sensor indices (capacity,), timestamps (capacity,) [ns], fields (capacity, 3) [T]
+    and covariances (capacity, 3, 3) [T²].
     """
 
     def __init__(self, names: tuple[str, ...], capacity: int, batch: Record) -> None:

@@ -11,28 +11,22 @@ from mag_tracking.calibration.reading_faults import ReadingFaults
 from mag_tracking.calibration.sensor_state import N_WINDOW
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.health.clocks import ClockSpan
+from mag_tracking.stages.settings import CalibrateSettings
 from mag_tracking.units import NS
 
 LOOK_AHEAD_S = 300.0
 """[s] Duration, from the start of the recording, that is searched for the most frequent level of a
 sensor that is not quiet at the start."""
-
 LEARNING_TOLERANCE_S = 1.0
 """Excess over the nominal learning time above which a target is considered present [s]."""
-
 MIN_BLOCKS = 6.0
 """Minimum learning time [blocks], which applies to slow sensors with long blocks."""
-
 MIN_LEVEL_FRACTION = 1.0 / 3.0
 """Minimum total duration of a background level, as a fraction of the learning time."""
-
 N_READINGS_AT_ONCE = 8
 """Number of readings per batch while the initial background is learnt."""
-
-
 N_BEGINNING = N_WINDOW + 1
 """Number of readings per sensor in which faults of the drivers are searched before the
 backgrounds."""
@@ -66,11 +60,8 @@ class Prescan:
 
 def prescan(batches: Iterable[Readings], network: SensorNetwork,
             settings: CalibrateSettings) -> Prescan:
-    """Find the backgrounds of sensors if a target is present at the start of the raw readings.
-
-    The batches are consumed up to `LOOK_AHEAD_S`. If the network file contains all backgrounds,
-    there are only faults.
-    """
+    """Find the backgrounds of sensors, unless the network file contains all of them, if a target is
+    present at the start of the raw readings."""
     without_background = [name for name, level in zip(network.names, network.background,
                                                       strict=True) if level is None]
     batches = iter(batches)
@@ -121,8 +112,8 @@ def _level_of(recorder: BlockRecorder, departed_at: float | None,
               learnt: tuple[float, FloatArray] | None) -> tuple[MostFrequentLevel | None, bool]:
     """Return (most frequent level or None, whether a target was present at the start).
 
-    A target that was present had left by `departed_at` [s]; only later readings then determine the
-    level. If the field later returns to the level `learnt` at the start, no target was present.
+    Then only readings after its departure at `departed_at` [s] count. If the field later returns to
+    the level `learnt` at the start, no target was present.
     """
     level = recorder.quiet_level()
     if level is None or departed_at is None or learnt is None \
@@ -151,10 +142,8 @@ def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
 
 def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: MostFrequentLevel,
                     recorder: BlockRecorder, settings: CalibrateSettings) -> bool:
-    """Whether the initial background was learnt early and equals the most frequent level.
-
-    If relearning is disabled, any initial background that was learnt early is accepted.
-    """
+    """Whether the initial background was learnt early and, unless relearning is disabled, equals
+    the most frequent level."""
     max_time = LEARNING_TOLERANCE_S + max(settings.learn_s, MIN_BLOCKS * level.block_s)
     if learnt is None or learnt[0] > max_time:
         return False

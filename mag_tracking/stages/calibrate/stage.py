@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -26,24 +27,17 @@ from mag_tracking.calibration.survey import SurveySettings
 from mag_tracking.errors import NetworkError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
-from mag_tracking.stages.calibrate.driver_faults import MAX_MARKED, DriverFaults
 from mag_tracking.stages.calibrate.field_comparison import FieldComparison
-from mag_tracking.stages.calibrate.output_buffer import OVERRULED as OVERRULED
 from mag_tracking.stages.calibrate.output_buffer import OutputBuffer
 from mag_tracking.stages.calibrate.rejections import (
+    MAX_MARKED,
     REJECTIONS,
-    Rejections,
+    DriverFaults,
     own_covariances,
 )
-from mag_tracking.stages.calibrate.restoration import (
-    BackgroundRestoration,
-    StoredBackground,
-    stored_background,
-)
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
-from mag_tracking.stages.health.clocks import ClockSpan, corrected
+from mag_tracking.stages.health.clocks import ClockSpan, TimestampMonitor, corrected
 from mag_tracking.stages.health.diagnosis import Cause
-from mag_tracking.stages.health.timestamps import TimestampMonitor
+from mag_tracking.stages.settings import CalibrateSettings
 from mag_tracking.stages.stage import MAX_BACKWARD_JUMP_S
 from mag_tracking.units import NEVER, NS
 
@@ -60,13 +54,22 @@ standard deviations of the noise."""
 MAX_FORWARD_JUMP_S = 60.0
 """[s] Maximum forward jump of a timestamp. A larger jump is treated as corrupt unless the next
 timestamp confirms it."""
-
 MAX_SYNCHRONOUS = 16
 """Maximum number of sensors whose blocks may end at the same time. In larger networks, the blocks
 are staggered, because evaluating all blocks at once would delay the readings."""
-
 FAULTS_FOUND = 'faults of drivers found'
 """Key in the counts for the events after which `driver_faults` are others."""
+
+
+@dataclass(frozen=True)
+class StoredBackground:
+    """Stored background of one sensor, to be restored after a restart."""
+
+    stamp_ns: int
+    background: FloatArray
+    """(3,) T, sensor frame. NaN for an axis that is not reported."""
+    covariance: FloatArray
+    """Noise covariance of one sample, (3, 3) T², sensor frame."""
 
 
 class Calibrate:
@@ -75,31 +78,19 @@ class Calibrate:
     The clock offset and the corrections of hard and soft iron in the network file are applied
     first. The field remains in the sensor frame. The covariance is taken from the reading if
     available (unless the measured noise contradicts it), otherwise from the network file; otherwise
-    it is estimated.
+    it is estimated. The rules are in `calibration/readings.hpp`; this class handles the events that
+    the compiled code reports.
 
-    The rules are in `calibration/readings.hpp`; this class handles the events that the compiled
-    code reports.
-
-    Parameters
-    ----------
-    background_type : type, optional
-        Class that estimates the background of each sensor.
-    survey : SurveySettings, optional
-        Settings of the comparison of the backgrounds with the Earth's field.
-
-    Attributes
-    ----------
-    counts : number of readings by outcome, and of events such as time jumps
-    driver_faults : marks and repetitions, which are left out
-    timestamps : faults of the timestamps, and rates
+    A `background_type` estimates the background of each sensor; `survey` has the settings of the
+    comparison with the Earth's field. `rejections` are {sensor: {(cause, description): number}}.
     """
 
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,
                  background_type: type[RunningBackground] = RunningBackground,
                  survey: SurveySettings | None = None) -> None:
         self.counts: Counter[str] = Counter()
-        self.rejections = Rejections(network.names)
-        self._settings, self._sensors = settings, new_sensors(len(network))
+        self.rejections = {name: Counter[tuple[Cause, str]]() for name in network.names}
+        self.settings, self._sensors = settings, new_sensors(len(network))
         self._batches = np.zeros(1, core.BATCH)
         self.driver_faults = DriverFaults(network.names, self._sensors)
         self._limits = np.array([(
@@ -113,7 +104,7 @@ class Calibrate:
         self._index = {name: i for i, name in enumerate(network.names)}
         self._background: dict[str, RunningBackground] = {}
         self._changes = SharedChanges()
-        self._restoration = BackgroundRestoration(settings.max_resume_gap_s)
+        self._stored: dict[str, StoredBackground] = {}
         self.timestamps = TimestampMonitor(network.names)
         self._comparison = FieldComparison(network, survey or SurveySettings())
         self.update_network(network)
@@ -121,23 +112,21 @@ class Calibrate:
     def update_network(self, network: SensorNetwork) -> None:
         """Apply a new calibration of the same sensors; raises NetworkError if their names differ.
 
-        If the offset or the correction of a sensor has changed, the background of this sensor is
-        learnt again. Otherwise it is retained, even while it is frozen.
+        The background of a sensor whose offset or correction has changed is learnt again.
         """
         if network.names != tuple(self._index):
             raise NetworkError(f'the new network has the sensors {", ".join(network.names)}; '
                                f'expected {", ".join(self._index)}')
         previous, self._network = self._network if self._background else None, network
         self._comparison.use(network)
-        self._decimators = {name: Decimator(self._settings.decimate_to_hz)
-                            for name in network.names}
+        self._decimators = {name: Decimator(self.settings.decimate_to_hz) for name in network.names}
         for i, name in enumerate(network.names):
             is_unchanged = previous is not None \
                 and are_equal(previous.offset[i], network.offset[i]) \
                 and are_equal(previous.correction[i], network.correction[i])
             shift = int(self._sensors[i]['clock_offset_ns'] - network.clock_offset_ns[i])
             if previous is not None and (not is_unchanged or shift):
-                self._restoration.forget(name)
+                self._stored.pop(name, None)
             if not is_unchanged or shift:
                 self._reject_held(i, 'the calibration changed')
             if not is_unchanged:
@@ -162,7 +151,7 @@ class Calibrate:
 
     def _new_background(self, i: int) -> RunningBackground:
         """Create the background estimator of sensor `i` from the settings and the network file."""
-        s, network = self._settings, self._network
+        s, network = self.settings, self._network
         return self._background_type(
             s.learn_s, MEMORY_S, GUARD_S, BLOCK_S, FREEZE_STD, s.relearn_s,
             network.background[i], network.noise_std[i],
@@ -175,11 +164,7 @@ class Calibrate:
         return [name for name, b in self._background.items() if not b.ready]
 
     def input_doubts(self) -> dict[str, dict[str, DoubtfulTimes]]:
-        """{reason: {sensor: intervals}} in which backgrounds or timestamps were doubtful, if any.
-
-        A background is doubtful while it is provisional or may contain the field of a target, and
-        while it contradicts the Earth's field.
-        """
+        """{reason: {sensor: intervals}} in which backgrounds or timestamps were doubtful."""
         out = {DOUBTFUL_BACKGROUND: {n: b.doubtful_times for n, b in self._background.items()
                                      if b.doubtful_times},
                CONTRADICTS_EARTH_FIELD: self._comparison.doubtful_times(),
@@ -187,10 +172,8 @@ class Calibrate:
         return {reason: by_sensor for reason, by_sensor in out.items() if by_sensor}
 
     def latest_doubt(self, sensor: str) -> tuple[int, int | None] | None:
-        """Latest interval [ns] in which the background or the timestamps of a sensor were doubtful.
-
-        An open interval has the end None and comes first. None if there is no interval.
-        """
+        """Latest interval [ns] in which the background or the timestamps of a sensor were doubtful,
+        if any; an open one, with the end None, comes first."""
         times = [interval for by_sensor in (
             self._background[sensor].doubtful_times, self._comparison.times_of(sensor),
             self.timestamps.doubtful_times().get(sensor, ()))
@@ -204,8 +187,10 @@ class Calibrate:
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
         """Number of accepted and rejected readings of a sensor, the latter also by cause."""
-        return self.rejections.counts_of(sensor) \
-            + Counter(accepted=int(self._state_of(sensor)['accepted']))
+        rejections = self.rejections[sensor]
+        counts = Counter({f'rejected: {text}': n for (_, text), n in rejections.items()})
+        return counts + Counter(rejected=rejections.total(),
+                                accepted=int(self._state_of(sensor)['accepted']))
 
     def lowest_rate(self, sensor: str) -> float:
         """Lowest rate [Hz] of a sensor so far, without repetitions; inf if unknown."""
@@ -216,10 +201,7 @@ class Calibrate:
         return self._sensors[self._index[sensor]]
 
     def feed(self, readings: Readings) -> list[Readings]:
-        """Calibrate raw readings, and return those that are no longer held as at most one batch.
-
-        The result does not depend on how the readings are split into batches.
-        """
+        """Calibrate raw readings, and return those that are no longer held as at most one batch."""
         rows = readings.rows(self._index)
         validity, covariances = own_covariances(readings)
         stamps, fields = plain(readings.stamp_ns, np.int64), plain(readings.field)
@@ -237,9 +219,9 @@ class Calibrate:
         return out.finish(self.counts)
 
     def _new_output(self, n: int) -> OutputBuffer:
-        """Reset the batch counters, and create a buffer for the output of `n` raw readings."""
-        capacity = n + int(self._sensors['n_held'].sum())
-        if self._settings.decimate_to_hz:
+        """Create a buffer for the output of `n` raw readings."""
+        capacity = n + self.n_held
+        if self.settings.decimate_to_hz:
             capacity += sum(d.n_waiting for d in self._decimators.values())
         return OutputBuffer(self._network.names, capacity, self._batches[0])
 
@@ -259,9 +241,13 @@ class Calibrate:
             self.counts['time jumped back'] += 1
             self._sensors[i]['first_ns'] = self._sensors[i]['last_ns'] = NEVER
         elif reason == core.RESTORABLE:
-            self.counts[self._restoration.restore(name, int(batch['stamp_ns']),
-                                                  self._background[name])] += 1
-            self._sensors[i]['is_restorable'] = False
+            stored, self._sensors[i]['is_restorable'] = self._stored.pop(name), False
+            age_ns = int(batch['stamp_ns']) - stored.stamp_ns
+            is_recent = 0 < age_ns <= self.settings.max_resume_gap_s * NS
+            if is_recent:
+                self._background[name].resume(stored.background, stored.covariance)
+            self.counts['backgrounds restored' if is_recent else
+                        'outdated backgrounds not restored'] += 1
         elif reason == core.PASSED:
             self._calibrate_released(i, out)
         elif reason != core.SPIKES:
@@ -285,7 +271,7 @@ class Calibrate:
         for k in range(int(s['n_released'])):
             stamp, validity = int(s['held_ns'][k]), int(s['held_own'][k])
             field, covariance = s['held_field'][k].copy(), s['held_covariance'][k]
-            if not self._settings.decimate_to_hz:
+            if not self.settings.decimate_to_hz:
                 self._calibrate_reading(i, stamp, field, validity, covariance, out)
                 continue
             decimator = self._decimators[name]
@@ -327,11 +313,8 @@ class Calibrate:
 
     def start_from(self, levels: Mapping[str, MostFrequentLevel],
                    steps: Mapping[str, FloatArray], faults: Mapping[str, ReadingFaults]) -> None:
-        """Initialise the stage with the results of a first pass over the readings.
-
-        `levels` are the backgrounds of the sensors that are not quiet at the start, `steps` (3,)
-        [T] the resolution of the axes of each sensor.
-        """
+        """Initialise the stage with the results of a first pass: `levels` of the sensors that are
+        not quiet at the start, and `steps` (3,) [T], the resolution of their axes."""
         for name, found in faults.items():
             if found:
                 self.driver_faults.store(name, found)
@@ -347,25 +330,28 @@ class Calibrate:
 
     def resume(self, stored: Mapping[str, StoredBackground]) -> None:
         """Provide stored backgrounds, which are restored at the first reading of each sensor."""
-        self._restoration.set_stored(stored)
+        self._stored = dict(stored)
         self._mark_restorable()
 
     def _mark_restorable(self) -> None:
         """Mark sensors with a stored background: compiled code then reports their first reading."""
-        self._sensors['is_restorable'] = [name in self._restoration for name in self._index]
+        self._sensors['is_restorable'] = [name in self._stored for name in self._index]
 
     def stored(self, sensor: str) -> StoredBackground | None:
         """Background of a sensor for `resume`; None while it is unknown or doubtful."""
         background, last = self._background[sensor], self.last_stamp_ns(sensor)
-        if not background.certain or last is None:
+        C = background.covariance
+        if not background.certain or last is None or C is None:
             return None
-        return stored_background(background, last, self.background(sensor))
+        # An axis that has just started to report has a level but no noise variance yet.
+        level = np.where(np.isnan(np.diagonal(C)), np.nan, self.background(sensor))
+        return None if np.isnan(level).all() else StoredBackground(last, level, C)
 
     def idle(self) -> None:
         """Evaluate the completed blocks now, instead of at the next reading of their sensors.
 
-        This does not change results: only in a large network are completed blocks deferred, and
-        there the reading that completes a block is calibrated with the previous background.
+        Only in a large network are completed blocks deferred, and there the reading that completes
+        a block is calibrated with the previous background.
         """
         for i in np.flatnonzero(self._sensors['is_full']):
             self._evaluate_block(int(i))
@@ -386,18 +372,16 @@ class Calibrate:
         """Count `n` rejected readings of a sensor by cause and description."""
         if n:
             self.counts[f'rejected: {cause[1]}'] += n
-            self.rejections.add(sensor, cause, n)
+            self.rejections[sensor][cause] += n
 
     def forget(self, sensors: Collection[str] = ()) -> None:
-        """Discard the backgrounds of sensors, by default of all sensors, and learn them again.
-
-        Raises NetworkError if a sensor is not in the network.
-        """
+        """Discard the backgrounds of sensors, by default of all, and learn them again; raises
+        NetworkError for an unknown sensor."""
         for name in sensors:
             self._network.index(name)
         for name in sensors or self._network.names:
             self._background[name].forget()
-            self._restoration.forget(name)
+            self._stored.pop(name, None)
         self._mark_restorable()
 
     def last_stamp_ns(self, sensor: str) -> int | None:

@@ -1,4 +1,4 @@
-// Python module of the per-frame computations for resting axes; see resting_axes.py.
+// Python module of the per-frame computations for resting axes; see stage.py.
 
 #include <algorithm>
 #include <cmath>

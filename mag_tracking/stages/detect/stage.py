@@ -8,39 +8,40 @@ from dataclasses import replace
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.covariances import whitened_energy
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.network import SensorNetwork
-from mag_tracking.records import Detection, FieldFrame
-from mag_tracking.stages.detect.resting_axes import RestingAxes
-from mag_tracking.stages.detect.settings import DetectSettings
+from mag_tracking.records import Detection, FieldFrame, plain
+from mag_tracking.stages.detect import core
+from mag_tracking.stages.settings import DetectSettings
+from mag_tracking.stages.stage import Stage
 from mag_tracking.units import NS
 
+MEMORY_FRAMES = 100
+"""Approximate number of frames without a target over which the square of each axis is averaged."""
+RESTING_RATIO = 25.0
+"""Minimum ratio of the nominal to the measured variance of an axis at rest."""
+VARIANCE_REDUCTION = 20.0
+"""Factor by which the variance of an axis at rest is reduced: the quantisation error of one step is
+no noise of an axis that does not change without a target. In a network of two sensors, a single
+step of one axis, which background drift can cause, remains below the threshold."""
 RELEASE_PROBABILITY = 1e-2
 """Probability that noise exceeds the release threshold, unless that of the detection is larger. A
 frame below that threshold is quiet."""
-
 RECOVERY_S = 5.0
 """[s] Approximate time in which the calibration learns the background again after a target."""
 
 
-class Detect:
+class Detect(Stage[FieldFrame, FieldFrame | Detection]):
     """Decides for each frame whether a target is present, and reports onset and release.
 
-    Attributes
-    ----------
-    max_consecutive_above : largest number of consecutive frames above the threshold
-
-    References
-    ----------
-    [T10]_ eq. (5.14)-(5.19).
+    `max_consecutive_above` is the largest number of consecutive frames above the threshold.
     """
 
     def __init__(self, network: SensorNetwork, settings: DetectSettings) -> None:
         self.counts: Counter[str] = Counter()
-        self._names = network.names
-        self._settings = settings
+        self._names, self.settings = network.names, settings
         self._thresholds: dict[tuple[float, int], float] = {}
         self._next_id = 1
         self._max_ratio, self._max_ratios = 0.0, np.zeros(len(network))
@@ -48,33 +49,28 @@ class Detect:
         self._single_thresholds = np.array([np.inf, *(
             self.threshold(settings.false_alarm_probability, k) for k in (1, 2, 3))])
         self.max_consecutive_above = 0
-        self._resting = RestingAxes(len(network))
+        # Number of frames without a target, and mean square of the field in them, for each axis.
+        self._n_quiet: FloatArray = np.zeros((len(network), 3))
+        self._mean_square: FloatArray = np.zeros((len(network), 3))
         self._reset()
 
     def _reset(self) -> None:
         """Reset to the state without a detection."""
-        self._present = False
-        self._n_above = 0
+        self._present, self._n_above, self._frozen_s = False, 0, 0.0
         self._last_ns: int | None = None
         self._last_active_ns: int | None = None
         self._onset_ns: int | None = None
-        self._frozen_s = 0.0
 
     def threshold(self, probability: float, degrees_of_freedom: int) -> float:
-        """Energy threshold that noise exceeds with `probability`; cached.
-
-        The degrees of freedom are the measured axes.
-        """
+        """Energy threshold of the measured axes that noise exceeds with `probability`; cached."""
         key = probability, degrees_of_freedom
         if key not in self._thresholds:
             self._thresholds[key] = float(energy_threshold(probability, degrees_of_freedom))
         return self._thresholds[key]
 
     def feed(self, frame: FieldFrame) -> list[FieldFrame | Detection]:
-        """Test a frame: return an onset or release, if any, and the frame with its detection flag.
-
-        A frame with an invalid covariance is dropped.
-        """
+        """Test a frame: return an onset or release, if any, and the frame with its detection flag,
+        unless its covariance is invalid."""
         out: list[FieldFrame | Detection] = []
         if self._last_ns is not None and frame.stamp_ns <= self._last_ns:
             self.counts['time jumped back'] += 1
@@ -82,31 +78,27 @@ class Detect:
             self._reset()
         self._last_ns = frame.stamp_ns
         try:
-            energy, axes = whitened_energy(frame.field, self._resting.covariance(
-                frame.covariance, self._background_variance(frame.stamp_ns)))
+            energy, axes = whitened_energy(frame.field, core.scaled(
+                plain(frame.covariance), self._n_quiet, self._mean_square, MEMORY_FRAMES / 4,
+                RESTING_RATIO, VARIANCE_REDUCTION, self._background_variance(frame.stamp_ns)))
         except np.linalg.LinAlgError:
             self.counts['rejected: frame with a covariance that is not positive definite'] += 1
             return out
         statistic, n = float(energy.sum()), int(axes.sum())
         self.counts['frames'] += 1
         if n:
-            self._record_excursions(energy, axes, statistic, n)
+            if not self._present:
+                self._max_ratio = max(self._max_ratio, statistic / self.threshold(
+                    self.settings.false_alarm_probability, n))
+                np.maximum(self._max_ratios, energy / self._single_thresholds[axes],
+                           out=self._max_ratios)
             out += self._update_presence(frame.stamp_ns, statistic, n, energy / np.maximum(axes, 1))
         else:
             self.counts['frames without a measurement'] += 1
         if not self._present and not self._n_above:
-            self._resting.learn(frame.field)
+            core.learn(plain(frame.field), MEMORY_FRAMES, self._n_quiet, self._mean_square)
         return [*out, replace(frame, target_present=self._present, statistic=statistic,
                               degrees_of_freedom=n)]
-
-    def _record_excursions(self, energy: FloatArray, axes: IntArray, statistic: float,
-                           n: int) -> None:
-        """Update the largest ratios of energy to threshold unless a target is detected."""
-        if not self._present:
-            ratio = statistic / self.threshold(self._settings.false_alarm_probability, n)
-            self._max_ratio = max(self._max_ratio, ratio)
-            np.maximum(self._max_ratios, energy / self._single_thresholds[axes],
-                       out=self._max_ratios)
 
     @property
     def largest_excursion(self) -> float:
@@ -114,10 +106,7 @@ class Detect:
         return float(np.sqrt(self._max_ratio))
 
     def largest_excursions(self) -> FloatArray:
-        """Square root of the largest ratio of energy to single-sensor threshold, for each sensor.
-
-        As for `largest_excursion`, only frames without a detection are used.
-        """
+        """As `largest_excursion`, with the energy and the threshold of each sensor alone."""
         return np.sqrt(self._max_ratios)
 
     def _background_variance(self, stamp_ns: int) -> float:
@@ -126,13 +115,13 @@ class Detect:
             self._frozen_s = (stamp_ns - self._onset_ns) / NS
         elif self._last_active_ns is not None and stamp_ns - self._last_active_ns > RECOVERY_S * NS:
             self._frozen_s = 0.0
-        s = self._settings
+        s = self.settings
         return (s.background_std + s.background_drift * self._frozen_s) ** 2
 
     def _update_presence(self, stamp_ns: int, statistic: float, n: int,
                          per_axis: FloatArray) -> list[Detection]:
         """Update the detection state, and return the onset or release, if there is one."""
-        s = self._settings
+        s = self.settings
         if statistic > self.threshold(s.false_alarm_probability, n):
             self.counts['frames above the threshold'] += 1
             self._n_above += 1
@@ -169,13 +158,6 @@ class Detect:
     def _detection(self, stamp_ns: int, onset: bool, statistic: float, n: int,
                    strongest: str) -> Detection:
         """Create the onset or release record of the current detection."""
-        p = self._settings.false_alarm_probability
+        p = self.settings.false_alarm_probability
         return Detection(stamp_ns, self._next_id, onset, statistic, n,
                          self.threshold(p, n) if n else float('nan'), p, strongest)
-
-    def idle(self) -> None:
-        """Do nothing: no work is deferred."""
-
-    def flush(self) -> list[FieldFrame | Detection]:
-        """Return an empty list: no frame is buffered."""
-        return []

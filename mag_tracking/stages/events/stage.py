@@ -16,12 +16,11 @@ from mag_tracking.inference.driving_direction import (
 )
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Detection, Readings
-from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
-from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.events.single_sensor_pass import ClosestPoint, closest_point
 from mag_tracking.stages.events.stays import Stays
+from mag_tracking.stages.settings import AlignSettings, DetectSettings
 from mag_tracking.stages.track.low_rate import SampleRates
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NEVER, NS

@@ -1,13 +1,23 @@
-"""Findings about the clocks of the timestamps, compared with the times of receipt."""
+"""Faults of timestamps, and clocks of the sensors, compared by the times of receipt."""
 
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from mag_tracking.arrays import IntArray
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.calibration.doubtful_times import DoubtfulTimes, doubtful_since, updated
+from mag_tracking.calibration.timestamps import (
+    MAX_ERROR_S,
+    WINDOW,
+    TimestampError,
+    TimestampFault,
+    latest_interval_s,
+    timestamp_fault,
+)
 from mag_tracking.network import SensorNetwork
 from mag_tracking.stages.health.diagnosis import Cause, Finding
+from mag_tracking.stages.health.window import ReadingBuffer
 from mag_tracking.units import NS
 
 MAX_CLOCK_DIFFERENCE_S = 60.0
@@ -36,6 +46,20 @@ UNITS = ((1e3, 'the seconds of its timestamps are milliseconds'),
 """Factor by which the timestamps advance too fast, and the reason."""
 MAX_RATIO_ERROR = 0.1
 """Maximum relative error of this factor; of clocks that are compared, it is 1."""
+UPDATE_INTERVAL = 64
+"""Number of new readings of a sensor after which its timestamps are examined again."""
+CAUSES = {
+    TimestampError.ZERO: (Cause.ZERO_STAMPS, 'set the timestamps in the driver'),
+    TimestampError.COARSE: (
+        Cause.COARSE_STAMPS, 'let the driver set timestamps of a finer resolution'),
+    TimestampError.PACKET: (
+        Cause.PACKET_STAMPS, 'let the driver set the timestamp of each reading'),
+    TimestampError.BURST: (
+        Cause.BURST_STAMPS, 'let the driver set the time of measurement instead of the time of '
+        'arrival'),
+    TimestampError.UNIT: (
+        Cause.MILLISECOND_STAMPS, 'correct the unit of the timestamps in the driver')}
+"""Cause and remedy of each error of timestamps."""
 
 
 class ClockSpan(NamedTuple):
@@ -62,11 +86,6 @@ class ClockSpan(NamedTuple):
         return (self.last_received_ns - self.last_ns) / NS
 
     @property
-    def first_delay_s(self) -> float:
-        """Delay from the first timestamp to its receipt [s]."""
-        return (self.first_received_ns - self.first_ns) / NS
-
-    @property
     def rate(self) -> float:
         """Advance of the timestamps relative to the times of receipt; NaN if unknown."""
         received_ns = self.last_received_ns - self.first_received_ns
@@ -80,22 +99,17 @@ class ClockSpan(NamedTuple):
     def ahead_s(self, reference: 'ClockSpan') -> tuple[float, bool]:
         """Time [s] by which this clock is ahead of another, and whether it is too large for delays.
 
-        Clocks that do not advance like the time of receipt, as those of a fast replay, cannot be
-        compared.
+        Clocks that do not advance like the time of receipt (a fast replay) cannot be compared.
         """
         ahead_s = reference.delay_s - self.delay_s
-        first_s = reference.first_delay_s - self.first_delay_s
+        first_s = (reference.first_received_ns - reference.first_ns) / NS \
+            - (self.first_received_ns - self.first_ns) / NS
         if not all(abs(clock.rate - 1.0) <= MAX_RATIO_ERROR for clock in (self, reference)):
             return ahead_s, False
         if abs(first_s - ahead_s) > MAX_CHANGE * abs(ahead_s):
             return ahead_s, abs(ahead_s) > MAX_CLOCK_DIFFERENCE_S
         is_ahead = min(self.delay_s, reference.delay_s) < -MIN_AHEAD_S
         return ahead_s, abs(ahead_s) > (MAX_CLOCK_ERROR_S if is_ahead else MAX_LATENCY_S)
-
-    @property
-    def is_since_boot(self) -> bool:
-        """Whether the timestamps count from the start of the device."""
-        return 0 < self.last_ns < EARLIEST_DATE_S * NS < self.last_received_ns
 
     @property
     def wrong_unit(self) -> str | None:
@@ -111,10 +125,7 @@ def corrected(clocks: Mapping[str, ClockSpan], network: SensorNetwork) -> dict[s
 
 
 def clock_differences(clocks: Mapping[str, ClockSpan]) -> dict[str, tuple[float, bool]]:
-    """Compare clocks with the one nearest to the clock of the host, as by `ClockSpan.ahead_s`.
-
-    In a replay, all clocks differ from that of the host by about the same time.
-    """
+    """Compare clocks with the one nearest to the clock of the host, as by `ClockSpan.ahead_s`."""
     reference = min(clocks.values(), key=lambda clock: abs(clock.delay_s), default=None)
     return {} if reference is None else {
         name: clock.ahead_s(reference) for name, clock in clocks.items()}
@@ -129,13 +140,12 @@ def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
                           'correct the unit of the timestamps in the driver',
                           Cause.MILLISECOND_STAMPS)
             continue
-        if clock.is_since_boot:
+        if 0 < clock.last_ns < EARLIEST_DATE_S * NS < clock.last_received_ns:
             differs = abs(ahead_s) > MAX_BOOT_DIFFERENCE_S
             yield Finding(
                 differs, name, 'its timestamps count from the start of its device (the latest '
-                f'is {clock.last_ns / NS:.4g} s)' + (
-                    f', and differ by {ahead_s:+.4g} s from those of other sensors'
-                    if differs else ''),
+                f'is {clock.last_ns / NS:.4g} s)' + (', and differ by '
+                f'{ahead_s:+.4g} s from those of other sensors' if differs else ''),
                 'let the driver use the time of arrival, or add the time of the start',
                 Cause.BOOT_STAMPS)
         elif differs:
@@ -143,3 +153,80 @@ def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
                           'the timestamps of other sensors', 'synchronise its clock (chrony, PTP); '
                           'knocks correct only offsets below half a second',
                           Cause.CLOCK_DIFFERS)
+
+
+def timestamp_finding(sensor: str, fault: TimestampFault) -> Finding:
+    """Convert a fault of timestamps to a finding, serious if its error exceeds `MAX_ERROR_S`."""
+    is_serious, text = fault.error_s > MAX_ERROR_S, fault.text
+    if is_serious and np.isfinite(fault.error_s):
+        text += (f'; the timestamps are wrong by up to {1e3 * fault.error_s:.0f} ms, which makes '
+                 'tracks ambiguous')
+    cause, advice = CAUSES[fault.error]
+    return Finding(is_serious, sensor, text, advice, cause)
+
+
+class TimestampMonitor:
+    """Examines the timestamps of several sensors while their readings arrive."""
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        n = len(names)
+        self._index = {name: j for j, name in enumerate(names)}
+        self._buffer = ReadingBuffer(n, UPDATE_INTERVAL)
+        self._stamps: list[IntArray] = [np.zeros(0, dtype=np.int64)] * n
+        self._fields: list[FloatArray] = [np.zeros((0, 3))] * n
+        self._worst: dict[int, TimestampFault] = {}
+        self._longest_s: FloatArray = np.zeros(n)
+        self._doubtful_times: list[DoubtfulTimes] = [()] * n
+        self._differing: set[str] = set()
+
+    def add(self, rows: IntArray, stamps: IntArray, fields: FloatArray) -> None:
+        """Add readings; `rows` are sensor indices, and negative ones are skipped."""
+        i = 0
+        while (i := self._buffer.add(rows, stamps, fields, 0, i)) < len(rows):
+            self._examine(int(rows[i]))
+
+    def _examine(self, j: int) -> None:
+        """Examine the latest readings of sensor `j`, and update its doubtful times."""
+        fault, first_ns = self._latest_fault(j), int(self._buffer.peek(j)[0][0])
+        stamps, fields, _ = self._buffer.pop(j)
+        self._stamps[j] = np.append(self._stamps[j], stamps)[-WINDOW:]
+        self._fields[j] = np.append(self._fields[j], fields, axis=0)[-WINDOW:]
+        if fault is not None:
+            self._worst[j] = fault.after(self._worst.get(j))
+        else:
+            self._longest_s[j] = max(self._longest_s[j], latest_interval_s(self._stamps[j]))
+        times = self._doubtful_times[j]
+        self._doubtful_times[j] = doubtful_since(times, first_ns) \
+            if fault is not None and fault.error_s > MAX_ERROR_S \
+            else updated(times, int(stamps[-1]), False)
+
+    def _latest_fault(self, j: int) -> TimestampFault | None:
+        """Fault in the latest readings of sensor `j`, including those in the buffer."""
+        stamps, fields, _ = self._buffer.peek(j)
+        return timestamp_fault(np.append(self._stamps[j], stamps)[-WINDOW:],
+                               np.append(self._fields[j], fields, axis=0)[-WINDOW:])
+
+    def compare_clocks(self, clocks: Mapping[str, ClockSpan]) -> None:
+        """Mark all timestamps of sensors whose clocks differ from those of other sensors now."""
+        self._differing = {
+            name for name, (_, differs) in clock_differences(clocks).items() if differs}
+
+    def doubtful_times(self) -> dict[str, DoubtfulTimes]:
+        """Intervals in which timestamps were wrong by over `MAX_ERROR_S`, by sensor."""
+        out = {name: self._doubtful_times[j] for name, j in self._index.items()
+               if self._doubtful_times[j]}
+        return {**out, **dict.fromkeys(self._differing, ((0, None),))}
+
+    def worst_fault(self, sensor: str) -> TimestampFault | None:
+        """Fault of a sensor with the largest error so far."""
+        j = self._index[sensor]
+        latest, worst = self._latest_fault(j), self._worst.get(j)
+        return worst if latest is None else latest.after(worst)
+
+    def lowest_rate(self, sensor: str) -> float:
+        """Lowest rate [Hz] of a sensor without faults of the timestamps; inf if unknown."""
+        j = self._index[sensor]
+        stamps = np.append(self._stamps[j], self._buffer.peek(j)[0])
+        latest_s = latest_interval_s(stamps) if self.worst_fault(sensor) is None else 0.0
+        longest_s = max(float(self._longest_s[j]), latest_s)
+        return 1.0 / longest_s if longest_s else float('inf')

@@ -1,4 +1,4 @@
-// Python module of the buffer of raw readings; see reading_buffer.py.
+// Python module of the buffer of raw readings; see window.py.
 
 #include "../../python.hpp"
 

@@ -94,20 +94,9 @@ class Diagnosis:
         return '; '.join([str(self.finding), *(f'therefore {f.fault}' for f in self.consequences)])
 
 
-@dataclass(frozen=True)
-class _Explained:
-    """Causes that follow from another cause."""
-
-    symptoms: frozenset[Cause]
-    """Reported as consequences."""
-    artefacts: frozenset[Cause] = frozenset()
-    """Not reported: in the presence of the cause, the statement of the finding is wrong."""
-
-
-def _explained(symptoms: str, artefacts: str = '') -> _Explained:
-    """Create an entry from the names of the causes, separated by spaces."""
-    return _Explained(*(frozenset(Cause[name] for name in names.split())
-                        for names in (symptoms, artefacts)))
+def _explained(symptoms: str, artefacts: str = '') -> tuple[set[Cause], set[Cause]]:
+    """Causes of symptoms and artefacts, from their names, separated by spaces."""
+    return {Cause[name] for name in symptoms.split()}, {Cause[name] for name in artefacts.split()}
 
 
 _UNUSABLE = 'NO_BACKGROUND NO_DETECTION MISSED_TARGETS CONSTANT'
@@ -115,7 +104,6 @@ _STAMP_SYMPTOMS = ('DUPLICATE_STAMPS BACKWARD_STAMPS TOO_FAR_AHEAD FRAMES_TOO_LO
                    'RATE_TOO_LOW RELEARNT_BACKGROUND ' + _UNUSABLE)
 _STAMP_ARTEFACTS = 'CLOCK_DIFFERS CLOCK_STEPPED DELAY_VARIES DELAYED LOST SPIKES STUCK'
 _WRONG_STAMPS = _explained(_STAMP_SYMPTOMS, _STAMP_ARTEFACTS)
-
 _EXPLAINED = {
     Cause.OVERLOADED: _explained('LOST DELAY_VARIES DELAYED REJECTED', 'CLOCK_STEPPED'),
     Cause.DAMAGED_RECORDING: _explained('UNDECODABLE NO_MESSAGES LOST', 'CLOCK_STEPPED'),
@@ -152,8 +140,8 @@ _EXPLAINED = {
     Cause.CONSTANT: _explained('NO_BACKGROUND NO_DETECTION MISSED_TARGETS'),
     Cause.NO_BACKGROUND: _explained('NO_DETECTION'),
 }
-"""What each cause explains."""
-
+"""{cause: (causes that follow from it and are reported as consequences, causes that are not
+reported because the statement of the finding is then wrong)}."""
 _NETWORK_WIDE = frozenset({
     Cause.OVERLOADED, Cause.DAMAGED_RECORDING, Cause.UNDECODABLE,
     Cause.FRAMES_TOO_LONG, Cause.REJECTED, Cause.NO_DETECTION})
@@ -164,8 +152,8 @@ their own subject."""
 def ranked(findings: Iterable[Finding]) -> list[Diagnosis]:
     """Attach each finding to the cause that explains it; serious diagnoses come first.
 
-    A further finding of the same cause and subject is a consequence of the first one. Findings that
-    are artefacts of another finding are omitted.
+    A further finding of the same cause and subject is a consequence of the first one. Artefacts of
+    another finding are omitted.
     """
     same_fault: dict[tuple[str, Cause], list[Finding]] = {}
     for finding in findings:
@@ -186,12 +174,11 @@ def ranked(findings: Iterable[Finding]) -> list[Diagnosis]:
 
 def _explains(a: Finding, b: Finding) -> bool:
     """Whether finding `a` explains finding `b`, as a consequence or as an artefact."""
-    explained = _EXPLAINED.get(a.cause)
-    return explained is not None and b.cause in explained.symptoms | explained.artefacts \
+    return any(b.cause in causes for causes in _EXPLAINED.get(a.cause, ())) \
         and (a.subject == b.subject or not _NETWORK_WIDE.isdisjoint({a.cause, b.cause}))
 
 
 def _is_artefact(finding: Finding, present: Iterable[Finding]) -> bool:
     """Whether a finding is an artefact of a `present` finding that is not an artefact itself."""
-    return any(_explains(f, finding) and finding.cause in _EXPLAINED[f.cause].artefacts
+    return any(_explains(f, finding) and finding.cause in _EXPLAINED[f.cause][1]
                and not _is_artefact(f, present) for f in present)

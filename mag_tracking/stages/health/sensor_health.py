@@ -1,7 +1,4 @@
-"""Health: detect faults in the readings of a sensor, and advise how to fix them.
-
-Readings are monitored without being changed or delayed. Memory is bounded by a window of readings.
-"""
+"""Health: detect faults in the readings of a sensor, and advise how to fix them."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -18,9 +15,8 @@ from mag_tracking.calibration.reading_faults import (
 )
 from mag_tracking.calibration.sensor_state import COARSE_FRACTION, MIN_CHANGES, smallest_steps
 from mag_tracking.quantities import occurrences
-from mag_tracking.stages.health.clocks import ClockSpan
+from mag_tracking.stages.health.clocks import ClockSpan, timestamp_finding
 from mag_tracking.stages.health.diagnosis import Cause, Finding
-from mag_tracking.stages.health.timestamps import timestamp_finding
 from mag_tracking.stages.health.window import median_field, quantiles, sample_noise_std
 from mag_tracking.units import NEVER, NS
 
@@ -53,7 +49,7 @@ noise; see `isolated_readings`."""
 
 
 class SensorHealth:
-    """Monitors the readings of one sensor.
+    """Monitors the readings of one sensor, in a window.
 
     Statistics are updated after every `update_interval` readings, before each query, and for each
     batch. The marks and repetitions of `faults` are not evaluated as readings.
@@ -67,11 +63,11 @@ class SensorHealth:
         self._buffered: list[tuple[int, FloatArray, int]] = []
         self._stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._received: IntArray = np.zeros(0, dtype=np.int64)
+        self._field_stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._raw_fields: FloatArray = np.zeros((0, 3))
-        # Latest reading; window of the readings without marks and repetitions, and its timestamps.
+        # Latest reading; window of the readings without marks and repetitions.
         self._latest: FloatArray = np.zeros((0, 3))
         self._fields: FloatArray = np.zeros((0, 3))
-        self._field_stamps: IntArray = np.zeros(0, dtype=np.int64)
         self._is_saturated: BoolArray = np.zeros(0, dtype=bool)
         self._interval_ns, self._jitter = float('nan'), float('inf')
         self._timestamp_fault: timestamps.TimestampFault | None = None
@@ -95,12 +91,9 @@ class SensorHealth:
 
     @property
     def counts(self) -> 'Counter[str]':
-        """Number of readings, and number of faults of each type.
-
-        The keys are `readings`, `lost`, `duplicates`, `backward timestamps`, `clock steps`,
-        `spikes`, `saturated`, `without any axis` and `stuck readings`; `x`, `y` and `z` count
-        missing axes.
-        """
+        """Numbers of `readings`, of missing axes (`x`, `y`, `z`), and of faults: `lost`,
+        `duplicates`, `backward timestamps`, `clock steps`, `spikes`, `saturated`, `without any
+        axis`, `stuck readings`."""
         self.update()
         return self._counts
 
@@ -115,8 +108,7 @@ class SensorHealth:
     def add_batch(self, stamps: IntArray, fields: FloatArray, received: IntArray) -> None:
         """Add at most `WINDOW` readings directly to the window, and update the statistics.
 
-        An unknown time of receipt is `NEVER`. The arrays may be modified afterwards. Readings that
-        `add` has buffered are not added first, so use either `add` or `add_batch`.
+        An unknown time of receipt is `NEVER`. Use either `add` or `add_batch`.
         """
         n, self._cache, self._delays = len(stamps), {}, None
         if not n:
@@ -141,7 +133,7 @@ class SensorHealth:
 
     def _check_timestamps(self, n: int) -> None:
         """Count the faults in the timestamps of the `n` latest readings."""
-        # The first interval starts at the preceding reading, if there is one.
+        # The first interval begins at the preceding reading, if there is one.
         intervals = np.diff(self._stamps[-n - 1:])
         self._counts['duplicates'] += int((intervals == 0).sum())
         self._counts['backward timestamps'] += int((intervals < 0).sum())
@@ -178,10 +170,8 @@ class SensorHealth:
                 / self._interval_ns
 
     def _are_gaps(self, intervals: IntArray) -> BoolArray:
-        """Whether readings are missing in each of the latest intervals [ns].
-
-        The adjacent intervals compensate for a timestamp that is only late.
-        """
+        """Whether readings are missing in each of the latest intervals [ns]; the adjacent ones
+        compensate for a timestamp that is only late."""
         n, dt = len(intervals), self._interval_ns
         nearby = np.concatenate([[dt], np.diff(self._stamps), [dt]])[-n - 2:]
         spans = nearby[:-2] + intervals + nearby[2:]
@@ -227,11 +217,8 @@ class SensorHealth:
 
     def _count_runs(self, is_repeated: BoolArray, unchanged_since: IntArray,
                     stamps: IntArray) -> None:
-        """Count repeated and changed readings.
-
-        `is_repeated` (n,) marks the readings that equal the previous reading. `unchanged_since`
-        (n,) [ns] is the start of the run of identical readings to which each reading belongs.
-        """
+        """Count repeated and changed readings; `unchanged_since` (n,) [ns] is the start of the run
+        of identical readings to which each reading belongs."""
         changed = np.flatnonzero(~is_repeated)
         if not len(changed):
             self._run_length += len(is_repeated)
@@ -266,10 +253,7 @@ class SensorHealth:
 
     @property
     def noise_std(self) -> FloatArray:
-        """Noise std (3,) [T]; NaN for a missing axis or too few readings.
-
-        It is computed from second differences, which suppress targets.
-        """
+        """Noise std (3,) [T], as by `sample_noise_std`."""
         return self._cached('noise', sample_noise_std)
 
     @property
@@ -288,8 +272,7 @@ class SensorHealth:
     def dead_axes(self) -> str:
         """Axes, such as 'xz', that did not change within the window although another axis changed.
 
-        For a sensor with coarse resolution, these are axes that have never changed although another
-        axis changed by more than `MIN_MOVED_STEPS` quantisation steps.
+        With coarse resolution, they have never changed, and the other one by `MIN_MOVED_STEPS`.
         """
         self.update()
         if len(self._fields) < WINDOW:
@@ -323,16 +306,14 @@ class SensorHealth:
                  max_field: float = 1e-3, is_live: bool = True) -> list[Finding]:
         """Faults of the sensor `name`, without ranking.
 
-        `noise_std` (3,) [T] is that of the calibration; readings above `max_field` [T] are
-        rejected. The timestamps of a replay (not `is_live`) may be old or repeat, so clocks are not
-        checked.
+        `noise_std` (3,) [T] is that of the calibration. The timestamps of a replay (not `is_live`)
+        may be old or repeat, so clocks are not checked.
         """
         n = self.counts['readings']
         if not n:
             return [Finding(True, name, 'no reading', 'check its cable, its driver and the topic '
                             'in the network file', Cause.NO_MESSAGES)]
-        found = [*(self._clock_findings(name) if is_live else ()),
-                 *self._time_findings(name, n), *self._value_findings(name, n, max_field)]
+        found = [*self._time_findings(name, n, is_live), *self._value_findings(name, n, max_field)]
         if noise_std is not None and not np.nanmax(np.abs(self.field), initial=0.0) > max_field:
             noise_ratio = self.noise_std / noise_std
             if np.nanmax(noise_ratio, initial=0.0) > 3.0:
@@ -343,22 +324,19 @@ class SensorHealth:
                                      Cause.NOISY))
         return found
 
-    def _clock_findings(self, name: str) -> Iterator[Finding]:
-        """Yield findings about clock steps and backward timestamps."""
-        if n := self.counts['clock steps']:
-            yield Finding(True, name, f'its clock stepped {occurrences(n)} relative to the '
-                          f'host, by up to {self._largest_step_s:+.2f} s', 'synchronise the '
+    def _time_findings(self, name: str, n: int, is_live: bool) -> Iterator[Finding]:
+        """Yield findings about timestamps, lost readings and delays."""
+        c, (median, low, high) = self.counts, self.delay_s
+        if c['clock steps'] and is_live:
+            yield Finding(True, name, f'its clock stepped {occurrences(c["clock steps"])} relative '
+                          f'to the host, by up to {self._largest_step_s:+.2f} s', 'synchronise the '
                           'clocks (chrony, PTP), and take timestamps from a monotonic clock',
                           Cause.CLOCK_STEPPED)
-        if n := self.counts['backward timestamps']:
-            yield Finding(True, name, f'timestamps went back {occurrences(n)}', 'check for two '
-                          'publishers on one topic, a clock that was set, or a looped replay',
+        if c['backward timestamps'] and is_live:
+            yield Finding(True, name, 'timestamps went back '
+                          f'{occurrences(c["backward timestamps"])}', 'check for two publishers on '
+                          'one topic, a clock that was set, or a looped replay',
                           Cause.BACKWARD_STAMPS)
-
-    def _time_findings(self, name: str, n: int) -> Iterator[Finding]:
-        """Yield findings about duplicate timestamps, lost readings and delays."""
-        c = self.counts
-        median, low, high = self.delay_s
         if self._timestamp_fault is not None:
             yield timestamp_finding(name, self._timestamp_fault)
         if c['duplicates'] > 0.001 * n:

@@ -6,15 +6,45 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.calibration.sensor_state import smallest_steps
+from mag_tracking.records import plain
+from mag_tracking.stages.health import core
+
+
+class ReadingBuffer:
+    """Buffer for at most `capacity` raw readings of each of `n` sensors, in order of arrival."""
+
+    def __init__(self, n: int, capacity: int) -> None:
+        self._count = np.zeros(n, dtype=np.int64)
+        self._stamp, self._received = np.zeros((2, n, capacity), dtype=np.int64)
+        self._field = np.zeros((n, capacity, 3))
+
+    def add(self, rows: IntArray, stamps: IntArray, fields: FloatArray, received_ns: int,
+            first: int) -> int:
+        """Add readings from index `first` until a buffer is full; return the next index.
+
+        Readings with a negative index in `rows`, that of the sensor, are skipped.
+        """
+        return core.add_readings(plain(rows, np.int64), plain(stamps, np.int64), plain(fields),
+                                 received_ns, first, self._count, self._stamp, self._received,
+                                 self._field)
+
+    def pop(self, j: int) -> tuple[IntArray, FloatArray, IntArray]:
+        """Remove and return the timestamps, fields and times of receipt of sensor `j`: views, which
+        the next readings of the sensor overwrite."""
+        out = self.peek(j)
+        self._count[j] = 0
+        return out
+
+    def peek(self, j: int) -> tuple[IntArray, FloatArray, IntArray]:
+        """Return the readings of a sensor, as `pop`, and keep them in the buffer."""
+        k = int(self._count[j])
+        return self._stamp[j, :k], self._field[j, :k], self._received[j, :k]
 
 
 def quantiles(values: Sequence[float] | FloatArray | IntArray,
               *probabilities: float) -> list[float]:
-    """Quantiles of finite values, by linear interpolation; NaN if `values` is empty.
-
-    This is `numpy.quantile` without its checks, which take longer than the computation for small
-    arrays.
-    """
+    """Quantiles of finite values, as `numpy.quantile` but without its slow checks; NaN if there are
+    no values."""
     if not len(values):
         return [float('nan')] * len(probabilities)
     ordered, out = np.sort(values), []
@@ -34,9 +64,8 @@ def median_field(fields: FloatArray) -> FloatArray:
 def sample_noise_std(fields: FloatArray) -> FloatArray:
     """Noise std (3,) of each axis of `fields` (n, 3), from second differences without outliers.
 
-    Second differences suppress a passing target, whose field has a slope but hardly any curvature
-    from one reading to the next. The result is at least the quantisation error, and NaN for an axis
-    with fewer than eight second differences.
+    They suppress a passing target, whose field has hardly any curvature from one reading to the
+    next. The result is at least the quantisation error; NaN for fewer than eight differences.
     """
     out, steps = np.full(3, np.nan), smallest_steps(fields)
     for axis, d in enumerate(np.abs(np.diff(fields, n=2, axis=0)).T):

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from mag_tracking.settings import replace
 from mag_tracking.stages.align import stage as align_stage
-from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
+from mag_tracking.stages.settings import AlignSettings
 from mag_tracking.stages.stage import rejected
 from support.counters import assert_counts, count_of
 from support.disordered_samples import C, disorder

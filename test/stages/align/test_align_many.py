@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from mag_tracking.records import Readings
 from mag_tracking.settings import replace
 from mag_tracking.stages.align import core
-from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
+from mag_tracking.stages.settings import AlignSettings
 from support.disordered_samples import disorder
 from support.networks import line_network
 from support.samples import batch, one

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mag_tracking.settings import replace
-from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import MAX_HELD, Align
+from mag_tracking.stages.settings import AlignSettings
 from mag_tracking.stages.stage import rejected
 from support.clock_steps import sample, stream, wild, with_clock_step
 from support.counters import assert_counts, count_of

@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 
 from mag_tracking.errors import SettingsError
-from mag_tracking.stages.align.frame_period import (
-    frame_period,
-    frame_period_warning,
-    shortest_delay,
-)
-from mag_tracking.stages.align.settings import AlignSettings
+from mag_tracking.stages.align.stage import frame_period, frame_period_warning, shortest_delay
+from mag_tracking.stages.settings import AlignSettings
 from support.passes import ROAD, network_of
 
 AUTO = AlignSettings()

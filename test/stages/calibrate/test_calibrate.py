@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from mag_tracking.errors import NetworkError
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
-from mag_tracking.stages.calibrate.stage import OVERRULED, Calibrate
+from mag_tracking.stages.calibrate.output_buffer import OVERRULED
+from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.settings import CalibrateSettings
 from mag_tracking.stages.stage import rejected
 from support.calibration_runs import EARTH, SIGMA, feed, running, sample, stage
 from support.counters import assert_counts, count_of

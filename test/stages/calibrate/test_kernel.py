@@ -8,8 +8,9 @@ import pytest
 from mag_tracking.calibration import core
 from mag_tracking.records import Readings
 from mag_tracking.stages.calibrate import stage as calibrate
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
-from mag_tracking.stages.calibrate.stage import OVERRULED, Calibrate
+from mag_tracking.stages.calibrate.output_buffer import OVERRULED
+from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.settings import CalibrateSettings
 from support.counters import count_of
 from support.faulty_streams import FAULTS, stream
 from support.networks import line_network

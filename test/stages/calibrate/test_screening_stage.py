@@ -8,8 +8,8 @@ import pytest
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.settings import replace
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.settings import CalibrateSettings
 from mag_tracking.stages.stage import rejected
 from support.bundled import VEHICLES, vehicle_path
 from support.counters import assert_counts

@@ -14,13 +14,11 @@ from mag_tracking.inference.detection_theory import (
 )
 from mag_tracking.records import Detection, FieldFrame
 from mag_tracking.settings import replace
-from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.calibrate import stage as calibrate_stage
-from mag_tracking.stages.calibrate.settings import CalibrateSettings
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.detect.settings import DetectSettings
 from mag_tracking.stages.detect.stage import Detect
+from mag_tracking.stages.settings import AlignSettings, CalibrateSettings, DetectSettings
 from support.counters import count_of
 from support.marks import studied
 from support.networks import line_network

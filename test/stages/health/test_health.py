@@ -14,9 +14,8 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.run import RecordingSource
 from mag_tracking.stages.health.diagnosis import ranked
-from mag_tracking.stages.health.reading_buffer import ReadingBuffer
 from mag_tracking.stages.health.sensor_health import WINDOW, SensorHealth
-from mag_tracking.stages.health.window import quantiles
+from mag_tracking.stages.health.window import ReadingBuffer, quantiles
 from support.bundled import DATA, NETWORK_FILE, VEHICLES, vehicle_path
 from support.networks import line_network
 from support.samples import MagSample, one, sample_dict

@@ -5,10 +5,14 @@ import pytest
 
 from mag_tracking.calibration.doubtful_times import are_doubtful
 from mag_tracking.calibration.timestamps import MAX_ERROR_S, TimestampError, timestamp_fault
-from mag_tracking.stages.health.clocks import ClockSpan, clock_findings
+from mag_tracking.stages.health.clocks import (
+    ClockSpan,
+    TimestampMonitor,
+    clock_findings,
+    timestamp_finding,
+)
 from mag_tracking.stages.health.diagnosis import Cause
 from mag_tracking.stages.health.sensor_health import SensorHealth
-from mag_tracking.stages.health.timestamps import TimestampMonitor, timestamp_finding
 from mag_tracking.units import NEVER, NS
 from support.spoilt_stamps import (
     EPOCH_NS,
