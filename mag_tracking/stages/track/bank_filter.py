@@ -14,9 +14,9 @@ from mag_tracking.physics.vehicles import MAX_TURN_RATE, RowVehicle
 from mag_tracking.records import FieldFrame, plain
 from mag_tracking.stages.track import core
 from mag_tracking.stages.track.initiation_magnet import NEAR_FIELD_LENGTH
+from mag_tracking.stages.track.initiation_vehicle import MAX_CAR_ROW
 from mag_tracking.stages.track.observation import TIME_RESOLUTION_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.stages.track.unobserved_length import MAX_CAR_ROW
 
 LINEAR_FRACTION = 0.25
 """Displacement over which the field is approximately linear, as a fraction of the distance to the

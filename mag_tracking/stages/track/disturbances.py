@@ -1,4 +1,4 @@
-"""Disturbances: fields that start a track, but that no target explains."""
+"""Disturbances: smooth fields that start a track, but that no target explains."""
 
 from dataclasses import dataclass, replace
 
@@ -8,10 +8,32 @@ from scipy.special import chdtri
 from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.event_records import Disturbance
 from mag_tracking.inference.axes import whitened_energy
+from mag_tracking.inference.filter_bank import log_sum_exp
+from mag_tracking.inference.gauss_markov import GaussMarkovVectors
+from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 
 FALSE_ALARM_PROBABILITY = 1e-6
 """Probability that the noise of a sensor alone marks it as affected in a frame."""
+
+GRADIENT_RATIO = 0.3
+"""Prior standard deviation of the change of a common field from the centre of the network to its
+edge, relative to the standard deviation of the field."""
+
+MIN_STD = 1e-15
+"""Minimum standard deviation of the noise of a sensor [T]. Network files with less noise are
+rejected."""
+
+UNKNOWN_FIELD_STD = 1e-4
+"""Prior standard deviation of the field after a handover [T]."""
+
+MIN_GRADIENT_SENSORS = 3
+"""Minimum number of sensors for which the common field has a gradient. With fewer sensors, a
+gradient could explain any readings."""
+
+MAX_COMMON_SENSORS = 8
+"""Maximum number of sensors in the model of a common field. The cost of the model grows with the
+cube of this number."""
 
 
 @dataclass(frozen=True)
@@ -84,3 +106,98 @@ def field_magnitudes(frame: FieldFrame) -> FloatArray:
     """Magnitude (n_sensors,) of the field of a frame, T; 0 if the reading is missing."""
     magnitude: FloatArray = np.sqrt(np.nansum(np.square(frame.field), axis=1))
     return magnitude
+
+
+class DisturbanceModel:
+    """Models of smooth fields without a target, as the alternative explanation of a track.
+
+    `background_std` is in T. A model starts with zero field at the first frame of a track, but with
+    an unknown field if it starts during the track (`is_handover`).
+    """
+
+    def __init__(self, network: SensorNetwork, background_std: float,
+                 is_handover: bool = False) -> None:
+        n = len(network)
+        self._background_std, self._is_handover = background_std, is_handover
+        self._sensor, self._own_H = np.repeat(np.arange(n), 3), np.tile(np.eye(3), (n, 1))
+        # The common field covers the first sensors; the others have independent fields.
+        covered = np.arange(min(n, MAX_COMMON_SENSORS))
+        self._common_H = _common_field_matrix(
+            network.part(covered) if n > len(covered) else network)
+        self._filters: tuple[GaussMarkovVectors, GaussMarkovVectors, GaussMarkovVectors] | None \
+            = None
+        # Log-weights of independent fields and of a common field.
+        self._log_w = np.log([0.5, 0.5])
+
+    @property
+    def uniform(self) -> float:
+        """Probability of a common field over the network, given that there is no target."""
+        return float(np.exp(self._log_w[1]))
+
+    def log_density(self, frame: FieldFrame, dt: float, model_error: FloatArray) -> float | None:
+        """Update the models with a frame; return its log-density given the previous frames.
+
+        `model_error` (n_sensors,) [T²] is the variance per axis that the tracker assumes. The
+        result is None for the first frame with readings after a handover, and 0 before the first
+        reading.
+        """
+        is_present = np.isfinite(frame.field.ravel())
+        noise = np.einsum('jii->ji', frame.covariance)
+        variance = np.maximum(noise + model_error[:, None], MIN_STD**2).ravel()[is_present]
+        y = frame.field.ravel()[is_present]
+        is_first = self._filters is None and self._is_handover
+        if self._filters is None:
+            if not len(y):
+                return 0.0
+            self._initialise(float(np.median(noise.ravel()[is_present])))
+        assert self._filters is not None
+        covered, remaining, common = self._filters
+        sensor, H = self._sensor[is_present], self._own_H[is_present]
+        k = int(np.searchsorted(sensor, MAX_COMMON_SENSORS))
+        remaining_density = remaining.log_density(
+            sensor[k:] - MAX_COMMON_SENSORS, H[k:], y[k:], variance[k:], dt)
+        log_joint = self._log_w + remaining_density + [
+            covered.log_density(sensor[:k], H[:k], y[:k], variance[:k], dt),
+            common.log_density(np.zeros(k, dtype=np.int64),
+                               self._common_H[is_present[:len(self._common_H)]], y[:k],
+                               variance[:k], dt)]
+        evidence = float(log_sum_exp(log_joint))
+        self._log_w = log_joint - evidence
+        return None if is_first else evidence
+
+    def _initialise(self, noise: float) -> None:
+        """Initialise the filters; `noise` [T²] is the median noise variance of the first frame."""
+        scale = np.sqrt(self._background_std**2 + noise)
+        n = len(self._sensor) // 3
+        n_covered = min(n, MAX_COMMON_SENSORS)
+        n_field = self._common_H.shape[1] - 3 * n_covered
+        std = UNKNOWN_FIELD_STD if self._is_handover else self._background_std
+        # The backgrounds follow the field in the state, and do not drift.
+        scales = scale * np.concatenate([np.ones(3), np.full(n_field - 3, GRADIENT_RATIO),
+                                         np.zeros(3 * n_covered)])
+        scale_per_axis = np.full(3, scale)
+        self._filters = (GaussMarkovVectors(n_covered, scale_per_axis, std),
+                         GaussMarkovVectors(n - n_covered, scale_per_axis, std),
+                         GaussMarkovVectors(1, scales, std))
+
+
+def _common_field_matrix(network: SensorNetwork) -> FloatArray:
+    """Matrix (3 n_sensors, m) that maps a common field and the backgrounds to the sensor axes.
+
+    The field is uniform and, with at least `MIN_GRADIENT_SENSORS` sensors, has a gradient. Without
+    sources inside the network, the gradient is symmetric and traceless. Its five parameters are the
+    changes of the field [T] from the centre of the network to its edge.
+    """
+    n, R_sw = len(network), network.R_sw
+    field = np.tile(np.eye(3), (n, 1, 1))
+    if n >= MIN_GRADIENT_SENSORS:
+        offsets = network.positions - network.centre
+        radius = np.linalg.norm(offsets, axis=1).max()
+        x, y, z = (offsets / (radius or 1.0)).T
+        zero = np.zeros(n)
+        # Columns: Gxx, Gyy, Gxy, Gxz, Gyz; Gzz = -Gxx - Gyy.
+        gradient = np.stack([np.stack([x, zero, y, z, zero], axis=1),
+                             np.stack([zero, y, x, zero, z], axis=1),
+                             np.stack([-z, -z, zero, x, y], axis=1)], axis=1)
+        field = np.concatenate([field, gradient], axis=2)
+    return np.hstack([(R_sw @ field).reshape(3 * n, -1), np.eye(3 * n)])

@@ -11,8 +11,8 @@ from mag_tracking.inference.innovation_consistency import InnovationConsistency
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.approach import Approach
 from mag_tracking.stages.track.disturbances import field_magnitudes
+from mag_tracking.stages.track.plausibility import Approach
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 

@@ -19,6 +19,9 @@ from mag_tracking.settings import USER, param
 REFERENCE_FIELD = 5e-5
 """Field for which `VehicleSettings.induced_share` is defined [T]."""
 
+MAX_CAR_ROW = 4.0
+"""[m] Maximum length of the row of dipoles of a car. The iron of longer vehicles extends beyond the
+row."""
 LATERAL_STD = 1.5
 """[m] Standard deviation of the lateral distance from a starting line."""
 ALONG_STD = 3.0

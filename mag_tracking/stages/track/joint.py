@@ -1,14 +1,47 @@
-"""Joint explanation of the latest frames of a track by several vehicles."""
+"""Other explanations of the latest frames: when to search for them, and which to accept."""
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtrc
 
 from mag_tracking.arrays import FloatArray
+from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
+from mag_tracking.inference.sliding_sum import SlidingSum
+from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, field_energies
 from mag_tracking.stages.track.relinearisation import Window
+from mag_tracking.units import NS
+
+NEGLIGIBLE_ENERGY, WEAK_ENERGY = 0.1, 1.0
+"""Squared norm of the whitened field per frame below which a target that moves away is removed
+from a joint track. The larger limit applies if the track has the maximum number of targets. Up to
+the larger limit, the field of a target does not disturb other targets."""
+
+DETECTABLE_ENERGY = 4.0
+"""Minimum squared norm of the whitened field of a detectable target. For a tracked vehicle, it
+applies to the last frame. For a new vehicle, it applies to the sum over a window at each sensor.
+For a path in a search, it applies to the energy in the window that the prior of the moments
+predicts."""
+
+FALSE_ALARM_PROBABILITY = 1e-3
+"""Probability per test that noise alone triggers a comparison with other explanations."""
+
+WINDOW_S, MIN_INTERVAL_S = 0.25, 0.15
+"""Duration of the tested frames, and minimum interval between any comparison and the next one that
+improbable innovations trigger [s]."""
+
+LONG_INTERVAL_S, INTERVAL_GROWTH = 0.3, 1.5
+"""Interval after which a long vehicle is compared with two vehicles [s], and factor by which this
+interval grows with each comparison."""
+
+ACCEPT_NATS, REPEATED_NATS, UNDECIDED_NATS = 10.0, 5.0, -5.0
+"""Minimum log-odds of another explanation [nats]: to be accepted at once, to be accepted in two
+successive comparisons, and to mark the track as doubtful if it is not accepted."""
+
+IMPROBABLE, LONG_VEHICLE = 'improbable innovations', 'a long vehicle'
+"""Reasons to compare a track with other explanations."""
 
 CONFIDENT_NATS = 15.0
 """Log-odds below which an explanation is marked as doubtful for a limited time [nats]. The limit is
@@ -30,6 +63,85 @@ OVERTAKING_RATIO = 1.8
 MIN_MOVING_SPEED = 1.0
 """Minimum speed of vehicles whose directions are compared [m/s]. The heading of slower vehicles is
 unknown."""
+
+
+def field_energies(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame
+                ) -> FloatArray:
+    """Squared norm (n_sensors,) of the whitened field of a target of `state` (n_x,) at each
+    sensor."""
+    field = bank_filter.observation.field_of(state, [target], np.zeros(len(frame.field)))
+    return whitened_energy(np.where(np.isnan(frame.field), np.nan, field), frame.covariance)[0]
+
+
+def field_energy(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame
+                 ) -> float:
+    """Squared norm of the whitened field of a target of `state` (n_x,), summed over all sensors."""
+    return float(field_energies(bank_filter, target, state, frame).sum())
+
+
+def first_weak_frame(bank_filter: BankFilter, target: int, window: Window | None, origin: int
+                     ) -> int:
+    """Index in the window of the frame after the last one in which the energy of a target exceeds
+    `WEAK_ENERGY`; 0 without a window, or if it never does.
+
+    `origin` selects the hypothesis whose path is used.
+    """
+    if window is None:
+        return 0
+    row = int(np.searchsorted(window.anchor.origin, origin))
+    are_strong = [field_energy(bank_filter, target, path[row], frame) > WEAK_ENERGY
+                  for path, frame in zip(window.paths, window.frames, strict=True)]
+    return max((k for k, is_strong in enumerate(are_strong) if is_strong), default=-1) + 1
+
+
+class NewTargetEvidence:
+    """Decides when to compare a track with other explanations, and whether to accept one.
+
+    A comparison is due when the latest innovations are improbable. A model of one long vehicle may
+    explain two short vehicles without improbable innovations. A track of a long vehicle is
+    therefore also compared at intervals.
+    """
+
+    def __init__(self) -> None:
+        self._latest = SlidingSum(WINDOW_S)
+        self._last_comparison_ns: int | None = None
+        self._was_probable = False
+        self._was_rejected = self._is_long = False
+        self._long_interval_s = LONG_INTERVAL_S
+
+    def add(self, nis: float, degrees_of_freedom: int, stamp_ns: int, rejected: bool,
+            is_long: bool) -> None:
+        """Add a frame with its normalised innovation squared `nis`.
+
+        One `rejected` sensor of two triggers a comparison like improbable innovations do. With more
+        sensors, the majority shows that the rejected sensor is faulty. `is_long` refers to the best
+        hypothesis.
+        """
+        self._latest.add(stamp_ns, [nis, degrees_of_freedom])
+        self._was_rejected, self._is_long = rejected, is_long
+
+    def due(self, stamp_ns: int) -> str | None:
+        """Return `IMPROBABLE` or `LONG_VEHICLE` if a comparison is due, and restart the interval;
+        else None."""
+        total, freedom = self._latest.total
+        elapsed_s = np.inf if self._last_comparison_ns is None \
+            else (stamp_ns - self._last_comparison_ns) / NS
+        reason = None
+        if self._was_rejected or chdtrc(max(freedom, 1.0), total) <= FALSE_ALARM_PROBABILITY:
+            reason = IMPROBABLE if elapsed_s >= MIN_INTERVAL_S else None
+        elif self._is_long and elapsed_s >= self._long_interval_s:
+            reason = LONG_VEHICLE
+            self._long_interval_s *= INTERVAL_GROWTH
+        if reason is not None:
+            self._last_comparison_ns = stamp_ns
+        return reason
+
+    def accepts(self, log_odds: float) -> bool:
+        """Record a comparison, and return whether the other explanation, with its log-odds [nats]
+        against the track, is accepted: immediately, or in two successive comparisons."""
+        accepts = log_odds > ACCEPT_NATS or self._was_probable and log_odds > REPEATED_NATS
+        self._was_probable = log_odds > REPEATED_NATS and not accepts
+        return accepts
 
 
 @dataclass(frozen=True)

@@ -16,15 +16,14 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.bank_size import sensors_at_start
-from mag_tracking.stages.track.clock_comparison import ClockComparison
+from mag_tracking.stages.track.cross_check import ClockComparison
 from mag_tracking.stages.track.disturbances import Disturbances
-from mag_tracking.stages.track.low_rate import SampleRates
 from mag_tracking.stages.track.observation import MAX_ROTATION
+from mag_tracking.stages.track.plausibility import SampleRates
 from mag_tracking.stages.track.running_track import RunningTrack, TrackRecord
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.stages.track.target import target_of
+from mag_tracking.stages.track.target import sensors_at_start, target_of
 from mag_tracking.units import NS
 
 NO_SCALE = 'detections not tracked (scale not observable with one sensor)'

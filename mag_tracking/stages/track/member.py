@@ -12,8 +12,7 @@ from mag_tracking.physics.bounds import impossible_reason
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.clock_comparison import ClockComparison
-from mag_tracking.stages.track.cross_check import CrossCheck
+from mag_tracking.stages.track.cross_check import ClockComparison, CrossCheck
 from mag_tracking.stages.track.disturbances import UnexplainedField
 from mag_tracking.stages.track.evidence import LOST, TrackEvidence
 from mag_tracking.stages.track.joint import JointExplanation

@@ -18,17 +18,21 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.initiation_vehicle import TURN_SHARE, moment_directions
-from mag_tracking.stages.track.joint import JointExplanation, are_sensed_by_two
-from mag_tracking.stages.track.new_target_evidence import IMPROBABLE
-from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, field_energy
+from mag_tracking.stages.track.joint import (
+    DETECTABLE_ENERGY,
+    IMPROBABLE,
+    JointExplanation,
+    are_sensed_by_two,
+    field_energy,
+)
 from mag_tracking.stages.track.relinearisation import Window
-from mag_tracking.stages.track.vehicle_state import VehicleState
-from mag_tracking.stages.track.window_search import WindowSearch
-from mag_tracking.stages.track.window_start import (
+from mag_tracking.stages.track.steady_search import in_order_of
+from mag_tracking.stages.track.window_search import (
     DEPTH_STD,
     KnownVehicleHypothesis,
+    VehicleState,
+    WindowSearch,
     WindowStart,
-    in_order_of,
     inserted,
     labels_of,
     overlap_depth,

@@ -1,14 +1,19 @@
-"""Plausibility of the state of a vehicle: mounting, height, road and speed."""
+"""Plausibility of a vehicle: its approach, its states, and the rate of its readings."""
 
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-from mag_tracking.arrays import BoolArray, FloatArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration.growth import growth_of
+from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
+from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.initiation_vehicle import LATERAL_STD, VehicleSettings
 from mag_tracking.stages.track.observation import Observation
+from mag_tracking.stages.track.settings import TrackSettings
+from mag_tracking.units import NEVER, NS
 
 P_MOUNTING = 0.05
 """Probability that the estimated mounting angles of correctly mounted sensors are flagged."""
@@ -33,6 +38,38 @@ MAX_RELATIVE_MOVE = 0.75
 """Maximum motion of a target within a frame, relative to its distance to the second nearest sensor.
 Fields are averaged over the frame, with a relative error of about half the square of this ratio.
 The nearest sensor is ignored, because the error of a single sensor does not mislead a track."""
+
+SENSED_LEVEL = 2.5
+"""RMS of the whitened field above which the target counts as sensed."""
+
+GROWTH_RATIO = 10.0
+"""Ratio of the highest to the lowest field level in the test; the lowest level is
+`SENSED_LEVEL`."""
+
+MIN_LOG2_RATIO = -0.25
+"""Minimum log2 ratio of the durations of the first and the second half of the growth. The
+theoretical value is 0.55 for a target that approaches at constant speed, and -0.83 for a target
+that starts from rest next to a sensor. The value of a sudden jump of the field is near 0."""
+
+FALL_FRACTION = 0.85
+"""If the field falls below this fraction of its previous maximum while the target is sensed, the
+target has passed its first sensor, and the test passes."""
+
+LEVEL_TIME_STD = 0.5
+"""Uncertainty of the time at which the field reached a level, in frame periods."""
+
+MAX_FRAMES = 1000
+"""The test is skipped if the field has not grown by `GROWTH_RATIO` within this number of frames."""
+
+N_INTERVALS = 8
+"""Number of latest intervals of a sensor that determine its rate. A sensor is slow if most of them
+are too long, so that single lost readings do not matter."""
+
+MIN_INTERVALS = 2
+"""Minimum number of intervals that are too long for a sensor to be slow."""
+
+N_PATHS = 41
+"""Number of paths between the outermost lanes that are compared."""
 
 
 class Plausibility:
@@ -149,3 +186,118 @@ def _needs_rotated_sensors(observation: Observation, x: FloatArray, mounting_std
     variance = np.einsum('jii->ji', observation.own_covariance[:, :3, :3])
     squared_norm = float((angles**2 / np.maximum(variance, mounting_std**2)).sum())
     return bool(squared_norm > chdtri(angles.size, P_MOUNTING))
+
+
+class Approach:
+    """Approach test on the first frames of a track, until the field has grown by `GROWTH_RATIO`."""
+
+    def __init__(self) -> None:
+        self._times: list[float] = []
+        self._levels: list[float] = []
+        self._is_open = True
+
+    def add(self, frame: FieldFrame) -> bool:
+        """Add a frame, and return whether it completes the test and the test fails."""
+        if not self._is_open:
+            return False
+        self._times.append(frame.stamp_ns / NS)
+        energy, n_axes = whitened_energy(frame.field, frame.covariance)
+        # The RMS of pure noise is 1; smaller values carry no information.
+        self._levels.append(float(np.sqrt(max(energy.sum() / max(n_axes.sum(), 1), 1.0))))
+        self._is_open = self._levels[-1] <= GROWTH_RATIO * SENSED_LEVEL \
+            and len(self._levels) < MAX_FRAMES
+        return not self._is_open and self._is_doubtful()
+
+    def _is_doubtful(self) -> bool:
+        """Whether the field grows unlike the field of a target that approaches from afar."""
+        time, levels = np.array(self._times), np.array(self._levels)
+        growth = growth_of(time, levels, SENSED_LEVEL, GROWTH_RATIO * SENSED_LEVEL)
+        # If the field falls before it reaches the highest level, the target has passed its first
+        # sensor.
+        is_falling = levels < FALL_FRACTION * np.maximum.accumulate(levels)
+        if growth is None or (is_falling & (levels > SENSED_LEVEL)).any():
+            return False
+        std = LEVEL_TIME_STD * float(np.median(np.diff(time)))
+        return bool(np.log2((growth.early + std) / (growth.late + std)) < MIN_LOG2_RATIO)
+
+
+def typical_speed(settings: TrackSettings) -> float:
+    """Median of the initial speeds of a vehicle, m/s."""
+    return float(np.median(settings.vehicle.speeds))
+
+
+def required_rate(network: SensorNetwork, settings: TrackSettings) -> float:
+    """Minimum rate of readings that shows the pass of a vehicle, Hz; 0 for a magnet, which may be
+    at rest.
+
+    Between two readings, a vehicle at `typical_speed` must not move further than
+    `MAX_RELATIVE_MOVE` times its distance from the nearest sensor. The field of a pass at distance
+    d and speed v has little content above the frequency v / (2 d), because its spectrum decreases
+    like exp(-2 pi f d / v). The distance is that of the path between the outermost lanes that keeps
+    furthest from all sensors, and includes `LATERAL_STD`: a lower rate is too low in every lane.
+    """
+    if settings.target != 'vehicle':
+        return 0.0
+    vehicle = settings.vehicle
+    offsets = np.linspace(min(vehicle.lateral_offsets), max(vehicle.lateral_offsets), N_PATHS)
+    relative = network.positions - network.positions.mean(axis=0)
+    z = network.positions[:, 2] - min(kind.height for kind in vehicle.kinds)
+    distances = []
+    for heading in np.deg2rad(vehicle.arrival_headings_deg):
+        lateral = np.cos(heading) * relative[:, 1] - np.sin(heading) * relative[:, 0]
+        nearest = np.hypot(lateral - offsets[:, None], z).min(axis=1)
+        distances.append(np.hypot(nearest.max(), LATERAL_STD))
+    return typical_speed(settings) / (MAX_RELATIVE_MOVE * float(np.median(distances)))
+
+
+def low_rate_fault(rate: float, network: SensorNetwork, settings: TrackSettings) -> str | None:
+    """Message about a rate [Hz] that is too low for tracks; None if it suffices or is unknown
+    (NaN)."""
+    required = required_rate(network, settings)
+    if not rate < required:
+        return None
+    speed = typical_speed(settings)
+    return (f'{rate:.3g} Hz is too slow: a car moves {speed / rate:.3g} m between readings (at '
+            f'{speed:g} m/s); at least {np.ceil(10.0 * required) / 10.0:g} Hz are needed for '
+            'tracks')
+
+
+class SampleRates:
+    """Rates of the sensors, from the frames in which they have samples."""
+
+    def __init__(self, network: SensorNetwork, settings: TrackSettings) -> None:
+        required = required_rate(network, settings)
+        self._max_interval_s = 1.0 / required if required else np.inf
+        n = len(network)
+        self._last_ns: IntArray = np.full(n, NEVER, dtype=np.int64)
+        self._intervals_s: FloatArray = np.zeros((n, N_INTERVALS))
+        self._next = np.zeros(n, dtype=np.int64)
+        # Whether all stored intervals of all sensors are short; latest frame with all sensors.
+        self._are_short, self._complete_ns = False, NEVER
+
+    def add(self, frame: FieldFrame, first: int = 0) -> None:
+        """Update the rates with a frame whose first sensor has the index `first` in the network."""
+        is_complete = len(frame.n_samples) == len(self._last_ns) and bool(frame.n_samples.all())
+        interval_ns, self._complete_ns = frame.stamp_ns - self._complete_ns, \
+            frame.stamp_ns if is_complete else NEVER
+        if self._are_short and is_complete and 0 < interval_ns <= self._max_interval_s * NS:
+            # Another short interval of each sensor changes nothing.
+            self._last_ns[:] = frame.stamp_ns
+            return
+        measuring = np.flatnonzero(frame.n_samples)
+        rows = measuring + first
+        interval_s = (frame.stamp_ns - self._last_ns[rows]) / NS / frame.n_samples[measuring]
+        is_known = (self._last_ns[rows] != NEVER) & (interval_s > 0.0)
+        self._last_ns[rows] = frame.stamp_ns
+        rows, interval_s = rows[is_known], interval_s[is_known]
+        self._intervals_s[rows, self._next[rows] % N_INTERVALS] = interval_s
+        self._next[rows] += 1
+        self._are_short = bool((self._next >= N_INTERVALS).all()
+                               and (self._intervals_s <= self._max_interval_s).all())
+
+    def are_slow(self) -> BoolArray:
+        """Whether most of the latest intervals of each sensor are too long, (n_sensors,)."""
+        n_long = np.count_nonzero(self._intervals_s > self._max_interval_s, axis=1)
+        n_known = np.minimum(self._next, N_INTERVALS)
+        are_slow: BoolArray = (n_long >= MIN_INTERVALS) & (2 * n_long > n_known)
+        return are_slow

@@ -19,21 +19,25 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
-from mag_tracking.stages.track.clock_comparison import ClockComparison
-from mag_tracking.stages.track.disturbance_model import DisturbanceModel
-from mag_tracking.stages.track.disturbances import UnexplainedField
+from mag_tracking.stages.track.cross_check import ClockComparison
+from mag_tracking.stages.track.disturbances import DisturbanceModel, UnexplainedField
 from mag_tracking.stages.track.evidence import MIN_OBSERVED_FRACTION, OUT_OF_REACH
-from mag_tracking.stages.track.joint import JointExplanation
+from mag_tracking.stages.track.joint import (
+    NEGLIGIBLE_ENERGY,
+    UNDECIDED_NATS,
+    WEAK_ENERGY,
+    JointExplanation,
+    NewTargetEvidence,
+    field_energy,
+)
 from mag_tracking.stages.track.member import BankUpdate, Member, MemberView, members_in_order
-from mag_tracking.stages.track.new_target_evidence import UNDECIDED_NATS, NewTargetEvidence
 from mag_tracking.stages.track.new_target_search import NewTargetSearch
-from mag_tracking.stages.track.reach import NEGLIGIBLE_ENERGY, WEAK_ENERGY, field_energy
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.stages.track.target import Target
 from mag_tracking.stages.track.track_bank import FrameUpdate, TrackBank
-from mag_tracking.stages.track.vehicle_state import VehicleState
+from mag_tracking.stages.track.window_search import VehicleState
 from mag_tracking.units import NS
 
 UNDECIDED_S = 1.0

@@ -28,9 +28,8 @@ from mag_tracking.stages.track.initiation_vehicle import (
     SPEED_STD,
     VehicleSettings,
 )
+from mag_tracking.stages.track.joint import DETECTABLE_ENERGY
 from mag_tracking.stages.track.pass_samples import PassSamples
-from mag_tracking.stages.track.reach import DETECTABLE_ENERGY
-from mag_tracking.stages.track.window_start import in_order_of
 
 N_DIPOLES = 3
 """Number of dipoles of the rows in the search; sufficient for a car near a sensor."""
@@ -356,3 +355,9 @@ def _best_distinct(theta: FloatArray, cost: FloatArray, tolerance: FloatArray, n
     is_usable = np.isfinite(cost)
     paths: FloatArray = theta[is_usable]
     return paths[distinct(paths, cost[is_usable], tolerance, n_max)]
+
+
+def in_order_of(first: FloatArray, pair: FloatArray) -> FloatArray:
+    """Pair of paths (2, 7) in the order that matches another pair best, by distance."""
+    d = np.linalg.norm(pair[:, None, :2] - first[:, :2], axis=2)
+    return pair if d[0, 0] + d[1, 1] <= d[0, 1] + d[1, 0] else pair[::-1].copy()

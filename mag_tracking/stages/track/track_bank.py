@@ -11,13 +11,14 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.initial_bank import InitialBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.bank_size import MIN_WEIGHT, max_hypotheses, max_sensors
-from mag_tracking.stages.track.joint import JointExplanation
+from mag_tracking.stages.track.joint import JointExplanation, first_weak_frame
 from mag_tracking.stages.track.observation import Observation
-from mag_tracking.stages.track.reach import first_weak_frame
 from mag_tracking.stages.track.relinearisation import Relinearisation, Window
-from mag_tracking.stages.track.sensor_rejection import SensorRejection
-from mag_tracking.stages.track.sensor_selection import SensorSubset, exchange_sensor_states
+from mag_tracking.stages.track.sensor_selection import (
+    SensorRejection,
+    SensorSubset,
+    exchange_sensor_states,
+)
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import (
     NOT_SMOOTHED,
@@ -25,7 +26,7 @@ from mag_tracking.stages.track.smoothing import (
     TrackState,
     WholeTrack,
 )
-from mag_tracking.stages.track.target import Target
+from mag_tracking.stages.track.target import MIN_WEIGHT, Target, max_hypotheses, max_sensors
 from mag_tracking.units import NS
 
 PRUNE_RATIO = 1e-12

@@ -1,16 +1,34 @@
-"""Searches of a window for vehicles without a track: samples, path prior and start grid."""
+"""Searches of a window for vehicles without a track: samples, start hypotheses and their states."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from mag_tracking.arrays import FloatArray
+from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.geometry import overlap, rotation_about_z
+from mag_tracking.network import SensorNetwork
+from mag_tracking.physics.vehicles import RowVehicle
+from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.initiation_vehicle import (
+    START_TURN_RATIO,
+    VehicleSettings,
+    soft_iron,
+    starting_covariance,
+    vehicle_model,
+)
 from mag_tracking.stages.track.pass_samples import PassSamples
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.stages.track.steady_search import PathPrior, StartGrid, SteadySearch
-from mag_tracking.stages.track.vehicle_state import VehicleState
-from mag_tracking.stages.track.window_start import KnownVehicleHypothesis
 from mag_tracking.units import NS
+
+MIN_MOMENT = 1e-6
+"""[A m^2] Minimum magnitude of a moment at which its direction is defined."""
+
+OVERLAP_WIDTH, OVERHANG, DEPTH_STD = 1.5, 1.0, 1.0
+"""[m] Lateral distance below which two vehicles overlap, minimum longitudinal gap between their
+rows of dipoles, and standard deviation of the overlap depth due to uncertain paths."""
 
 MAX_SAMPLES = 320
 """Maximum number of samples of a search. Windows with more samples are decimated."""
@@ -18,6 +36,178 @@ MAX_SAMPLES = 320
 KNOWN_STD, KNOWN_MOMENT_RATIO = 0.7, 0.3
 """[m], [m/s] Standard deviation of the positions and velocities of tracked vehicles in a search,
 and relative standard deviation of their moments."""
+
+
+@dataclass(frozen=True)
+class VehicleState:
+    """Conversion of straight paths (`PATH` of `steady_pass`) to states of `RowVehicle`."""
+
+    settings: VehicleSettings
+    network: SensorNetwork
+    background_std: float
+    """[T] Standard deviation of each background."""
+
+    @cached_property
+    def _model(self) -> RowVehicle:
+        """Vehicle model of the settings."""
+        return vehicle_model(self.settings, self.network)
+
+    @property
+    def _n_dipoles(self) -> int:
+        """Number of dipoles of a vehicle."""
+        return self._model.n_dipoles
+
+    @property
+    def length_column(self) -> int | None:
+        """Column of the length in the state of a vehicle; None if all vehicles are points."""
+        return 9 + 3 * self._n_dipoles if self._n_dipoles > 1 else None
+
+    def prior(self, theta: FloatArray, moments: FloatArray, t: float, kind: int, label: int
+              ) -> tuple[FloatArray, FloatArray]:
+        """Mean (n_t,) and covariance (n_t, n_t) of a vehicle that arrives on a path `theta` (7,),
+        at time `t` [s] on it.
+
+        The mean lies on the path, and its moment has the estimated direction, that of `moments`
+        (k, 3) [A m², world frame]. All other values equal the prior at the start of a track.
+        """
+        s = self.settings
+        R = rotation_about_z(float(np.deg2rad(s.arrival_headings_deg[label])))
+        total = moments.sum(axis=0)
+        mean = s.kinds[kind].moment * total / max(float(np.linalg.norm(total)), MIN_MOMENT)
+        x = self.along(theta, mean[None], np.array([t]), kind)[0]
+        x[2], x[5] = s.kinds[kind].height, 0.0
+        if self._n_dipoles > 1:
+            x[9 + 3 * self._n_dipoles] = s.kinds[kind].length
+        return x, starting_covariance(s, kind, R, float(theta[3]), s.kinds[kind].moment_std)
+
+    def along(self, theta: FloatArray, moments: FloatArray, times: FloatArray, kind: int
+              ) -> FloatArray:
+        """States (n, n_t) at `times` [s] on a straight path `theta` (7,), for a row of dipoles with
+        `moments` (k, 3) from the tail to the head, A m², world frame."""
+        d, s, length = self._n_dipoles, self.settings, float(theta[6])
+        heading = float(theta[4])
+        R = rotation_about_z(heading)
+        soft_D = soft_iron(s, kind)
+        x = np.zeros((len(times), len(self._model.state_names)))
+        velocity = np.array([theta[3] * np.cos(heading), theta[3] * np.sin(heading), theta[5]])
+        x[:, :3], x[:, 3:6] = theta[:3] + times[:, None] * velocity, velocity
+        ordered = moments[::-1] if length < 0.0 else moments
+        is_point = s.kinds[kind].length_std == 0.0
+        dipole_moments = np.tile(moments.sum(axis=0) / d, (d, 1)) if is_point \
+            else _resampled(ordered, d)
+        induced = soft_D * self._model.field_strength
+        x[:, 6:6 + 3 * d] = (dipole_moments @ R - induced @ R / d).ravel()
+        x[:, 6 + 3 * d:9 + 3 * d] = soft_D
+        if d > 1:
+            x[:, 9 + 3 * d] = s.kinds[kind].length if is_point else abs(length)
+        return x
+
+    def hard_moments(self, x: FloatArray) -> FloatArray:
+        """Hard iron moments (d, 3) of the dipoles of a vehicle with state `x` (n_t,), A m², vehicle
+        frame."""
+        hard: FloatArray = x[6:6 + 3 * self._n_dipoles].reshape(-1, 3)
+        return hard
+
+    def turning(self, x: FloatArray, P: FloatArray, target: int) -> FloatArray | None:
+        """Return `P` with the turn-rate variance of one target set to its initial value; None if
+        turning is disabled.
+
+        The state `x` (n_x,) contains several targets.
+        """
+        if not self._model.turn_acceleration:
+            return None
+        n = len(self._model.state_names)
+        first, w = target * n, (target + 1) * n - 1
+        out = P.copy()
+        out[w, w] = START_TURN_RATIO**2 * self._model.turn_variance(
+            np.hypot(x[first + 3], x[first + 4]))
+        return out
+
+
+def _resampled(moments: FloatArray, d: int) -> FloatArray:
+    """Resample `moments` (k, 3) to `d` dipoles (d, 3); the total and the centroid are preserved."""
+    if len(moments) == 1 or d == 1:
+        return np.tile(moments.sum(axis=0) / d, (d, 1))
+    coordinates = np.linspace(0.0, d - 1.0, len(moments))
+    weights = np.maximum(1.0 - np.abs(coordinates - np.arange(d)[:, None]), 0.0)
+    resampled: FloatArray = weights @ moments
+    return resampled
+
+
+@dataclass(frozen=True)
+class PathHypothesis:
+    """A hypothesis of several vehicles, with the path along which it is linearised."""
+
+    x: FloatArray
+    """(n_x,) State at the start of the window."""
+    P: FloatArray
+    """(n_x, n_x) Covariance at the start of the window."""
+    path: FloatArray
+    """(n, n_x) States at the frames of the window."""
+    label: tuple[int, ...]
+    """Index of the arrival direction of each vehicle."""
+    kind: tuple[int, ...]
+    log_w: float
+
+
+@dataclass(frozen=True)
+class WindowStart(PathHypothesis):
+    """Hypothesis of known and new vehicles, at the start of a window."""
+
+    n_new: int
+    """Number of new vehicles, which are the last ones."""
+    replaced: int | None
+    """As in `JointExplanation`."""
+
+    @property
+    def new_indices(self) -> range:
+        """Indices of the new vehicles."""
+        return range(len(self.kind) - self.n_new, len(self.kind))
+
+
+@dataclass(frozen=True)
+class KnownVehicleHypothesis(PathHypothesis):
+    """Hypothesis of the known vehicles in a search for new vehicles."""
+
+    filter: BankFilter | None
+    """Filter for this number of vehicles; None if no vehicle is known."""
+
+
+def inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
+    """Covariance (n + k, n + k) with an independent `block` (k, k) inserted into `P` at row
+    `at`."""
+    n, k = len(P), len(block)
+    rows = np.append(np.arange(at), np.arange(at + k, n + k))
+    out = np.zeros((n + k, n + k))
+    out[rows[:, None], rows] = P
+    out[at:at + k, at:at + k] = block
+    return out
+
+
+def labels_of(labels: Sequence[tuple[int, ...]]) -> IntArray:
+    """Labels of each vehicle, for each hypothesis, in the shape required by `FilterBank`, (n,) or
+    (n, n_targets)."""
+    out = np.array(labels)
+    return out[:, 0].copy() if out.shape[1] == 1 else out
+
+
+def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length_column: int | None) -> float:
+    """Maximum depth by which any two vehicles overlap along a joint path (n, n_x), m.
+
+    Each vehicle has `n_one` states, with its length at `length_column`, which is None if all
+    vehicles are points.
+    """
+    x = path[:, :n_one * n_targets].reshape(len(path), n_targets, n_one)
+    depth = 0.0
+    for i in range(n_targets):
+        for k in range(i):
+            gap = OVERHANG + (0.0 if length_column is None else
+                              0.5 * (np.abs(x[:, i, length_column])
+                                     + np.abs(x[:, k, length_column])))
+            pair = x[:, [i, k]].swapaxes(0, 1)
+            depth = max(depth, float(overlap(
+                pair[:, :, :2], pair[:, :, 3:5], gap, OVERLAP_WIDTH).max()))
+    return depth
 
 
 class WindowSearch:
