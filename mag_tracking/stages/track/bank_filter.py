@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.sources import Magnet, SourceModel
@@ -26,6 +27,18 @@ SAME_TIME_FRACTION = 0.05
 """A frame whose samples span less than this fraction of the interval since the previous frame is
 treated as simultaneous. The first frame of a track is always treated as simultaneous, because
 differences between frames determine velocities better than differences within a frame."""
+
+
+NEGLIGIBLE_ENERGY, WEAK_ENERGY = 0.1, 1.0
+"""Squared norm of the whitened field per frame below which a target that moves away is removed
+from a joint track. The larger limit applies if the track has the maximum number of targets. Up to
+the larger limit, the field of a target does not disturb other targets."""
+
+DETECTABLE_ENERGY = 4.0
+"""Minimum squared norm of the whitened field of a detectable target. For a tracked vehicle, it
+applies to the last frame. For a new vehicle, it applies to the sum over a window at each sensor.
+For a path in a search, it applies to the energy in the window that the prior of the moments
+predicts."""
 
 
 class PathResult(NamedTuple):
@@ -222,6 +235,12 @@ class BankFilter:
         times of a frame, T, sensor frame."""
         others = [k for k in range(self.observation.n_targets) if k != target]
         return self.observation.field_of(bank.x[i], others, self.time_offset(frame, dt))
+
+    def field_energies(self, target: int, x: FloatArray, frame: FieldFrame) -> FloatArray:
+        """Squared norm (n_sensors,) of the whitened field of a target of a state `x` (n_x,) at each
+        sensor."""
+        field = self.observation.field_of(x, [target], self._zero_offset)
+        return whitened_energy(np.where(np.isnan(frame.field), np.nan, field), frame.covariance)[0]
 
     def _lengths(self, kind: IntArray) -> FloatArray:
         """Near-field length (n, n_targets) [m] of each target, from its kind."""

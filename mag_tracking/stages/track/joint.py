@@ -6,24 +6,11 @@ import numpy as np
 from scipy.special import chdtrc
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.inference.axes import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.sliding_sum import SlidingSum
-from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.bank_filter import DETECTABLE_ENERGY, BankFilter
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.units import NS
-
-NEGLIGIBLE_ENERGY, WEAK_ENERGY = 0.1, 1.0
-"""Squared norm of the whitened field per frame below which a target that moves away is removed
-from a joint track. The larger limit applies if the track has the maximum number of targets. Up to
-the larger limit, the field of a target does not disturb other targets."""
-
-DETECTABLE_ENERGY = 4.0
-"""Minimum squared norm of the whitened field of a detectable target. For a tracked vehicle, it
-applies to the last frame. For a new vehicle, it applies to the sum over a window at each sensor.
-For a path in a search, it applies to the energy in the window that the prior of the moments
-predicts."""
 
 FALSE_ALARM_PROBABILITY = 1e-3
 """Probability per test that noise alone triggers a comparison with other explanations."""
@@ -63,35 +50,6 @@ OVERTAKING_RATIO = 1.8
 MIN_MOVING_SPEED = 1.0
 """Minimum speed of vehicles whose directions are compared [m/s]. The heading of slower vehicles is
 unknown."""
-
-
-def field_energies(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame
-                ) -> FloatArray:
-    """Squared norm (n_sensors,) of the whitened field of a target of `state` (n_x,) at each
-    sensor."""
-    field = bank_filter.observation.field_of(state, [target], np.zeros(len(frame.field)))
-    return whitened_energy(np.where(np.isnan(frame.field), np.nan, field), frame.covariance)[0]
-
-
-def field_energy(bank_filter: BankFilter, target: int, state: FloatArray, frame: FieldFrame
-                 ) -> float:
-    """Squared norm of the whitened field of a target of `state` (n_x,), summed over all sensors."""
-    return float(field_energies(bank_filter, target, state, frame).sum())
-
-
-def first_weak_frame(bank_filter: BankFilter, target: int, window: Window | None, origin: int
-                     ) -> int:
-    """Index in the window of the frame after the last one in which the energy of a target exceeds
-    `WEAK_ENERGY`; 0 without a window, or if it never does.
-
-    `origin` selects the hypothesis whose path is used.
-    """
-    if window is None:
-        return 0
-    row = int(np.searchsorted(window.anchor.origin, origin))
-    are_strong = [field_energy(bank_filter, target, path[row], frame) > WEAK_ENERGY
-                  for path, frame in zip(window.paths, window.frames, strict=True)]
-    return max((k for k, is_strong in enumerate(are_strong) if is_strong), default=-1) + 1
 
 
 class NewTargetEvidence:
@@ -204,7 +162,7 @@ def are_sensed_by_two(joint: JointExplanation) -> bool:
     """
     n, best = joint.bank.label.shape[1], joint.bank.best()
     for i in range(n - (1 if joint.replaced is None else 2), n):
-        energy = sum(field_energies(joint.bank_filter, i, path[best], frame) for path, frame in
+        energy = sum(joint.bank_filter.field_energies(i, path[best], frame) for path, frame in
                      zip(joint.window.paths, joint.window.frames, strict=True))
         if np.count_nonzero(energy > DETECTABLE_ENERGY) < 2:
             return False

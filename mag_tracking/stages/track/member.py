@@ -2,7 +2,6 @@
 
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,50 +10,21 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.physics.bounds import impossible_reason
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.cross_check import ClockComparison, CrossCheck
 from mag_tracking.stages.track.disturbances import UnexplainedField
 from mag_tracking.stages.track.evidence import LOST, TrackEvidence
 from mag_tracking.stages.track.joint import JointExplanation
-from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.plausibility import Plausibility
 from mag_tracking.stages.track.published_pose import ambiguities, published_track, smoothed_pose
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.stages.track.target import Target
+from mag_tracking.stages.track.track_bank import TrackBank
 
 MAX_POSITIONS = 64
 """Maximum number of stored recent positions. If two vehicles replace one, the positions show which
 of the two continues the track."""
-
-
-@dataclass(frozen=True)
-class BankUpdate:
-    """Bank of a running track after a frame."""
-
-    frame: FieldFrame
-    """Readings used for the update, from the sensors of the track."""
-    dt: float
-    """Time since the previous frame [s]."""
-    bank: FilterBank
-    """Hypotheses of all members."""
-    bank_filter: BankFilter
-    sensors: SensorSubset
-    settings: TrackSettings
-
-
-@dataclass(frozen=True)
-class MemberView:
-    """Bank of a running track, restricted to one member."""
-
-    bank: FilterBank
-    best: int
-    """Index of the published hypothesis."""
-    observation: Observation
-    gain: float
-    """Increase of the log-likelihood of the latest frames by relinearising the path of this
-    hypothesis, relative to the filter [nats]."""
 
 
 class Member:
@@ -120,50 +90,51 @@ class Member:
                      for stamp_ns, position in self._recent_positions if stamp_ns in position_at]
         return float(np.mean(distances)) if distances else 0.0
 
-    def publish(self, update: BankUpdate, view: MemberView) -> list[Track]:
-        """Create and store the `Track` record of this member for a frame.
+    def publish(self, track: TrackBank, bank: FilterBank, best: int, frame: FieldFrame, dt: float
+                ) -> list[Track]:
+        """Create and store the `Track` record of this member for a frame of the sensors of `track`,
+        `dt` seconds after the previous one, from hypothesis `best` of the `bank` of this member.
 
         The result is empty if the state is impossible, which ends the member.
         """
-        record = self._create_record(update, view)
+        record = self._create_record(track, bank, best, frame, dt)
         self._impossible = impossible_reason(record.velocity, record.moment, record.mounting)
         if self._impossible:
-            if update.bank_filter.is_implausible(view.bank, view.best, update.frame):
+            if track.filter.is_implausible(bank, best, frame):
                 # The field contradicts the track, which is therefore lost, whatever its state.
                 self._impossible = LOST
             return []
         self.last = record
-        self._position_std = float(np.sqrt(np.trace(view.bank.P[view.best, :2, :2])))
-        self._was_unambiguous |= not self.last.ambiguous
-        self._recent_positions.append((self.last.stamp_ns, self.last.position[:2]))
+        self._position_std = float(np.sqrt(np.trace(bank.P[best, :2, :2])))
+        self._was_unambiguous |= not record.ambiguous
+        self._recent_positions.append((record.stamp_ns, record.position[:2]))
         self._counts['poses'] += 1
-        return [self.last]
+        return [record]
 
-    def _create_record(self, update: BankUpdate, view: MemberView) -> Track:
+    def _create_record(self, track: TrackBank, bank: FilterBank, best: int, frame: FieldFrame,
+                       dt: float) -> Track:
         """Update the evidence with a frame, and return the `Track` record for this frame."""
-        frame, dt, sensors, best = update.frame, update.dt, update.sensors, view.best
+        sensors, x, P = track.sensors, bank.x[best], bank.P[best]
         measured: BoolArray = ~np.isnan(frame.field)
         measuring = np.flatnonzero(measured.any(axis=1))
         is_single_sensor = len(sensors.network) > 1 and len(measuring) == 1
         self.evidence.count_single_sensor_time(is_single_sensor, dt)
         if self._unobserved_length is not None:
             self._unobserved_length.update(
-                view.bank.x[best], view.bank.P[best], sensors.network.positions[measuring],
+                x, P, sensors.network.positions[measuring],
                 self.last is not None and (self.evidence.is_doubtful or not self.last.ambiguous))
         reasons = self.evidence.update_doubts(
-            self._doubts(update, view, is_single_sensor), frame.stamp_ns)
+            self._doubts(track, bank, best, frame, dt, is_single_sensor), frame.stamp_ns)
         excess = 1.0 if self._target.starts_anywhere else self.evidence.innovations.excess
         return sensors.for_whole_network(published_track(
-            view.bank, best, self._target.model, self._target.orientation, self._target.arrivals,
+            bank, best, self._target.model, self._target.orientation, self._target.arrivals,
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
             existence=self.evidence.existence, degrees_of_freedom=int(measured.sum()),
             found=reasons, excess=excess, unobserved_length=self._unobserved_length,
-            difference=self.cross_check.difference,
-            ambiguous_poses=update.settings.ambiguous_poses,
-            predicted=update.bank_filter.predicted_field(update.bank, best, frame, dt),
-            mounting=view.observation.angles(view.bank.x[best].copy()),
-            mounting_covariance=view.observation.angle_covariances(view.bank.P[best])),
-            update.settings)
+            difference=self.cross_check.difference, ambiguous_poses=track.settings.ambiguous_poses,
+            predicted=track.filter.predicted_field(track.bank, best, frame, dt),
+            mounting=track.single_target.angles(x.copy()),
+            mounting_covariance=track.single_target.angle_covariances(P)), track.settings)
 
     @property
     def passed_below(self) -> bool:
@@ -183,11 +154,12 @@ class Member:
             or not self.evidence.bayes_factor.is_favoured(settings.min_bayes_factor) \
             or not self._target.starts_anywhere and self.evidence.is_sensed_by_one
 
-    def _doubts(self, update: BankUpdate, view: MemberView, is_single_sensor: bool) -> set[str]:
+    def _doubts(self, track: TrackBank, bank: FilterBank, best: int, frame: FieldFrame, dt: float,
+                is_single_sensor: bool) -> set[str]:
         """Update the checks of the member, and return the doubts about its latest pose."""
-        bank, best, evidence, settings = view.bank, view.best, self.evidence, update.settings
+        evidence, settings = self.evidence, track.settings
         reasons = evidence.doubts | ({doubts.ONE_SENSOR} if is_single_sensor else set())
-        if update.bank_filter.is_implausible(bank, best, update.frame):
+        if track.filter.is_implausible(bank, best, frame):
             reasons.add(doubts.MISFIT)
         if not evidence.bayes_factor.is_favoured(settings.min_bayes_factor):
             reasons.add(doubts.DISTURBANCE_MODEL)
@@ -195,25 +167,19 @@ class Member:
         if self._target.starts_anywhere:
             return reasons
         reasons |= evidence.vehicle_doubts(
-            bank.nis[best], int(np.count_nonzero(~np.isnan(update.frame.field))),
+            bank.nis[best], int(np.count_nonzero(~np.isnan(frame.field))),
             settings.min_bayes_factor)
-        if self._overfits(update, view):
+        if evidence.update_filter_doubt(track.relinearisation.gain(int(bank.origin[best])),
+                                        frame.stamp_ns, settings.relinearise_window_s):
+            self._counts['doubtful poses: the filter fits better than its path'] += 1
             reasons.add(doubts.OVERFIT)
-        reasons |= self.cross_check.doubts(self._clocks.largest_offset_s(update.sensors.rows))
+        reasons |= self.cross_check.doubts(self._clocks.largest_offset_s(track.sensors.rows))
         reasons |= self._plausibility.evaluate(
-            view.observation, bank, best, settings.vehicle,
-            np.deg2rad(settings.mounting_std_deg), update.dt)
+            track.single_target, bank, best, settings.vehicle,
+            np.deg2rad(settings.mounting_std_deg), dt)
         for reason in reasons & doubts.PERMANENT:
             evidence.flag(reason)
         return reasons | evidence.doubts
-
-    def _overfits(self, update: BankUpdate, view: MemberView) -> bool:
-        """Update and return the doubt that the filter fits the frames better than its path."""
-        overfits = self.evidence.update_filter_doubt(view.gain, update.frame.stamp_ns,
-                                                     update.settings.relinearise_window_s)
-        if overfits:
-            self._counts['doubtful poses: the filter fits better than its path'] += 1
-        return overfits
 
     def reason_to_end(self, sensors: SensorSubset, settings: TrackSettings) -> str | None:
         """Update the end conditions with the latest record; return the reason to end the track, or

@@ -16,15 +16,9 @@ from scipy.linalg import block_diag
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
-from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.bank_filter import DETECTABLE_ENERGY, BankFilter
 from mag_tracking.stages.track.initiation_vehicle import TURN_SHARE, moment_directions
-from mag_tracking.stages.track.joint import (
-    DETECTABLE_ENERGY,
-    IMPROBABLE,
-    JointExplanation,
-    are_sensed_by_two,
-    field_energy,
-)
+from mag_tracking.stages.track.joint import IMPROBABLE, JointExplanation, are_sensed_by_two
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.stages.track.steady_search import in_order_of
 from mag_tracking.stages.track.window_search import (
@@ -184,8 +178,8 @@ class NewTargetSearch:
 
     def _is_sensed(self, known: KnownVehicleHypothesis, i: int) -> bool:
         """Whether the field of vehicle `i` is detectable in the last frame."""
-        return field_energy(
-            self._filter, i, known.path[-1], self._window.frames[-1]) > DETECTABLE_ENERGY
+        return bool(self._filter.field_energies(
+            i, known.path[-1], self._window.frames[-1]).sum() > DETECTABLE_ENERGY)
 
     def _is_elsewhere(self, joint: JointExplanation) -> bool:
         """Whether the relocated vehicle is more than `MIN_DISPLACEMENT_M` from its track."""
@@ -323,11 +317,11 @@ class NewTargetSearch:
                             anchor.label.copy(), anchor.kind.copy(), np.arange(n), bank.nis[rows])
         n_frames = len(self._window.frames)
         per_frame = log_likelihood[rows] / n_frames
-        window = Window(anchor, self._window.is_updated, self._window.frames,
-                        self._window.intervals,
+        window = Window(anchor, self._window.is_updated, self._window.max_hypotheses,
+                        self._window.frames, self._window.intervals,
                         [np.ascontiguousarray(paths[rows, k]) for k in range(n_frames)],
                         [per_frame.copy() for _ in range(n_frames)],
-                        float(log_sum_exp(log_w[rows])), self._window.max_hypotheses)
+                        [float(log_sum_exp(log_w[rows])) / n_frames] * n_frames)
         n_targets = len(starts[0].kind)
         return JointExplanation(latest, window, self._filter_of(n_targets), log_odds,
                                 starts[0].replaced, n_targets > self._n_targets)

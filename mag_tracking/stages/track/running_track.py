@@ -18,19 +18,17 @@ from mag_tracking.event_records import Disturbance
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
+from mag_tracking.stages.track.bank_filter import (
+    NEGLIGIBLE_ENERGY,
+    WEAK_ENERGY,
+    BankFilter,
+    NoTarget,
+)
 from mag_tracking.stages.track.cross_check import ClockComparison
 from mag_tracking.stages.track.disturbances import DisturbanceModel, UnexplainedField
 from mag_tracking.stages.track.evidence import MIN_OBSERVED_FRACTION, OUT_OF_REACH
-from mag_tracking.stages.track.joint import (
-    NEGLIGIBLE_ENERGY,
-    UNDECIDED_NATS,
-    WEAK_ENERGY,
-    JointExplanation,
-    NewTargetEvidence,
-    field_energy,
-)
-from mag_tracking.stages.track.member import BankUpdate, Member, MemberView, members_in_order
+from mag_tracking.stages.track.joint import UNDECIDED_NATS, JointExplanation, NewTargetEvidence
+from mag_tracking.stages.track.member import Member, members_in_order
 from mag_tracking.stages.track.new_target_search import NewTargetSearch
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
@@ -152,43 +150,35 @@ class RunningTrack:
         for member in () if self._target.starts_anywhere else self.members:
             member.evidence.check_approach(self._final_sensors.part_of(frame))
         used = self._bank.sensors.part_of(frame)
-        frame_update = self._bank.advance(used, 0.0 if self._restart_after_gap(used, dt) else dt)
+        before_gap = self._bank.restart_after_gap(used, dt)
+        # The path before the gap was smoothed on its own.
+        self.members[0].early += before_gap or []
+        frame_update = self._bank.advance(used, dt if before_gap is None else 0.0)
         if not self._update_evidence(frame_update, dt):
             return self.end('no hypothesis explains the field')
         self._bank.store_and_prune(frame_update, publish)
         best = self.bank.best()
         self._update_new_target_evidence(frame_update, best)
-        if not publish and not self._bank.is_lagged:
+        if not publish and not self._settings.smoothing_lag_s:
             return []
         views = [self._view(i, best) for i in range(len(self.members))]
-        lagged = self._bank.lagged(best, frame_update.frame, dt, publish)
+        frame = frame_update.frame
+        lagged = self._bank.lag.smoothed(self._bank.filter, self.bank, best, frame, dt, publish)
         lagged_poses = [pose for i, view in enumerate(views) for pose in self._smoothed(
             i, view, False, lagged, self.members[i].is_doubtful(self._settings))]
         if not publish:
             return []
-        update = BankUpdate(frame_update.frame, dt, self.bank, self._bank.filter,
-                            self._bank.sensors, self._settings)
         out: list[TrackRecord] = [
             record for member, view in zip(self.members, views, strict=True)
-            for record in member.publish(update, view)]
+            for record in member.publish(self._bank, *view, frame, dt)]
         self._handover_due = best if self._bank.sensors.is_part else None
-        return [*out, *lagged_poses, *self._end_lost_members(frame_update.frame)]
+        return [*out, *lagged_poses, *self._end_lost_members(frame)]
 
-    def _view(self, i: int, best: int) -> MemberView:
-        """View of member `i` alone; `best` is the index of the best joint hypothesis."""
+    def _view(self, i: int, best: int) -> tuple[FilterBank, int]:
+        """Bank of member `i` alone, and the index of its published hypothesis; `best` is that of
+        the joint hypotheses."""
         bank = self.bank.extract_target(i, self._bank.single_target.n_target)
-        row = best if bank is self.bank else bank.best()
-        return MemberView(bank, row, self._bank.single_target, self._bank.gain(row))
-
-    def _restart_after_gap(self, frame: FieldFrame, dt: float) -> bool:
-        """Start the hypotheses again if the target was lost in a gap; return whether they were."""
-        states = self._bank.smoothed(self.bank.best(), False) \
-            if self._target.is_lost_after(self._settings, self._bank.sensors.network, dt) else []
-        if not self._bank.restart_after_gap(frame, dt):
-            return False
-        # The path before the gap was smoothed on its own.
-        self.members[0].early += states
-        return True
+        return bank, best if bank is self.bank else bank.best()
 
     def _update_evidence(self, frame_update: FrameUpdate, dt: float) -> bool:
         """Update the evidence of the members; return False if no hypothesis explains the frame."""
@@ -237,8 +227,8 @@ class RunningTrack:
         """Whether the field of member `i` is weak and the member does not approach a sensor."""
         last = self.members[i].last
         assert last is not None
-        energy = field_energy(self._bank.filter, i, self.bank.x[self.bank.best()], frame)
-        return energy < (WEAK_ENERGY if self._is_at_limit else NEGLIGIBLE_ENERGY) \
+        energy = self._bank.filter.field_energies(i, self.bank.x[self.bank.best()], frame).sum()
+        return bool(energy < (WEAK_ENERGY if self._is_at_limit else NEGLIGIBLE_ENERGY)) \
             and not self._bank.sensors.is_approached_by(last)
 
     def _end_lost_members(self, frame: FieldFrame) -> list[TrackRecord]:
@@ -288,15 +278,16 @@ class RunningTrack:
         view = self._view(i, best)
         doubtful = member.evidence.ends_in_misfit or member.is_doubtful(self._settings)
         return [replace(member.last, ended=True),
-                *self._smoothed(i, view, False, self._bank.remaining_lagged(best), doubtful),
+                *self._smoothed(i, view, False, self._bank.lag.remaining(
+                    self._bank.filter, self.bank, best), doubtful),
                 *self._smoothed(i, view, True, self._bank.smoothed(best), doubtful)]
 
-    def _smoothed(self, i: int, view: MemberView, complete: bool, states: list[TrackState],
-                  doubtful: bool) -> list[SmoothedPose]:
+    def _smoothed(self, i: int, view: tuple[FilterBank, int], complete: bool,
+                  states: list[TrackState], doubtful: bool) -> list[SmoothedPose]:
         """Smoothed poses of member `i`; if `complete`, also those before other members joined."""
         member, n = self.members[i], self._bank.single_target.n_target
         own_states = member.states_of(member.slot if complete else i, n, states)
-        return member.smoothed(view.bank, view.best, complete,
+        return member.smoothed(*view, complete,
                                [*member.early, *own_states] if complete else own_states, doubtful)
 
     @property
@@ -312,7 +303,7 @@ class RunningTrack:
         If one is nearly as probable as the track, the track is marked as doubtful for a limited
         time.
         """
-        window, n = self._bank.window, len(self.members)
+        window, n = self._bank.relinearisation.window, len(self.members)
         if self.ended is not None or self._target.starts_anywhere or window is None \
                 or self.members[0].last is None:
             return None

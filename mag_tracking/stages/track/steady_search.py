@@ -20,6 +20,7 @@ from mag_tracking.inference.matrices import ignoring_overflow, pseudo_inverse
 from mag_tracking.inference.separable_fit import distinct
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.steady_pass import N_STRAIGHT, PATH, SteadyPass
+from mag_tracking.stages.track.bank_filter import DETECTABLE_ENERGY
 from mag_tracking.stages.track.initiation_vehicle import (
     CLIMB_STD,
     CROSS_SPEED_STD,
@@ -28,7 +29,6 @@ from mag_tracking.stages.track.initiation_vehicle import (
     SPEED_STD,
     VehicleSettings,
 )
-from mag_tracking.stages.track.joint import DETECTABLE_ENERGY
 from mag_tracking.stages.track.pass_samples import PassSamples
 
 N_DIPOLES = 3
