@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track import doubts
@@ -27,8 +27,7 @@ SIGNIFICANT_STDS = 4.0
 """An offset is significant only if it exceeds this number of standard deviations."""
 
 MEMORY_PASSES = 20
-"""Effective number of passes in the estimate. Older passes lose weight, because clocks drift and
-are adjusted."""
+"""Effective number of passes in the estimate; clocks drift and are adjusted."""
 
 FORGETTING_FACTOR, CONTRADICTED_FACTOR = 1.0 - 1.0 / MEMORY_PASSES, 0.5
 """Factor on the previous information at a pass that agrees with the estimate, and at a pass that
@@ -47,8 +46,7 @@ CHECK_INTERVAL_RATIO = 1.7
 """Ratio of the delays of successive fits after the maximum of the field."""
 
 BEFORE_S, AFTER_S = 4.0, 3.0
-"""Frames from `BEFORE_S` before to `AFTER_S` after the maximum of the field belong to the pass
-[s]."""
+"""[s] Duration of a pass before and after the maximum of the field."""
 
 MIN_FRAMES, MAX_FRAMES = 12, 128
 """Minimum and maximum number of frames in a fit. A longer pass is decimated."""
@@ -58,8 +56,7 @@ STEADY_S = 1.5
 to be constant [s]."""
 
 LATE_MISFIT = 8.0
-"""Maximum misfit (reduced chi-square) of a fit after `STEADY_S`. The turn rate of a car may have
-changed by then."""
+"""Maximum misfit (reduced chi-square) of a fit after `STEADY_S`, when the turn rate may change."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +91,7 @@ class ClockOffset:
 class ClockComparison:
     """Clock offsets estimated from several passes by recursive least squares.
 
-    A wrong sensor position has the same effect as a wrong clock if all vehicles pass in the same
-    direction at the same speed.
+    If all vehicles pass alike, a wrong sensor position has the same effect as a wrong clock.
     """
 
     def __init__(self, n_sensors: int) -> None:
@@ -110,11 +106,7 @@ class ClockComparison:
 
     def largest_offset_s(self, rows: IntArray) -> float:
         """Largest significant offset between the clocks of two of the sensors `rows` of the
-        network; 0 if none is significant.
-
-        Clocks that were compared in only one pass are ignored, because this pass may contain two
-        vehicles.
-        """
+        network, else 0; a clock needs two passes, because one may contain two vehicles."""
         repeated = rows[self._n_passes[rows] > 1]
         return float(self._offset_s[np.ix_(repeated, repeated)].max(initial=0.0))
 
@@ -138,28 +130,30 @@ class ClockComparison:
                            int(self._n_passes[j]))
 
     def add(self, rigid_pass: RigidPass, rows: IntArray) -> None:
-        """Add a pass with the sensors `rows` of the network to the estimate.
-
-        A pass is ignored if no straight path explains it, if a bent path explains it significantly
-        better, or if the vehicle is so slow that the fit hardly depends on the clocks.
-        """
+        """Add a pass with the sensors `rows` of the network; it is ignored if no straight path
+        explains it, if a bent one is significantly better, or if the vehicle is too slow for the
+        clocks to matter."""
         is_slow = rigid_pass.speed * MAX_OFFSET < MIN_DISTANCE
         if is_slow or not (rigid_pass.is_explained and rigid_pass.is_straight):
             return
         is_known = np.abs(rigid_pass.offset) <= MAX_OFFSET
         is_known[rigid_pass.reference] = False
-        factor = CONTRADICTED_FACTOR if self._contradicts(rigid_pass, rows, is_known) \
-            else FORGETTING_FACTOR
+        compared, reference = np.flatnonzero(is_known), rows[rigid_pass.reference]
+        offset, std = self._offsets()
+        contradicts = any(abs(rigid_pass.offset[j] - offset[rows[j], reference])
+                          > SIGNIFICANT_STDS * np.sqrt(rigid_pass.clock_variance(j)
+                                                       + std[rows[j], reference]**2)
+                          for j in compared)
+        factor = CONTRADICTED_FACTOR if contradicts else FORGETTING_FACTOR
         self._information *= factor
         self._vector *= factor
-        for j in np.flatnonzero(is_known):
+        for j in compared:
             direction = np.zeros(len(self._vector))
-            direction[rows[j]], direction[rows[rigid_pass.reference]] = 1.0, -1.0
+            direction[rows[j]], direction[reference] = 1.0, -1.0
             self._information += np.outer(direction, direction) / rigid_pass.clock_variance(j)
             self._vector += direction * rigid_pass.offset[j] / rigid_pass.clock_variance(j)
-        if is_known.any():
-            self._n_passes[rows[is_known]] += 1
-            self._n_passes[rows[rigid_pass.reference]] += 1
+        if len(compared):
+            self._n_passes[[*rows[compared], reference]] += 1
         self._weight = 1.0 + factor * self._weight
         self._slowness = 1.0 / rigid_pass.speed + factor * self._slowness
         offset, std = self._offsets()
@@ -168,15 +162,6 @@ class ClockComparison:
         min_offset = MIN_DISTANCE * self._slowness / self._weight
         self._offset_s = np.where(
             (offset > SIGNIFICANT_STDS * std) & (offset > min_offset), offset, 0.0)
-
-    def _contradicts(self, rigid_pass: RigidPass, rows: IntArray, is_known: BoolArray) -> bool:
-        """Whether a pass contradicts the previous estimate for any clock in the mask `is_known`."""
-        offset, std = self._offsets()
-        reference = rows[rigid_pass.reference]
-        return any(
-            abs(rigid_pass.offset[j] - offset[rows[j], reference]) > SIGNIFICANT_STDS * np.sqrt(
-                rigid_pass.clock_variance(j) + std[rows[j], reference]**2)
-            for j in np.flatnonzero(is_known))
 
     def _offsets(self) -> tuple[FloatArray, FloatArray]:
         """Time by which the clock of each row is ahead of the clock of each column, and its std,
@@ -192,13 +177,11 @@ class ClockComparison:
 
 
 class _FrameSummary(NamedTuple):
-    """Time, field and target state of a frame."""
+    """Time [ns], largest field [T] of any sensor, and position and velocity (6,) of a frame."""
 
     stamp_ns: int
     magnitude: float
-    """Largest field of any sensor [T]."""
     state: FloatArray
-    """Position and velocity (6,) of the best hypothesis at the time of the frame."""
 
 
 class CrossCheck:
@@ -236,58 +219,40 @@ class CrossCheck:
             self._has_risen = self._min_magnitude <= PASSED_FRACTION * magnitude
         self._min_magnitude = min(self._min_magnitude, magnitude)
         # Drop frames that belong neither to this pass nor to a later one.
-        earliest = frame.stamp_ns - BEFORE_S * NS
-        self._frames = [f for f in self._frames if f.stamp_ns >= earliest or self._is_in_pass(f)]
+        earliest, peak_ns = frame.stamp_ns - BEFORE_S * NS, self._peak.stamp_ns
+        self._frames = [f for f in self._frames if f.stamp_ns >= earliest
+                        or _is_in_pass(f.stamp_ns, peak_ns)]
         self._frames.append(frame)
 
-    def _is_in_pass(self, frame: FieldFrame) -> bool:
-        """Whether a frame is from `BEFORE_S` before to `AFTER_S` after the maximum of the field."""
-        assert self._peak is not None
-        return -BEFORE_S * NS <= frame.stamp_ns - self._peak.stamp_ns <= AFTER_S * NS
-
     def doubts(self, clocks_apart_s: float) -> set[str]:
-        """Fit the pass if a fit is due, and return the doubts about the track.
-
-        `clocks_apart_s` is the largest significant offset between the clocks, from earlier passes.
-        """
+        """Fit the pass if a fit is due, and return the doubts about the track; `clocks_apart_s` is
+        the largest significant offset between the clocks, from earlier passes."""
         if self._current is None:
             return set()
         self._fit_if_due(self._current.magnitude)
-        if self._covers(self._current.stamp_ns):
-            self.difference = self._difference_at(self._current.stamp_ns, self._current.state)
+        if self.latest is not None and self._covers(self._current.stamp_ns):
+            self.difference = self.latest.difference(self._current.stamp_ns, self._current.state)
         reasons = self._pass_doubts()
-        speed = float(np.hypot(self._current.state[3], self._current.state[4]))
-        if clocks_apart_s * speed > MIN_DISTANCE:
+        if clocks_apart_s * float(np.hypot(*self._current.state[3:5])) > MIN_DISTANCE:
             reasons.add(doubts.CLOCKS_APART)
         return reasons
 
     def differences(self, states: Sequence[TrackState]) -> list[FloatArray]:
-        """`RigidPass.difference` (6,) of each smoothed state, in chronological order, m and m/s.
-
-        States before or after the pass have the difference of the first or last state in the pass.
-        If no state is in the pass, all have `difference`.
-        """
+        """`RigidPass.difference` (6,) of each smoothed state, in chronological order, m and m/s;
+        before and after the pass that of its first and last state, `difference` without any."""
         covered = [k for k, (stamp_ns, _, _) in enumerate(states) if self._covers(stamp_ns)]
-        if not covered:
+        if self.latest is None or not covered:
             return [self.difference] * len(states)
         first, last = covered[0], covered[-1]
-        in_pass = [self._difference_at(stamp_ns, x[:6])
+        in_pass = [self.latest.difference(stamp_ns, x[:6])
                    for stamp_ns, x, _ in states[first:last + 1]]
         return [in_pass[min(max(k, first), last) - first] for k in range(len(states))]
 
     def _covers(self, stamp_ns: int) -> bool:
-        """Whether the latest fit determines the position of the vehicle at a time.
-
-        A track that begins at the maximum of the field contains only part of a pass, which many
-        paths would explain.
-        """
+        """Whether the latest fit determines the position of the vehicle at a time; the part of a
+        pass after the maximum of the field alone could be on many paths."""
         return self.latest is not None and self._is_whole_pass \
-            and -BEFORE_S * NS <= stamp_ns - self.latest.stamp_ns <= AFTER_S * NS
-
-    def _difference_at(self, stamp_ns: int, state: FloatArray) -> FloatArray:
-        """Difference (6,) of a state (6,) from the latest fit, at a time that the fit covers."""
-        assert self.latest is not None
-        return self.latest.difference(stamp_ns, state)
+            and _is_in_pass(stamp_ns, self.latest.stamp_ns)
 
     @property
     def is_doubtful(self) -> bool:
@@ -308,7 +273,7 @@ class CrossCheck:
                 or magnitude > PASSED_FRACTION * peak.magnitude:
             return
         elapsed_s = (current.stamp_ns - peak.stamp_ns) / NS
-        frames = [f for f in self._frames if self._is_in_pass(f)]
+        frames = [f for f in self._frames if _is_in_pass(f.stamp_ns, peak.stamp_ns)]
         if elapsed_s < self._due_s or len(frames) < MIN_FRAMES:
             return
         self._due_s = CHECK_INTERVAL_RATIO * elapsed_s
@@ -344,3 +309,8 @@ class CrossCheck:
                          self._period_s, self._network.positions):
             reasons.add(doubts.FRAMES_TOO_LONG)
         return reasons
+
+
+def _is_in_pass(stamp_ns: int, peak_ns: int) -> bool:
+    """Whether a time belongs to the pass with the maximum of the field at `peak_ns`."""
+    return -BEFORE_S * NS <= stamp_ns - peak_ns <= AFTER_S * NS

@@ -177,8 +177,7 @@ class Member:
         reasons |= self._plausibility.evaluate(
             track.single_target, bank, best, settings.vehicle,
             np.deg2rad(settings.mounting_std_deg), dt)
-        for reason in reasons & doubts.PERMANENT:
-            evidence.flag(reason)
+        evidence.doubts |= reasons & doubts.PERMANENT
         return reasons | evidence.doubts
 
     def reason_to_end(self, sensors: SensorSubset, settings: TrackSettings) -> str | None:

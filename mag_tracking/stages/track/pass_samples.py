@@ -20,11 +20,11 @@ MODEL_ERROR = 0.04
 """Error of the field of a row of dipoles, relative to the field; treated as noise."""
 
 NEAR_ERROR_LENGTH = 0.2
-"""[m] Minimum product of the relative field error and the distance to the sensor, in samples that
-include the model error near the sensors."""
+"""[m] Minimum product of the relative field error and the distance to the sensor, for samples with
+the model error near the sensors."""
 
 MAX_SENSORS = 4
-"""Maximum number of sensors in a fit. The sensors with the strongest fields are used."""
+"""Maximum number of sensors in a fit: those with the strongest fields."""
 
 N_STEPS, TOLERANCE = 30, 1e-3
 """Maximum number of steps of a fit, and relative improvement of the cost below which it ends."""
@@ -61,8 +61,7 @@ class PassSamples:
         return self.n_values - self.backgrounds.shape[1] - 3 * n_dipoles
 
     def with_near_field_error(self, path: FloatArray) -> 'PassSamples':
-        """Copy of the samples with noise that includes the model error near the sensors, for a
-        `SteadyPass` path (10,)."""
+        """Samples with the model error near the sensors as noise, on a `SteadyPass` path (10,)."""
         c, s = np.cos(path[4]), np.sin(path[4])
         displacement = self.t[:, None] * np.array([c * path[3], s * path[3], path[5]])
         relative_error = np.maximum(MODEL_ERROR, NEAR_ERROR_LENGTH / np.linalg.norm(
@@ -106,9 +105,8 @@ class PassSamples:
         """Fit a row of dipoles on a steady path with the parameters `free` of `SteadyPass` from
         each of `starts` (n, n_free).
 
-        Returns the best path with its clock offsets (10 + n_clocks,), its sum of squared whitened
-        residuals (infinite if no start is valid), and the covariance (n_free, n_free) of the free
-        parameters, zero for parameters that are not observable.
+        Returns the best path with its clock offsets (10 + n_clocks,), its cost (infinite if no
+        start is valid), and the covariance (n_free, n_free), zero for unobservable parameters.
         """
         model = SteadyPass(self.t, self.positions, self.M, self.clock, free,
                            np.zeros(N_PATH + self.n_clocks), n_dipoles)

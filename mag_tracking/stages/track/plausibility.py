@@ -19,54 +19,51 @@ P_MOUNTING = 0.05
 """Probability that the estimated mounting angles of correctly mounted sensors are flagged."""
 
 P_HEIGHT = 1e-3
-"""Probability that the height of a vehicle is flagged, although it follows the distribution of its
-kind."""
+"""Probability that the height of a vehicle of its kind is flagged."""
 
 LANE_STDS, LANE_STDS_LATER = 1.645, 3.0
 """Maximum distance of a vehicle from the outermost configured lane, in standard deviations: at its
-closest point to any sensor, and at later times, when it may have turned off. One in twenty vehicles
-on that lane exceeds the first limit."""
+closest point to any sensor, which one in twenty vehicles on that lane exceeds, and later, when it
+may have turned off."""
 
 MAX_ONE_SIDED_WIDTH = 2.0
-"""[m] Maximum lateral extent of sensors that are assumed to stand on one side of a road, because no
-lane fits between them."""
+"""[m] Maximum lateral extent of sensors on one side of a road: no lane fits between them."""
 
 MIN_SPEED = 1.0
 """[m/s] Minimum speed of a vehicle at which its heading is defined."""
 
 MAX_RELATIVE_MOVE = 0.75
-"""Maximum motion of a target within a frame, relative to its distance to the second nearest sensor.
-Fields are averaged over the frame, with a relative error of about half the square of this ratio.
-The nearest sensor is ignored, because the error of a single sensor does not mislead a track."""
+"""Maximum motion of a target within a frame, relative to its distance to the second nearest sensor,
+because the error of a single sensor does not mislead a track. The relative error of the average
+over the frame is about half the square of this ratio."""
 
 SENSED_LEVEL = 2.5
 """RMS of the whitened field above which the target counts as sensed."""
 
 GROWTH_RATIO = 10.0
-"""Ratio of the highest to the lowest field level in the test; the lowest level is
-`SENSED_LEVEL`."""
+"""Ratio of the highest field level in the test to the lowest, `SENSED_LEVEL`."""
 
 MIN_LOG2_RATIO = -0.25
-"""Minimum log2 ratio of the durations of the first and the second half of the growth. The
-theoretical value is 0.55 for a target that approaches at constant speed, and -0.83 for a target
-that starts from rest next to a sensor. The value of a sudden jump of the field is near 0."""
+"""Minimum log2 ratio of the durations of the first and the second half of the growth. In theory it
+is 0.55 for an approach at constant speed, -0.83 for a start from rest next to a sensor, and near 0
+for a sudden jump of the field."""
 
 FALL_FRACTION = 0.85
-"""If the field falls below this fraction of its previous maximum while the target is sensed, the
-target has passed its first sensor, and the test passes."""
+"""Fraction of its previous maximum below which the field of a sensed target falls if the target has
+passed its first sensor, which passes the test."""
 
 LEVEL_TIME_STD = 0.5
 """Uncertainty of the time at which the field reached a level, in frame periods."""
 
 MAX_FRAMES = 1000
-"""The test is skipped if the field has not grown by `GROWTH_RATIO` within this number of frames."""
+"""Number of frames after which the test is skipped if the field has not grown enough."""
 
 N_INTERVALS = 8
-"""Number of latest intervals of a sensor that determine its rate. A sensor is slow if most of them
-are too long, so that single lost readings do not matter."""
+"""Number of latest intervals of a sensor; it is slow if most of them are too long, so that single
+lost readings do not matter."""
 
 MIN_INTERVALS = 2
-"""Minimum number of intervals that are too long for a sensor to be slow."""
+"""Minimum number of too long intervals of a slow sensor."""
 
 N_PATHS = 41
 """Number of paths between the outermost lanes that are compared."""
@@ -86,8 +83,8 @@ class Plausibility:
         """Update the closest approach of all hypotheses; return the doubts about the published
         hypothesis `best`, in a frame of duration `dt` [s].
 
-        `mounting_std` [rad] is the minimum std of the mounting angles. It also applies to
-        accurately mounted sensors, because a model error also rotates the field.
+        `mounting_std` [rad] is the minimum std of the mounting angles of all sensors, because a
+        model error also rotates the field.
         """
         x, kind = bank.x[best], int(bank.kind[best])
         self._update_road_check(bank, settings, observation.positions)
@@ -126,12 +123,8 @@ def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray
     """Whether states (n, n_x) pass all sensors (n_sensors, 3) on one side, beyond the lanes.
 
     The distance of such a vehicle is hardly observable: a train on another line resembles a truck
-    nearby, and a truck beyond a sensor resembles a car on the near side of a sensor with an
-    inverted axis.
-
-    Lanes are on both sides of the centre of the network. A network that extends beyond the road
-    covers an area. A vehicle may then be as far outside the outermost sensors as a lane is from the
-    centre.
+    nearby. Lanes are on both sides of the centre of the network. In a network that extends beyond
+    the road, a vehicle may be as far outside the outermost sensors as a lane is from the centre.
     """
     speed = np.maximum(np.hypot(x[:, 3], x[:, 4]), MIN_SPEED)
     offsets = positions[:, :2, None] - x[:, :2].T
@@ -146,11 +139,8 @@ def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray
 
 
 def lane_note(settings: VehicleSettings, network: SensorNetwork) -> str | None:
-    """Explanation of which lanes are covered if the sensors stand on one side of the road.
-
-    None for one sensor, for a compact network, and unless the sensors are in a line along most of
-    the arrival directions.
-    """
+    """Explanation of which lanes are covered if the sensors are in a line along most of the arrival
+    directions, else None; also None for one sensor and for a compact network."""
     headings = np.deg2rad(settings.arrival_headings_deg)
     across = np.array([-np.sin(headings), np.cos(headings)])
     is_one_sided = np.ptp(network.positions[:, :2] @ across, axis=0) < MAX_ONE_SIDED_WIDTH
@@ -206,10 +196,8 @@ class Approach:
         self._levels.append(float(np.sqrt(max(energy.sum() / max(n_axes.sum(), 1), 1.0))))
         self._is_open = self._levels[-1] <= GROWTH_RATIO * SENSED_LEVEL \
             and len(self._levels) < MAX_FRAMES
-        return not self._is_open and self._is_doubtful()
-
-    def _is_doubtful(self) -> bool:
-        """Whether the field grows unlike the field of a target that approaches from afar."""
+        if self._is_open:
+            return False
         time, levels = np.array(self._times), np.array(self._levels)
         growth = growth_of(time, levels, SENSED_LEVEL, GROWTH_RATIO * SENSED_LEVEL)
         # If the field falls before it reaches the highest level, the target has passed its first
@@ -231,10 +219,9 @@ def required_rate(network: SensorNetwork, settings: TrackSettings) -> float:
     at rest.
 
     Between two readings, a vehicle at `typical_speed` must not move further than
-    `MAX_RELATIVE_MOVE` times its distance from the nearest sensor. The field of a pass at distance
-    d and speed v has little content above the frequency v / (2 d), because its spectrum decreases
-    like exp(-2 pi f d / v). The distance is that of the path between the outermost lanes that keeps
-    furthest from all sensors, and includes `LATERAL_STD`: a lower rate is too low in every lane.
+    `MAX_RELATIVE_MOVE` times its distance d from the nearest sensor: the spectrum of its field
+    decreases like exp(-2 pi f d / v). The distance is that of the path between the outermost lanes
+    that keeps furthest from all sensors, plus `LATERAL_STD`: a lower rate is too low in every lane.
     """
     if settings.target != 'vehicle':
         return 0.0
@@ -251,8 +238,7 @@ def required_rate(network: SensorNetwork, settings: TrackSettings) -> float:
 
 
 def low_rate_fault(rate: float, network: SensorNetwork, settings: TrackSettings) -> str | None:
-    """Message about a rate [Hz] that is too low for tracks; None if it suffices or is unknown
-    (NaN)."""
+    """Message about a rate [Hz] that is too low for tracks; None if sufficient or unknown (NaN)."""
     required = required_rate(network, settings)
     if not rate < required:
         return None

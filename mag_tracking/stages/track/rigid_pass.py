@@ -1,9 +1,9 @@
 """Fit of a steady path to the whole pass of a vehicle.
 
-A filter bends the path of its target to fit faulty measurements: clock offsets, a clipped field, or
-a second vehicle. A path with steady acceleration and turn rate cannot bend in this way. If no such
-path explains a pass, a sensor is faulty or there are several vehicles. If a straight path explains
-the pass only with free clock offsets, the clocks differ.
+A filter bends the path of its target to fit clock offsets, a clipped field, or a second vehicle. A
+path with steady acceleration and turn rate cannot. If no such path explains a pass, a sensor is
+faulty or there are several vehicles. If a straight path explains the pass only with free clock
+offsets, the clocks differ.
 
 The fit of a row of dipoles at constant velocity follows TSP14 sections III.A and V.
 """
@@ -24,8 +24,8 @@ from mag_tracking.stages.track.pass_samples import PassSamples
 from mag_tracking.units import NS
 
 N_SHORT, N_LONG = 3, 5
-"""Number of dipoles of the two rows: the long row explains any vehicle; the short one cannot
-compensate for clock offsets."""
+"""Number of dipoles of the two rows: the long one explains any vehicle, and might compensate for
+clock offsets."""
 
 LENGTH, LONG_LENGTH = 3.0, 8.0
 """[m] Start values of the distance from the first to the last dipole, for the short and the long
@@ -35,8 +35,8 @@ SMALL_OFFSET, LARGE_OFFSET = 0.1, 0.3
 """[s] Start values of the clock offsets, used with both signs."""
 
 OFFSET_STD, MAX_OFFSET = 0.15, 0.5
-"""[s] Prior standard deviation of clock offsets, and their maximum. A larger offset is not
-accepted, because a turn has the same effect."""
+"""[s] Prior standard deviation of clock offsets, and their maximum, beyond which a turn has the
+same effect."""
 
 START_TURN_RATE = 0.4
 """[rad/s] Start value of the turn rate of a bent path, used with both signs."""
@@ -46,19 +46,17 @@ GOOD_MISFIT, MAX_MISFIT = 1.3, 1.5
 it."""
 
 P_CLOCKS, P_BEND = 1e-5, 1e-3
-"""Significance levels for clock offsets, and for a bent path: probability that noise alone improves
-the fit significantly although the clocks are correct, or although the motion is straight."""
+"""Probabilities that noise alone improves the fit significantly although the clocks are correct, or
+although the motion is straight."""
 
 MIN_DISTANCE = 1.0
-"""[m] Clock offsets are harmless if the target moves by less than this during the offset."""
+"""[m] Motion of the target during a clock offset below which the offset is harmless."""
 
 MIDDLE_STD = 0.5
-"""[m] Standard deviation with which the apparent magnetic centre of a vehicle varies from sensor to
-sensor."""
+"""[m] Standard deviation of the apparent magnetic centre of a vehicle from sensor to sensor."""
 
 MAX_DISTANCE, MAX_SPEED = 30.0, 100.0
-"""[m], [m/s] Maximum distance of a tracked vehicle from the nearest sensor, and its maximum
-speed."""
+"""[m], [m/s] Maximum distance of a vehicle from the nearest sensor, and its maximum speed."""
 
 _STRAIGHT = np.arange(N_STRAIGHT)
 _BENT = np.arange(N_PATH)
@@ -66,10 +64,8 @@ _BENT = np.arange(N_PATH)
 
 @dataclass(frozen=True)
 class RigidPass:
-    """Fits of a vehicle on a steady path to the frames of its whole pass.
-
-    Costs are sums of squared whitened residuals.
-    """
+    """Fits of a vehicle on a steady path to its whole pass; costs are sums of squared whitened
+    residuals."""
 
     stamp_ns: int
     """Time of the strongest field; time zero of the paths."""
@@ -87,14 +83,12 @@ class RigidPass:
     reference: int
     """Index of the sensor with the strongest field; its clock is the reference."""
     offset: FloatArray
-    """(n_sensors,) [s] Time by which each clock is ahead of the reference; NaN if the clock was not
-    compared or its offset is not observable."""
+    """(n_sensors,) [s] Time by which each clock is ahead of the reference; NaN if not compared or
+    not observable."""
     offset_std: FloatArray
-    """(n_sensors,) [s] Standard deviation due to noise and model error alone; 0 for the
-    reference."""
+    """(n_sensors,) [s] Standard deviation due to noise and model error alone; reference: 0."""
     position: FloatArray
-    """(3,) [m] Position at the time of the strongest field, on the straight path with free clock
-    offsets."""
+    """(3,) [m] Position at the time of the strongest field, with free clock offsets."""
     velocity: FloatArray
     """(3,) [m/s] Velocity on the straight path with free clock offsets."""
     straight_paths: FloatArray
@@ -112,8 +106,7 @@ class RigidPass:
         return self.cost_with_offsets <= GOOD_MISFIT * self.degrees_of_freedom
 
     def closest(self, positions: FloatArray) -> FloatArray:
-        """Point (3,) of the straight path with free clock offsets that is closest to any sensor,
-        m."""
+        """Point (3,) of the path with free clock offsets that is closest to any sensor, m."""
         offsets = positions - self.position
         squared_speed = max(float(self.velocity @ self.velocity), 1e-12)
         points = self.position + (offsets @ self.velocity / squared_speed)[:, None] * self.velocity
@@ -142,15 +135,13 @@ class RigidPass:
         return max(self.cost_with_offsets / self.degrees_of_freedom, 1.0)
 
     def clock_variance(self, sensor: int) -> float:
-        """Variance of the clock offset of a sensor, including the variation of the magnetic centre,
-        s²."""
+        """Variance of the clock offset of a sensor, with that of the magnetic centre, s²."""
         return float(self.widening * self.offset_std[sensor]**2 + (MIDDLE_STD / self.speed)**2)
 
     @property
     def needs_clock_offsets(self) -> bool:
-        """Whether clock offsets explain the pass better than a path without them, straight or bent.
-
-        They must be significant, at most `MAX_OFFSET`, and displace the target by `MIN_DISTANCE`.
+        """Whether clock offsets explain the pass significantly better than a path without them,
+        straight or bent; they displace the target by `MIN_DISTANCE`, and are at most `MAX_OFFSET`.
         """
         offset = float(np.nanmax(np.abs(self.offset)))
         if not self.is_explained or offset > MAX_OFFSET or offset * self.speed < MIN_DISTANCE:
@@ -169,12 +160,9 @@ class RigidPass:
 
 def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int,
                    starts: FloatArray) -> RigidPass | None:
-    """Fit straight and bent paths to the frames of a pass; None if the frames do not determine a
-    path.
-
-    The search starts at positions and velocities `starts` (n, 6) [m, m/s] at the time of the
-    strongest field, `stamp_ns`.
-    """
+    """Fit straight and bent paths to the frames of a pass, from positions and velocities `starts`
+    (n, 6) [m, m/s] at the time `stamp_ns` of the strongest field; None if the frames do not
+    determine a path."""
     data = PassSamples.of(network, frames, stamp_ns)
     n_clocks = data.n_clocks
     if n_clocks < 1 or data.n_free(N_LONG) <= N_PATH:
@@ -240,11 +228,8 @@ class _RowFits(NamedTuple):
 
 def _fit_long_row(data: PassSamples, straight: FloatArray, bent: FloatArray, adds_starts: bool
               ) -> _RowFits:
-    """Fit a long row of dipoles, starting at the `straight` and `bent` paths of a short row.
-
-    The bent fit starts at the fitted straight path and, if `adds_starts`, also at both paths of the
-    short row.
-    """
+    """Fit a long row of dipoles, starting at the `straight` and `bent` paths of a short row; the
+    bent fit starts at the fitted straight path and, if `adds_starts`, also at these two."""
     near = data.with_near_field_error(bent)
     starts = np.array([straight, bent, straight, bent])
     starts[2:, PATH.index('length')] = LONG_LENGTH

@@ -114,7 +114,7 @@ class RunningTrack:
             for member in self.members:
                 if reason not in member.evidence.doubts:
                     self.counts[f'tracks with doubtful readings: {reason}'] += 1
-                    member.evidence.flag(reason)
+                    member.evidence.doubts.add(reason)
 
     def begin(self, frame: FieldFrame, recent: list[FieldFrame], approach_unobserved: bool = False
               ) -> list[TrackRecord]:
@@ -186,7 +186,7 @@ class RunningTrack:
         if frame_update.n_rejected and np.count_nonzero(frame.n_samples) <= frame_update.n_rejected:
             # Without a majority of sensors, the track itself may be wrong.
             for member in self.members:
-                member.evidence.flag(doubts.SENSORS_CONTRADICT)
+                member.evidence.doubts.add(doubts.SENSORS_CONTRADICT)
         if not np.isfinite(frame_update.evidence):
             self.counts['frames that no hypothesis explains'] += 1
             return False
@@ -273,7 +273,7 @@ class RunningTrack:
             return []
         if member.passed_below:
             self.counts[BELOW_SENSORS] += 1
-            member.evidence.flag(doubts.BELOW_SENSORS)
+            member.evidence.doubts.add(doubts.BELOW_SENSORS)
         best = self.bank.best()
         view = self._view(i, best)
         doubtful = member.evidence.ends_in_misfit or member.is_doubtful(self._settings)

@@ -31,7 +31,7 @@ OVERLAP_WIDTH, OVERHANG, DEPTH_STD = 1.5, 1.0, 1.0
 rows of dipoles, and standard deviation of the overlap depth due to uncertain paths."""
 
 MAX_SAMPLES = 320
-"""Maximum number of samples of a search. Windows with more samples are decimated."""
+"""Maximum number of samples of a search; windows with more are decimated."""
 
 KNOWN_STD, KNOWN_MOMENT_RATIO = 0.7, 0.3
 """[m], [m/s] Standard deviation of the positions and velocities of tracked vehicles in a search,
@@ -53,39 +53,31 @@ class VehicleState:
         return vehicle_model(self.settings, self.network)
 
     @property
-    def _n_dipoles(self) -> int:
-        """Number of dipoles of a vehicle."""
-        return self._model.n_dipoles
-
-    @property
     def length_column(self) -> int | None:
         """Column of the length in the state of a vehicle; None if all vehicles are points."""
-        return 9 + 3 * self._n_dipoles if self._n_dipoles > 1 else None
+        return 9 + 3 * self._model.n_dipoles if self._model.n_dipoles > 1 else None
 
     def prior(self, theta: FloatArray, moments: FloatArray, t: float, kind: int, label: int
               ) -> tuple[FloatArray, FloatArray]:
-        """Mean (n_t,) and covariance (n_t, n_t) of a vehicle that arrives on a path `theta` (7,),
-        at time `t` [s] on it.
-
-        The mean lies on the path, and its moment has the estimated direction, that of `moments`
-        (k, 3) [A m², world frame]. All other values equal the prior at the start of a track.
-        """
+        """Mean (n_t,), on a path `theta` (7,) at time `t` [s] and with the direction of `moments`
+        (k, 3) [A m², world frame], and covariance (n_t, n_t) of an arriving vehicle; all else as at
+        the start of a track."""
         s = self.settings
         R = rotation_about_z(float(np.deg2rad(s.arrival_headings_deg[label])))
         total = moments.sum(axis=0)
         mean = s.kinds[kind].moment * total / max(float(np.linalg.norm(total)), MIN_MOMENT)
         x = self.along(theta, mean[None], np.array([t]), kind)[0]
         x[2], x[5] = s.kinds[kind].height, 0.0
-        if self._n_dipoles > 1:
-            x[9 + 3 * self._n_dipoles] = s.kinds[kind].length
+        if self.length_column is not None:
+            x[self.length_column] = s.kinds[kind].length
         return x, starting_covariance(s, kind, R, float(theta[3]), s.kinds[kind].moment_std)
 
     def along(self, theta: FloatArray, moments: FloatArray, times: FloatArray, kind: int
               ) -> FloatArray:
         """States (n, n_t) at `times` [s] on a straight path `theta` (7,), for a row of dipoles with
         `moments` (k, 3) from the tail to the head, A m², world frame."""
-        d, s, length = self._n_dipoles, self.settings, float(theta[6])
-        heading = float(theta[4])
+        d, s = self._model.n_dipoles, self.settings
+        heading, length = float(theta[4]), float(theta[6])
         R = rotation_about_z(heading)
         soft_D = soft_iron(s, kind)
         x = np.zeros((len(times), len(self._model.state_names)))
@@ -105,15 +97,12 @@ class VehicleState:
     def hard_moments(self, x: FloatArray) -> FloatArray:
         """Hard iron moments (d, 3) of the dipoles of a vehicle with state `x` (n_t,), A m², vehicle
         frame."""
-        hard: FloatArray = x[6:6 + 3 * self._n_dipoles].reshape(-1, 3)
+        hard: FloatArray = x[6:6 + 3 * self._model.n_dipoles].reshape(-1, 3)
         return hard
 
     def turning(self, x: FloatArray, P: FloatArray, target: int) -> FloatArray | None:
-        """Return `P` with the turn-rate variance of one target set to its initial value; None if
-        turning is disabled.
-
-        The state `x` (n_x,) contains several targets.
-        """
+        """Return `P` with the turn-rate variance of one target of a joint state `x` (n_x,) set to
+        its initial value; None if turning is disabled."""
         if not self._model.turn_acceleration:
             return None
         n = len(self._model.state_names)
@@ -125,7 +114,7 @@ class VehicleState:
 
 
 def _resampled(moments: FloatArray, d: int) -> FloatArray:
-    """Resample `moments` (k, 3) to `d` dipoles (d, 3); the total and the centroid are preserved."""
+    """Resample `moments` (k, 3) to `d` dipoles (d, 3) with the same total and centroid."""
     if len(moments) == 1 or d == 1:
         return np.tile(moments.sum(axis=0) / d, (d, 1))
     coordinates = np.linspace(0.0, d - 1.0, len(moments))
@@ -166,7 +155,7 @@ class WindowStart(PathHypothesis):
 
 
 @dataclass(frozen=True)
-class KnownVehicleHypothesis(PathHypothesis):
+class KnownVehicles(PathHypothesis):
     """Hypothesis of the known vehicles in a search for new vehicles."""
 
     filter: BankFilter | None
@@ -174,8 +163,7 @@ class KnownVehicleHypothesis(PathHypothesis):
 
 
 def inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
-    """Covariance (n + k, n + k) with an independent `block` (k, k) inserted into `P` at row
-    `at`."""
+    """Covariance (n + k, n + k) with an independent `block` (k, k) inserted into `P` at `at`."""
     n, k = len(P), len(block)
     rows = np.append(np.arange(at), np.arange(at + k, n + k))
     out = np.zeros((n + k, n + k))
@@ -185,18 +173,15 @@ def inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
 
 
 def labels_of(labels: Sequence[tuple[int, ...]]) -> IntArray:
-    """Labels of each vehicle, for each hypothesis, in the shape required by `FilterBank`, (n,) or
-    (n, n_targets)."""
+    """Labels of each vehicle and hypothesis in the shape of `FilterBank`, (n,) or (n, n_targets).
+    """
     out = np.array(labels)
     return out[:, 0].copy() if out.shape[1] == 1 else out
 
 
 def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length_column: int | None) -> float:
-    """Maximum depth by which any two vehicles overlap along a joint path (n, n_x), m.
-
-    Each vehicle has `n_one` states, with its length at `length_column`, which is None if all
-    vehicles are points.
-    """
+    """Maximum depth by which any two vehicles, of `n_one` states each, overlap along a joint path
+    (n, n_x), m; `length_column` is None if all vehicles are points."""
     x = path[:, :n_one * n_targets].reshape(len(path), n_targets, n_one)
     depth = 0.0
     for i in range(n_targets):
@@ -235,11 +220,12 @@ class WindowSearch:
         return StartGrid(self.samples, self.prior,
                          self.prior.starts(self._vehicles.settings, self._vehicles.network))
 
-    def beside(self, known: KnownVehicleHypothesis) -> SteadySearch:
+    def beside(self, known: KnownVehicles) -> SteadySearch:
         """Search for a vehicle in addition to known vehicles."""
-        samples = self.samples
+        samples, backgrounds = self.samples, \
+            self._vehicles.background_std * self.samples.backgrounds
         if known.filter is None:
-            return SteadySearch(samples, self.prior, np.zeros(len(samples.y)), self._backgrounds())
+            return SteadySearch(samples, self.prior, np.zeros(len(samples.y)), backgrounds)
         path, t = known.path[self._frame_indices], self.times[self._frame_indices]
         n, kind = len(path), np.array([known.kind])
         fields = [known.filter.fields_at(path[k], kind, self._window.frames[i],
@@ -252,20 +238,12 @@ class WindowSearch:
         columns = self._error_columns(H, path[-1], t, known.filter.observation.n_one)
         columns = columns[:, samples.compared].reshape(len(W), 3, -1)
         return SteadySearch(samples, self.prior, np.einsum('nij,nj->ni', W, h).ravel(),
-                            np.hstack([self._backgrounds(), (W @ columns).reshape(3 * len(W), -1)]))
-
-    def _backgrounds(self) -> FloatArray:
-        """Whitened fields (3 n, q) of the backgrounds, each at one standard deviation."""
-        return self._vehicles.background_std * self.samples.backgrounds
+                            np.hstack([backgrounds, (W @ columns).reshape(3 * len(W), -1)]))
 
     def _error_columns(self, H: FloatArray, x: FloatArray, t: FloatArray, n_one: int) -> FloatArray:
         """Field errors (n, n_sensors, 3, q) due to one std of each position, velocity or moment of
-        the known vehicles.
-
-        `H` (n, n_sensors, 3, n_t) holds the derivatives of the fields with respect to the vehicle
-        states. The times `t` (n,) [s] are relative to the end of the path; `x` (n_x,) is the state
-        there.
-        """
+        the known vehicles, from the derivatives `H` (n, n_sensors, 3, n_t) of the fields at times
+        `t` (n,) [s] relative to the end of the path, and the state `x` (n_x,) there."""
         out = []
         for first in range(0, H.shape[-1], n_one):
             H_one = H[..., first:first + n_one]
