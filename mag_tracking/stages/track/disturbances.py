@@ -1,6 +1,13 @@
-"""Disturbances: smooth fields that start a track, but that no target explains."""
+"""Disturbances: smooth fields that start a track, but that no target explains.
+
+Two models of a smooth field compete with a target. In the first, each sensor has an independent
+field (temperature, a knock, a cable). In the second, one field with a gradient covers the network
+(a geomagnetic storm, a power line, a tram). Both allow for the same model error as the tracker;
+otherwise a smooth field would be favoured whenever a target is near.
+"""
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from scipy.special import chdtri
@@ -18,22 +25,23 @@ FALSE_ALARM_PROBABILITY = 1e-6
 
 GRADIENT_RATIO = 0.3
 """Prior standard deviation of the change of a common field from the centre of the network to its
-edge, relative to the standard deviation of the field."""
+edge, relative to that of the field."""
 
 MIN_STD = 1e-15
-"""Minimum standard deviation of the noise of a sensor [T]. Network files with less noise are
-rejected."""
+"""[T] Minimum standard deviation of the noise of a sensor in a network file."""
 
 UNKNOWN_FIELD_STD = 1e-4
 """Prior standard deviation of the field after a handover [T]."""
 
 MIN_GRADIENT_SENSORS = 3
-"""Minimum number of sensors for which the common field has a gradient. With fewer sensors, a
-gradient could explain any readings."""
+"""Minimum number of sensors for a common field with a gradient, which could explain any readings of
+fewer."""
 
 MAX_COMMON_SENSORS = 8
-"""Maximum number of sensors in the model of a common field. The cost of the model grows with the
-cube of this number."""
+"""Maximum number of sensors in the model of a common field, whose cost grows with its cube."""
+
+_Filters: TypeAlias = tuple[GaussMarkovVectors, GaussMarkovVectors, GaussMarkovVectors]
+"""Independent fields of the covered and of the other sensors, and a common field of the covered."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +49,7 @@ class UnexplainedField:
     """Field of a track that no target explains."""
 
     track_id: int
-    """Identifier of the track."""
     begin_ns: int
-    """Start of the track [ns]."""
     largest: FloatArray
     """Largest field measured by each sensor, (n_sensors,) T."""
     sensed: BoolArray
@@ -78,18 +84,14 @@ class Disturbances:
         return [self._current]
 
     def feed(self, frame: FieldFrame) -> None:
-        """Update the current disturbance, if any, with a frame that belongs to no track.
-
-        The disturbance may grow stronger and affect additional sensors.
-        """
+        """Update the current disturbance, if any, with a frame that belongs to no track."""
         if self._current is not None:
             energy, n_axes = whitened_energy(frame.field, frame.covariance)
             self._largest = np.maximum(self._largest, field_magnitudes(frame))
             self._sensed |= energy > chdtri(np.maximum(n_axes, 1), FALSE_ALARM_PROBABILITY)
 
     def end(self, stamp_ns: int) -> list[Disturbance]:
-        """Return the closing record of the disturbance in progress, if any, at the release of the
-        detection or at a gap in the frames."""
+        """Return the closing record of the disturbance in progress, if any."""
         if self._current is None:
             return []
         last, self._current = self._current, None
@@ -109,10 +111,8 @@ def field_magnitudes(frame: FieldFrame) -> FloatArray:
 
 
 class DisturbanceModel:
-    """Models of smooth fields without a target, as the alternative explanation of a track.
-
-    `background_std` is in T. A model starts with zero field at the first frame of a track, but with
-    an unknown field if it starts during the track (`is_handover`).
+    """Models of smooth fields without a target, which start with a background of `background_std`
+    [T] at the first frame of a track, but with an unknown field during the track (`is_handover`).
     """
 
     def __init__(self, network: SensorNetwork, background_std: float,
@@ -124,8 +124,7 @@ class DisturbanceModel:
         covered = np.arange(min(n, MAX_COMMON_SENSORS))
         self._common_H = _common_field_matrix(
             network.part(covered) if n > len(covered) else network)
-        self._filters: tuple[GaussMarkovVectors, GaussMarkovVectors, GaussMarkovVectors] | None \
-            = None
+        self._filters: _Filters | None = None
         # Log-weights of independent fields and of a common field.
         self._log_w = np.log([0.5, 0.5])
 
@@ -149,8 +148,7 @@ class DisturbanceModel:
         if self._filters is None:
             if not len(y):
                 return 0.0
-            self._initialise(float(np.median(noise.ravel()[is_present])))
-        assert self._filters is not None
+            self._filters = self._initial_filters(float(np.median(noise.ravel()[is_present])))
         covered, remaining, common = self._filters
         sensor, H = self._sensor[is_present], self._own_H[is_present]
         k = int(np.searchsorted(sensor, MAX_COMMON_SENSORS))
@@ -165,8 +163,8 @@ class DisturbanceModel:
         self._log_w = log_joint - evidence
         return None if is_first else evidence
 
-    def _initialise(self, noise: float) -> None:
-        """Initialise the filters; `noise` [T²] is the median noise variance of the first frame."""
+    def _initial_filters(self, noise: float) -> _Filters:
+        """Filters of the fields at the first frame, whose median noise variance is `noise` [T²]."""
         scale = np.sqrt(self._background_std**2 + noise)
         n = len(self._sensor) // 3
         n_covered = min(n, MAX_COMMON_SENSORS)
@@ -176,17 +174,16 @@ class DisturbanceModel:
         scales = scale * np.concatenate([np.ones(3), np.full(n_field - 3, GRADIENT_RATIO),
                                          np.zeros(3 * n_covered)])
         scale_per_axis = np.full(3, scale)
-        self._filters = (GaussMarkovVectors(n_covered, scale_per_axis, std),
-                         GaussMarkovVectors(n - n_covered, scale_per_axis, std),
-                         GaussMarkovVectors(1, scales, std))
+        return (GaussMarkovVectors(n_covered, scale_per_axis, std),
+                GaussMarkovVectors(n - n_covered, scale_per_axis, std),
+                GaussMarkovVectors(1, scales, std))
 
 
 def _common_field_matrix(network: SensorNetwork) -> FloatArray:
     """Matrix (3 n_sensors, m) that maps a common field and the backgrounds to the sensor axes.
 
-    The field is uniform and, with at least `MIN_GRADIENT_SENSORS` sensors, has a gradient. Without
-    sources inside the network, the gradient is symmetric and traceless. Its five parameters are the
-    changes of the field [T] from the centre of the network to its edge.
+    The five parameters of the gradient, symmetric and traceless without sources inside the network,
+    are the changes of the field [T] from the centre of the network to its edge.
     """
     n, R_sw = len(network), network.R_sw
     field = np.tile(np.eye(3), (n, 1, 1))

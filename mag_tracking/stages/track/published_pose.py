@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias, TypedDict
+from typing import TypeAlias, TypedDict
 
 import numpy as np
 
@@ -42,20 +42,18 @@ Flags: TypeAlias = tuple[bool, bool, bool]
 """Whether the rotation about the x, y and z axis of the body is unobservable."""
 
 OrientationEstimate: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, Flags]
-"""Quaternion, derivative, variance of the unobservable part, and flags; see `Orientation`."""
+"""Quaternion (4,), derivative (3, n_t) of the small rotation about the world axes with respect to
+the target state, variance (3, 3) [rad²] of the unobservable part, to be added, and flags."""
 
 
 class UnobservedLength:
-    """Uncertainty of the middle of a vehicle due to the part that no sensor has observed yet; use
-    one instance for each target.
+    """Uncertainty of the middle of a vehicle due to the part that no sensor has observed yet.
 
-    Until its rear has passed a sensor, an apparent car may be the engine of a truck. A row of
-    dipoles explains both, and both models are too inaccurate for a reliable comparison.
-
-    The iron of a long vehicle is at its engine, axles and load, so the row of dipoles is shorter
-    than the vehicle. Until the rear has been observed, the rest of the vehicle is assumed to be
-    behind the row. Afterwards, it may be at either end, and the middle is uniformly distributed
-    between these two cases.
+    Until its rear has passed a sensor, an apparent car may be the engine of a truck; both models
+    are too inaccurate for a reliable comparison. The iron of a long vehicle is at its engine, axles
+    and load, so the row of dipoles is shorter than the vehicle. Until the rear has been observed,
+    the rest is assumed to be behind the row; afterwards, the middle is uniformly distributed
+    between the cases that it is at either end.
 
     All kinds of vehicle, with `lengths` and `length_stds` in m, are equally frequent.
     """
@@ -68,17 +66,13 @@ class UnobservedLength:
 
     def update(self, x: FloatArray, P: FloatArray, positions: FloatArray, is_certain: bool) -> None:
         """Update the direction of travel and, if the position is certain (unambiguous), the
-        distance travelled.
-
-        The state `x` (n_t,) begins with position and velocity. `positions` (n_sensors, 3) are those
-        of the sensors that measured.
-        """
+        distance travelled, with a target state `x` (n_t,) and the `positions` (n_sensors, 3) of the
+        sensors that measured."""
         self._forward = self._direction(x, P)
         if not is_certain or not len(positions):
             return
         if self._distance_travelled > 0.0:
-            # After the first sensor the distance along the path is used, which is also valid in a
-            # turn.
+            # After the first sensor, the distance along the path is also valid in a turn.
             self._distance_travelled += float(np.linalg.norm(x[:2] - self._last_position))
         else:
             self._distance_travelled = float(offset_from_nearest(x[:2], positions) @ self._forward)
@@ -107,43 +101,6 @@ class UnobservedLength:
         return x[3:5] / speed if is_moving else self._forward
 
 
-class Orientation(Protocol):
-    """Interface that computes an orientation from a target state."""
-
-    def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
-        """Orientation of one state.
-
-        Parameters
-        ----------
-        x : (n_t,) array
-            Target state that begins with position and velocity.
-        P : (n_t, n_t) array
-            Covariance of the state.
-
-        Returns
-        -------
-        q : (4,) array, xyzw
-        T : (3, n_t) array
-            Derivative of the small rotation about the world axes with respect to the state.
-        unobserved : (3, 3) array, rad^2
-            Variance of the unobservable part, to be added.
-        flags : (3,) tuple of bool
-            Whether the rotation about the x, y and z axis of the body is unobservable.
-        """
-
-    def quaternions(self, x: FloatArray) -> FloatArray:
-        """Quaternions of several states.
-
-        Parameters
-        ----------
-        x : (n, n_t) array
-
-        Returns
-        -------
-        (n, 4) array
-        """
-
-
 class PoseFields(TypedDict):
     """Entries of `Track` and `SmoothedPose` that are computed from a target state."""
 
@@ -163,7 +120,7 @@ class VehicleOrientation:
     """Orientation along the velocity; roll and pitch are unobservable."""
 
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
-        """Orientation of one state, as for `Orientation`."""
+        """Orientation of a target state `x` (n_t,) with covariance `P` (n_t, n_t)."""
         squared_speed = x[3] ** 2 + x[4] ** 2
         T = np.zeros((3, len(x)))
         if squared_speed > 0.0:
@@ -184,11 +141,11 @@ class MagnetOrientation:
     """Orientation along the moment; the rotation about the moment is unobservable."""
 
     axis: FloatArray
-    """(3,) Direction of the moment in the frame of the magnet. The flag of the unobservable
-    rotation is set for the body axis nearest to it."""
+    """(3,) Direction of the moment in the frame of the magnet; the rotation about the body axis
+    nearest to it is flagged as unobservable."""
 
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
-        """Orientation of one state, as for `VehicleOrientation`."""
+        """Orientation of a target state `x` (n_t,)."""
         m = x[6:9]
         squared_norm = m @ m
         T = np.zeros((3, len(x)))
@@ -202,6 +159,10 @@ class MagnetOrientation:
     def quaternions(self, x: FloatArray) -> FloatArray:
         """Quaternions (n, 4) of states (n, n_t)."""
         return np.array([quaternion_between(self.axis, m) for m in x[:, 6:9]])
+
+
+Orientation: TypeAlias = VehicleOrientation | MagnetOrientation
+"""Function that computes the orientation from a target state."""
 
 
 def published_track(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
@@ -231,7 +192,9 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     fields, flags = _pose_fields(model, orientation, bank.x[best, :n_t], excess * P,
                                  int(bank.kind[best]), unobserved_length, difference)
     reasons = doubts.ordered({*found, *ambiguities(bank, best, is_separated)})
-    uncertainty: PoseUncertainty | None = pose_uncertainty(fields)
+    uncertainty: PoseUncertainty | None = PoseUncertainty(
+        fields['covariance'], fields['orientation_covariance'],
+        fields['position_orientation_covariance'])
     if reasons and ambiguous_poses != BEST:
         uncertainty = mixture_uncertainty(
             bank, best, is_separated, model, orientation, fields, P, excess) \
@@ -260,12 +223,8 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
 def covariance_about(bank: FilterBank, best: int, model: SourceModel, is_separated: BoolArray
                      ) -> FloatArray:
     """Covariance (n_t, n_t) about the state of hypothesis `best`, from all hypotheses at the same
-    position.
-
-    Hypotheses at the same position differ in linearisation, kind of target and motion; these
-    differences are part of the error. Hypotheses at other positions (`is_separated`) make the track
-    ambiguous instead.
-    """
+    position, which differ in linearisation, kind and motion; hypotheses at other positions
+    (`is_separated`) make the track ambiguous instead."""
     return _second_moment(bank, best, model, np.where(is_separated, -np.inf, bank.log_w))
 
 
@@ -286,12 +245,11 @@ def _second_moment(bank: FilterBank, best: int, model: SourceModel,
 
 def mixture_uncertainty(bank: FilterBank, best: int, is_separated: BoolArray, model: SourceModel,
                         orientation: Orientation, published: PoseFields, P_unwidened: FloatArray,
-                        excess: float = 1.0) -> PoseUncertainty:
+                        excess: float) -> PoseUncertainty:
     """Uncertainty of a pose if any of the hypotheses may be correct.
 
     `published` is the pose from the hypotheses at the same position as `best`, with a wider
-    covariance than `P_unwidened`, the result of `covariance_about`. `is_separated` is that of
-    `FilterBank`, and `excess` that of `published_track`.
+    covariance than `P_unwidened`, the result of `covariance_about`.
     """
     n_t = len(model.state_names)
     widening = published['covariance'] - excess * P_unwidened[:6, :6]
@@ -313,15 +271,8 @@ def mixture_uncertainty(bank: FilterBank, best: int, is_separated: BoolArray, mo
         + np.einsum('n,ni,nj->ij', weight, displacement, rotations))
 
 
-def pose_uncertainty(fields: PoseFields) -> PoseUncertainty:
-    """Uncertainty of a published pose."""
-    return PoseUncertainty(fields['covariance'], fields['orientation_covariance'],
-                           fields['position_orientation_covariance'])
-
-
 def ambiguities(bank: FilterBank, best: int, is_separated: BoolArray) -> set[str]:
-    """Doubts about the position and the arrival direction of the best hypothesis; `is_separated` is
-    that of `FilterBank`."""
+    """Doubts about the position and the arrival direction of the best hypothesis."""
     reasons = set()
     if bank.weight(is_separated) > AMBIGUOUS_WEIGHT:
         reasons.add(doubts.ANOTHER_PLACE)

@@ -30,9 +30,8 @@ _States: TypeAlias = tuple[FloatArray, FloatArray]
 """States and covariances of a bank."""
 
 SENSORS_PER_REJECTION = 8
-"""Number of measuring sensors for each sensor that may be rejected. With fewer sensors, one may be
-rejected. If more rejections are needed, the track itself is wrong. A majority of fitting sensors
-does not confirm the track, because sensors far from the target fit any hypothesis."""
+"""Number of measuring sensors for each sensor that may be rejected, at least one. If more must
+be rejected, the track itself is wrong; sensors far from the target fit any hypothesis."""
 
 
 def nearest_sensors(positions: FloatArray, position: FloatArray, n: int) -> IntArray:
@@ -81,10 +80,7 @@ class SensorSubset:
 
     def ahead_of(self, state: FloatArray, n: int) -> 'SensorSubset':
         """Subset of the `n` sensors nearest to the predicted position of a target with `state`
-        (n_x,).
-
-        It is the same object if it already contains the nearer half of these sensors.
-        """
+        (n_x,); the same object if it already contains the nearer half of these sensors."""
         position = state[:2] + PREDICTION_S * state[3:5]
         is_enough = np.isin(
             nearest_sensors(self.full_network.positions, position, n // 2), self.rows).all()
@@ -96,9 +92,22 @@ class SensorSubset:
         return bool(offset @ track.velocity[:2] < 0.0)
 
     def for_whole_network(self, track: Track, settings: TrackSettings) -> Track:
-        """Extend a track record of these sensors to all sensors of the network."""
-        return for_whole_network(track, self.rows, self.full_network, settings) if self.is_part \
-            else track
+        """Extend a track record of these sensors to all sensors of the network.
+
+        Entries of the other sensors are NaN; their mounting angles have the prior covariance.
+        """
+        if not self.is_part:
+            return track
+        n_sensors, rows = len(self.full_network), self.rows
+        predicted, nis = np.full((n_sensors, 3), np.nan), np.full(n_sensors, np.nan)
+        predicted[rows], nis[rows] = track.predicted, track.nis_by_sensor
+        mounting, covariance = track.mounting, track.mounting_covariance
+        if len(mounting):
+            mounting = np.zeros((n_sensors, 3))
+            covariance = angle_priors(self.full_network, np.deg2rad(settings.mounting_std_deg))
+            mounting[rows], covariance[rows] = track.mounting, track.mounting_covariance
+        return replace(track, predicted=predicted, nis_by_sensor=nis, mounting=mounting,
+                       mounting_covariance=covariance)
 
 
 def exchange_sensor_states(bank: FilterBank, before: IntArray, after: IntArray,
@@ -135,24 +144,6 @@ def _state_columns(n_t: int, n_own: int, n_sensors: int) -> IntArray:
                       n_t + n_own * n_sensors + 3 * j + np.arange(3)])
 
 
-def for_whole_network(track: Track, rows: IntArray, network: SensorNetwork,
-                      settings: TrackSettings) -> Track:
-    """Extend a track record from the sensors `rows` to all sensors of the network.
-
-    Entries of the other sensors are NaN; their mounting angles have the prior covariance.
-    """
-    n_sensors = len(network)
-    predicted, nis = np.full((n_sensors, 3), np.nan), np.full(n_sensors, np.nan)
-    predicted[rows], nis[rows] = track.predicted, track.nis_by_sensor
-    mounting, covariance = track.mounting, track.mounting_covariance
-    if len(mounting):
-        mounting = np.zeros((n_sensors, 3))
-        covariance = angle_priors(network, np.deg2rad(settings.mounting_std_deg))
-        mounting[rows], covariance[rows] = track.mounting, track.mounting_covariance
-    return replace(track, predicted=predicted, nis_by_sensor=nis, mounting=mounting,
-                   mounting_covariance=covariance)
-
-
 class SensorRejection:
     """Update of a bank that excludes sensors whose measurements contradict the other sensors."""
 
@@ -161,7 +152,7 @@ class SensorRejection:
         self.clear()
 
     def clear(self) -> None:
-        """Clear the list of sensors that were rejected in the previous frame."""
+        """Forget the sensors that were rejected in the previous frame."""
         self._rejected: tuple[int, ...] = ()
 
     def advance(self, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame, dt: float
@@ -169,21 +160,23 @@ class SensorRejection:
         """Predict and update a bank with a frame, without sensors that contradict the others.
 
         Returns the predicted states (n_hyp, n_x), log-likelihoods (n_hyp,), the frame without the
-        rejected sensors, and the number of rejections by description, one per rejected sensor.
+        rejected sensors, and the counts of each rejected sensor.
         """
         # Copying all states takes as long as the update. If the frame fits the hypothesis that
         # leads before the update, it usually also fits the hypothesis that leads afterwards.
-        may_contradict = not self._fits_leader(bank_filter, bank, frame, dt)
+        leader = bank.alone(int(np.argmax(bank.log_w)))
+        may_contradict = not _fits(bank_filter, leader, frame,
+                                   bank_filter.advance(leader, frame, dt)[1])
         prior = bank.x, bank.P
         predicted, log_likelihood = bank_filter.advance(bank, frame, dt, keeps_prior=may_contradict)
-        if not may_contradict or self._fits(bank_filter, bank, frame, log_likelihood):
+        if not may_contradict or _fits(bank_filter, bank, frame, log_likelihood):
             self._rejected = ()
             return predicted, log_likelihood, frame, Counter()
         full_update = bank.x, bank.P, bank.nis, log_likelihood
         for rejected in self._candidates(bank_filter, bank, prior, frame, dt):
-            log_likelihood, reduced = self._update_without(
+            log_likelihood, reduced = _update_without(
                 bank_filter, bank, prior, frame, dt, rejected)
-            if self._fits(bank_filter, bank, reduced, log_likelihood):
+            if _fits(bank_filter, bank, reduced, log_likelihood):
                 self._rejected = rejected
                 return predicted, log_likelihood, reduced, Counter(
                     {f'frames in which {self._names[j]} was rejected': 1 for j in rejected})
@@ -207,38 +200,33 @@ class SensorRejection:
             for j in present:
                 if j not in rejected:
                     candidate = (*rejected, j)
-                    log_likelihood, reduced = self._update_without(
+                    log_likelihood, reduced = _update_without(
                         bank_filter, bank, prior, frame, dt, candidate)
-                    misfit[candidate] = _misfit(bank, reduced, log_likelihood)
+                    leader = _leader(bank, log_likelihood)
+                    # Normalised innovation squared per axis of the leading hypothesis.
+                    misfit[candidate] = np.inf if leader is None else float(
+                        np.nansum(bank.nis[leader])) / np.count_nonzero(~np.isnan(reduced.field))
             rejected = min(misfit, key=misfit.__getitem__)
             yield rejected
 
-    @staticmethod
-    def _update_without(bank_filter: BankFilter, bank: FilterBank, prior: _States,
-                        frame: FieldFrame, dt: float, rejected: tuple[int, ...]
-                        ) -> tuple[FloatArray, FieldFrame]:
-        """Repeat the update without some sensors; return log-likelihoods and the reduced frame."""
-        is_missing = np.isin(np.arange(len(frame.field)), rejected)
-        reduced = replace(frame, field=np.where(is_missing[:, None], np.nan, frame.field),
-                          covariance=np.where(is_missing[:, None, None], np.nan, frame.covariance),
-                          n_samples=np.where(is_missing, 0, frame.n_samples),
-                          time_offset=np.where(is_missing, 0.0, frame.time_offset))
-        bank.x, bank.P = prior
-        return bank_filter.advance(bank, reduced, dt, keeps_prior=True)[1], reduced
 
-    @classmethod
-    def _fits_leader(cls, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame,
-                     dt: float) -> bool:
-        """Whether the frame fits the hypothesis that leads before the update."""
-        leader = bank.alone(int(np.argmax(bank.log_w)))
-        return cls._fits(bank_filter, leader, frame, bank_filter.advance(leader, frame, dt)[1])
+def _update_without(bank_filter: BankFilter, bank: FilterBank, prior: _States, frame: FieldFrame,
+                    dt: float, rejected: tuple[int, ...]) -> tuple[FloatArray, FieldFrame]:
+    """Repeat the update without some sensors; return log-likelihoods and the reduced frame."""
+    is_missing = np.isin(np.arange(len(frame.field)), rejected)
+    reduced = replace(frame, field=np.where(is_missing[:, None], np.nan, frame.field),
+                      covariance=np.where(is_missing[:, None, None], np.nan, frame.covariance),
+                      n_samples=np.where(is_missing, 0, frame.n_samples),
+                      time_offset=np.where(is_missing, 0.0, frame.time_offset))
+    bank.x, bank.P = prior
+    return bank_filter.advance(bank, reduced, dt, keeps_prior=True)[1], reduced
 
-    @staticmethod
-    def _fits(bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame,
-              log_likelihood: FloatArray) -> bool:
-        """Whether the frame fits the hypothesis that leads after the update."""
-        leader = _leader(bank, log_likelihood)
-        return leader is not None and not bank_filter.is_implausible(bank, leader, frame)
+
+def _fits(bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame,
+          log_likelihood: FloatArray) -> bool:
+    """Whether the frame fits the hypothesis that leads after the update."""
+    leader = _leader(bank, log_likelihood)
+    return leader is not None and not bank_filter.is_implausible(bank, leader, frame)
 
 
 def _leader(bank: FilterBank, log_likelihood: FloatArray) -> int | None:
@@ -246,10 +234,3 @@ def _leader(bank: FilterBank, log_likelihood: FloatArray) -> int | None:
     log_w = bank.log_w + log_likelihood
     leader = int(np.argmax(log_w))
     return leader if np.isfinite(log_w[leader]) else None
-
-
-def _misfit(bank: FilterBank, frame: FieldFrame, log_likelihood: FloatArray) -> float:
-    """Normalised innovation squared per axis of the leading hypothesis; infinite if none leads."""
-    leader = _leader(bank, log_likelihood)
-    n_axes = np.count_nonzero(~np.isnan(frame.field))
-    return np.inf if leader is None else float(np.nansum(bank.nis[leader])) / n_axes

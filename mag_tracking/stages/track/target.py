@@ -34,27 +34,25 @@ from mag_tracking.stages.track.published_pose import (
 from mag_tracking.stages.track.settings import TrackSettings
 
 MAX_BYTES = 4 << 30
-"""Memory above which settings are rejected [bytes]. The limit applies to the covariances of all
-starting hypotheses. The peak memory is 1.5 times as large."""
+"""[bytes] Memory for the covariances of all starting hypotheses above which settings are rejected;
+the peak memory is 1.5 times as large."""
 
 START_BYTES = 250_000_000
-"""Memory for the covariances with which a track starts [bytes]. If the covariances with all sensors
-need more, the track starts with fewer sensors. The remaining sensors are added after the frames
-before the detection if few hypotheses are then probable, otherwise later."""
+"""[bytes] Memory for the covariances with which a track starts. Sensors that need more are added
+after the frames before the detection if few hypotheses are then probable, otherwise later."""
 
 MIN_SENSORS_AT_START = 4
-"""Minimum number of sensors at the start of a track. The sensors nearest to the strongest field are
-used."""
+"""Minimum number of sensors at the start of a track, those nearest to the strongest field."""
 
 WIDER_BYTES = 100_000_000
-"""Maximum memory of the covariances after the remaining sensors have been added [bytes]."""
+"""[bytes] Maximum memory of the covariances after the remaining sensors have been added."""
 
 MIN_HYPOTHESES = 100
 """Minimum number of retained hypotheses, even if they exceed `WIDER_BYTES`."""
 
 MIN_WEIGHT = 0.999
-"""Minimum total weight of the hypotheses that are retained when the remaining sensors are added. If
-more weight were dropped, the track would appear more certain than the frames justify."""
+"""Minimum total weight of the hypotheses that are retained when the remaining sensors are added, so
+that the track does not appear more certain than the frames justify."""
 
 _FLOAT_BYTES = 8
 
@@ -70,11 +68,10 @@ class Target:
     kinds: Sequence[str]
     """Name of each kind of target."""
     unobserved_length: Callable[[], UnobservedLength | None]
-    """Factory that is called for each track. It returns the uncertainty of the middle of a vehicle
-    due to its unobserved length; None for a magnet."""
+    """Factory, for each track, of the uncertainty of the middle of a vehicle due to its unobserved
+    length; None for a magnet."""
     starts_anywhere: bool
-    """Whether a track may start anywhere. A lost magnet may be found at any position, but a vehicle
-    starts on an arrival line."""
+    """Whether a track may start anywhere, like a magnet, or on an arrival line, like a vehicle."""
     start: Callable[[TrackSettings, SensorNetwork, FieldFrame, FloatArray], FilterBank | None]
     """Function that returns the first hypotheses from the settings, a network, a frame and the
     covariances (n_sensors, n_own, n_own) of mounting angles and model errors; None if the frame
@@ -93,43 +90,32 @@ def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
     if settings.target == 'vehicle':
         vehicle = settings.vehicle
         row = vehicle_model(vehicle, network)
-        check_vehicle_bank(settings, network, row)
+        _check_vehicle_bank(settings, network, row)
         return Target(row, VehicleOrientation(), vehicle.arrival_names,
                       [kind.name for kind in vehicle.kinds],
                       partial(UnobservedLength, [kind.length for kind in vehicle.kinds],
                               [kind.length_std for kind in vehicle.kinds]),
-                      False, _start_vehicle)
+                      False, lambda s, network, frame, own_covariance: start_vehicle(
+                          s.vehicle, network, frame, s.background_std, own_covariance))
     if settings.target == 'magnet':
         magnet = settings.magnet
         if not any(magnet.axis):
             raise SettingsError('track.magnet.axis: the zero vector has no direction')
         model = magnet_model(magnet)
-        check_magnet_bank(settings, network, model)
-        return Target(model,
-                      MagnetOrientation(np.array(magnet.axis)),
-                      ('',), ('',), lambda: None, True, _start_magnet,
+        _check_bank('track.magnet', {'optima': MAX_STARTS}, settings, _n_sensors(settings, network),
+                    model)
+        return Target(model, MagnetOrientation(np.array(magnet.axis)), ('',), ('',), lambda: None,
+                      True, lambda s, network, frame, own_covariance: start_magnet(
+                          s.magnet, network, frame, s.background_std, own_covariance,
+                          s.field_error),
                       lambda s, network, dt: is_lost_after(s.magnet, network, dt))
     raise SettingsError(f'track.target: expected vehicle or magnet, got {settings.target!r}')
 
 
-def _start_vehicle(settings: TrackSettings, network: SensorNetwork, frame: FieldFrame,
-                   own_covariance: FloatArray) -> FilterBank | None:
-    """First hypotheses of a vehicle; None if the frame does not allow a start."""
-    return start_vehicle(settings.vehicle, network, frame, settings.background_std,
-                         own_covariance)
-
-
-def _start_magnet(settings: TrackSettings, network: SensorNetwork, frame: FieldFrame,
-                  own_covariance: FloatArray) -> FilterBank | None:
-    """First hypotheses of a magnet; None if the frame does not allow a start."""
-    return start_magnet(settings.magnet, network, frame, settings.background_std, own_covariance,
-                        settings.field_error)
-
-
-def check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
-                       model: SourceModel) -> None:
-    """Check the memory for the hypotheses of a vehicle; raises SettingsError if the starting
-    hypotheses, or `MIN_HYPOTHESES` with the maximum number of sensors, exceed `MAX_BYTES`."""
+def _check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
+                        model: SourceModel) -> None:
+    """Raise SettingsError if the starting hypotheses of a vehicle, or `MIN_HYPOTHESES` with the
+    maximum number of sensors, exceed `MAX_BYTES`."""
     _check_bank('track.vehicle', _vehicle_factors(settings), settings,
                 sensors_at_start(settings, network, model), model)
     n = _n_sensors(settings, network)
@@ -166,7 +152,7 @@ def max_sensors(observation: Observation, n_hyp: int) -> int:
 
 
 def _max_affordable_sensors(n_hyp: int, n_target: int, n_per_sensor: int) -> int:
-    """Maximum number of sensors of a bank within `START_BYTES`; see `max_sensors`."""
+    """Maximum number of sensors of a bank, as `max_sensors`."""
     n_states = math.isqrt(START_BYTES // (_FLOAT_BYTES * n_hyp))
     return max((n_states - n_target) // n_per_sensor, MIN_SENSORS_AT_START)
 
@@ -174,16 +160,7 @@ def _max_affordable_sensors(n_hyp: int, n_target: int, n_per_sensor: int) -> int
 def max_hypotheses(observation: Observation, n_sensors: int) -> int:
     """Maximum number of hypotheses that a track retains when it changes to `n_sensors` sensors:
     those within `WIDER_BYTES`, but at least `MIN_HYPOTHESES`."""
-    size = _FLOAT_BYTES * observation.n_states(n_sensors)**2
-    return max(MIN_HYPOTHESES, WIDER_BYTES // size)
-
-
-def check_magnet_bank(settings: TrackSettings, network: SensorNetwork,
-                      model: SourceModel) -> None:
-    """Check the memory for a magnet; raises SettingsError if the starting hypotheses exceed
-    `MAX_BYTES`."""
-    _check_bank('track.magnet', {'optima': MAX_STARTS}, settings, _n_sensors(settings, network),
-                model)
+    return max(MIN_HYPOTHESES, WIDER_BYTES // (_FLOAT_BYTES * observation.n_states(n_sensors)**2))
 
 
 def _check_bank(group: str, factors: Mapping[str, int], settings: TrackSettings, n: int,
