@@ -21,34 +21,32 @@ from mag_tracking.stages.track.settings import TrackSettings
 
 LINEAR_FRACTION = 0.25
 """Displacement over which the field is approximately linear, as a fraction of the distance to the
-nearest sensor. The cube of that distance then changes by a factor of about two."""
+nearest sensor, whose cube then changes by a factor of about two."""
 
 SAME_TIME_FRACTION = 0.05
-"""A frame whose samples span less than this fraction of the interval since the previous frame is
-treated as simultaneous. The first frame of a track is always treated as simultaneous, because
-differences between frames determine velocities better than differences within a frame."""
+"""Fraction of the interval since the previous frame below which the samples of a frame count as
+simultaneous, like those of the first frame of a track."""
 
 
 NEGLIGIBLE_ENERGY, WEAK_ENERGY = 0.1, 1.0
-"""Squared norm of the whitened field per frame below which a target that moves away is removed
-from a joint track. The larger limit applies if the track has the maximum number of targets. Up to
-the larger limit, the field of a target does not disturb other targets."""
+"""Squared norm of the whitened field per frame below which a target that moves away is removed from
+a joint track, and up to which it does not disturb other targets; the latter is the limit if the
+track has the maximum number of targets."""
 
 DETECTABLE_ENERGY = 4.0
-"""Minimum squared norm of the whitened field of a detectable target. For a tracked vehicle, it
-applies to the last frame. For a new vehicle, it applies to the sum over a window at each sensor.
-For a path in a search, it applies to the energy in the window that the prior of the moments
-predicts."""
+"""Minimum squared norm of the whitened field of a detectable target: of a tracked vehicle in the
+last frame, of a new vehicle in a window at each sensor, and of a path in a search according to the
+prior of its moments."""
 
 
 class PathResult(NamedTuple):
     """Result of `BankFilter.run_along`; the first axis of every array is the hypothesis."""
 
     log_likelihood: FloatArray
-    """Log-likelihood of the frames used for updates, (n_hyp,); -inf if a dipole is at a sensor or a
+    """(n_hyp,) Log-likelihood of the frames used for updates; -inf if a dipole is at a sensor or a
     variance is negative."""
     max_shift: FloatArray
-    """Largest distance of the smoothed positions from the path in the last pass, (n_hyp,), in
+    """(n_hyp,) Largest distance of the smoothed positions from the path in the last pass, in
     standard deviations of the position."""
     used: BoolArray
     """Whether the hypothesis was updated with each frame, (n_hyp, n)."""
@@ -72,10 +70,8 @@ def compiled_filter(model: SourceModel, observation: Observation
 
 
 class BankFilter:
-    """Stateless prediction and update of a `FilterBank` of targets that share a state.
-
-    The fields of the `n_targets` targets add up.
-    """
+    """Stateless prediction and update of a `FilterBank` of `n_targets` targets that share a state,
+    and whose fields add up."""
 
     def __init__(self, network: SensorNetwork, model: SourceModel, settings: TrackSettings,
                  n_targets: int = 1) -> None:
@@ -97,8 +93,7 @@ class BankFilter:
             [kind.length for kind in settings.vehicle.kinds] if is_vehicle else [0.0]) > MAX_CAR_ROW
 
     def move(self, bank: FilterBank, dt: float) -> None:
-        """Predict a bank in place by `dt` seconds, without an update; negative values move it
-        backwards, without process noise."""
+        """Predict a bank in place by `dt` seconds; negative values add no process noise."""
         n = self._n_sensors
         empty_frame = FieldFrame(0, np.full((n, 3), np.nan), np.tile(np.eye(3), (n, 1, 1)),
                                  np.zeros(n, dtype=np.int64), np.zeros(n))
@@ -106,19 +101,18 @@ class BankFilter:
 
     def advance(self, bank: FilterBank, frame: FieldFrame, dt: float, keeps_prior: bool = False
                 ) -> tuple[FloatArray, FloatArray]:
-        """Predict a bank in place to the time of a frame and update it; return the predicted states
-        (n_hyp, n_x) and the log-likelihoods (n_hyp,), which are -inf if a dipole is at a sensor.
+        """Predict a bank in place to the time of a frame, if `dt` [s] is positive, and update it;
+        return the predicted states (n_hyp, n_x) and the log-likelihoods (n_hyp,), which are -inf if
+        a dipole is at a sensor.
 
-        The prediction over `dt` seconds is skipped unless `dt` is positive. The setting
-        `iterations` is the number of linearisations. With `keeps_prior`, new arrays replace
-        `bank.x` and `bank.P` instead of overwriting them, which is slower.
+        With `keeps_prior`, new arrays replace `bank.x` and `bank.P` instead of overwriting them,
+        which is slower.
         """
         return self._advance(bank, frame, dt, dt > 0.0, self._settings.iterations, keeps_prior)
 
     def _advance(self, bank: FilterBank, frame: FieldFrame, dt: float, moves: bool,
                  iterations: int, keeps_prior: bool = False) -> tuple[FloatArray, FloatArray]:
-        """Advance a bank like `advance`; skip the prediction unless `moves`, and the update with 0
-        iterations."""
+        """Advance a bank; skip the prediction unless `moves`, and the update with 0 iterations."""
         n_hyp = len(bank)
         decay, variance = self.observation.drift(np.asarray(dt), self._settings.background_drift)
         # With a thousand hypotheses the speed is limited by memory: writing to new arrays takes
@@ -139,10 +133,8 @@ class BankFilter:
                   intervals: Sequence[float], paths: FloatArray, *, passes: int, step: float,
                   first_is_updated: bool, rejects_outliers: bool = False,
                   wants_covariances: bool = False) -> PathResult:
-        """Filter and smooth each hypothesis along its path; the bank moves in place from the first
-        to the last of the n frames.
-
-        Each pass is linearised along the path of the previous pass.
+        """Filter and smooth each hypothesis along its path, and each pass along the path of the
+        previous one; the bank moves in place from the first to the last of the n frames.
 
         Parameters
         ----------
@@ -183,18 +175,15 @@ class BankFilter:
 
     def time_offset(self, frame: FieldFrame, dt: float) -> FloatArray:
         """Sampling time (n_sensors,) of each sensor relative to the timestamp of a frame, s, in
-        multiples of `TIME_RESOLUTION_S`; 0 if the frame is treated as simultaneous."""
+        multiples of `TIME_RESOLUTION_S`; 0 if simultaneous."""
         offset: FloatArray = frame.time_offset
         if dt <= 0.0 or offset.max() - offset.min() < SAME_TIME_FRACTION * dt:
             return self._zero_offset
         return np.round(offset / TIME_RESOLUTION_S) * TIME_RESOLUTION_S
 
     def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
-        """Variance (n_sensors,) per axis of the model error in the field of hypothesis `i`, T²; 0
-        where a dipole is at the sensor.
-
-        Only the part of the error that is uncorrelated with the previous frame is included.
-        """
+        """Variance (n_sensors,) per axis of the part of the model error in the field of hypothesis
+        `i` that is uncorrelated with the previous frame, T²; 0 where a dipole is at the sensor."""
         error = self.observation.model_error(
             bank.x[i], self._lengths(bank.kind[i:i + 1])[0], self._settings.field_error)
         time = self._settings.model_error_time_s
@@ -204,29 +193,19 @@ class BankFilter:
     def predicted_field(self, bank: FilterBank, i: int, frame: FieldFrame,
                         dt: float) -> FloatArray:
         """Field (n_sensors, 3) that hypothesis `i` predicts for a frame, T, sensor frame, with
-        backgrounds.
-
-        The estimated model errors are excluded, because almost any field would fit with them.
-        """
-        x = self.observation.without_errors(bank.x[i:i + 1])
-        h, _, _ = self.observation.fields(
-            x, self.time_offset(frame, dt), self._lengths(bank.kind[i:i + 1]),
-            self._settings.field_error)
-        field: FloatArray = h[0] + x[0, -3 * self._n_sensors:].reshape(-1, 3)
-        return field
+        backgrounds, but without model errors, with which almost any field would fit."""
+        h, _ = self.fields_at(bank.x[i], bank.kind[i:i + 1], frame, dt)
+        return h + bank.x[i, -3 * self._n_sensors:].reshape(-1, 3)
 
     def fields_at(self, x: FloatArray, kind: IntArray, frame: FieldFrame, dt: float
                   ) -> tuple[FloatArray, FloatArray]:
-        """Fields (n_sensors, 3) of the targets of a state `x` (n_x,) at the sampling times of a
-        frame, T, sensor frame, and their derivatives (n_sensors, 3, n_target) with respect to the
-        target states.
-
-        Backgrounds and model errors are excluded. `kind` (1,) or (1, n_targets) is the kind of each
-        target.
-        """
-        h, H, _ = self.observation.fields(
-            self.observation.without_errors(x[None]), self.time_offset(frame, dt),
-            self._lengths(kind), self._settings.field_error)
+        """Fields (n_sensors, 3) of the targets of a state `x` (n_x,) with kinds `kind` (1,) or
+        (1, n_targets) at the sampling times of a frame, T, sensor frame, without backgrounds and
+        model errors, and their derivatives (n_sensors, 3, n_target)."""
+        without_errors = x[None].copy()
+        self.observation.own(without_errors)[..., self.observation.n_angles:] = 0.0
+        h, H, _ = self.observation.fields(without_errors, self.time_offset(frame, dt),
+                                          self._lengths(kind), self._settings.field_error)
         return h[0], H[0, :, :, :self.observation.n_target]
 
     def field_of_others(self, bank: FilterBank, i: int, target: int, frame: FieldFrame,
@@ -265,21 +244,16 @@ class BankFilter:
 
 
 class NoTarget:
-    """Filter of the backgrounds without a target; its log-density is the reference for the evidence
-    of a target.
-
-    `background_std` [T] is the initial std of each background, per axis.
-    """
+    """Filter of the backgrounds without a target, the reference for the evidence of a target, with
+    an initial std of `background_std` [T] per axis."""
 
     def __init__(self, n_sensors: int, background_std: float) -> None:
         self._x = np.zeros((n_sensors, 3))
         self._P = np.tile(background_std**2 * np.eye(3), (n_sensors, 1, 1))
 
     def log_density(self, frame: FieldFrame, dt: float, background_drift: float) -> float:
-        """Update the backgrounds with a frame; return its log-density given the previous frames.
-
-        `background_drift` is a random walk [T/√s].
-        """
+        """Update the backgrounds, with a random walk of `background_drift` [T/√s], with a frame;
+        return its log-density given the previous frames."""
         self._P += background_drift**2 * dt * np.eye(3)
         is_present = ~np.isnan(frame.field)
         both_present = is_present[:, :, None] & is_present[:, None, :]

@@ -1,7 +1,5 @@
-"""Track management: initiation, maintenance and deletion of tracks.
-
-The manager turns frames with a detection verdict into tracks. A track starts with a detection and
-is updated with each frame. It ends with the release of the detection, or when its target is lost.
+"""Track management: initiation with a detection, maintenance with each frame, and deletion of
+tracks with the release of the detection, or when the target is lost.
 """
 
 from collections import Counter, deque
@@ -28,29 +26,23 @@ from mag_tracking.units import NS
 
 NO_SCALE = 'detections not tracked (scale not observable with one sensor)'
 NO_SCALE_FRAMES = 'frames in which no track could start (scale not observable with one sensor)'
-
 TOO_SLOW = 'detections not tracked (the rate of the sensors is too low)'
-
 UNCERTAIN_ORIENTATIONS = ('sensors with an orientation uncertainty above '
                           f'{np.degrees(MAX_ROTATION):g} degrees')
-
-DISTURBANCE_TRACKS = 'tracks explained by a disturbance'
-
-STARTED_IN_TAIL = 'tracks started in a larger field after the target of a detection was lost'
+"""Keys of event counts that others use."""
 
 RESTART_ENERGY_RATIO = 4.0
 """Minimum energy of the frame in which a track starts after a lost track, relative to the maximum
-energy of the lost track. A ratio of 4 corresponds to twice the field. The field of a departing
-vehicle only decreases."""
+energy of the lost track: the field of a departing vehicle only decreases."""
 
 
 class TrackManager:
     """Track management: turns frames with a detection verdict into tracks.
 
-    While a target is present, the manager returns one `Track` per frame and target. Smoothed poses
-    follow with a fixed lag during the track, and for the whole track at its end. Vehicles that
-    appear during a track become members of the track. A given clock comparison is continued. Raises
-    SettingsError if the settings contradict each other.
+    While a target is present, the manager returns one `Track` per frame and target, smoothed poses
+    with a fixed lag, and at the end of a track those of the whole track. Vehicles that appear
+    during a track become its members. A given clock comparison is continued. Raises SettingsError
+    if the settings contradict each other.
 
     Attributes
     ----------
@@ -69,17 +61,15 @@ class TrackManager:
         self._last_ns: int | None = None
         # [T^2] Maximum energy of the field since the start of the latest track.
         self._max_energy = 0.0
-        # [T^2] After a target was lost, a track starts only if the energy of the field exceeds this
-        # limit; None if no target was lost in the current detection.
+        # [T^2] Energy above which a track starts; None if no target was lost in the detection.
         self._restart_energy: float | None = None
         self._next_network: SensorNetwork | None = None
         self._disturbances = Disturbances(network.names)
         self._rates = SampleRates(network, settings)
         self._input_doubts: InputDoubts = {}
         self._doubtful_rows: dict[str, dict[int, DoubtfulTimes]] = {}
-        n_uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
-                          for s in network.orientation_std)
-        if n_uncertain:
+        if n_uncertain := sum(bool(s is not None and s.max() > MAX_ROTATION)
+                              for s in network.orientation_std):
             self.counts[UNCERTAIN_ORIENTATIONS] = n_uncertain
 
     def use_network(self, network: SensorNetwork) -> None:
@@ -188,16 +178,15 @@ class TrackManager:
         """Start or extend a disturbance with unexplained fields of `tracks`; return its records."""
         out: list[TrackRecord] = []
         for found in (found for track in tracks for found in track.unexplained):
-            self.counts[DISTURBANCE_TRACKS] += 1
+            self.counts['tracks explained by a disturbance'] += 1
             out += self._disturbances.begin(found, stamp_ns)
         return out
 
     def _maintain(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
         """Update the running tracks with a frame, delete the ended ones, and return the records."""
-        doubtful = self._doubtful_sensors(frame)
         self._max_energy = max(self._max_energy, _energy(frame))
         for track in self._tracks:
-            track.flag_doubtful_sensors(doubtful)
+            track.flag_doubtful_sensors(self._doubtful_sensors(frame))
         out = [record for track in self._tracks for record in track.step(frame, dt)]
         return out + self._delete_ended(frame.stamp_ns)
 
@@ -244,7 +233,8 @@ class TrackManager:
         self.counts['tracks'] += 1
         is_in_tail = self._restart_energy is not None
         if is_in_tail:
-            self.counts[STARTED_IN_TAIL] += 1
+            self.counts['tracks started in a larger field after the target of a detection was '
+                        'lost'] += 1
         self._restart_energy, self._max_energy = None, _energy(frame)
         track = RunningTrack(self._next_id, self._target, s, sensors, bank_filter, bank,
                              self.counts, self._clocks, later_sensors)
@@ -276,11 +266,8 @@ class TrackManager:
 
 
 def _energy(frame: FieldFrame) -> float:
-    """Squared norm of the field, summed over all sensors [T²].
-
-    It is not weighted with the noise, because the noise assumed by the detector increases during a
-    detection.
-    """
+    """Squared norm of the field, summed over all sensors [T²], not weighted with the noise, which
+    increases during a detection."""
     return float(np.nansum(np.square(frame.field)))
 
 

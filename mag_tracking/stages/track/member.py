@@ -36,7 +36,6 @@ class Member:
     ----------
     last : latest record
     ended : reason for the end; None while the target is tracked
-    is_lost : whether the member ended while the target was still detected
     early : smoothed states from the time before the target shared its state with other targets
     slot : index of the target in the joint states that are stored for smoothing
     """
@@ -49,7 +48,6 @@ class Member:
         self.cross_check = CrossCheck(sensors.network)
         self.last: Track | None = None
         self.ended: str | None = None
-        self.is_lost = False
         self.early: list[TrackState] = []
         self.slot = 0
         # Reason to end because the latest state is impossible; empty if it is possible.
@@ -73,11 +71,9 @@ class Member:
         self._plausibility = Plausibility()
 
     def start_alongside(self, first: 'Member', stamp_ns: int, ratio: float) -> None:
-        """Start as a new target of a track, in addition to its first member.
-
-        The new target inherits from the first member the doubt that it was not seen approaching,
-        and the evidence for a target against a disturbance. `ratio` is the minimum Bayes factor.
-        """
+        """Start as a new target of a track; it inherits from the first member the doubt that it was
+        not seen approaching, and the evidence for a target against a disturbance, with the minimum
+        Bayes factor `ratio`."""
         self.evidence.flag_start(doubts.NOT_SEEN_APPROACHING in first.evidence.doubts,
                                  self._sensors.full_network, False)
         self.evidence.bayes_factor.add(first.evidence.bayes_factor.log_ratio, stamp_ns, ratio)
@@ -138,11 +134,9 @@ class Member:
 
     @property
     def passed_below(self) -> bool:
-        """Whether the target passed below the sensors, and everything else about it is plausible.
-
-        The field of a dipole is the same at opposite points. If two sensors are exchanged, a
-        vehicle therefore fits well on the opposite side of the centre, below the sensors.
-        """
+        """Whether the target passed below the sensors, and all else about it is plausible. If two
+        sensors are exchanged, a vehicle fits well at the opposite point, where its field is the
+        same."""
         if self.last is None or self._target.starts_anywhere \
                 or set(self.last.doubts) - {doubts.HEIGHT, doubts.BELOW_SENSORS}:
             return False
@@ -191,10 +185,7 @@ class Member:
 
     def unexplained(self, uniform: float) -> UnexplainedField | None:
         """Field of the track, if all its poses were ambiguous and a disturbance explains it better;
-        else None.
-
-        `uniform` is the probability that the field is the same at all sensors of the network.
-        """
+        `uniform` is the probability of a common field over the network."""
         if self._was_unambiguous or self.last is None \
                 or self.evidence.bayes_factor.disfavoured_s(self.last.stamp_ns) <= 0.0:
             return None
@@ -212,11 +203,8 @@ class Member:
     def smoothed(self, bank: FilterBank, best: int, complete: bool, states: list[TrackState],
                  doubtful: bool) -> list[SmoothedPose]:
         """Smoothed poses for the states of hypothesis `best` in the bank of this member; `complete`
-        if they cover the whole track, all ambiguous if `doubtful`.
-
-        Poses at times at which the filter was doubtful are marked as ambiguous, because smoothing
-        corrects its errors only in part.
-        """
+        if they cover the whole track, all ambiguous if `doubtful`, and ambiguous where the filter
+        was, because smoothing corrects its errors only in part."""
         ambiguous = doubtful or bool(ambiguities(bank, best, bank.is_separated(best)))
         poses = [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
@@ -233,11 +221,8 @@ class Member:
 def members_in_order(members: Sequence[Member], new: Member | None, joint: JointExplanation,
                      n_one: int) -> list[Member]:
     """The members and a new target, ordered like the states in a joint explanation, with `n_one`
-    per vehicle.
-
-    If two vehicles replace one member, this member continues as the vehicle whose path is nearer to
-    its published positions.
-    """
+    per vehicle. A member that two vehicles replace continues as the one whose path is nearer to its
+    published positions."""
     others = list(members)
     replaced = others.pop(joint.replaced) if joint.replaced is not None else None
     if new is None or replaced is None:

@@ -1,8 +1,7 @@
 """A running track: its members, their published poses, and the evidence for and against them.
 
 A track usually has one target. Targets whose fields overlap at the sensors are members of one track
-and share a state. Otherwise, a field could be attributed to the wrong target, and would be missing
-from the evidence for the correct target.
+and share a state, so that no field is attributed to the wrong target.
 
 Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
 """
@@ -38,11 +37,9 @@ from mag_tracking.stages.track.track_bank import FrameUpdate, TrackBank
 from mag_tracking.stages.track.window_search import VehicleState
 from mag_tracking.units import NS
 
-UNDECIDED_S = 1.0
-"""[s] Duration of the doubt after another explanation was about as probable as the track."""
-
-DOUBTED_S = 3.0
-"""[s] Duration of the doubt about the uncertain vehicles of an accepted explanation."""
+UNDECIDED_S, DOUBTED_S = 1.0, 3.0
+"""[s] Duration of the doubt after another explanation was about as probable as the track, and of
+that about the uncertain vehicles of an accepted explanation."""
 
 BELOW_SENSORS = 'vehicles that appear to pass below the sensors'
 
@@ -51,10 +48,8 @@ TrackRecord = Track | SmoothedPose | Disturbance
 
 
 class RunningTrack:
-    """Track of a single target, or of several targets that share a state.
-
-    Event counts of the stage are updated in place. `later_sensors` are used as soon as the bank is
-    small enough.
+    """Track of a single target, or of several targets that share a state; parameters as for
+    `TrackBank`.
 
     Attributes
     ----------
@@ -106,8 +101,8 @@ class RunningTrack:
                 member.use(self._bank.sensors)
 
     def flag_doubtful_sensors(self, sensors: Mapping[str, Sequence[int]]) -> None:
-        """Mark the track as doubtful if it uses a sensor with doubtful readings; `sensors` has
-        their indices by reason."""
+        """Mark the track as doubtful if it uses one of the `sensors` with doubtful readings, given
+        as indices by reason."""
         for reason, rows in sensors.items():
             if not np.isin(self._final_sensors.rows, rows).any():
                 continue
@@ -118,28 +113,24 @@ class RunningTrack:
 
     def begin(self, frame: FieldFrame, recent: list[FieldFrame], approach_unobserved: bool = False
               ) -> list[TrackRecord]:
-        """Process the `recent` frames (oldest first) and the frame of the detection, all with the
-        sensors of the whole network; return the records of the detection frame.
-
-        `approach_unobserved` means that the recent frames do not show the approach of the target.
-        """
-        observed_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
-        first = self.members[0]
+        """Process the `recent` frames (oldest first), which do not show the approach of the target
+        if `approach_unobserved`, and the frame of the detection, all of the whole network; return
+        the records of the detection frame."""
+        frames, first = [*recent, frame], self.members[0]
         first.evidence.flag_start(
-            approach_unobserved
-            or observed_ns < MIN_OBSERVED_FRACTION * self._settings.lookback_s * NS,
+            approach_unobserved or frame.stamp_ns - frames[0].stamp_ns
+            < MIN_OBSERVED_FRACTION * self._settings.lookback_s * NS,
             self._final_sensors.full_network, self._target.starts_anywhere)
         first.begin_ns = frame.stamp_ns
-        self._bank.begin(recent[0] if recent else frame, frame)
+        self._bank.begin(frames[0], frame)
         dt = 0.0
-        for before, after in pairwise([*recent, frame]):
+        for before, after in pairwise(frames):
             self.step(before, dt, publish=False)
             dt = (after.stamp_ns - before.stamp_ns) / NS
-        if self.ended is None:
-            before_rows = self._bank.sensors.rows
-            if self._bank.widen(dt):
-                first.cross_check.finish(self._clocks, before_rows)
-                self._use_bank_sensors(True)
+        rows = self._bank.sensors.rows
+        if self.ended is None and self._bank.widen(dt):
+            first.cross_check.finish(self._clocks, rows)
+            self._use_bank_sensors(True)
         return self.step(frame, dt)
 
     def step(self, frame: FieldFrame, dt: float, publish: bool = True) -> list[TrackRecord]:
@@ -157,13 +148,15 @@ class RunningTrack:
         if not self._update_evidence(frame_update, dt):
             return self.end('no hypothesis explains the field')
         self._bank.store_and_prune(frame_update, publish)
-        best = self.bank.best()
-        self._update_new_target_evidence(frame_update, best)
+        frame, bank, best = frame_update.frame, self.bank, self.bank.best()
+        self._new_target_evidence.add(
+            float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
+            frame.stamp_ns, frame_update.n_rejected > 0 and len(frame.field) == 2,
+            bool(self._bank.filter.are_long(bank.kind[best:best + 1])[0]))
         if not publish and not self._settings.smoothing_lag_s:
             return []
         views = [self._view(i, best) for i in range(len(self.members))]
-        frame = frame_update.frame
-        lagged = self._bank.lag.smoothed(self._bank.filter, self.bank, best, frame, dt, publish)
+        lagged = self._bank.lag.smoothed(self._bank.filter, bank, best, frame, dt, publish)
         lagged_poses = [pose for i, view in enumerate(views) for pose in self._smoothed(
             i, view, False, lagged, self.members[i].is_doubtful(self._settings))]
         if not publish:
@@ -194,34 +187,20 @@ class RunningTrack:
         no_target = self._no_target.log_density(frame, dt, self._settings.background_drift)
         disturbance_model = self._disturbance_model.log_density(
             frame, dt, self._bank.filter.model_error(self.bank, best, dt))
+        n = self._bank.single_target.n_target
         for i, member in enumerate(self.members):
             member.evidence.add(frame_update.evidence - no_target)
             if disturbance_model is not None:
                 member.evidence.bayes_factor.add(
                     frame_update.evidence - disturbance_model, frame.stamp_ns,
                     self._settings.min_bayes_factor)
-            own_frame, first = self._member_frame(i, best, frame, dt), \
-                i * self._bank.single_target.n_target
+            own_frame = frame if len(self.members) == 1 else replace(
+                frame, field=frame.field - self._bank.filter.field_of_others(
+                    self.bank, best, i, frame, dt))
             member.evidence.add_frame(own_frame, self._bank.sensors.rows, self.bank.nis[best])
             if self._settings.cross_check and not self._target.starts_anywhere:
-                member.cross_check.add(
-                    own_frame, self.bank.x[best, first:first + self._bank.single_target.n_target])
+                member.cross_check.add(own_frame, self.bank.x[best, i * n:(i + 1) * n])
         return True
-
-    def _update_new_target_evidence(self, frame_update: FrameUpdate, best: int) -> None:
-        """Update the evidence for new targets with the innovations of hypothesis `best`."""
-        bank, frame = self.bank, frame_update.frame
-        self._new_target_evidence.add(
-            float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
-            frame.stamp_ns, frame_update.n_rejected > 0 and len(frame.field) == 2,
-            bool(self._bank.filter.are_long(bank.kind[best:best + 1])[0]))
-
-    def _member_frame(self, i: int, best: int, frame: FieldFrame, dt: float) -> FieldFrame:
-        """Frame without the fields that hypothesis `best` predicts for the other members."""
-        if len(self.members) == 1:
-            return frame
-        others = self._bank.filter.field_of_others(self.bank, best, i, frame, dt)
-        return replace(frame, field=frame.field - others)
 
     def _is_out_of_reach(self, i: int, frame: FieldFrame) -> bool:
         """Whether the field of member `i` is weak and the member does not approach a sensor."""
@@ -235,24 +214,18 @@ class RunningTrack:
         """End the members that are lost or out of reach, and return their closing records."""
         out: list[TrackRecord] = []
         for member in list(self.members):
-            reason = member.reason_to_end(self._bank.sensors, self._settings)
-            if reason is None and len(self.members) > 1 \
-                    and self._is_out_of_reach(self.members.index(member), frame):
+            reason, i = member.reason_to_end(self._bank.sensors, self._settings), \
+                self.members.index(member)
+            if reason is None and len(self.members) > 1 and self._is_out_of_reach(i, frame):
                 reason = OUT_OF_REACH
-            if reason is not None:
-                member.is_lost = True
-                out += self._end_member(member, reason)
-        return out
-
-    def _end_member(self, member: Member, reason: str) -> list[TrackRecord]:
-        """End one member, remove its states from the joint state, and return closing records."""
-        if len(self.members) == 1:
-            self.is_lost = member.is_lost
-            return self.end(reason)
-        i = self.members.index(member)
-        out = self._close_member(i, reason)
-        self._bank.without_target(i)
-        del self.members[i]
+            if reason is None:
+                continue
+            if len(self.members) == 1:
+                self.is_lost = True
+                return out + self.end(reason)
+            out += self._close_member(i, reason)
+            self._bank.without_target(i)
+            del self.members[i]
         return out
 
     def end(self, reason: str) -> list[TrackRecord]:
@@ -298,11 +271,8 @@ class RunningTrack:
 
     def new_target(self) -> JointExplanation | None:
         """Search for another explanation of the latest frames, if a search is due; None if none is
-        sufficiently probable.
-
-        If one is nearly as probable as the track, the track is marked as doubtful for a limited
-        time.
-        """
+        sufficiently probable. One that is nearly as probable as the track makes it doubtful for a
+        limited time."""
         window, n = self._bank.relinearisation.window, len(self.members)
         if self.ended is not None or self._target.starts_anywhere or window is None \
                 or self.members[0].last is None:
