@@ -18,7 +18,7 @@ from mag_tracking.inference.driving_direction import (
 )
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.anderson import anderson_residual
-from mag_tracking.records import Detection, Readings, plain
+from mag_tracking.records import Detection, FieldFrame, Readings, plain
 from mag_tracking.stages.align.settings import AlignSettings
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.settings import DetectSettings
@@ -32,17 +32,16 @@ PAD_S = 1.0
 """[s] Length of the margins without a target, before the onset and after the release."""
 
 MAX_DURATION_S = 120.0
-"""[s] Maximum duration of an event. For a longer detection, only the latest readings are used."""
+"""[s] Maximum duration of an event; only the latest readings of a longer detection are used."""
 
 SIGNATURE_POINTS = 33
 """Number of points of a signature."""
 
 MAX_SAMPLES = 200
-"""Maximum number of samples in the search. If a pass has more, blocks of samples are averaged."""
+"""Maximum number of samples in the search; blocks of samples of a longer pass are averaged."""
 
 MAX_STARTS = 5
-"""Maximum number of grid points from which the search starts. With a single axis, the cost function
-has several local minima."""
+"""Number of grid points from which the search starts; with one axis it has several minima."""
 
 CORRELATION_TIME = 2.0
 """[time scales] Correlation time of the residual when a dipole is fitted to a vehicle."""
@@ -51,15 +50,15 @@ CENTRE_OFFSET = 0.15
 """[time scales] Typical distance of a vehicle's magnetic centre from the middle of its body."""
 
 MIN_SAMPLES = 8
-"""Minimum number of samples for a fit. Only samples with all reported axes are counted."""
+"""Minimum number of samples with all reported axes for a fit."""
 
 
 class Events:
     """Converts calibrated readings to pass events, one for each detection at each sensor.
 
     The events that one batch completes are returned sensor by sensor. An event contains no lengths,
-    because a single sensor does not observe the spatial scale. The align and track settings
-    determine the rate below which a pass is not resolved.
+    because a single sensor does not observe the spatial scale. The track settings determine the
+    rate below which a pass is not resolved.
     """
 
     def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
@@ -72,10 +71,8 @@ class Events:
                          for j, part in enumerate(parts)]
 
     def set_relearnt(self, backgrounds: Mapping[str, RunningBackground]) -> None:
-        """Set the changes of each sensor's background, which are not the departure of a target.
-
-        Without them, the event of a parked vehicle ends when its field has become the background.
-        """
+        """Set the changes of each sensor's background, without which the event of a parked vehicle
+        ends when its field has become the background."""
         for name, background in backgrounds.items():
             self._sensors[self._index[name]].relearnt = background.relearnt
 
@@ -141,9 +138,7 @@ class _SensorEvents:
         for frame in self._align.feed(readings):
             self._rates.add(frame, self._j)
             self._frame_stamps.append(frame.stamp_ns)
-            for record in self._detect.feed(frame):
-                if isinstance(record, Detection):
-                    out += self._on_detection(record)
+            out += self._detected(frame)
             begin = frame.stamp_ns if self._onset_ns is None else \
                 max(self._onset_ns, frame.stamp_ns - int(MAX_DURATION_S * NS))
             while self._buffer[0].stamp_ns[-1] < begin - (2 * PAD_S * NS + self._hold_ns):
@@ -152,11 +147,7 @@ class _SensorEvents:
 
     def flush(self) -> list[PassEvent]:
         """Return the events that are still in progress at the end of the input."""
-        out: list[PassEvent] = []
-        for frame in self._align.flush():
-            for record in self._detect.feed(frame):
-                if isinstance(record, Detection):
-                    out += self._on_detection(record)
+        out = [event for frame in self._align.flush() for event in self._detected(frame)]
         if self._buffer:
             last_ns = int(self._buffer[-1].stamp_ns[-1])
             if self._onset_ns is not None:
@@ -165,13 +156,16 @@ class _SensorEvents:
         self._onset_ns = None
         return out
 
-    def _on_detection(self, detection: Detection) -> list[PassEvent]:
-        """Store the time of an onset, or return the event that a release completes."""
-        if detection.onset:
-            # The frames that confirm a detection take long at a low rate.
-            self._onset_ns = self._frame_stamps[0] if self._is_slow else detection.stamp_ns
-            return []
-        return self._event(detection.stamp_ns - self._hold_ns, True)
+    def _detected(self, frame: FieldFrame) -> list[PassEvent]:
+        """Store the time of an onset in a frame, or return the event that a release completes."""
+        out: list[PassEvent] = []
+        for record in self._detect.feed(frame):
+            if isinstance(record, Detection) and record.onset:
+                # The frames that confirm a detection take long at a low rate.
+                self._onset_ns = self._frame_stamps[0] if self._is_slow else record.stamp_ns
+            elif isinstance(record, Detection):
+                out += self._event(record.stamp_ns - self._hold_ns, True)
+        return out
 
     def _event(self, release_ns: int, ended: bool) -> list[PassEvent]:
         """Return a list with the event that ends at `release_ns`; empty without finite readings."""
@@ -227,10 +221,8 @@ class _SensorEvents:
 
 
 def _left_to_right(horizontal: FloatArray, noise_std: float, n_quiet: int) -> float:
-    """Probability that the target passes the sensor from left to right; 0.5 if unobservable.
-
-    The first `n_quiet` samples of the field `horizontal` (n, 2) [T] precede the target.
-    """
+    """Probability that the target passes the sensor from left to right; 0.5 if unobservable. The
+    first `n_quiet` samples of the field `horizontal` (n, 2) [T] precede the target."""
     rotation = rotation_of_pass(horizontal, noise_std, n_quiet)
     if rotation is None:
         return 0.5
@@ -253,15 +245,12 @@ def _median_interval(stamp: IntArray) -> float:
 
 
 def _signature(t: FloatArray, field: FloatArray, time: float, scale: float) -> FloatArray:
-    """Field (`SIGNATURE_POINTS`, 3) [T] at equidistant times around the closest point of approach.
-
-    The times are centred on `time` and proportional to `scale`. The field is NaN outside the
-    readings, or if `scale` is not finite.
-    """
-    if not np.isfinite(scale):
-        return np.full((SIGNATURE_POINTS, 3), np.nan)
-    times = time + scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN, SIGNATURE_POINTS)
+    """Field (`SIGNATURE_POINTS`, 3) [T] at equidistant times around `time`, proportional to
+    `scale`; NaN outside the readings, or if `scale` is not finite."""
     out = np.full((SIGNATURE_POINTS, 3), np.nan)
+    if not np.isfinite(scale):
+        return out
+    times = time + scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN, SIGNATURE_POINTS)
     for a in range(3):
         is_measured = ~np.isnan(field[:, a])
         if is_measured.any():
@@ -286,8 +275,8 @@ def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> Cl
     """Fit the Anderson functions of a dipole on a straight line to the field (n, 3) of one sensor.
 
     One axis is sufficient; a missing axis is NaN. `noise_std` (3,) [T] is the noise of one reading.
-    The linear parameters (three coefficients and a constant per axis) are solved for each candidate
-    time and time scale. See [TSP14]_ eq. (22), (23), with the exponent 5/2.
+    Three coefficients and a constant per axis are solved for each candidate time and time scale.
+    See [TSP14]_ eq. (22), (23), with the exponent 5/2.
     """
     present = ~np.isnan(field).all(axis=0) & ~np.isnan(noise_std)
     complete = ~np.isnan(field[:, present]).any(axis=1)

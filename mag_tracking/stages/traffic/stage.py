@@ -46,12 +46,11 @@ INTERFERENCE_S = 2.0
 """[s] A direction is not checked if another vehicle is tracked within this time of the crossing."""
 
 REACQUIRED_S, REACQUIRED_M = 1.0, 3.0
-"""[s], [m] Maximum separation in time and along the line of two crossings that belong to one
-vehicle, whose track was lost and reacquired near the line."""
+"""[s], [m] Maximum separation in time and along the line of two crossings of one vehicle, whose
+track was lost and reacquired near the line."""
 
 SMOOTHED_LEAD_S = 3.0
-"""[s] Maximum time from the first pose of a smoothed path to the first published pose of its
-track."""
+"""[s] Maximum time from the first smoothed to the first published pose of a track."""
 
 MAX_WAIT_S = 120.0
 """[s] Maximum time that passages and summaries wait for a running track."""
@@ -63,16 +62,13 @@ MAX_AGE_S = 70.0
 """[s] Maximum age of stored frames; longer than any smoothed track."""
 
 MIN_LATERAL = 1.5
-"""[m] Minimum distance of a sensor from the path. A closer sensor does not observe the
-direction."""
+"""[m] Minimum distance of a sensor that observes the direction from the path."""
 
 MAX_ALONG = 12.0
-"""[m] Maximum distance along the path between the crossing and the closest point of approach to a
-sensor."""
+"""[m] Maximum distance between the crossing and the closest point of approach to a sensor."""
 
 WINDOW_RATIO = 3.0
-"""Distance that the vehicle travels in half the window, relative to the distance between sensor and
-path."""
+"""Distance that the vehicle travels in half the window, relative to that of the sensor from it."""
 
 MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S = 0.5, 4.0
 """[s] Bounds of half the duration of the window."""
@@ -82,10 +78,7 @@ MAX_LOG_ODDS = float(np.log(MAX_CONFIDENCE / (1.0 - MAX_CONFIDENCE)))
 
 
 class TrackedFrame(NamedTuple):
-    """A frame and the records that the tracker returned for it.
-
-    If `frame` is None, the records belong to tracks that end because the frames have ended.
-    """
+    """A frame, None after the last one, and the records that the tracker returned for it."""
 
     frame: FieldFrame | None
     records: Sequence[Track | SmoothedPose | Disturbance]
@@ -119,10 +112,10 @@ class _PendingCrossing(NamedTuple):
 class Traffic:
     """Converts tracked frames to passages and summaries.
 
-    A vehicle is counted when its track has ended, from its smoothed poses if available. Passages
-    are returned in chronological order, unless a track lasts longer than `MAX_WAIT_S`. Without
-    `counts_vehicles`, as for other targets, nothing is counted. Raises SettingsError if a class has
-    the name of vehicles that match no class.
+    A vehicle is counted when its track has ended, from its smoothed poses if available, and only
+    with `counts_vehicles`. Passages are returned in chronological order, unless a track lasts
+    longer than `MAX_WAIT_S`. Raises SettingsError if a class has the name of vehicles that match no
+    class.
     """
 
     def __init__(self, network: SensorNetwork, settings: TrafficSettings,
@@ -210,10 +203,8 @@ class Traffic:
             path.add(track)
 
     def _count_ended(self, now_ns: int | None) -> list[VehiclePassage]:
-        """Find the crossings of ended tracks, and return the passages that are due.
-
-        A passage is due when no earlier passage can follow, or if `now_ns` is None.
-        """
+        """Find the crossings of ended tracks, and return the passages that are due: all that no
+        earlier passage can follow, or all if `now_ns` is None."""
         ended = {id: track for id, track in self._open.items() if track.ended}
         self._ended += ended.values()
         for id, track in ended.items():
@@ -276,8 +267,8 @@ class Traffic:
 def _are_same_vehicle(one: _PendingCrossing, other: _PendingCrossing) -> bool:
     """Whether two crossings belong to one vehicle whose track was lost near the line."""
     separation_s = abs(other.crossing.stamp_ns - one.crossing.stamp_ns) / NS
-    separation_m = abs(one.line.lateral_offset(one.crossing.position) - one.line.lateral_offset(
-        other.crossing.position))
+    separation_m = abs(one.line.lateral_offset(one.crossing.position)
+                       - one.line.lateral_offset(other.crossing.position))
     return ((one.crossing.is_extrapolated or other.crossing.is_extrapolated)
             and separation_s < REACQUIRED_S and separation_m < REACQUIRED_M
             and not one.track.overlaps(other.track.begin_ns, other.track.last_ns))
@@ -289,7 +280,7 @@ def _is_running(record: Track | SmoothedPose | Disturbance) -> bool:
 
 
 def _class_of(pose: Pose, classes: Sequence[VehicleClass]) -> ClassPosterior:
-    """Classify a vehicle by the magnitude of its moment, and by its length if available."""
+    """Class of a vehicle by the magnitude of its moment, and by its length if available."""
     magnitude, shares = float(np.linalg.norm(pose.moment)), [c.share for c in classes]
     if not magnitude > 0.0:
         prior = np.array(shares)
@@ -311,10 +302,8 @@ class FieldDirection:
         self._frames: deque[FieldFrame] = deque()
 
     def add(self, frame: FieldFrame, since_ns: int) -> None:
-        """Store a frame, and drop frames not needed for crossings from `since_ns` on.
-
-        If time jumps back, all earlier frames are dropped.
-        """
+        """Store a frame, and drop frames not needed for crossings from `since_ns` on, and all if
+        time jumps back."""
         if self._frames and frame.stamp_ns <= self._frames[-1].stamp_ns:
             self._frames.clear()
         self._frames.append(frame)
@@ -324,10 +313,8 @@ class FieldDirection:
             self._frames.popleft()
 
     def error_probability(self, crossing: Crossing) -> float:
-        """Probability that the direction of a crossing is wrong.
-
-        NaN if the direction is not observable, or if the sensors contradict each other.
-        """
+        """Probability that the direction of a crossing is wrong; NaN if it is not observable, or if
+        the sensors contradict each other."""
         velocity = crossing.pose.velocity[:2]
         speed = float(np.hypot(*velocity))
         if not self._frames or speed < 0.1:
