@@ -37,20 +37,14 @@ MAX_DURATION_S = 120.0
 SIGNATURE_POINTS = 33
 """Number of points of a signature."""
 
-MAX_SAMPLES = 200
-"""Maximum number of samples in the search; blocks of samples of a longer pass are averaged."""
+MAX_SAMPLES, MIN_SAMPLES, MAX_STARTS = 200, 8, 5
+"""Maximum number of samples (blocks of a longer pass are averaged) and minimum number of complete
+samples in a fit, and number of grid points from which its search starts; with one axis it has
+several minima."""
 
-MAX_STARTS = 5
-"""Number of grid points from which the search starts; with one axis it has several minima."""
-
-CORRELATION_TIME = 2.0
-"""[time scales] Correlation time of the residual when a dipole is fitted to a vehicle."""
-
-CENTRE_OFFSET = 0.15
-"""[time scales] Typical distance of a vehicle's magnetic centre from the middle of its body."""
-
-MIN_SAMPLES = 8
-"""Minimum number of samples with all reported axes for a fit."""
+CORRELATION_TIME, CENTRE_OFFSET = 2.0, 0.15
+"""[time scales] Correlation time of the residual when a dipole is fitted to a vehicle, and typical
+distance of its magnetic centre from the middle of its body."""
 
 
 class Events:

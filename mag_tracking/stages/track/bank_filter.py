@@ -19,13 +19,10 @@ from mag_tracking.stages.track.initiation_vehicle import MAX_CAR_ROW
 from mag_tracking.stages.track.observation import TIME_RESOLUTION_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
 
-LINEAR_FRACTION = 0.25
+LINEAR_FRACTION, SAME_TIME_FRACTION = 0.25, 0.05
 """Displacement over which the field is approximately linear, as a fraction of the distance to the
-nearest sensor, whose cube then changes by a factor of about two."""
-
-SAME_TIME_FRACTION = 0.05
-"""Fraction of the interval since the previous frame below which the samples of a frame count as
-simultaneous, like those of the first frame of a track."""
+nearest sensor, whose cube then changes by a factor of two; and fraction of the interval since the
+previous frame below which the samples of a frame count as simultaneous."""
 
 
 NEGLIGIBLE_ENERGY, WEAK_ENERGY = 0.1, 1.0

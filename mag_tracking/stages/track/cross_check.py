@@ -23,8 +23,9 @@ from mag_tracking.stages.track.rigid_pass import (
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.units import NS
 
-SIGNIFICANT_STDS = 4.0
-"""An offset is significant only if it exceeds this number of standard deviations."""
+SIGNIFICANT_STDS, PRIOR_STD_S = 4.0, 1e3
+"""Minimum number of standard deviations of a significant offset, and prior standard deviation [s]
+of the offset of each clock."""
 
 MEMORY_PASSES = 20
 """Effective number of passes in the estimate; clocks drift and are adjusted."""
@@ -33,17 +34,12 @@ FORGETTING_FACTOR, CONTRADICTED_FACTOR = 1.0 - 1.0 / MEMORY_PASSES, 0.5
 """Factor on the previous information at a pass that agrees with the estimate, and at a pass that
 contradicts it."""
 
-PRIOR_STD_S = 1e3
-"""Prior standard deviation of the offset of each clock [s]."""
-
 PASSED_FRACTION = 0.6
 """A vehicle has passed when the field is below this fraction of its maximum."""
 
-FIRST_CHECK_S = 0.12
-"""Delay of the first fit after the maximum of the field [s]."""
-
-CHECK_INTERVAL_RATIO = 1.7
-"""Ratio of the delays of successive fits after the maximum of the field."""
+FIRST_CHECK_S, CHECK_INTERVAL_RATIO = 0.12, 1.7
+"""[s] Delay of the first fit after the maximum of the field, and ratio of the delays of successive
+fits."""
 
 BEFORE_S, AFTER_S = 4.0, 3.0
 """[s] Duration of a pass before and after the maximum of the field."""
@@ -51,12 +47,9 @@ BEFORE_S, AFTER_S = 4.0, 3.0
 MIN_FRAMES, MAX_FRAMES = 12, 128
 """Minimum and maximum number of frames in a fit. A longer pass is decimated."""
 
-STEADY_S = 1.5
-"""Time after the maximum of the field for which acceleration and turn rate of a vehicle are assumed
-to be constant [s]."""
-
-LATE_MISFIT = 8.0
-"""Maximum misfit (reduced chi-square) of a fit after `STEADY_S`, when the turn rate may change."""
+STEADY_S, LATE_MISFIT = 1.5, 8.0
+"""[s] Time after the maximum of the field for which acceleration and turn rate are assumed to be
+constant, and maximum misfit (reduced chi-square) of a later fit."""
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,8 @@ MAX_SINGLE_SENSOR_S = 0.5
 """[s] Maximum total time in which only one of several sensors measures the target of an unambiguous
 track."""
 
-LOST = 'target lost'
-OUT_OF_REACH = 'out of reach'
-UNEXPLAINED = 'unexplained'
+LOST, OUT_OF_REACH, UNEXPLAINED = 'target lost', 'out of reach', 'unexplained'
 """Reasons to end a track."""
-
 UNEXPLAINED_S = 3.0
 """[s] Time after which a track ends that a disturbance explains better than a target, unless a
 target explained it better earlier."""

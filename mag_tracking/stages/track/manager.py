@@ -22,6 +22,7 @@ from mag_tracking.stages.track.running_track import RunningTrack, TrackRecord
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.target import sensors_at_start, target_of
+from mag_tracking.stages.track.track_bank import TrackBank
 from mag_tracking.units import NS
 
 NO_SCALE = 'detections not tracked (scale not observable with one sensor)'
@@ -236,8 +237,9 @@ class TrackManager:
             self.counts['tracks started in a larger field after the target of a detection was '
                         'lost'] += 1
         self._restart_energy, self._max_energy = None, _energy(frame)
-        track = RunningTrack(self._next_id, self._target, s, sensors, bank_filter, bank,
-                             self.counts, self._clocks, later_sensors)
+        track = RunningTrack(self._next_id, TrackBank(
+            self._target, s, sensors, bank_filter, bank, self.counts, later_sensors), self.counts,
+            self._clocks)
         self._next_id += 1
         self._tracks.append(track)
         track.flag_doubtful_sensors(self._doubtful_sensors(*recent, frame))

@@ -23,8 +23,7 @@ from mag_tracking.stages.track.target import Target
 from mag_tracking.stages.track.track_bank import TrackBank
 
 MAX_POSITIONS = 64
-"""Maximum number of stored recent positions. If two vehicles replace one, the positions show which
-of the two continues the track."""
+"""Maximum number of stored positions, which show which of two vehicles continues a track."""
 
 
 class Member:
@@ -134,9 +133,11 @@ class Member:
 
     @property
     def passed_below(self) -> bool:
-        """Whether the target passed below the sensors, and all else about it is plausible. If two
-        sensors are exchanged, a vehicle fits well at the opposite point, where its field is the
-        same."""
+        """Whether the target passed below the sensors, and all else about it is plausible.
+
+        If two sensors are exchanged, a vehicle fits well at the opposite point, where the field of
+        a dipole is the same.
+        """
         if self.last is None or self._target.starts_anywhere \
                 or set(self.last.doubts) - {doubts.HEIGHT, doubts.BELOW_SENSORS}:
             return False
@@ -221,8 +222,7 @@ class Member:
 def members_in_order(members: Sequence[Member], new: Member | None, joint: JointExplanation,
                      n_one: int) -> list[Member]:
     """The members and a new target, ordered like the states in a joint explanation, with `n_one`
-    per vehicle. A member that two vehicles replace continues as the one whose path is nearer to its
-    published positions."""
+    per vehicle; a member that two vehicles replace continues as the one nearer to its positions."""
     others = list(members)
     replaced = others.pop(joint.replaced) if joint.replaced is not None else None
     if new is None or replaced is None:

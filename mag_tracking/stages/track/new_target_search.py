@@ -47,14 +47,10 @@ LOG_P_ARRIVAL, LOG_P_LOST = np.log(0.05), np.log(0.01)
 """Log-probabilities that another vehicle arrives during a pass, and that the track of a vehicle was
 at a wrong position during the whole window."""
 
-MIN_DISPLACEMENT_M = 2.0
-"""[m] Minimum distance of a vehicle at another position from its track."""
-
-MAX_RATIO = 5.0
-"""Maximum speed and moment of a new vehicle, relative to the largest values in the settings."""
-
-N_DISTANCES = 10
-"""Number of possible positions of a new target on its line at the start of the window."""
+MIN_DISPLACEMENT_M, MAX_RATIO, N_DISTANCES = 2.0, 5.0, 10
+"""Minimum distance [m] of a vehicle at another position from its track, maximum speed and moment of
+a new vehicle relative to the largest ones in the settings, and number of its possible positions on
+a line at the start of the window."""
 
 
 class NewTargetSearch:

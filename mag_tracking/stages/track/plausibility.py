@@ -15,11 +15,9 @@ from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NEVER, NS
 
-P_MOUNTING = 0.05
-"""Probability that the estimated mounting angles of correctly mounted sensors are flagged."""
-
-P_HEIGHT = 1e-3
-"""Probability that the height of a vehicle of its kind is flagged."""
+P_MOUNTING, P_HEIGHT = 0.05, 1e-3
+"""Probabilities that the mounting angles of correctly mounted sensors, and the height of a vehicle
+of its kind, are flagged."""
 
 LANE_STDS, LANE_STDS_LATER = 1.645, 3.0
 """Maximum distance of a vehicle from the outermost configured lane, in standard deviations: at its
@@ -37,11 +35,9 @@ MAX_RELATIVE_MOVE = 0.75
 because the error of a single sensor does not mislead a track. The relative error of the average
 over the frame is about half the square of this ratio."""
 
-SENSED_LEVEL = 2.5
-"""RMS of the whitened field above which the target counts as sensed."""
-
-GROWTH_RATIO = 10.0
-"""Ratio of the highest field level in the test to the lowest, `SENSED_LEVEL`."""
+SENSED_LEVEL, GROWTH_RATIO = 2.5, 10.0
+"""RMS of the whitened field above which the target counts as sensed, and ratio of the highest level
+in the approach test to this one."""
 
 MIN_LOG2_RATIO = -0.25
 """Minimum log2 ratio of the durations of the first and the second half of the growth. In theory it
@@ -52,18 +48,13 @@ FALL_FRACTION = 0.85
 """Fraction of its previous maximum below which the field of a sensed target falls if the target has
 passed its first sensor, which passes the test."""
 
-LEVEL_TIME_STD = 0.5
-"""Uncertainty of the time at which the field reached a level, in frame periods."""
+LEVEL_TIME_STD, MAX_FRAMES = 0.5, 1000
+"""Uncertainty of the time at which the field reached a level, in frame periods, and number of
+frames after which the test is skipped if the field has not grown enough."""
 
-MAX_FRAMES = 1000
-"""Number of frames after which the test is skipped if the field has not grown enough."""
-
-N_INTERVALS = 8
-"""Number of latest intervals of a sensor; it is slow if most of them are too long, so that single
-lost readings do not matter."""
-
-MIN_INTERVALS = 2
-"""Minimum number of too long intervals of a slow sensor."""
+N_INTERVALS, MIN_INTERVALS = 8, 2
+"""Number of latest intervals of a sensor, most of which are too long if it is slow, and minimum
+number of these; single lost readings do not matter."""
 
 N_PATHS = 41
 """Number of paths between the outermost lanes that are compared."""

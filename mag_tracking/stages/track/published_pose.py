@@ -30,13 +30,10 @@ MIN_SPEED_STDS = 3.0
 UNOBSERVED_VARIANCE = np.pi**2
 """[rad^2] Variance of an angle that is not observable from the field."""
 
-NEGLIGIBLE_WEIGHT = 1e-6
-"""Weight relative to the heaviest hypothesis below which a hypothesis is excluded from
-covariances."""
-
-AMBIGUOUS_WEIGHT = 0.05
-"""A track is ambiguous if the total weight of the hypotheses at other positions, or with other
-arrival directions, exceeds this value."""
+NEGLIGIBLE_WEIGHT, AMBIGUOUS_WEIGHT = 1e-6, 0.05
+"""Weight relative to the heaviest hypothesis below which a hypothesis is excluded from covariances,
+and total weight of the hypotheses at other positions, or with other arrival directions, above which
+a track is ambiguous."""
 
 Flags: TypeAlias = tuple[bool, bool, bool]
 """Whether the rotation about the x, y and z axis of the body is unobservable."""

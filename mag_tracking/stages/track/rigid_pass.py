@@ -49,11 +49,9 @@ P_CLOCKS, P_BEND = 1e-5, 1e-3
 """Probabilities that noise alone improves the fit significantly although the clocks are correct, or
 although the motion is straight."""
 
-MIN_DISTANCE = 1.0
-"""[m] Motion of the target during a clock offset below which the offset is harmless."""
-
-MIDDLE_STD = 0.5
-"""[m] Standard deviation of the apparent magnetic centre of a vehicle from sensor to sensor."""
+MIN_DISTANCE, MIDDLE_STD = 1.0, 0.5
+"""[m] Motion of the target during a clock offset below which the offset is harmless, and standard
+deviation of the apparent magnetic centre of a vehicle from sensor to sensor."""
 
 MAX_DISTANCE, MAX_SPEED = 30.0, 100.0
 """[m], [m/s] Maximum distance of a vehicle from the nearest sensor, and its maximum speed."""

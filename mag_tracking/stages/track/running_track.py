@@ -17,12 +17,7 @@ from mag_tracking.event_records import Disturbance
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.bank_filter import (
-    NEGLIGIBLE_ENERGY,
-    WEAK_ENERGY,
-    BankFilter,
-    NoTarget,
-)
+from mag_tracking.stages.track.bank_filter import NEGLIGIBLE_ENERGY, WEAK_ENERGY, NoTarget
 from mag_tracking.stages.track.cross_check import ClockComparison
 from mag_tracking.stages.track.disturbances import DisturbanceModel, UnexplainedField
 from mag_tracking.stages.track.evidence import MIN_OBSERVED_FRACTION, OUT_OF_REACH
@@ -32,7 +27,6 @@ from mag_tracking.stages.track.new_target_search import NewTargetSearch
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import TrackState
-from mag_tracking.stages.track.target import Target
 from mag_tracking.stages.track.track_bank import FrameUpdate, TrackBank
 from mag_tracking.stages.track.window_search import VehicleState
 from mag_tracking.units import NS
@@ -48,8 +42,9 @@ TrackRecord = Track | SmoothedPose | Disturbance
 
 
 class RunningTrack:
-    """Track of a single target, or of several targets that share a state; parameters as for
-    `TrackBank`.
+    """Track of a single target, or of several targets that share a state.
+
+    The event counts of the stage are updated in place.
 
     Attributes
     ----------
@@ -58,15 +53,13 @@ class RunningTrack:
     is_lost : whether the last member ended while it was still detected
     """
 
-    def __init__(self, id: int, target: Target, settings: TrackSettings, sensors: SensorSubset,
-                 bank_filter: BankFilter, bank: FilterBank, counts: 'Counter[str]',
-                 clocks: ClockComparison, later_sensors: SensorSubset) -> None:
+    def __init__(self, id: int, bank: TrackBank, counts: 'Counter[str]', clocks: ClockComparison
+                 ) -> None:
         self.counts, self._clocks = counts, clocks
         self.ended: str | None = None
         self.is_lost = False
-        self._target, self._settings = target, settings
-        self._bank = TrackBank(target, settings, sensors, bank_filter, bank, counts, later_sensors)
-        self.members = [Member(id, target, sensors, counts, clocks, 0)]
+        self._bank, self._target, self._settings = bank, bank.target, bank.settings
+        self.members = [Member(id, bank.target, bank.sensors, counts, clocks, 0)]
         self._new_target_evidence = NewTargetEvidence()
         # Whether the track had the maximum number of members at the last search.
         self._is_at_limit = False
@@ -270,9 +263,10 @@ class RunningTrack:
         return [u for u in found if u is not None]
 
     def new_target(self) -> JointExplanation | None:
-        """Search for another explanation of the latest frames, if a search is due; None if none is
-        sufficiently probable. One that is nearly as probable as the track makes it doubtful for a
-        limited time."""
+        """Search for another explanation of the latest frames, if due; None if none is probable.
+
+        One that is nearly as probable as the track marks it as doubtful for a limited time.
+        """
         window, n = self._bank.relinearisation.window, len(self.members)
         if self.ended is not None or self._target.starts_anywhere or window is None \
                 or self.members[0].last is None:

@@ -44,15 +44,10 @@ after the frames before the detection if few hypotheses are then probable, other
 MIN_SENSORS_AT_START = 4
 """Minimum number of sensors at the start of a track, those nearest to the strongest field."""
 
-WIDER_BYTES = 100_000_000
-"""[bytes] Maximum memory of the covariances after the remaining sensors have been added."""
-
-MIN_HYPOTHESES = 100
-"""Minimum number of retained hypotheses, even if they exceed `WIDER_BYTES`."""
-
-MIN_WEIGHT = 0.999
-"""Minimum total weight of the hypotheses that are retained when the remaining sensors are added, so
-that the track does not appear more certain than the frames justify."""
+WIDER_BYTES, MIN_HYPOTHESES, MIN_WEIGHT = 100_000_000, 100, 0.999
+"""Limits when the remaining sensors are added: maximum memory of the covariances [bytes], minimum
+number of retained hypotheses even beyond it, and minimum total weight of these, so that the track
+does not appear more certain than the frames justify."""
 
 _FLOAT_BYTES = 8
 

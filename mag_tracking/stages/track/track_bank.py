@@ -67,7 +67,7 @@ class TrackBank:
     def __init__(self, target: Target, settings: TrackSettings, sensors: SensorSubset,
                  bank_filter: BankFilter, bank: FilterBank, counts: 'Counter[str]',
                  later_sensors: SensorSubset) -> None:
-        self._target, self.settings, self._counts = target, settings, counts
+        self.target, self.settings, self._counts = target, settings, counts
         self.bank, self.filter, self.sensors = bank, bank_filter, sensors
         self.later_sensors: SensorSubset | None = later_sensors
         self._rejection = SensorRejection(sensors.network.names)
@@ -83,7 +83,7 @@ class TrackBank:
 
     def filter_of(self, n_targets: int) -> BankFilter:
         """Filter for a given number of targets."""
-        return BankFilter(self.sensors.network, self._target.model, self.settings, n_targets)
+        return BankFilter(self.sensors.network, self.target.model, self.settings, n_targets)
 
     def configure(self, settings: TrackSettings) -> None:
         """Apply new values of the live settings."""
@@ -113,9 +113,9 @@ class TrackBank:
         """Start the hypotheses again at the time of `frame` if the target was lost in the gap
         before it, and return the smoothed states before the gap; None if not started again."""
         network = self.sensors.network
-        if not self._target.is_lost_after(self.settings, network, dt):
+        if not self.target.is_lost_after(self.settings, network, dt):
             return None
-        bank = self._target.start(self.settings, network, frame,
+        bank = self.target.start(self.settings, network, frame,
                                   self.filter.observation.own_covariance)
         if bank is None:
             return None

@@ -173,8 +173,7 @@ def inserted(P: FloatArray, block: FloatArray, at: int) -> FloatArray:
 
 
 def labels_of(labels: Sequence[tuple[int, ...]]) -> IntArray:
-    """Labels of each vehicle and hypothesis in the shape of `FilterBank`, (n,) or (n, n_targets).
-    """
+    """Labels of each vehicle and hypothesis in the shape of `FilterBank`, (n,) or (n, m)."""
     out = np.array(labels)
     return out[:, 0].copy() if out.shape[1] == 1 else out
 
