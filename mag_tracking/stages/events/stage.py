@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.background import RelearntBackground, RunningBackground
 from mag_tracking.event_records import SIGNATURE_SPAN, PassEvent
 from mag_tracking.inference.driving_direction import (
@@ -195,6 +195,7 @@ class _SensorEvents:
         squared_field = np.nansum(field**2, axis=1)
         peak = int(np.argmax(squared_field))
         is_detected = (onset_ns <= stamp) & (stamp <= release_ns)
+        interval_s = float(np.median(np.diff(stamp))) / NS if len(stamp) > 1 else 0.0
         present = ~np.all(np.isnan(field), axis=0)
         closest, left_to_right = ClosestPoint((int(stamp[peak]) - onset_ns) / NS, np.inf, np.nan), \
             0.5
@@ -203,24 +204,18 @@ class _SensorEvents:
             closest = closest_point(t, field, noise)
             horizontal = horizontal_field(field, self._R_ws)
             is_complete = ~np.isnan(horizontal).any(axis=1)
-            left_to_right = _left_to_right(
+            rotation = rotation_of_pass(
                 horizontal[is_complete], float(np.nanmean(noise)) if is_complete.any() else 0.0,
                 int(np.count_nonzero(stamp < onset_ns)))
+            if rotation is not None:
+                left_to_right = float(np.clip(rotation.left_to_right, 1.0 - MAX_CONFIDENCE,
+                                              MAX_CONFIDENCE))
         return PassEvent(
             self._name, 0, ended, onset_ns, release_ns, int(stamp[peak]), field[peak],
-            float(np.sum(squared_field[is_detected]) * _median_interval(stamp)),
+            float(np.sum(squared_field[is_detected]) * interval_s),
             ''.join(np.array(list('xyz'))[present]), noise,
             onset_ns + int(round(closest.time * NS)), closest.time_std, closest.time_scale,
             left_to_right, _signature(t, field, closest.time, closest.time_scale))
-
-
-def _left_to_right(horizontal: FloatArray, noise_std: float, n_quiet: int) -> float:
-    """Probability that the target passes the sensor from left to right; 0.5 if unobservable. The
-    first `n_quiet` samples of the field `horizontal` (n, 2) [T] precede the target."""
-    rotation = rotation_of_pass(horizontal, noise_std, n_quiet)
-    if rotation is None:
-        return 0.5
-    return float(np.clip(rotation.left_to_right, 1.0 - MAX_CONFIDENCE, MAX_CONFIDENCE))
 
 
 def _median_noise(readings: Readings) -> FloatArray:
@@ -231,11 +226,6 @@ def _median_noise(readings: Readings) -> FloatArray:
         for a in np.flatnonzero(~np.isnan(readings.field).all(axis=0)).tolist():
             out[a] = np.sqrt(np.nanmedian(variance[:, a]))
     return out
-
-
-def _median_interval(stamp: IntArray) -> float:
-    """Median interval [s] between readings; 0 for fewer than two readings."""
-    return float(np.median(np.diff(stamp))) / NS if len(stamp) > 1 else 0.0
 
 
 def _signature(t: FloatArray, field: FloatArray, time: float, scale: float) -> FloatArray:

@@ -148,8 +148,14 @@ class BankFilter:
         out = PathResult(np.empty(n_hyp), np.empty(n_hyp), np.empty((n_hyp, n), dtype=bool),
                          np.empty((n_hyp, n, n_x, n_x) if wants_covariances else 0))
         new_x, new_P = np.empty_like(bank.x), np.empty_like(bank.P)
+        dt = np.array(intervals, dtype=float)
+        decay, variance = self.observation.drift(dt, self._settings.background_drift)
         self._compiled.run_along(
-            **self._frames(frames, intervals), first_is_updated=first_is_updated,
+            field=np.array([frame.field for frame in frames]),
+            covariance=known_covariance(np.array([f.covariance for f in frames])),
+            offset=np.array([self.time_offset(f, t)
+                             for f, t in zip(frames, intervals, strict=True)]),
+            dt=dt, decay=decay, variance=variance, first_is_updated=first_is_updated,
             max_nis=self._settings.end_nis if rejects_outliers else np.inf,
             iterations=self._settings.iterations, passes=passes, step=step,
             field_error=self._settings.field_error,
@@ -158,17 +164,6 @@ class BankFilter:
             max_shift=out.max_shift, covariances=out.covariances, used=out.used)
         bank.x, bank.P = new_x, new_P
         return out
-
-    def _frames(self, frames: Sequence[FieldFrame], intervals: Sequence[float]
-                ) -> dict[str, FloatArray]:
-        """Arrays of the frames for the compiled `run_along`, by the names of its arguments."""
-        dt = np.array(intervals, dtype=float)
-        decay, variance = self.observation.drift(dt, self._settings.background_drift)
-        return {'field': np.array([frame.field for frame in frames]),
-                'covariance': known_covariance(np.array([f.covariance for f in frames])),
-                'offset': np.array([self.time_offset(f, t)
-                                    for f, t in zip(frames, intervals, strict=True)]),
-                'dt': dt, 'decay': decay, 'variance': variance}
 
     def time_offset(self, frame: FieldFrame, dt: float) -> FloatArray:
         """Sampling time (n_sensors,) of each sensor relative to the timestamp of a frame, s, in

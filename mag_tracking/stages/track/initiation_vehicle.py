@@ -199,19 +199,13 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
             kinds += [kind] * len(states[-1])
     bank = FilterBank.from_targets(np.vstack(states), np.vstack(covariances), np.array(labels),
                                    len(network), background_std, own_covariance, np.array(kinds))
-    return _add_turning_hypotheses(bank, model, TURN_SHARE)
-
-
-def _add_turning_hypotheses(bank: FilterBank, model: RowVehicle, fraction: float) -> FilterBank:
-    """Bank with turning copies of all hypotheses, with a total weight of `fraction`, if enabled."""
     if not model.turn_acceleration:
         return bank
     n, w = len(bank), len(model.state_names) - 1
     doubled = bank.rows(np.tile(np.arange(n), 2))
     doubled.origin = np.arange(2 * n)
-    doubled.log_w = np.log(np.repeat([1.0 - fraction, fraction], n) / n)
-    doubled.P[n:, w, w] = START_TURN_RATIO**2 * model.turn_variance(np.hypot(bank.x[:, 3],
-                                                                             bank.x[:, 4]))
+    doubled.log_w = np.log(np.repeat([1.0 - TURN_SHARE, TURN_SHARE], n) / n)
+    doubled.P[n:, w, w] = START_TURN_RATIO**2 * model.turn_variance(np.hypot(*bank.x[:, 3:5].T))
     return doubled
 
 

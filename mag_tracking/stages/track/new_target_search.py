@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 from scipy.linalg import block_diag
 
-from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.stages.track.bank_filter import DETECTABLE_ENERGY, BankFilter
 from mag_tracking.stages.track.initiation_vehicle import TURN_SHARE, moment_directions
@@ -153,12 +153,17 @@ class NewTargetSearch:
         begin = int(window.is_updated)
         anchor_log_w = bank.log_w[order] + window.evidence \
             - np.sum([values[rows] for values in window.log_likelihoods[begin:]], axis=0)
-        path_result = self._filter.run_along(anchor, window.frames, window.intervals, paths,
-                                             passes=PASSES, step=STEP,
-                                             first_is_updated=window.is_updated)
-        is_usable = np.isfinite(path_result.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
-        track_log_likelihood = np.where(is_usable, path_result.log_likelihood, -np.inf)
-        return order, track_log_likelihood, anchor_log_w + track_log_likelihood, paths
+        log_likelihood = self._run_along(anchor, paths, self._n_targets)
+        return order, log_likelihood, anchor_log_w + log_likelihood, paths
+
+    def _run_along(self, bank: FilterBank, paths: FloatArray, n_targets: int) -> FloatArray:
+        """Filter and smooth a bank along its paths, both in place; return the log-likelihoods (n,)
+        of the window, -inf for unusable paths."""
+        result = self._filter_of(n_targets).run_along(
+            bank, self._window.frames, self._window.intervals, paths, passes=PASSES, step=STEP,
+            first_is_updated=self._window.is_updated)
+        is_usable = np.isfinite(result.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
+        return np.where(is_usable, result.log_likelihood, -np.inf)
 
     def _leading_indices(self, rows: IntArray, log_w: FloatArray) -> list[int]:
         """Indices into `rows` of the hypotheses to be tried: the best of each arrival and kind."""
@@ -269,19 +274,15 @@ class NewTargetSearch:
         Returns the bank at the last frame, log-likelihoods (n,), log-weights (n,) and paths
         (n, n_frames, n_x).
         """
-        window, n = self._window, len(starts)
+        n = len(starts)
         bank = FilterBank(
             np.array([s.x for s in starts]), np.array([s.P for s in starts]), np.zeros(n),
             labels_of([s.label for s in starts]), labels_of([s.kind for s in starts]), np.arange(n),
             np.full((n, len(self._vehicles.network)), np.nan))
         paths = np.array([s.path for s in starts])
-        path_result = self._filter_of(len(starts[0].kind)).run_along(
-            bank, window.frames, window.intervals, paths, passes=PASSES, step=STEP,
-            first_is_updated=window.is_updated)
-        is_usable: BoolArray = np.isfinite(path_result.log_likelihood) \
-            & np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(bank.x).all(axis=1) \
-            & [self._are_plausible(s, x) for s, x in zip(starts, bank.x, strict=True)]
-        log_likelihood = np.where(is_usable, path_result.log_likelihood, -np.inf)
+        log_likelihood = self._run_along(bank, paths, len(starts[0].kind))
+        log_likelihood[~np.isfinite(bank.x).all(axis=1) | [
+            not self._are_plausible(s, x) for s, x in zip(starts, bank.x, strict=True)]] = -np.inf
         log_w = log_likelihood + [s.log_w for s in starts] - 0.5 * np.square(
             [overlap_depth(path, self._n_one, len(s.kind), self._vehicles.length_column) / DEPTH_STD
              for s, path in zip(starts, paths, strict=True)])
