@@ -11,8 +11,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.disturbances import field_magnitudes
-from mag_tracking.stages.track.plausibility import moves_too_far
-from mag_tracking.stages.track.rigid_pass import (
+from mag_tracking.stages.track.pass_samples import (
     LONG_LENGTH,
     MAX_MISFIT,
     MAX_OFFSET,
@@ -20,6 +19,7 @@ from mag_tracking.stages.track.rigid_pass import (
     RigidPass,
     fit_rigid_pass,
 )
+from mag_tracking.stages.track.plausibility import moves_too_far
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.units import NS
 
