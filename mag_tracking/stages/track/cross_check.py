@@ -285,23 +285,17 @@ class CrossCheck:
 
     def _pass_doubts(self) -> set[str]:
         """Doubts about the track that follow from the latest fit."""
-        reasons: set[str] = set()
         latest = self.latest
         if latest is None:
-            return reasons
-        # The middle of a long vehicle is uncertain by up to its length.
-        if np.hypot(self.difference[0], self.difference[1]) > LONG_LENGTH:
-            reasons.add(doubts.ANOTHER_PLACE)
-        if self._is_misfit or latest.misfit > LATE_MISFIT:
-            reasons.add(doubts.NO_STEADY_PATH)
-        if not latest.is_explained:
-            return reasons
-        if latest.needs_clock_offsets:
-            reasons.add(doubts.CLOCKS_APART)
-        if moves_too_far(latest.closest(self._network.positions), latest.velocity,
-                         self._period_s, self._network.positions):
-            reasons.add(doubts.FRAMES_TOO_LONG)
-        return reasons
+            return set()
+        return doubts.applying({
+            # The middle of a long vehicle is uncertain by up to its length.
+            doubts.ANOTHER_PLACE: np.hypot(*self.difference[:2]) > LONG_LENGTH,
+            doubts.NO_STEADY_PATH: self._is_misfit or latest.misfit > LATE_MISFIT,
+            doubts.CLOCKS_APART: latest.needs_clock_offsets,
+            doubts.FRAMES_TOO_LONG: latest.is_explained and moves_too_far(
+                latest.closest(self._network.positions), latest.velocity, self._period_s,
+                self._network.positions)})
 
 
 def _is_in_pass(stamp_ns: int, peak_ns: int) -> bool:

@@ -1,6 +1,6 @@
 """Doubts: the published reasons why a pose is ambiguous, and their meanings."""
 
-from collections.abc import Set
+from collections.abc import Mapping, Set
 
 from mag_tracking.calibration.doubtful_times import (
     CONTRADICTS_EARTH_FIELD,
@@ -69,6 +69,11 @@ MEANINGS = {
     NO_STEADY_PATH: 'no path with steady acceleration and turning explains the whole pass',
 }
 """Meaning of each doubt, in the order of publication."""
+
+
+def applying(conditions: Mapping[str, object]) -> set[str]:
+    """Doubts whose conditions are true."""
+    return {name for name, applies in conditions.items() if applies}
 
 
 def ordered(doubts: Set[str]) -> tuple[str, ...]:

@@ -181,18 +181,13 @@ class TrackEvidence:
 
         `nis` (n_sensors,) is the normalised innovation squared of each sensor; NaN if missing.
         """
-        reasons = set()
-        if self.bayes_factor.is_recently_disfavoured(min_bayes_factor):
-            reasons.add(doubts.DISTURBANCE_MODEL)
-        if self.contradicts(nis, degrees_of_freedom):
-            reasons.add(doubts.CONTRADICTION)
-        if self.is_sensed_by_one:
-            reasons.add(doubts.FELT_BY_ONE_SENSOR)
-        if self.innovations.excess > 1.0:
-            reasons.add(doubts.INNOVATIONS)
         if self.innovations.fails:
             self.doubts.add(doubts.INNOVATIONS)
-        return reasons
+        return doubts.applying({
+            doubts.DISTURBANCE_MODEL: self.bayes_factor.is_recently_disfavoured(min_bayes_factor),
+            doubts.CONTRADICTION: self.contradicts(nis, degrees_of_freedom),
+            doubts.FELT_BY_ONE_SENSOR: self.is_sensed_by_one,
+            doubts.INNOVATIONS: self.innovations.excess > 1.0})
 
     def update_filter_doubt(self, gain: float, stamp_ns: int, window_s: float) -> bool:
         """Update and return the doubt about the filter, which lasts from a frame with `gain` below

@@ -118,7 +118,10 @@ class NewTargetSearch:
 
         `track_evidence` is the log-evidence of the track.
         """
-        starts = self._add_turning_starts(self._refine_starts(starts))
+        _, _, log_w, paths = self._run_starts(starts)
+        order = np.argsort(-log_w, kind='stable')[:MAX_EXPLANATIONS]
+        starts = self._add_turning_starts([replace(starts[k], path=paths[k]) for k in order.tolist()
+                                           if log_w[k] >= log_w.max() - MAX_LOSS_NATS])
         bank, log_likelihood, log_w, paths = self._run_starts(starts)
         rows = np.flatnonzero(np.isfinite(log_w))
         if not len(rows):
@@ -247,13 +250,6 @@ class NewTargetSearch:
                 (*known.kind, *kinds), known.log_w + len(paths) * self._log_prior, len(paths),
                 replaced))
         return starts
-
-    def _refine_starts(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
-        """Refine the paths of the starts; return the starts about as probable as the best one."""
-        _, _, log_w, paths = self._run_starts(starts)
-        order = np.argsort(-log_w, kind='stable')[:MAX_EXPLANATIONS]
-        return [replace(starts[k], path=paths[k]) for k in order.tolist()
-                if log_w[k] >= log_w.max() - MAX_LOSS_NATS]
 
     def _add_turning_starts(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
         """Return the starts and copies of them, in each of which one new vehicle turns."""

@@ -77,22 +77,16 @@ class Plausibility:
         `mounting_std` [rad] is the minimum std of the mounting angles of all sensors, because a
         model error also rotates the field.
         """
-        x, kind = bank.x[best], int(bank.kind[best])
-        self._update_road_check(bank, settings, observation.positions)
-        reasons = set()
-        if _needs_rotated_sensors(observation, x, mounting_std):
-            reasons.add(doubts.SENSORS_ROTATED)
-        height_error = abs(float(x[2]) - settings.kinds[kind].height)
-        if height_error > -ndtri(P_HEIGHT / 2.0) * settings.kinds[kind].height_std:
-            reasons.add(doubts.HEIGHT)
-        if x[2] < 0.0 < settings.kinds[kind].height:
-            reasons.add(doubts.BELOW_SENSORS)
-        if self._was_off_road[bank.origin[best]] or _is_off_road(
-                x[None], settings, observation.positions, LANE_STDS_LATER)[0]:
-            reasons.add(doubts.OFF_THE_ROAD)
-        if moves_too_far(x[:3], x[3:6], dt, observation.positions):
-            reasons.add(doubts.FRAMES_TOO_LONG)
-        return reasons
+        x, kind, positions = bank.x[best], settings.kinds[bank.kind[best]], observation.positions
+        self._update_road_check(bank, settings, positions)
+        return doubts.applying({
+            doubts.SENSORS_ROTATED: _needs_rotated_sensors(observation, x, mounting_std),
+            doubts.HEIGHT:
+                abs(float(x[2]) - kind.height) > -ndtri(P_HEIGHT / 2.0) * kind.height_std,
+            doubts.BELOW_SENSORS: x[2] < 0.0 < kind.height,
+            doubts.OFF_THE_ROAD: self._was_off_road[bank.origin[best]]
+            or _is_off_road(x[None], settings, positions, LANE_STDS_LATER)[0],
+            doubts.FRAMES_TOO_LONG: moves_too_far(x[:3], x[3:6], dt, positions)})
 
     def _update_road_check(self, bank: FilterBank, settings: VehicleSettings,
                            positions: FloatArray) -> None:

@@ -270,12 +270,10 @@ def mixture_uncertainty(bank: FilterBank, best: int, is_separated: BoolArray, mo
 
 def ambiguities(bank: FilterBank, best: int, is_separated: BoolArray) -> set[str]:
     """Doubts about the position and the arrival direction of the best hypothesis."""
-    reasons = set()
-    if bank.weight(is_separated) > AMBIGUOUS_WEIGHT:
-        reasons.add(doubts.ANOTHER_PLACE)
-    if 1.0 - np.exp(bank.log_w).sum(where=bank.label == bank.label[best]) > AMBIGUOUS_WEIGHT:
-        reasons.add(doubts.ANOTHER_ARRIVAL)
-    return reasons
+    arrival_weight = np.exp(bank.log_w).sum(where=bank.label == bank.label[best])
+    return doubts.applying({
+        doubts.ANOTHER_PLACE: bank.weight(is_separated) > AMBIGUOUS_WEIGHT,
+        doubts.ANOTHER_ARRIVAL: 1.0 - arrival_weight > AMBIGUOUS_WEIGHT})
 
 
 def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray, *,
