@@ -8,7 +8,7 @@ import pytest
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
-from mag_tracking.simulation.scenario import Path, point_body
+from mag_tracking.simulation.scenario import Path
 from mag_tracking.stages.track import manager, target, track_bank
 from mag_tracking.stages.track.doubts import DOUBTFUL_BACKGROUND
 from mag_tracking.stages.track.plausibility import Approach
@@ -22,6 +22,7 @@ from support.bundled import POINT
 from support.counters import count_of
 from support.networks import line_network
 from support.samples import one, simulate
+from support.scenario import point_body
 
 
 def bank_of(rng, n_hyp, n_t, n_own, n_sensors):
