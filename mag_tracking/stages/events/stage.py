@@ -30,18 +30,14 @@ from mag_tracking.units import NEVER, NS
 
 PAD_S = 1.0
 """[s] Length of the margins without a target, before the onset and after the release."""
-
 MAX_DURATION_S = 120.0
 """[s] Maximum duration of an event; only the latest readings of a longer detection are used."""
-
 SIGNATURE_POINTS = 33
 """Number of points of a signature."""
-
 MAX_SAMPLES, MIN_SAMPLES, MAX_STARTS = 200, 8, 5
 """Maximum number of samples (blocks of a longer pass are averaged) and minimum number of complete
 samples in a fit, and number of grid points from which its search starts; with one axis it has
 several minima."""
-
 CORRELATION_TIME, CENTRE_OFFSET = 2.0, 0.15
 """[time scales] Correlation time of the residual when a dipole is fitted to a vehicle, and typical
 distance of its magnetic centre from the middle of its body."""

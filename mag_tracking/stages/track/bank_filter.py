@@ -23,13 +23,10 @@ LINEAR_FRACTION, SAME_TIME_FRACTION = 0.25, 0.05
 """Displacement over which the field is approximately linear, as a fraction of the distance to the
 nearest sensor, whose cube then changes by a factor of two; and fraction of the interval since the
 previous frame below which the samples of a frame count as simultaneous."""
-
-
 NEGLIGIBLE_ENERGY, WEAK_ENERGY = 0.1, 1.0
 """Squared norm of the whitened field per frame below which a target that moves away is removed from
 a joint track, and up to which it does not disturb other targets; the latter is the limit if the
 track has the maximum number of targets."""
-
 DETECTABLE_ENERGY = 4.0
 """Minimum squared norm of the whitened field of a detectable target: of a tracked vehicle in the
 last frame, of a new vehicle in a window at each sensor, and of a path in a search according to the

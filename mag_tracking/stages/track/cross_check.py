@@ -26,27 +26,20 @@ from mag_tracking.units import NS
 SIGNIFICANT_STDS, PRIOR_STD_S = 4.0, 1e3
 """Minimum number of standard deviations of a significant offset, and prior standard deviation [s]
 of the offset of each clock."""
-
 MEMORY_PASSES = 20
 """Effective number of passes in the estimate; clocks drift and are adjusted."""
-
 FORGETTING_FACTOR, CONTRADICTED_FACTOR = 1.0 - 1.0 / MEMORY_PASSES, 0.5
 """Factor on the previous information at a pass that agrees with the estimate, and at a pass that
 contradicts it."""
-
 PASSED_FRACTION = 0.6
 """A vehicle has passed when the field is below this fraction of its maximum."""
-
 FIRST_CHECK_S, CHECK_INTERVAL_RATIO = 0.12, 1.7
 """[s] Delay of the first fit after the maximum of the field, and ratio of the delays of successive
 fits."""
-
 BEFORE_S, AFTER_S = 4.0, 3.0
 """[s] Duration of a pass before and after the maximum of the field."""
-
 MIN_FRAMES, MAX_FRAMES = 12, 128
 """Minimum and maximum number of frames in a fit. A longer pass is decimated."""
-
 STEADY_S, LATE_MISFIT = 1.5, 8.0
 """[s] Time after the maximum of the field for which acceleration and turn rate are assumed to be
 constant, and maximum misfit (reduced chi-square) of a later fit."""

@@ -22,24 +22,18 @@ from mag_tracking.records import FieldFrame
 
 FALSE_ALARM_PROBABILITY = 1e-6
 """Probability that the noise of a sensor alone marks it as affected in a frame."""
-
 GRADIENT_RATIO = 0.3
 """Prior standard deviation of the change of a common field from the centre of the network to its
 edge, relative to that of the field."""
-
 MIN_STD = 1e-15
 """[T] Minimum standard deviation of the noise of a sensor in a network file."""
-
 UNKNOWN_FIELD_STD = 1e-4
 """Prior standard deviation of the field after a handover [T]."""
-
 MIN_GRADIENT_SENSORS = 3
 """Minimum number of sensors for a common field with a gradient, which could explain any readings of
 fewer."""
-
 MAX_COMMON_SENSORS = 8
 """Maximum number of sensors in the model of a common field, whose cost grows with its cube."""
-
 _Filters: TypeAlias = tuple[GaussMarkovVectors, GaussMarkovVectors, GaussMarkovVectors]
 """Independent fields of the covered and of the other sensors, and a common field of the covered."""
 

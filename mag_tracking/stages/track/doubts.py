@@ -32,7 +32,6 @@ ANOTHER_VEHICLE = 'another_vehicle'
 PERMANENT = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
 """Doubts that persist until the end of a track, because they show that its path is distorted. Later
 frames may correct the causes of other doubts."""
-
 MEANINGS = {
     ANOTHER_PLACE: 'another position is still possible',
     ANOTHER_ARRIVAL: 'another arrival direction is still possible',

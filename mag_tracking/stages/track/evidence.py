@@ -19,38 +19,30 @@ from mag_tracking.units import NS
 MAX_SINGLE_SENSOR_S = 0.5
 """[s] Maximum total time in which only one of several sensors measures the target of an unambiguous
 track."""
-
 LOST, OUT_OF_REACH, UNEXPLAINED = 'target lost', 'out of reach', 'unexplained'
 """Reasons to end a track."""
 UNEXPLAINED_S = 3.0
 """[s] Time after which a track ends that a disturbance explains better than a target, unless a
 target explained it better earlier."""
-
 CONTRADICTION = 1e-5
 """Probability below which a field contradicts the track of a vehicle. The filter, which is still
 updated with it, may follow a wrong path that agrees with all later frames."""
-
 OVERFIT_NATS = float(np.log(1e4))
 """[nats] Maximum excess of the log-likelihood in the filter over that along the path of the same
 hypothesis. A filter that linearises each frame at a different state may fit the frames better than
 any single path can."""
-
 MIN_OBSERVED_FRACTION = 0.5
 """Fraction of the lookback that the frames before the detection of an unambiguous track cover."""
-
 SENSED_LEVEL = 4.0
 """Energy of the fields of a sensor that has sensed the target, in excess of the expected energy of
 its noise, in standard deviations."""
-
 TRANSIENT_DOUBTS = (doubts.OVERFIT, doubts.DISTURBANCE_MODEL, doubts.INNOVATIONS, doubts.MISFIT,
                     doubts.HEIGHT, doubts.BELOW_SENSORS, doubts.OFF_THE_ROAD,
                     doubts.NO_STEADY_PATH)
 """Doubts about the state of the filter in single frames, which smoothing resolves only in part."""
-
 TRANSIENT_S = 0.1
 """[s] Time for which a transient doubt persists, because one that is absent from a single frame may
 reappear in the next."""
-
 MAX_INTERVALS = 5000
 """Maximum number of stored intervals with doubtful poses; a track that is smoothed has fewer."""
 

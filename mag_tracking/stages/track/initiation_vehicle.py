@@ -18,7 +18,6 @@ from mag_tracking.settings import USER, param
 
 REFERENCE_FIELD = 5e-5
 """Field for which `VehicleSettings.induced_share` is defined [T]."""
-
 MAX_CAR_ROW = 4.0
 """[m] Maximum length of the row of dipoles of a car, beyond which the iron exceeds the row."""
 LATERAL_STD, ALONG_STD = 1.5, 3.0

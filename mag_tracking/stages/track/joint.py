@@ -14,31 +14,24 @@ from mag_tracking.units import NS
 
 FALSE_ALARM_PROBABILITY = 1e-3
 """Probability per test that noise alone triggers a comparison with other explanations."""
-
 WINDOW_S, MIN_INTERVAL_S = 0.25, 0.15
 """[s] Duration of the tested frames, and minimum interval between any comparison and the next one
 that improbable innovations trigger."""
-
 LONG_INTERVAL_S, INTERVAL_GROWTH = 0.3, 1.5
 """[s] Interval after which a long vehicle is compared with two vehicles, and factor by which this
 interval grows with each comparison."""
-
 ACCEPT_NATS, REPEATED_NATS, UNDECIDED_NATS = 10.0, 5.0, -5.0
 """[nats] Minimum log-odds of another explanation: to be accepted at once, to be accepted in two
 successive comparisons, and to mark the track as doubtful if it is not accepted."""
-
 IMPROBABLE, LONG_VEHICLE = 'improbable innovations', 'a long vehicle'
 """Reasons to compare a track with other explanations."""
-
 CONFIDENT_NATS, IMPLAUSIBLE_NATS = 15.0, 60.0
 """[nats] Log-odds below which an explanation is doubtful for a limited time: high, because the
 evidence treats model errors as independent between frames; and higher if a new vehicle crosses or
 overtakes another, which is rarer than a flipped axis or a train with a similar field."""
-
 CROSSING_COSINE, OVERTAKING_RATIO = 0.9, 1.8
 """Absolute cosine of the angle between velocities below which two vehicles cross, and maximum
 plausible speed ratio of two vehicles that move in the same direction."""
-
 MIN_MOVING_SPEED = 1.0
 """[m/s] Minimum speed of vehicles whose directions are compared."""
 

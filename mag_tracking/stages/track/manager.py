@@ -31,7 +31,6 @@ TOO_SLOW = 'detections not tracked (the rate of the sensors is too low)'
 UNCERTAIN_ORIENTATIONS = ('sensors with an orientation uncertainty above '
                           f'{np.degrees(MAX_ROTATION):g} degrees')
 """Keys of event counts that others use."""
-
 RESTART_ENERGY_RATIO = 4.0
 """Minimum energy of the frame in which a track starts after a lost track, relative to the maximum
 energy of the lost track: the field of a departing vehicle only decreases."""

@@ -34,19 +34,15 @@ from mag_tracking.stages.track.window_search import (
 
 PASSES, STEP = 3, 0.5
 """Number of Gauss-Newton steps along each path, and their damping factor."""
-
 MAX_KNOWN, MAX_FIRST, MAX_SECOND = 2, 3, 2
 """Maximum numbers of tried hypotheses of a single tracked vehicle (only the best of several), of
 first new vehicles for each hypothesis, and of second new vehicles for each first one."""
-
 MAX_LOSS_NATS, MAX_EXPLANATIONS = 10.0, 12
 """Maximum difference in log-probability between the best and another retained explanation [nats],
 and maximum number of retained explanations."""
-
 LOG_P_ARRIVAL, LOG_P_LOST = np.log(0.05), np.log(0.01)
 """Log-probabilities that another vehicle arrives during a pass, and that the track of a vehicle was
 at a wrong position during the whole window."""
-
 MIN_DISPLACEMENT_M, MAX_RATIO, N_DISTANCES = 2.0, 5.0, 10
 """Minimum distance [m] of a vehicle at another position from its track, maximum speed and moment of
 a new vehicle relative to the largest ones in the settings, and number of its possible positions on

@@ -13,7 +13,6 @@ from mag_tracking.physics.sources import SourceModel
 MAX_ROTATION = np.deg2rad(15.0)
 """[rad] Maximum standard deviation of a mounting angle. Larger values are reduced to this maximum,
 because rotations are approximated to first order. `TrackManager` counts the affected sensors."""
-
 TIME_RESOLUTION_S = 1e-3
 """[s] Resolution of sampling times. At 20 m/s, a target moves two centimetres in this time."""
 

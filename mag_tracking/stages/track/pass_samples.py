@@ -28,50 +28,37 @@ from mag_tracking.units import NS
 
 MODEL_ERROR = 0.04
 """Error of the field of a row of dipoles, relative to the field; treated as noise."""
-
 NEAR_ERROR_LENGTH = 0.2
 """[m] Minimum product of the relative field error and the distance to the sensor, for samples with
 the model error near the sensors."""
-
 MAX_SENSORS = 4
 """Maximum number of sensors in a fit: those with the strongest fields."""
-
 N_STEPS, TOLERANCE = 30, 1e-3
 """Maximum number of steps of a fit, and relative improvement of the cost below which it ends."""
-
 N_SHORT, N_LONG = 3, 5
 """Number of dipoles of the two rows: the long one explains any vehicle, and might compensate for
 clock offsets."""
-
 LENGTH, LONG_LENGTH = 3.0, 8.0
 """[m] Start values of the distance from the first to the last dipole, for the short and the long
 row."""
-
 SMALL_OFFSET, LARGE_OFFSET = 0.1, 0.3
 """[s] Start values of the clock offsets, used with both signs."""
-
 OFFSET_STD, MAX_OFFSET = 0.15, 0.5
 """[s] Prior standard deviation of clock offsets, and their maximum, beyond which a turn has the
 same effect."""
-
 START_TURN_RATE = 0.4
 """[rad/s] Start value of the turn rate of a bent path, used with both signs."""
-
 GOOD_MISFIT, MAX_MISFIT = 1.3, 1.5
 """Maximum reduced chi-square of a path that explains a pass well, and of a path that may explain
 it."""
-
 P_CLOCKS, P_BEND = 1e-5, 1e-3
 """Probabilities that noise alone improves the fit significantly although the clocks are correct, or
 although the motion is straight."""
-
 MIN_DISTANCE, MIDDLE_STD = 1.0, 0.5
 """[m] Motion of the target during a clock offset below which the offset is harmless, and standard
 deviation of the apparent magnetic centre of a vehicle from sensor to sensor."""
-
 MAX_DISTANCE, MAX_SPEED = 30.0, 100.0
 """[m], [m/s] Maximum distance of a vehicle from the nearest sensor, and its maximum speed."""
-
 _STRAIGHT = np.arange(N_STRAIGHT)
 
 _BENT = np.arange(N_PATH)

@@ -18,44 +18,34 @@ from mag_tracking.units import NEVER, NS
 P_MOUNTING, P_HEIGHT = 0.05, 1e-3
 """Probabilities that the mounting angles of correctly mounted sensors, and the height of a vehicle
 of its kind, are flagged."""
-
 LANE_STDS, LANE_STDS_LATER = 1.645, 3.0
 """Maximum distance of a vehicle from the outermost configured lane, in standard deviations: at its
 closest point to any sensor, which one in twenty vehicles on that lane exceeds, and later, when it
 may have turned off."""
-
 MAX_ONE_SIDED_WIDTH = 2.0
 """[m] Maximum lateral extent of sensors on one side of a road: no lane fits between them."""
-
 MIN_SPEED = 1.0
 """[m/s] Minimum speed of a vehicle at which its heading is defined."""
-
 MAX_RELATIVE_MOVE = 0.75
 """Maximum motion of a target within a frame, relative to its distance to the second nearest sensor,
 because the error of a single sensor does not mislead a track. The relative error of the average
 over the frame is about half the square of this ratio."""
-
 SENSED_LEVEL, GROWTH_RATIO = 2.5, 10.0
 """RMS of the whitened field above which the target counts as sensed, and ratio of the highest level
 in the approach test to this one."""
-
 MIN_LOG2_RATIO = -0.25
 """Minimum log2 ratio of the durations of the first and the second half of the growth. In theory it
 is 0.55 for an approach at constant speed, -0.83 for a start from rest next to a sensor, and near 0
 for a sudden jump of the field."""
-
 FALL_FRACTION = 0.85
 """Fraction of its previous maximum below which the field of a sensed target falls if the target has
 passed its first sensor, which passes the test."""
-
 LEVEL_TIME_STD, MAX_FRAMES = 0.5, 1000
 """Uncertainty of the time at which the field reached a level, in frame periods, and number of
 frames after which the test is skipped if the field has not grown enough."""
-
 N_INTERVALS, MIN_INTERVALS = 8, 2
 """Number of latest intervals of a sensor, most of which are too long if it is slow, and minimum
 number of these; single lost readings do not matter."""
-
 N_PATHS = 41
 """Number of paths between the outermost lanes that are compared."""
 

@@ -26,18 +26,14 @@ from mag_tracking.stages.track.settings import BEST, MIXTURE
 
 MIN_SPEED_STDS = 3.0
 """A vehicle has a heading if its speed exceeds this number of standard deviations."""
-
 UNOBSERVED_VARIANCE = np.pi**2
 """[rad^2] Variance of an angle that is not observable from the field."""
-
 NEGLIGIBLE_WEIGHT, AMBIGUOUS_WEIGHT = 1e-6, 0.05
 """Weight relative to the heaviest hypothesis below which a hypothesis is excluded from covariances,
 and total weight of the hypotheses at other positions, or with other arrival directions, above which
 a track is ambiguous."""
-
 Flags: TypeAlias = tuple[bool, bool, bool]
 """Whether the rotation about the x, y and z axis of the body is unobservable."""
-
 OrientationEstimate: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, Flags]
 """Quaternion (4,), derivative (3, n_t) of the small rotation about the world axes with respect to
 the target state, variance (3, 3) [rad²] of the unobservable part, to be added, and flags."""

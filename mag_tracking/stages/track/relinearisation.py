@@ -33,22 +33,17 @@ from mag_tracking.units import NS
 
 MAX_LOG_RATIO = np.log(1e3)
 """Maximum difference between the largest log-weight and that of a relinearised hypothesis."""
-
 PASSES, STEP_SIZE = 3, 0.5
 """Number of Gauss-Newton steps per relinearisation, which continues from the previous one, and
 their damping factor. Undamped steps diverge where the field is strongly nonlinear."""
-
 CONVERGED = 0.3
 """Maximum distance of the smoothed positions from a converged path in the last step, in standard
 deviations of the position."""
-
 ATTEMPTED, FAILED = 'paths relinearised', 'paths relinearised without success'
 """Keys of the event counts: all relinearised paths, and paths whose states were not adopted."""
-
 MAX_FRAMES = 64
 """Maximum number of frames in a window; at most half of it remain when the window moves. Without
 this limit, a window of several seconds at 100 Hz would exceed the capacity of one core."""
-
 MAX_ELEMENTS = 5_000_000
 """Maximum product of frames, hypotheses and squared number of states. With many sensors, fewer
 hypotheses are relinearised."""

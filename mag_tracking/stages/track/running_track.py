@@ -34,7 +34,6 @@ from mag_tracking.units import NS
 UNDECIDED_S, DOUBTED_S = 1.0, 3.0
 """[s] Duration of the doubt after another explanation was about as probable as the track, and of
 that about the uncertain vehicles of an accepted explanation."""
-
 BELOW_SENSORS = 'vehicles that appear to pass below the sensors'
 
 TrackRecord = Track | SmoothedPose | Disturbance

@@ -25,10 +25,8 @@ from mag_tracking.stages.track.settings import TrackSettings
 
 PREDICTION_S = 0.5
 """[s] Prediction horizon of the position near which sensors are selected."""
-
 _States: TypeAlias = tuple[FloatArray, FloatArray]
 """States and covariances of a bank."""
-
 SENSORS_PER_REJECTION = 8
 """Number of measuring sensors for each sensor that may be rejected, at least one. If more must
 be rejected, the track itself is wrong; sensors far from the target fit any hypothesis."""

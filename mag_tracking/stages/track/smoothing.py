@@ -23,18 +23,14 @@ from mag_tracking.units import NS
 
 NOT_SMOOTHED = 'tracks without smoothing'
 """Key of the number of tracks that could not be smoothed as a whole."""
-
 State: TypeAlias = tuple[FloatArray, FloatArray]
 """State (n_x,) and covariance (n_x, n_x)."""
-
 TrackState: TypeAlias = tuple[int, FloatArray, FloatArray]
 """Timestamp [ns], state (n_x,) and covariance (n_x, n_x)."""
-
 RELINEARISATIONS = 1
 """Number of relinearisations of a track along its previous result, for inaccurate predictions far
 from the sensors. Four would converge and improve the tracks of turning cars and trucks, but degrade
 the track of a car along a corridor of sensors."""
-
 MAX_ELEMENTS = 10_000_000
 """Maximum product of frames and squared number of states: 80 MB, less than a second."""
 

@@ -32,28 +32,21 @@ from mag_tracking.stages.track.pass_samples import PassSamples
 
 N_DIPOLES = 3
 """Number of dipoles of the rows in the search; sufficient for a car near a sensor."""
-
 GRID_STEP, GRID_MARGIN = 3.0, 12.0
 """[m] Spacing of the grid along an arrival line, and its range beyond the last sensor."""
-
 SPEED_COLUMN = PATH.index('speed')
 """Column of the speed in a path."""
-
 MIN_STD = 1e-3
 """[m], [m/s], [A m^2] Minimum standard deviation of a parameter without a spread in the settings,
 such as the length of a point."""
-
 MIN_SPEED_RATIO = 0.2
 """Minimum speed of an arriving vehicle, relative to the lowest starting speed."""
-
 N_STARTS, N_STEPS, TOLERANCE = 10, 12, 1e-3
 """Maximum numbers of refined distinct starts and of steps, and relative improvement of the cost
 below which the refinement ends."""
-
 START_TOLERANCE: FloatArray = np.array([4.0, 2.5, 1.0, 5.0, 0.3, 1.0, 3.0])
 PATH_TOLERANCE: FloatArray = np.array([1.0, 1.0, 1.0, 2.0, 0.3, 1.0, 9.0])
 """[m], [m/s], [rad] Differences up to which two starts, or two refined paths, are identical."""
-
 FIRST_PATH_STD: FloatArray = np.array([2.0, 1.5, 0.2, 3.0, 0.1, 0.1, 1.5])
 """[m], [m/s], [rad] Standard deviations of the path of the first vehicle in a search for a second
 one."""

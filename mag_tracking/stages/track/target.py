@@ -36,19 +36,15 @@ from mag_tracking.stages.track.settings import TrackSettings
 MAX_BYTES = 4 << 30
 """[bytes] Memory for the covariances of all starting hypotheses above which settings are rejected;
 the peak memory is 1.5 times as large."""
-
 START_BYTES = 250_000_000
 """[bytes] Memory for the covariances with which a track starts. Sensors that need more are added
 after the frames before the detection if few hypotheses are then probable, otherwise later."""
-
 MIN_SENSORS_AT_START = 4
 """Minimum number of sensors at the start of a track, those nearest to the strongest field."""
-
 WIDER_BYTES, MIN_HYPOTHESES, MIN_WEIGHT = 100_000_000, 100, 0.999
 """Limits when the remaining sensors are added: maximum memory of the covariances [bytes], minimum
 number of retained hypotheses even beyond it, and minimum total weight of these, so that the track
 does not appear more certain than the frames justify."""
-
 _FLOAT_BYTES = 8
 
 

@@ -25,14 +25,11 @@ from mag_tracking.units import NS
 
 MIN_MOMENT = 1e-6
 """[A m^2] Minimum magnitude of a moment at which its direction is defined."""
-
 OVERLAP_WIDTH, OVERHANG, DEPTH_STD = 1.5, 1.0, 1.0
 """[m] Lateral distance below which two vehicles overlap, minimum longitudinal gap between their
 rows of dipoles, and standard deviation of the overlap depth due to uncertain paths."""
-
 MAX_SAMPLES = 320
 """Maximum number of samples of a search; windows with more are decimated."""
-
 KNOWN_STD, KNOWN_MOMENT_RATIO = 0.7, 0.3
 """[m], [m/s] Standard deviation of the positions and velocities of tracked vehicles in a search,
 and relative standard deviation of their moments."""

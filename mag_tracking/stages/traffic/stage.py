@@ -38,35 +38,26 @@ from mag_tracking.units import NS
 AMBIGUOUS, CONTRADICTED, EXTRAPOLATED = 'ambiguous', 'direction_contradicted', 'extrapolated'
 """Doubts about a passage: the track is ambiguous at the line; the rotation of the fields
 contradicts the direction of the crossing; the track does not reach the line."""
-
 MAX_DIRECTION_ERROR = 0.9
 """Error probability above which the fields contradict the direction of a crossing."""
-
 INTERFERENCE_S, SMOOTHED_LEAD_S, MAX_WAIT_S = 2.0, 3.0, 120.0
 """[s] Time around a crossing in which another tracked vehicle prevents the check of its direction,
 maximum time from the first smoothed to the first published pose of a track, and maximum time that
 passages and summaries wait for a running track."""
-
 REACQUIRED_S, REACQUIRED_M = 1.0, 3.0
 """[s], [m] Maximum separation in time and along the line of two crossings of one vehicle, whose
 track was lost and reacquired near the line."""
-
 TrafficRecord: TypeAlias = VehiclePassage | TrafficSummary
 """Output of the stage."""
-
 MAX_AGE_S = 70.0
 """[s] Maximum age of stored frames; longer than any smoothed track."""
-
 MIN_LATERAL, MAX_ALONG = 1.5, 12.0
 """[m] Minimum distance of a sensor that observes the direction from the path, and maximum distance
 from the crossing to its closest point of approach."""
-
 WINDOW_RATIO = 3.0
 """Distance that the vehicle travels in half the window, relative to that of the sensor from it."""
-
 MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S = 0.5, 4.0
 """[s] Bounds of half the duration of the window."""
-
 MAX_LOG_ODDS = float(np.log(MAX_CONFIDENCE / (1.0 - MAX_CONFIDENCE)))
 """Largest log odds from one sensor."""
 
