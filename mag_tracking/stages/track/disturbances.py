@@ -128,12 +128,9 @@ class DisturbanceModel:
         return float(np.exp(self._log_w[1]))
 
     def log_density(self, frame: FieldFrame, dt: float, model_error: FloatArray) -> float | None:
-        """Update the models with a frame; return its log-density given the previous frames.
-
-        `model_error` (n_sensors,) [T²] is the variance per axis that the tracker assumes. The
-        result is None for the first frame with readings after a handover, and 0 before the first
-        reading.
-        """
+        """Update the models with a frame and the variance `model_error` (n_sensors,) [T²] per axis
+        that the tracker assumes; return its log-density given the previous frames, None for the
+        first one with readings after a handover, and 0 before the first reading."""
         is_present = np.isfinite(frame.field.ravel())
         noise = np.einsum('jii->ji', frame.covariance)
         variance = np.maximum(noise + model_error[:, None], MIN_STD**2).ravel()[is_present]

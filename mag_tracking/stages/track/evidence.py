@@ -97,10 +97,8 @@ class TrackEvidence:
 
     def flag_start(self, approach_unobserved: bool, network: SensorNetwork, starts_anywhere: bool
                    ) -> None:
-        """Mark the track as doubtful if its start was not observed or its range is not observable.
-
-        A target that `starts_anywhere`, like a magnet, need not be seen approaching.
-        """
+        """Mark the track as doubtful if its start was not observed, unless it `starts_anywhere`, or
+        if its range is not observable."""
         # A target that was not seen approaching may already have passed.
         if approach_unobserved and not starts_anywhere:
             self.doubts.add(doubts.NOT_SEEN_APPROACHING)
@@ -156,11 +154,11 @@ class TrackEvidence:
                         if stamp_ns <= expiry_ns}
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
-        """Whether the innovations `nis` (n_sensors,) of a frame are too large for the target model;
-        NaN if missing.
+        """Whether the innovations `nis` (n_sensors,) of a frame, NaN if missing, are too large for
+        the target model.
 
-        If the track uses at most two sensors, a contradiction also marks the track as doubtful,
-        because many paths fit the fields. With more sensors, later frames correct the track.
+        With at most two sensors, this marks the track as doubtful, because many paths fit the
+        fields. With more, later frames correct the track.
         """
         is_contradiction = bool(np.nansum(nis) > chdtri(degrees_of_freedom, CONTRADICTION))
         if is_contradiction and len(nis) <= 2:
@@ -198,11 +196,7 @@ class TrackEvidence:
 
     def count_single_sensor_time(self, is_single_sensor: bool, dt: float) -> None:
         """Update the total time in which only one of several sensors measured; flag the track if it
-        is too long.
-
-        A single sensor determines neither the scale of a track nor which of two mirror images is
-        correct. The other sensors do not always correct the error when they measure again.
-        """
+        is too long for the others to correct its scale, or its choice between mirror images."""
         self._single_sensor_s += dt if is_single_sensor else 0.0
         if self._single_sensor_s > MAX_SINGLE_SENSOR_S:
             self.doubts.add(doubts.ONE_SENSOR)

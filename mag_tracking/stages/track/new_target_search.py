@@ -50,15 +50,12 @@ a line at the start of the window."""
 
 
 class NewTargetSearch:
-    """Search for explanations by an additional vehicle, or by a vehicle at another position.
+    """Search for explanations by an additional vehicle, if it `may_add` one, or by a vehicle at
+    another position.
 
-    Parameters
-    ----------
-    filter_of : function that returns the `BankFilter` for a number of vehicles
-    n_targets : number of vehicles of the track
-    reason : reason from `NewTargetEvidence.due`; without improbable innovations, the search is
-        restricted to two vehicles in place of one
-    may_add : whether a vehicle may be added
+    For a `reason` from `NewTargetEvidence.due` other than improbable innovations, the search is
+    restricted to two vehicles in place of one. `filter_of` returns the filter for a number of
+    vehicles; the track has `n_targets`.
     """
 
     def __init__(self, bank: FilterBank, window: Window, filter_of: Callable[[int], BankFilter],
@@ -147,7 +144,7 @@ class NewTargetSearch:
         """
         window, bank = self._window, self._bank
         order = np.argsort(-bank.log_w, kind='stable')[:window.max_hypotheses]
-        rows = np.searchsorted(window.anchor.origin, bank.origin[order])
+        rows = window.rows_of(bank)[order]
         anchor, paths = window.anchor.rows(rows), np.stack([p[rows] for p in window.paths], axis=1)
         begin = int(window.is_updated)
         anchor_log_w = bank.log_w[order] + window.evidence \
@@ -179,21 +176,18 @@ class NewTargetSearch:
 
     def _known_vehicles(self, row: int, log_w: float, path: FloatArray) -> KnownVehicles:
         """Vehicles of hypothesis `row` of the track; `log_w` is its log-weight at the anchor."""
-        at = np.searchsorted(self._window.anchor.origin, self._bank.origin[[row]])
-        at_anchor = self._window.anchor.rows(at)
+        at_anchor = self._window.anchor.rows(self._window.rows_of(self._bank)[[row]])
         label, kind = (tuple(np.ravel(of[row]).tolist())
                        for of in (self._bank.label, self._bank.kind))
-        return KnownVehicles(at_anchor.x[0], at_anchor.P[0], path, label, kind, log_w,
-                                      self._filter)
+        return KnownVehicles(at_anchor.x[0], at_anchor.P[0], path, label, kind, log_w, self._filter)
 
     def _is_elsewhere(self, joint: JointExplanation) -> bool:
         """Whether the relocated vehicle is more than `MIN_DISPLACEMENT_M` from its track."""
-        n, current = self._n_one, self._bank.x[self._bank.best()]
         assert joint.replaced is not None
-        found = joint.bank.x[joint.bank.best()]
-        last = n * (self._n_targets - 1)
-        before = current[joint.replaced * n:joint.replaced * n + 2]
-        return bool(np.hypot(*(found[last:last + 2] - before)) > MIN_DISPLACEMENT_M)
+        first, last = (k * self._n_one for k in (joint.replaced, self._n_targets - 1))
+        before, found = (bank.x[bank.best()] for bank in (self._bank, joint.bank))
+        return bool(np.hypot(*(found[last:last + 2] - before[first:first + 2]))
+                    > MIN_DISPLACEMENT_M)
 
     def _remove_vehicle(self, known: KnownVehicles, i: int) -> KnownVehicles:
         """Known vehicles without vehicle `i`; only the sensor states, as at the start of a track,
@@ -243,8 +237,8 @@ class NewTargetSearch:
                 path.append(self._vehicles.along(theta, m, times, kind))
             starts.append(WindowStart(
                 x, P, np.hstack([*path, known.path[:, n_known:]]), (*known.label, *labels),
-                (*known.kind, *kinds), known.log_w + len(paths) * self._log_prior, len(paths),
-                replaced))
+                (*known.kind, *kinds), known.log_w + len(paths) * self._log_prior,
+                range(len(known.kind), len(known.kind) + len(paths)), replaced))
         return starts
 
     def _add_turning_starts(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
@@ -252,7 +246,7 @@ class NewTargetSearch:
         out = []
         for start in starts:
             turning = [P for P in (self._vehicles.turning(start.x, start.P, i)
-                                   for i in start.new_indices) if P is not None]
+                                   for i in start.new) if P is not None]
             out.append(start if not turning else replace(
                 start, log_w=start.log_w + float(np.log(1.0 - TURN_SHARE))))
             out += [replace(start, P=P, log_w=start.log_w + float(
@@ -284,7 +278,7 @@ class NewTargetSearch:
         """Whether the new vehicles in the state `x` (n_x,) have plausible speeds and moments; a
         stationary vehicle cannot have arrived during the window."""
         settings, n = self._vehicles.settings, self._n_one
-        for i in start.new_indices:
+        for i in start.new:
             speed = np.hypot(*x[i * n + 3:i * n + 5])
             moment = np.linalg.norm(self._vehicles.hard_moments(x[i * n:]).sum(axis=0))
             if not self._search.prior.min_speed <= speed <= MAX_RATIO * max(settings.speeds) \

@@ -168,16 +168,10 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     """Track record of hypothesis `best` of a bank; the keyword parameters from `stamp_ns` are
     entries of `Track`.
 
-    Parameters
-    ----------
-    arrivals : name of the arrival direction for each label
-    kinds : name of each kind of target
-    found : doubts about the pose, without the ambiguities of the bank
-    unobserved_length : uncertainty of the middle of a vehicle; None for a magnet
-    excess : ratio of the actual to the expected variance of the innovations, by which the
-        covariance is multiplied
-    difference : (6,) array, difference from another possible position and velocity, which the
-        covariance must cover, m and m/s
+    `arrivals` and `kinds` are the names for each label and kind, and `found` the doubts about the
+    pose without the ambiguities of the bank. The covariance is multiplied by `excess`, the ratio of
+    the actual to the expected variance of the innovations, and covers the `difference` (6,) [m,
+    m/s] from another possible position and velocity.
     """
     n_t = len(model.state_names)
     is_separated = bank.is_separated(best)

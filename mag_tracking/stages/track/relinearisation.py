@@ -1,21 +1,18 @@
 """Relinearisation of the leading hypotheses of a running track along their smoothed paths.
 
-An extended Kalman filter linearises each frame at the state predicted at that time. Far from the
-sensors, the error of the prediction is several metres, and the filter becomes and remains
-overconfident. Therefore the latest frames are filtered and smoothed again, with motion and field
-linearised along the smoothed path of each leading hypothesis, in damped Gauss-Newton steps on the
-path. If the steps converge, the state at the end of the path replaces the state of the filter, with
-the larger of both covariances. Otherwise only the covariance of the path is adopted, if it is
-larger: a filter that is linearised at different states gains information about directions that no
-single path can observe (Julier and Uhlmann 2001 found this for maps).
+An extended Kalman filter linearises each frame at its prediction. Far from the sensors, this is
+wrong by metres, and the filter becomes and remains overconfident. Therefore the latest frames are
+filtered and smoothed again along the smoothed path of each leading hypothesis, in damped
+Gauss-Newton steps on the path: the iterated Kalman smoother of Bell 1994. If the steps converge,
+the state at the end of the path replaces that of the filter, with the larger of both covariances.
+Otherwise only a larger covariance of the path is adopted: a filter that is linearised at different
+states gains information that no single path has (Julier and Uhlmann 2001 found this for maps).
 
-The likelihood of the frames along the path does not measure convergence: the model error and the
-drift of a moment are proportional to the moment, so the steps minimise a different cost, and a path
-may diverge to moments that explain any field. The path of a long vehicle, whose model error is
-largest, is adopted only if it explains the frames no worse than the filter did. Weights are not
-changed, because the likelihoods of relinearised and other hypotheses are not comparable.
-
-The method is the iterated Kalman smoother of Bell 1994.
+The likelihood along the path does not measure convergence: the model error and the drift of a
+moment are proportional to the moment, so the steps minimise a different cost, and a path may
+diverge to moments that explain any field. The path of a long vehicle, whose model error is largest,
+is adopted only if it explains the frames no worse than the filter did. Weights are not changed,
+because the likelihoods of relinearised and other hypotheses are not comparable.
 """
 
 from collections import Counter
@@ -119,12 +116,9 @@ class Relinearisation:
 
     def add(self, bank: FilterBank, predicted: FloatArray, log_likelihood: FloatArray,
             evidence: float, frame: FieldFrame, dt: float) -> None:
-        """Add a frame with which the bank has been updated.
-
-        `predicted` (n_hyp, n_x) are the states at which the frame was first linearised. `evidence`
-        is the log-density of the frame over all hypotheses, `log_likelihood` (n_hyp,) that of each
-        hypothesis.
-        """
+        """Add a frame with which the bank has been updated, the states `predicted` (n_hyp, n_x) at
+        which it was first linearised, and its log-density for each hypothesis, `log_likelihood`
+        (n_hyp,), and over all hypotheses, `evidence`."""
         if self._is_stale:
             self.begin(bank.copy(), True)
         window = self._window
@@ -184,11 +178,8 @@ class Relinearisation:
             else self._window
 
     def without_target(self, bank_filter: BankFilter, bank: FilterBank, i: int) -> None:
-        """Remove target `i` from the window of a bank and filter that include it.
-
-        The window is shortened to the frames after the last one in which the field of the target is
-        strong on the path of the best hypothesis.
-        """
+        """Remove target `i` from the window of a bank and filter that include it, and the frames up
+        to the last one in which its field is strong on the path of the best hypothesis."""
         window, best = self.window, bank.best()
         is_strong = [] if window is None else [
             bank_filter.field_energies(i, path[window.rows_of(bank)[best]], frame).sum()
@@ -254,11 +245,8 @@ def _replace_states(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArr
 
 def _widen_covariances(bank: FilterBank, rows: IntArray, x: FloatArray, P: FloatArray,
                        linear_range: Callable[[FloatArray], FloatArray]) -> None:
-    """Replace covariances `rows` in place where `P` has a larger position variance.
-
-    The new covariance includes the difference between `x` and the state of the bank. It is not
-    adopted if it is too large for the next linear update.
-    """
+    """Replace covariances `rows` in place where `P` has a larger position variance, plus the
+    difference of `x` from the state of the bank, unless it is too large for a linear update."""
     difference = x - bank.x[rows]
     wide_P = P + difference[:, :, None] * difference[:, None]
     own_variance, path_variance, wide_variance = (

@@ -1,11 +1,10 @@
 """Sensors that a track uses in a large network, and rejection of those that contradict the others.
 
-A state has up to nine elements per sensor, and the cost of an update is cubic in the number of
-sensors. Distant sensors would add little information and are not used.
+The cost of an update is cubic in the number of sensors, and distant ones add little information.
 
-A faulty sensor pulls a track away from the measurements of all other sensors. Its axes may be
-swapped, it may have been knocked over, or it may be near another vehicle. If a frame fits the
-leading hypothesis only without one or a few sensors, these sensors are rejected.
+A sensor with swapped axes, one that was knocked over, or one near another vehicle pulls a track
+away from all others. If a frame fits the leading hypothesis only without one or a few sensors,
+these are rejected.
 """
 
 from collections import Counter
@@ -90,10 +89,8 @@ class SensorSubset:
         return bool(offset @ track.velocity[:2] < 0.0)
 
     def for_whole_network(self, track: Track, settings: TrackSettings) -> Track:
-        """Extend a track record of these sensors to all sensors of the network.
-
-        Entries of the other sensors are NaN; their mounting angles have the prior covariance.
-        """
+        """Extend a track record of these sensors to all sensors of the network, with NaN and the
+        prior covariance of the mounting angles for the others."""
         if not self.is_part:
             return track
         n_sensors, rows = len(self.full_network), self.rows

@@ -42,14 +42,10 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     """Smoothed states of the only hypothesis of a bank at each frame, and the number of frames
     excluded because they contradict it.
 
-    Parameters
-    ----------
-    bank : bank of this hypothesis alone, at the first frame
-    intervals : time from the previous frame to each frame, s
-    updated : whether the bank has already been updated with the first frame
-    relinearisations : number of further passes, each linearised along the result of the previous
-        pass
-    path : known states (n_x,) at the first frames, at which the first pass is linearised
+    `intervals` [s] are the times since the previous frame, `updated` tells whether the bank at the
+    first frame has been updated with it, each of the `relinearisations` is a pass along the result
+    of the previous one, and `path` contains known states (n_x,) at the first frames, at which the
+    first pass is linearised.
     """
     paths = np.full((1, len(frames), bank.x.shape[1]), np.nan)
     for at, known in zip(paths[0], path, strict=False):

@@ -139,11 +139,8 @@ class TrackBank:
         self._whole_track.add(bank, update.frame, update.dt, publish)
 
     def smoothed(self, best: int, counts: bool = True) -> list[TrackState]:
-        """Smoothed states of hypothesis `best` at the published frames; empty if smoothing is
-        disabled or impossible.
-
-        `counts` tells whether excluded frames are counted.
-        """
+        """Smoothed states of hypothesis `best` at the published frames, empty if smoothing is
+        disabled or impossible; excluded frames are counted if `counts`."""
         states, n_excluded = self._whole_track.smoothed(self.bank, best)
         if counts:
             self._counts['frames left out of smoothing'] += n_excluded

@@ -140,15 +140,10 @@ class PathHypothesis:
 class WindowStart(PathHypothesis):
     """Hypothesis of known and new vehicles, at the start of a window."""
 
-    n_new: int
-    """Number of new vehicles, which are the last ones."""
+    new: range
+    """Indices of the new vehicles, which are the last ones."""
     replaced: int | None
     """As in `JointExplanation`."""
-
-    @property
-    def new_indices(self) -> range:
-        """Indices of the new vehicles."""
-        return range(len(self.kind) - self.n_new, len(self.kind))
 
 
 @dataclass(frozen=True)
