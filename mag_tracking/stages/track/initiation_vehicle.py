@@ -190,9 +190,8 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
             starts = _matching_positions(settings, network, energy, whitening, R, moments,
                                          of_kind.height)
             states.append(_initial_states(settings, kind, starts, velocities, hard_iron))
-            by_speed = np.array([
-                starting_covariance(settings, kind, R, v, of_kind.moment_std)
-                for v in settings.speeds])
+            by_speed = np.array([starting_covariance(settings, kind, R, v)
+                                 for v in settings.speeds])
             covariances.append(np.tile(by_speed.repeat(len(moments), 0), (len(starts), 1, 1)))
             labels += [label] * len(states[-1])
             kinds += [kind] * len(states[-1])
@@ -251,24 +250,23 @@ def _initial_states(settings: VehicleSettings, kind: int, positions: FloatArray,
     return x.reshape(-1, x.shape[-1])
 
 
-def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, speed: float,
-                        moment_std: float) -> FloatArray:
+def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, speed: float
+                        ) -> FloatArray:
     """Initial covariance (n_t, n_t) of a hypothesis that arrives along the x axis of `R` (3, 3), a
-    rotation to the world frame, with a std of the hard iron of `moment_std` [A m²] per axis."""
-    d = _n_dipoles(settings)
+    rotation to the world frame."""
+    d, of_kind = _n_dipoles(settings), settings.kinds[kind]
     soft_index = 6 + 3 * d
     soft_iron_std = settings.induced_share_std * _soft_iron_per_share(settings, kind)
     n_t = soft_index + 2 + min(d, 2) + int(settings.turn_acceleration > 0.0)
     P = np.zeros((n_t, n_t))
-    P[:3, :3] = R @ np.diag([ALONG_STD**2, LATERAL_STD**2,
-                             settings.kinds[kind].height_std**2]) @ R.T
+    P[:3, :3] = R @ np.diag([ALONG_STD**2, LATERAL_STD**2, of_kind.height_std**2]) @ R.T
     P[3:6, 3:6] = R @ np.diag([(SPEED_STD * speed) ** 2, (CROSS_SPEED_STD * speed) ** 2,
                                CLIMB_STD**2]) @ R.T
     mean = np.full((d, d), 1.0 / d)
-    among_dipoles = (moment_std**2 / d * mean
-                     + settings.kinds[kind].difference_std**2 * (np.eye(d) - mean))
+    among_dipoles = of_kind.moment_std**2 / d * mean \
+        + of_kind.difference_std**2 * (np.eye(d) - mean)
     P[6:soft_index, 6:soft_index] = np.kron(among_dipoles, np.eye(3))
     P[soft_index:soft_index + 3, soft_index:soft_index + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
     if d > 1:
-        P[soft_index + 3, soft_index + 3] = settings.kinds[kind].length_std**2
+        P[soft_index + 3, soft_index + 3] = of_kind.length_std**2
     return P

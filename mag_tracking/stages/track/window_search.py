@@ -67,7 +67,7 @@ class VehicleState:
         x[2], x[5] = s.kinds[kind].height, 0.0
         if self.length_column is not None:
             x[self.length_column] = s.kinds[kind].length
-        return x, starting_covariance(s, kind, R, float(theta[3]), s.kinds[kind].moment_std)
+        return x, starting_covariance(s, kind, R, float(theta[3]))
 
     def along(self, theta: FloatArray, moments: FloatArray, times: FloatArray, kind: int
               ) -> FloatArray:
