@@ -221,9 +221,9 @@ def _shorten(window: Window, bank_filter: BankFilter, bank: FilterBank, n: int) 
     moved = window.anchor.rows(np.arange(len(window.anchor)))
     _run_along(window, bank_filter, moved, np.stack(window.paths[:n + 1], axis=1), 1)
     window.anchor, window.is_updated = moved, True
-    for values in (window.frames, window.intervals, window.paths, window.log_likelihoods,
-                   window.evidences):
-        del values[:n]
+    window.frames, window.intervals = window.frames[n:], window.intervals[n:]
+    window.paths, window.log_likelihoods = window.paths[n:], window.log_likelihoods[n:]
+    window.evidences = window.evidences[n:]
     return moved
 
 
