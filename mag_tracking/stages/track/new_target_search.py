@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 from scipy.linalg import block_diag
 
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
 from mag_tracking.stages.track.bank_filter import DETECTABLE_ENERGY, BankFilter
 from mag_tracking.stages.track.initiation_vehicle import TURN_SHARE, moment_directions
@@ -267,8 +267,9 @@ class NewTargetSearch:
             np.full((n, len(self._vehicles.network)), np.nan))
         paths = np.array([s.path for s in starts])
         log_likelihood = self._run_along(bank, paths, len(starts[0].kind))
-        log_likelihood[~np.isfinite(bank.x).all(axis=1) | [
-            not self._are_plausible(s, x) for s, x in zip(starts, bank.x, strict=True)]] = -np.inf
+        is_usable: BoolArray = np.isfinite(log_likelihood) & np.isfinite(bank.x).all(axis=1) \
+            & [self._are_plausible(s, x) for s, x in zip(starts, bank.x, strict=True)]
+        log_likelihood = np.where(is_usable, log_likelihood, -np.inf)
         log_w = log_likelihood + [s.log_w for s in starts] - 0.5 * np.square(
             [overlap_depth(path, self._n_one, len(s.kind), self._vehicles.length_column) / DEPTH_STD
              for s, path in zip(starts, paths, strict=True)])
