@@ -42,9 +42,8 @@ class Member:
     def __init__(self, id: int, target: Target, sensors: SensorSubset, counts: 'Counter[str]',
                  clocks: ClockComparison, begin_ns: int) -> None:
         self.id, self._target, self._counts, self._clocks = id, target, counts, clocks
-        self.begin_ns, self._sensors = begin_ns, sensors
+        self.begin_ns, self.cross_check = begin_ns, CrossCheck(sensors.network)
         self.evidence, self._plausibility = TrackEvidence(len(sensors.full_network)), Plausibility()
-        self.cross_check = CrossCheck(sensors.network)
         self.last: Track | None = None
         self.ended: str | None = None
         self.early: list[TrackState] = []
@@ -58,23 +57,22 @@ class Member:
         self._recent_positions: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_POSITIONS)
 
     def use(self, sensors: SensorSubset) -> None:
-        """Switch to other sensors, and restart the cross-check."""
-        self._sensors = sensors
+        """Restart the cross-check with the sensors of the track."""
         self.cross_check = CrossCheck(sensors.network)
 
     def restart(self, sensors: SensorSubset) -> None:
-        """Switch to other sensors, drop the doubts caused by the field of another vehicle, and
-        restart the checks."""
+        """Drop the doubts caused by the field of another vehicle, and restart the checks."""
         self.evidence.drop_explained_doubts()
         self.use(sensors)
         self._plausibility = Plausibility()
 
-    def start_alongside(self, first: 'Member', stamp_ns: int, ratio: float) -> None:
+    def start_alongside(self, first: 'Member', sensors: SensorSubset, stamp_ns: int, ratio: float
+                        ) -> None:
         """Start as a new target of a track; it inherits from the first member the doubt that it was
         not seen approaching, and the evidence for a target against a disturbance, with the minimum
         Bayes factor `ratio`."""
         self.evidence.flag_start(doubts.NOT_SEEN_APPROACHING in first.evidence.doubts,
-                                 self._sensors.full_network, False)
+                                 sensors.full_network, False)
         self.evidence.bayes_factor.add(first.evidence.bayes_factor.log_ratio, stamp_ns, ratio)
 
     def distance_from(self, stamps_ns: Sequence[int], path: FloatArray) -> float:

@@ -307,7 +307,7 @@ class RunningTrack:
         if joint.adds:
             new = Member(id, self._target, sensors, self.counts, self._clocks,
                          now_ns - round(self._settings.lookback_s * NS))
-            new.start_alongside(self.members[0], now_ns, ratio)
+            new.start_alongside(self.members[0], sensors, now_ns, ratio)
         doubtful = joint.doubtful(n)
         self._bank.resume(joint)
         self.members, self._is_at_limit = members_in_order(self.members, new, joint, n), False
