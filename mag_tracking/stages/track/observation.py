@@ -86,22 +86,17 @@ class Observation:
         return self.n_target + (self.n_own + 3) * n_sensors
 
     def own(self, x: FloatArray) -> FloatArray:
-        """View of the mounting angles and model errors (..., n_sensors, n_own) in states (...,
-        n_x).
-        """
+        """Mounting angles and model errors (..., n_sensors, n_own) of states (..., n_x), a view."""
         n = len(self.positions)
         own = x[..., self.n_target:x.shape[-1] - 3 * n]
         return own.reshape(*own.shape[:-1], n, self.n_own)
 
     def angles(self, x: FloatArray) -> FloatArray:
-        """Mounting angles (..., n_sensors, 3) of states (..., n_x), rad; (..., 0, 3) if not
-        estimated.
-        """
+        """Mounting angles (..., n_sensors, 3) of states (..., n_x), rad; none if not estimated."""
         return self.own(x)[..., :3] if self.n_angles else np.zeros((*x.shape[:-1], 0, 3))
 
     def angle_covariances(self, P: FloatArray) -> FloatArray:
-        """Covariances (n_sensors, 3, 3) of the mounting angles, rad²; (0, 3, 3) if not
-        estimated."""
+        """Covariances (n_sensors, 3, 3) of the mounting angles, rad²; none if not estimated."""
         first = self.n_target + self.n_own * np.arange(len(self.positions))
         rows = first[:, None] + np.arange(3)
         return P[rows[:, :, None], rows[:, None, :]] if self.n_angles else np.zeros((0, 3, 3))
