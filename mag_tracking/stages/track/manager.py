@@ -1,6 +1,5 @@
-"""Track management: initiation with a detection, maintenance with each frame, and deletion of
-tracks with the release of the detection, or when the target is lost.
-"""
+"""Track management: tracks are initiated with a detection, maintained with each frame, and deleted
+with the release of the detection, or when the target is lost."""
 
 from collections import Counter, deque
 
