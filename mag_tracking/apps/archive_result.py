@@ -10,8 +10,8 @@ import numpy as np
 from mag_tracking.apps.archive_segments import work_file_errors
 from mag_tracking.arrays import IntArray
 from mag_tracking.files import replace_text
-from mag_tracking.stages.track.clock_comparison import ClockComparison
-from mag_tracking.stages.track.rigid_pass import RigidPass
+from mag_tracking.stages.track.cross_check import ClockComparison
+from mag_tracking.stages.track.pass_samples import RigidPass
 
 TRACKED_FILE = 'tracked.json'
 """Name of the file in the folder of a tracked segment."""

@@ -1,66 +1,16 @@
-"""Simulated scenarios with ground truth: bodies that move past a sensor network.
+"""Simulated scenarios: bodies that move past a sensor network.
 
 A simulated vehicle is a cloud of magnetised parts rather than one dipole, so that a point-target
 model has a realistic model error. A single part is a point target that matches this model.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import MU0, dipole_field
-from mag_tracking.records import Readings
-
-
-class Body(Protocol):
-    """A magnetic body that moves upright over the ground."""
-
-    def field(self, earth_field: FloatArray, position: FloatArray, heading: FloatArray,
-              points: FloatArray) -> FloatArray:
-        """Field of the body at given points.
-
-        Parameters
-        ----------
-        earth_field : (3,) array, T, world frame
-            Flux density B0.
-        position : (n, 2) array, m, world frame
-            Horizontal position of the body at each time.
-        heading : (n,) array, rad
-            Heading at each time, anticlockwise from x.
-        points : (n_sensors, 3) array, m, world frame
-            Positions at which the field is evaluated.
-
-        Returns
-        -------
-        (n, n_sensors, 3) array, T, world frame
-        """
-        ...
-
-
-class Trajectory(Protocol):
-    """Pose of a body as a function of time."""
-
-    def at(self, t: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Evaluate the trajectory.
-
-        Parameters
-        ----------
-        t : (n,) array, s
-            Times.
-
-        Returns
-        -------
-        position : (n, 2) array, m, world frame
-            Horizontal position.
-        heading : (n,) array, rad
-            Anticlockwise from x.
-        """
-        ...
 
 
 def body_poses(position: FloatArray, heading: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -89,7 +39,9 @@ class MagneticBody:
 
     def field(self, earth_field: FloatArray, position: FloatArray, heading: FloatArray,
               points: FloatArray) -> FloatArray:
-        """Field of the body, as `Body.field`; NaN at a point that coincides with a part."""
+        """Field (n, n_sensors, 3) [T] at `points` (n_sensors, 3) [m] of the body at horizontal
+        positions (n, 2) [m] with headings (n,) [rad, anticlockwise from x], all in the world frame;
+        NaN at a point that coincides with a part."""
         R, origin = body_poses(position, heading)
         r = origin[:, None] + np.einsum('nij,pj->npi', R, self.parts)
         B_body = np.einsum('nji,j->ni', R, earth_field)
@@ -97,17 +49,6 @@ class MagneticBody:
         m = np.einsum('nij,npj->npi', R, self.permanent + induced)
         B: FloatArray = dipole_field(points[None, :, None] - r[:, None], m[:, None]).sum(axis=2)
         return B
-
-
-def point_body(hard_iron: Sequence[float] | FloatArray, soft_iron: float,
-               height: float) -> MagneticBody:
-    """Create a point target that matches the model of the tracker.
-
-    `hard_iron` (3,) [A m²] is the moment m0 in the body frame, `soft_iron` [m³] the value D of all
-    axes, `height` [m] that above the ground.
-    """
-    return MagneticBody(np.array([[0.0, 0.0, height]]), np.array([hard_iron], dtype=float),
-                        soft_iron * np.eye(3)[None])
 
 
 def random_vehicle(rng: np.random.Generator, length: float = 4.3, width: float = 1.7,
@@ -154,7 +95,7 @@ class Path:
     """Radius of the arc, m."""
 
     def at(self, t: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Evaluate the trajectory, as `Trajectory.at`."""
+        """Positions (n, 2) [m] and headings (n,) [rad] at times `t` (n,) [s]."""
         s = self.speed * np.asarray(t, dtype=float)
         arc = abs(self.turn) * self.radius
         before_arc = np.minimum(s, self.straight)
@@ -169,57 +110,3 @@ class Path:
         position = self.start + np.stack([c * forward - w * sideways,
                                           w * forward + c * sideways], axis=1)
         return position, self.heading + angle
-
-
-@dataclass(frozen=True)
-class SensorErrorModel:
-    """Standard deviations of random sensor errors; zero disables an error."""
-
-    noise_std: float = 1.2e-8
-    """White noise, T."""
-    bias_std: float = 0.0
-    """Constant bias, T."""
-    drift_std: float = 0.0
-    """Constant drift rate, T/s."""
-    tilt_std: float = 0.0
-    """Mounting error about each axis, relative to the network file, rad."""
-    clock_std: float = 0.0
-    """Constant clock offset, s; 0 for the first sensor."""
-    gain_std: float = 0.0
-    """Relative gain error of each axis."""
-
-
-def simulate(network: SensorNetwork, body: Body, path: Trajectory, rate: float, duration: float,
-             rng: np.random.Generator, sensor_errors: SensorErrorModel | None = None,
-             start_s: float = 0.0) -> tuple[Readings, FloatArray, FloatArray, FloatArray]:
-    """Simulate the raw readings of all sensors for one body, with ground truth.
-
-    The samples at `rate` [Hz] begin at the timestamp `start_s` [s]. By default, the only sensor
-    error is white noise. Return the readings in chronological order, the time (n,) [s] of each
-    sample since the start, and the true position (n, 2) [m] and heading (n,) [rad] at these times.
-    Raises ValueError if the network has no Earth's field.
-    """
-    errors, earth_field = sensor_errors or SensorErrorModel(), network.earth_field
-    if earth_field is None:
-        raise ValueError('the simulation requires a network with an earth field; set earth_field')
-    t = np.arange(0.0, duration, 1.0 / rate, dtype=float)
-    fields = []
-    for j in range(len(network)):
-        offset = errors.clock_std * rng.standard_normal() if j else 0.0
-        position, heading = path.at(t + offset)
-        B = earth_field + body.field(earth_field, position, heading,
-                                     network.positions[j:j + 1])[:, 0]
-        a, b, c = errors.tilt_std * rng.standard_normal(3)
-        tilt = np.array([[1.0, -c, b], [c, 1.0, -a], [-b, a, 1.0]])
-        y = B @ network.R_ws[j] @ tilt
-        if errors.gain_std:
-            y *= 1.0 + errors.gain_std * rng.standard_normal(3)
-        y += errors.bias_std * rng.standard_normal(3)
-        y += errors.drift_std * rng.standard_normal(3) * t[:, None]
-        y += errors.noise_std * rng.standard_normal(y.shape)
-        fields.append(y)
-    n = len(network)
-    stamps = np.array([int(round((start_s + s) * 1e9)) for s in t], dtype=np.int64)
-    readings = Readings(network.names, np.tile(np.arange(n), len(t)), np.repeat(stamps, n),
-                        np.stack(fields, axis=1).reshape(-1, 3))
-    return readings, t, *path.at(t)

@@ -26,7 +26,7 @@ from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for
 from mag_tracking.recording.writer import RecordingWriter
-from mag_tracking.simulation import scenario
+from support import scenario
 from support.bundled import NETWORK_FILE
 from support.random_passes import KINDS, SIMULATORS, random_pass
 

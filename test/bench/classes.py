@@ -19,12 +19,12 @@ from mag_tracking.apps.classes import evaluate_classes, examples_of
 from mag_tracking.event_records import VehiclePassage
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.simulation.scenario import SensorErrorModel
 from support.box_vehicles import UNCALIBRATED, random_drive
 from support.bundled import NETWORK_FILE
 from support.labelled_passes import signatures
 from support.random_passes import SIMULATORS, random_course
 from support.samples import scenario
+from support.scenario import SensorErrorModel
 from support.situation_worlds import car, small, truck
 
 FRACTIONS = {'motorcycle': 0.05, 'car': 0.8, 'truck': 0.15}

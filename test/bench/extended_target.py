@@ -23,8 +23,9 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
-from mag_tracking.simulation.scenario import Path, SensorErrorModel, random_vehicle
+from mag_tracking.simulation.scenario import Path, random_vehicle
 from support.samples import one, recorded, simulate
+from support.scenario import SensorErrorModel
 
 ROOT = FilePath(__file__).resolve().parents[2]
 NETWORK = ROOT / 'config' / 'network.yaml'

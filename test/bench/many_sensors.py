@@ -23,9 +23,10 @@ import numpy as np  # noqa: E402  (the thread counts have to be set before NumPy
 
 from bench.figures import Figures  # noqa: E402
 from mag_tracking.pipeline import Pipeline, settings_for  # noqa: E402
-from mag_tracking.simulation.scenario import Path, point_body  # noqa: E402
+from mag_tracking.simulation.scenario import Path  # noqa: E402
 from support.networks import line_network  # noqa: E402
 from support.samples import one, simulate  # noqa: E402
+from support.scenario import point_body  # noqa: E402
 
 N_SENSORS, SPEED = 32, 15.0
 FRAMES = 20

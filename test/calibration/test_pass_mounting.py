@@ -16,10 +16,11 @@ from mag_tracking.calibration.orientation import (
 from mag_tracking.geometry import rotation_about_z
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
-from mag_tracking.simulation.scenario import Path, point_body
+from mag_tracking.simulation.scenario import Path
 from support.bundled import POINT
 from support.networks import line_network
 from support.samples import one, simulate
+from support.scenario import point_body
 from support.track_runs import drive
 
 NETWORK = line_network(3, tilt=0.6)

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from mag_tracking.calibration import core
 from mag_tracking.calibration.core import HELD, MAX_HELD, PASSES, RELEASED, SPIKE
 from mag_tracking.calibration.sensor_state import new_sensors
-from mag_tracking.simulation.scenario import Path, point_body, random_vehicle
+from mag_tracking.simulation.scenario import Path, random_vehicle
 from support.networks import line_network
 from support.samples import simulate
+from support.scenario import point_body
 from support.sensor_noise import EARTH, NS, SIGMA, noise
 
 

@@ -7,13 +7,14 @@ from scipy.stats import chi2, multivariate_normal
 
 from mag_tracking.physics.dipole import sensor_fields
 from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.simulation.scenario import Path, point_body
+from mag_tracking.simulation.scenario import Path
 from mag_tracking.stages.track.target import target_of
 from support import plain_kalman
 from support.bundled import POINT
 from support.marks import studied
 from support.networks import line_network
 from support.samples import one, simulate
+from support.scenario import point_body
 
 
 def dense_update(x, P, y, h, H, C, inflation, x_lin, n_own=0):

@@ -13,8 +13,9 @@ import magpylib
 import numpy as np
 
 from mag_tracking.physics.dipole import MU0
-from mag_tracking.simulation.scenario import Path, SensorErrorModel, body_poses
+from mag_tracking.simulation.scenario import Path, body_poses
 from support.passes import EARTH
+from support.scenario import SensorErrorModel
 
 UNCALIBRATED = SensorErrorModel(noise_std=1.2e-8, tilt_std=np.deg2rad(1.0), gain_std=0.01)
 """Errors of uncalibrated sensors that are mounted carefully."""
@@ -46,7 +47,7 @@ class BoxVehicle:
         return self.permanent + self.induced * B_body[:, None] / MU0
 
     def field(self, earth_field, position, heading, points):
-        """Field of the vehicle at `points`; implements `mag_tracking.simulation.scenario.Body`."""
+        """Field of the vehicle at `points`; a body of `support.scenario`."""
         R, origin = body_poses(position, heading)
         m = self.moments(np.einsum('nji,j->ni', R, earth_field))
         J = MU0 * m / self.sides.prod(axis=1)[:, None]
@@ -154,7 +155,7 @@ class Drive:
         return self.path.speed * (1.0 + self.speed_change / (1.0 + np.exp(-z)))
 
     def at(self, t):
-        """Position and heading at times `t`; implements `scenario.Trajectory`."""
+        """Position and heading at times `t`; a path of `support.scenario`."""
         t = np.asarray(t, dtype=float)
         position, heading = self.path.at(self._on_path(t))
         z = (t - self.swerve_at_s) / (self.swerve_s / 2.0)

@@ -40,7 +40,7 @@ class WheeledVehicle:
     radius: float = 0.3
 
     def field(self, earth_field, position, heading, points):
-        """Field of the vehicle at `points`; implements `mag_tracking.simulation.scenario.Body`."""
+        """Field of the vehicle at `points`; a body of `support.scenario`."""
         B = self.body.field(earth_field, position, heading, points)
         R, origin = body_poses(position, heading)
         distance = np.concatenate([[0.0], np.hypot(*np.diff(position[:, :2], axis=0).T).cumsum()])

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from mag_tracking.simulation.scenario import Path, point_body
+from mag_tracking.simulation.scenario import Path
 from support.networks import line_network
 from support.samples import simulate
+from support.scenario import point_body
 
 START_S = 1000.0
 SPEED = 10.0

@@ -6,9 +6,10 @@ from mag_tracking.analysis.pass_description import SensorErrors
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.file import read_network
 from mag_tracking.recording.writer import RecordingWriter
-from mag_tracking.simulation.scenario import Path, SensorErrorModel, point_body
+from mag_tracking.simulation.scenario import Path
 from support.bundled import NETWORK_FILE
 from support.samples import sample_dict, simulate
+from support.scenario import SensorErrorModel, point_body
 
 HARD, SOFT = [240.0, -130.0, 90.0], 6.0
 """Hard iron m0 [A m²] in the vehicle frame and soft iron D [m³] of the simulated vehicle."""

@@ -18,11 +18,11 @@ from mag_tracking.network.file import read_network
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.middleware import init_ros, make_executor
 from mag_tracking.nodes.stage_node import RESULT_QOS, STREAM_QOS
-from mag_tracking.simulation.scenario import point_body
 from support.bundled import NETWORK_FILE, POINT
 from support.mqtt_broker import Broker, password_lines
 from support.node_processes import MAX_S, start, stop
 from support.roadside import NOISE, Roadside
+from support.scenario import point_body
 from support.serial_line import SerialLine
 
 MAX_NEES = chi2.ppf(1.0 - 1e-4, 2)

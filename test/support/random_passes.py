@@ -7,10 +7,11 @@ import numpy as np
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
-from mag_tracking.simulation.scenario import Path, SensorErrorModel, random_vehicle
+from mag_tracking.simulation.scenario import Path, random_vehicle
 from support.box_vehicles import UNCALIBRATED, box_car, box_truck, random_drive
 from support.bundled import NETWORK_FILE
 from support.samples import scenario
+from support.scenario import SensorErrorModel
 from support.spoiler import apply
 
 SIMULATORS = ('clouds', 'boxes')

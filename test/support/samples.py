@@ -6,7 +6,7 @@ import numpy as np
 
 from mag_tracking.messages.schema import magnetic_field_dicts
 from mag_tracking.records import Readings
-from mag_tracking.simulation import scenario
+from support import scenario
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,10 @@ import numpy as np
 
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings
-from mag_tracking.simulation.scenario import Path, SensorErrorModel
+from mag_tracking.simulation.scenario import Path
 from support.box_vehicles import UNCALIBRATED, magnetised
 from support.samples import scenario
+from support.scenario import SensorErrorModel
 
 GRID_S = 0.01
 """[s] Step of the integration of the speed in a `Ride`."""
@@ -25,7 +26,7 @@ class Ride:
     """Speeds at `times`, (k,) m/s, interpolated linearly; negative in reverse."""
 
     def at(self, t):
-        """Position and heading at times `t`; implements `scenario.Trajectory`."""
+        """Position and heading at times `t`; a path of `support.scenario`."""
         t = np.asarray(t, dtype=float)
         grid = np.arange(0.0, max(self.times[-1], t.max()) + 2 * GRID_S, GRID_S)
         speed = np.interp(grid, self.times, self.speeds)
@@ -44,7 +45,7 @@ class Convoy:
     """[m] Distance of the centre of each body behind the centre of the convoy."""
 
     def field(self, earth_field, position, heading, points):
-        """Field of all bodies at `points`; implements `mag_tracking.simulation.scenario.Body`."""
+        """Field of all bodies at `points`; a body of `support.scenario`."""
         forward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
         return sum(body.field(earth_field, position - back * forward, heading, points)
                    for body, back in zip(self.bodies, self.behind, strict=True))

@@ -17,7 +17,7 @@ from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
 from mag_tracking.records import Detection, FieldFrame, Track
 from mag_tracking.results import result_folder
-from mag_tracking.simulation.scenario import Path, point_body
+from mag_tracking.simulation.scenario import Path
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.settings import AlignSettings, CalibrateSettings
@@ -29,6 +29,7 @@ from support.counters import assert_counts, count_of
 from support.marks import studied
 from support.networks import line_network
 from support.samples import MagSample, fed, one, recorded
+from support.scenario import point_body
 from support.track_runs import drive, magnet_frames
 
 NAME = 'straight_car_right'

@@ -3,10 +3,12 @@
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize
 
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.background import RelearntBackground, RunningBackground
 from mag_tracking.event_records import SIGNATURE_SPAN, PassEvent
 from mag_tracking.inference.driving_direction import (
@@ -15,32 +17,37 @@ from mag_tracking.inference.driving_direction import (
     rotation_of_pass,
 )
 from mag_tracking.network import SensorNetwork
-from mag_tracking.records import Detection, Readings
+from mag_tracking.physics.passes import anderson_residual
+from mag_tracking.records import Detection, FieldFrame, Readings, plain
 from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.stage import Detect
-from mag_tracking.stages.events.single_sensor_pass import ClosestPoint, closest_point
 from mag_tracking.stages.events.stays import Stays
 from mag_tracking.stages.settings import AlignSettings, DetectSettings
-from mag_tracking.stages.track.low_rate import SampleRates
+from mag_tracking.stages.track.plausibility import SampleRates
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NEVER, NS
 
 PAD_S = 1.0
 """[s] Length of the margins without a target, before the onset and after the release."""
-
 MAX_DURATION_S = 120.0
-"""[s] Maximum duration of an event. For a longer detection, only the latest readings are used."""
-
+"""[s] Maximum duration of an event; only the latest readings of a longer detection are used."""
 SIGNATURE_POINTS = 33
 """Number of points of a signature."""
+MAX_SAMPLES, MIN_SAMPLES, MAX_STARTS = 200, 8, 5
+"""Maximum number of samples (blocks of a longer pass are averaged) and minimum number of complete
+samples in a fit, and number of grid points from which its search starts; with one axis it has
+several minima."""
+CORRELATION_TIME, CENTRE_OFFSET = 2.0, 0.15
+"""[time scales] Correlation time of the residual when a dipole is fitted to a vehicle, and typical
+distance of its magnetic centre from the middle of its body."""
 
 
 class Events:
     """Converts calibrated readings to pass events, one for each detection at each sensor.
 
     The events that one batch completes are returned sensor by sensor. An event contains no lengths,
-    because a single sensor does not observe the spatial scale. The align and track settings
-    determine the rate below which a pass is not resolved.
+    because a single sensor does not observe the spatial scale. The track settings determine the
+    rate below which a pass is not resolved.
     """
 
     def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
@@ -53,10 +60,8 @@ class Events:
                          for j, part in enumerate(parts)]
 
     def set_relearnt(self, backgrounds: Mapping[str, RunningBackground]) -> None:
-        """Set the changes of each sensor's background, which are not the departure of a target.
-
-        Without them, the event of a parked vehicle ends when its field has become the background.
-        """
+        """Set the changes of each sensor's background, without which the event of a parked vehicle
+        ends when its field has become the background."""
         for name, background in backgrounds.items():
             self._sensors[self._index[name]].relearnt = background.relearnt
 
@@ -122,9 +127,7 @@ class _SensorEvents:
         for frame in self._align.feed(readings):
             self._rates.add(frame, self._j)
             self._frame_stamps.append(frame.stamp_ns)
-            for record in self._detect.feed(frame):
-                if isinstance(record, Detection):
-                    out += self._on_detection(record)
+            out += self._detected(frame)
             begin = frame.stamp_ns if self._onset_ns is None else \
                 max(self._onset_ns, frame.stamp_ns - int(MAX_DURATION_S * NS))
             while self._buffer[0].stamp_ns[-1] < begin - (2 * PAD_S * NS + self._hold_ns):
@@ -133,11 +136,7 @@ class _SensorEvents:
 
     def flush(self) -> list[PassEvent]:
         """Return the events that are still in progress at the end of the input."""
-        out: list[PassEvent] = []
-        for frame in self._align.flush():
-            for record in self._detect.feed(frame):
-                if isinstance(record, Detection):
-                    out += self._on_detection(record)
+        out = [event for frame in self._align.flush() for event in self._detected(frame)]
         if self._buffer:
             last_ns = int(self._buffer[-1].stamp_ns[-1])
             if self._onset_ns is not None:
@@ -146,13 +145,16 @@ class _SensorEvents:
         self._onset_ns = None
         return out
 
-    def _on_detection(self, detection: Detection) -> list[PassEvent]:
-        """Store the time of an onset, or return the event that a release completes."""
-        if detection.onset:
-            # The frames that confirm a detection take long at a low rate.
-            self._onset_ns = self._frame_stamps[0] if self._is_slow else detection.stamp_ns
-            return []
-        return self._event(detection.stamp_ns - self._hold_ns, True)
+    def _detected(self, frame: FieldFrame) -> list[PassEvent]:
+        """Store the time of an onset in a frame, or return the event that a release completes."""
+        out: list[PassEvent] = []
+        for record in self._detect.feed(frame):
+            if isinstance(record, Detection) and record.onset:
+                # The frames that confirm a detection take long at a low rate.
+                self._onset_ns = self._frame_stamps[0] if self._is_slow else record.stamp_ns
+            elif isinstance(record, Detection):
+                out += self._event(record.stamp_ns - self._hold_ns, True)
+        return out
 
     def _event(self, release_ns: int, ended: bool) -> list[PassEvent]:
         """Return a list with the event that ends at `release_ns`; empty without finite readings."""
@@ -188,6 +190,7 @@ class _SensorEvents:
         squared_field = np.nansum(field**2, axis=1)
         peak = int(np.argmax(squared_field))
         is_detected = (onset_ns <= stamp) & (stamp <= release_ns)
+        interval_s = float(np.median(np.diff(stamp))) / NS if len(stamp) > 1 else 0.0
         present = ~np.all(np.isnan(field), axis=0)
         closest, left_to_right = ClosestPoint((int(stamp[peak]) - onset_ns) / NS, np.inf, np.nan), \
             0.5
@@ -196,26 +199,18 @@ class _SensorEvents:
             closest = closest_point(t, field, noise)
             horizontal = horizontal_field(field, self._R_ws)
             is_complete = ~np.isnan(horizontal).any(axis=1)
-            left_to_right = _left_to_right(
+            rotation = rotation_of_pass(
                 horizontal[is_complete], float(np.nanmean(noise)) if is_complete.any() else 0.0,
                 int(np.count_nonzero(stamp < onset_ns)))
+            if rotation is not None:
+                left_to_right = float(np.clip(rotation.left_to_right, 1.0 - MAX_CONFIDENCE,
+                                              MAX_CONFIDENCE))
         return PassEvent(
             self._name, 0, ended, onset_ns, release_ns, int(stamp[peak]), field[peak],
-            float(np.sum(squared_field[is_detected]) * _median_interval(stamp)),
+            float(np.sum(squared_field[is_detected]) * interval_s),
             ''.join(np.array(list('xyz'))[present]), noise,
             onset_ns + int(round(closest.time * NS)), closest.time_std, closest.time_scale,
             left_to_right, _signature(t, field, closest.time, closest.time_scale))
-
-
-def _left_to_right(horizontal: FloatArray, noise_std: float, n_quiet: int) -> float:
-    """Probability that the target passes the sensor from left to right; 0.5 if unobservable.
-
-    The first `n_quiet` samples of the field `horizontal` (n, 2) [T] precede the target.
-    """
-    rotation = rotation_of_pass(horizontal, noise_std, n_quiet)
-    if rotation is None:
-        return 0.5
-    return float(np.clip(rotation.left_to_right, 1.0 - MAX_CONFIDENCE, MAX_CONFIDENCE))
 
 
 def _median_noise(readings: Readings) -> FloatArray:
@@ -228,24 +223,81 @@ def _median_noise(readings: Readings) -> FloatArray:
     return out
 
 
-def _median_interval(stamp: IntArray) -> float:
-    """Median interval [s] between readings; 0 for fewer than two readings."""
-    return float(np.median(np.diff(stamp))) / NS if len(stamp) > 1 else 0.0
-
-
 def _signature(t: FloatArray, field: FloatArray, time: float, scale: float) -> FloatArray:
-    """Field (`SIGNATURE_POINTS`, 3) [T] at equidistant times around the closest point of approach.
-
-    The times are centred on `time` and proportional to `scale`. The field is NaN outside the
-    readings, or if `scale` is not finite.
-    """
-    if not np.isfinite(scale):
-        return np.full((SIGNATURE_POINTS, 3), np.nan)
-    times = time + scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN, SIGNATURE_POINTS)
+    """Field (`SIGNATURE_POINTS`, 3) [T] at equidistant times around `time`, proportional to
+    `scale`; NaN outside the readings, or if `scale` is not finite."""
     out = np.full((SIGNATURE_POINTS, 3), np.nan)
+    if not np.isfinite(scale):
+        return out
+    times = time + scale * np.linspace(-SIGNATURE_SPAN, SIGNATURE_SPAN, SIGNATURE_POINTS)
     for a in range(3):
         is_measured = ~np.isnan(field[:, a])
         if is_measured.any():
             out[:, a] = np.interp(times, t[is_measured], field[is_measured, a], left=np.nan,
                                   right=np.nan)
     return out
+
+
+class ClosestPoint(NamedTuple):
+    """Closest point of approach of a pass, estimated from one sensor."""
+
+    time: float
+    """[s] Time of the closest point; of the largest field if the closest point is not observable.
+    NaN without samples."""
+    time_std: float
+    """[s] Standard deviation of `time`; inf if the closest point is not observable."""
+    time_scale: float
+    """[s] Range at the closest point divided by the speed; NaN if not observable."""
+
+
+def closest_point(t: FloatArray, field: FloatArray, noise_std: FloatArray) -> ClosestPoint:
+    """Fit the Anderson functions of a dipole on a straight line to the field (n, 3) of one sensor.
+
+    One axis is sufficient; a missing axis is NaN. `noise_std` (3,) [T] is the noise of one reading.
+    Three coefficients and a constant per axis are solved for each candidate time and time scale.
+    See [TSP14]_ eq. (22), (23), with the exponent 5/2.
+    """
+    present = ~np.isnan(field).all(axis=0) & ~np.isnan(noise_std)
+    complete = ~np.isnan(field[:, present]).any(axis=1)
+    if np.count_nonzero(complete) < MIN_SAMPLES:
+        strongest = float(t[np.argmax(np.nansum(field**2, axis=1))]) if len(t) else np.nan
+        return ClosestPoint(strongest, np.inf, np.nan)
+    t, y = _averaged(t[complete], field[complete][:, present] / noise_std[present])
+    t, y = plain(t), plain(y)
+    span = float(t[-1] - t[0])
+    strongest = float(t[np.argmax(np.sum(y**2, axis=1))])
+    if not span > 0.0:
+        return ClosestPoint(strongest, np.inf, np.nan)
+    interval = span / (len(t) - 1)
+
+    def cost(time: float, scale: float) -> float:
+        return anderson_residual(t, y, time, scale)
+
+    starts = sorted((cost(time, scale), time, scale)
+                    for scale in np.geomspace(1.5 * interval, span, 24).tolist()
+                    for time in np.arange(t[0], t[-1], max(0.3 * scale, interval)).tolist())
+
+    def cost_of(x: FloatArray) -> float:
+        return cost(float(x[0]), float(np.exp(x[1])))
+
+    best = min((minimize(cost_of, np.array([time, np.log(scale)]), method='Nelder-Mead', options={
+        'xatol': 1e-4 * interval, 'fatol': 1e-9 * (1.0 + at_start), 'maxiter': 200})
+        for at_start, time, scale in starts[:MAX_STARTS]), key=lambda result: float(result.fun))
+    time, scale = float(best.x[0]), float(np.exp(best.x[1]))
+    # The residual of a vehicle is larger than noise, so the variance is estimated from it.
+    residual_variance = max(best.fun / max(y.size - 4 * y.shape[1] - 2, 1), 0.0)
+    n_correlated = max(1.0, CORRELATION_TIME * scale / interval)
+    step = 0.05 * scale
+    curvature = (cost(time + step, scale) + cost(time - step, scale) - 2.0 * best.fun) / step**2
+    std = np.sqrt(2.0 * residual_variance * n_correlated / curvature) \
+        if curvature > 0.0 else np.inf
+    if not (t[0] <= time <= t[-1] and scale <= span and np.isfinite(std)):
+        return ClosestPoint(strongest, np.inf, np.nan)
+    return ClosestPoint(time, float(np.hypot(std, CENTRE_OFFSET * scale)), scale)
+
+
+def _averaged(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Average samples in at most `MAX_SAMPLES` equal blocks; drop an incomplete last block."""
+    n = -(-len(t) // MAX_SAMPLES) or 1
+    k = len(t) // n
+    return t[:k * n].reshape(k, n).mean(axis=1), y[:k * n].reshape(k, n, -1).mean(axis=1)

@@ -2,12 +2,9 @@
 
 The calibration learns the field of a parked vehicle as the new background (`calibrate.relearn_s`).
 The calibrated field then steps to zero, and the event ends although the vehicle has not left. When
-it leaves, the calibrated field steps to the opposite of its field, and back to zero. Both events
-are joined to one.
-
-The detection of a weak field ends before this if the uncertainty of the background exceeds the
-field, and begins again. Such events are joined as well. If another vehicle takes the place, the
-opposite field lasts until then.
+it leaves, the calibrated field steps to the opposite of its field, until it is learnt or another
+vehicle takes the place. Both events are joined to one, and so are those of a weak field whose
+detection is interrupted by the uncertainty of the background.
 """
 
 from collections.abc import Sequence
@@ -33,7 +30,7 @@ MIN_REMAINING = 0.5
 MIN_OPPOSITE = 0.5
 """Minimum fraction of the readings of an event with the opposite field of a departed vehicle."""
 MAX_GAP_S, MAX_GAP_INTERVALS = 5.0, 3.0
-"""Maximum gap between events of one vehicle [s], to which intervals between readings are added."""
+"""[s] Maximum gap between events of one vehicle, to which intervals between readings are added."""
 MIN_APPROACH = 0.3
 """Minimum decrease of the distance to the field without a vehicle, relative to the change of the
 background, for a vehicle to have left."""
@@ -49,12 +46,11 @@ class _Stay(NamedTuple):
 
 
 class _Held(NamedTuple):
-    """End of an event at which the field of the vehicle remained."""
+    """End of an event, None if it is complete, at which the field (3,) [T] of a vehicle
+    remained."""
 
     event: PassEvent | None
-    """None if the vehicle is one that has left, and whose event is complete."""
     level: FloatArray
-    """(3,) [T]"""
     release_ns: int
 
 
@@ -64,8 +60,8 @@ class Stays:
     Parameters
     ----------
     free_field : (3,) array, T, sensor frame
-        Field without a vehicle; NaN if unknown. If a change of the background leads towards this
-        field, a vehicle that was present from the start has left.
+        Field without a vehicle, towards which the background changes if a vehicle that was present
+        from the start leaves; NaN if unknown.
 
     Attributes
     ----------
@@ -80,12 +76,11 @@ class Stays:
 
     def add(self, event: PassEvent, readings: Readings,
             relearnt: Sequence[RelearntBackground]) -> list[PassEvent]:
-        """Add an event, and return the completed events.
+        """Add an event, and return the completed events; `readings` are the calibrated readings
+        from before its onset until after its release.
 
-        `readings` are the calibrated readings from before the onset until after the release. The
-        event itself is returned unless it is the arrival or the departure of a parked vehicle; a
-        departure completes the event of the arrival. The event of a vehicle that was present from
-        the start begins with the first reading.
+        The departure of a parked vehicle completes the event of its arrival. The event of a vehicle
+        that was present from the start begins with the first reading.
         """
         end_ns = int(readings.stamp_ns[-1])
         change = max((c for c in relearnt if event.onset_ns < c.stamp_ns <= end_ns),
@@ -120,10 +115,8 @@ class Stays:
 
     def _unchanged(self, event: PassEvent, fields: FloatArray, level: FloatArray,
                    tolerance: float) -> list[PassEvent]:
-        """Events completed by an event during which the background did not change.
-
-        `fields` (n, 3) [T] are its readings; `level` (3,) [T] is the field after its end.
-        """
+        """Events completed by an event during which the background did not change, with readings
+        `fields` (n, 3) [T] and the field `level` (3,) [T] after its end."""
         remains = np.linalg.norm(level) > MIN_REMAINING * np.linalg.norm(np.nan_to_num(event.peak))
         for k in reversed(range(len(self._open))):
             stay = self._open[k]
@@ -144,27 +137,21 @@ class Stays:
 
     def _changed(self, event: PassEvent, level: FloatArray, tolerance: float, noise: float,
                  change: RelearntBackground, is_first: bool) -> list[PassEvent]:
-        """Events completed by an event before whose end the background changed.
-
-        `level` (3,) [T] is the field before the change.
-        """
+        """Events completed by an event before whose end the background changed; `level` (3,) [T] is
+        the field before."""
         for k in reversed(range(len(self._open))):
             if np.linalg.norm(self._open[k].level + level) <= tolerance:
                 return [_until(self._open.pop(k), event.onset_ns, True)]
         if change.has_departed or np.linalg.norm(level) < MIN_FIELD_STDS * noise:
             return [event]
-        if is_first and self._has_departed(change):
+        before, after = (float(np.linalg.norm(np.nan_to_num(background - self._free_field)))
+                         for background in (change.before, change.after))
+        if is_first and before - after > MIN_APPROACH * _size(change):
             return [replace(event, onset_ns=self.first_ns, release_ns=event.onset_ns)]
         self._open.append(_Stay(event, level))
         if len(self._open) > MAX_OPEN:
             return [_until(self._open.pop(0), event.release_ns, False)]
         return []
-
-    def _has_departed(self, change: RelearntBackground) -> bool:
-        """Whether the previous background was further from the field without a vehicle."""
-        before, after = (float(np.linalg.norm(np.nan_to_num(level - self._free_field)))
-                         for level in (change.before, change.after))
-        return before - after > MIN_APPROACH * _size(change)
 
     def flush(self, last_ns: int) -> list[PassEvent]:
         """Return the events of vehicles that have not left by the last reading, as not ended."""

@@ -18,7 +18,7 @@ from mag_tracking.stages.health.clocks import (
     timestamp_finding,
 )
 from mag_tracking.stages.health.diagnosis import Cause, Finding
-from mag_tracking.stages.track.low_rate import low_rate_fault
+from mag_tracking.stages.track.plausibility import low_rate_fault
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.inference.covariances import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.sources import Magnet, SourceModel
@@ -14,28 +15,32 @@ from mag_tracking.physics.vehicles import MAX_TURN_RATE, RowVehicle
 from mag_tracking.records import FieldFrame, plain
 from mag_tracking.stages.track import core
 from mag_tracking.stages.track.initiation_magnet import NEAR_FIELD_LENGTH
+from mag_tracking.stages.track.initiation_vehicle import MAX_CAR_ROW
 from mag_tracking.stages.track.observation import TIME_RESOLUTION_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.stages.track.unobserved_length import MAX_CAR_ROW
 
-LINEAR_FRACTION = 0.25
+LINEAR_FRACTION, SAME_TIME_FRACTION = 0.25, 0.05
 """Displacement over which the field is approximately linear, as a fraction of the distance to the
-nearest sensor. The cube of that distance then changes by a factor of about two."""
-
-SAME_TIME_FRACTION = 0.05
-"""A frame whose samples span less than this fraction of the interval since the previous frame is
-treated as simultaneous. The first frame of a track is always treated as simultaneous, because
-differences between frames determine velocities better than differences within a frame."""
+nearest sensor, whose cube then changes by a factor of two; and fraction of the interval since the
+previous frame below which the samples of a frame count as simultaneous."""
+NEGLIGIBLE_ENERGY, WEAK_ENERGY = 0.1, 1.0
+"""Squared norm of the whitened field per frame below which a target that moves away is removed from
+a joint track, and up to which it does not disturb other targets; the latter is the limit if the
+track has the maximum number of targets."""
+DETECTABLE_ENERGY = 4.0
+"""Minimum squared norm of the whitened field of a detectable target: of a tracked vehicle in the
+last frame, of a new vehicle in a window at each sensor, and of a path in a search according to the
+prior of its moments."""
 
 
 class PathResult(NamedTuple):
     """Result of `BankFilter.run_along`; the first axis of every array is the hypothesis."""
 
     log_likelihood: FloatArray
-    """Log-likelihood of the frames used for updates, (n_hyp,); -inf if a dipole is at a sensor or a
+    """(n_hyp,) Log-likelihood of the frames used for updates; -inf if a dipole is at a sensor or a
     variance is negative."""
     max_shift: FloatArray
-    """Largest distance of the smoothed positions from the path in the last pass, (n_hyp,), in
+    """(n_hyp,) Largest distance of the smoothed positions from the path in the last pass, in
     standard deviations of the position."""
     used: BoolArray
     """Whether the hypothesis was updated with each frame, (n_hyp, n)."""
@@ -59,10 +64,8 @@ def compiled_filter(model: SourceModel, observation: Observation
 
 
 class BankFilter:
-    """Stateless prediction and update of a `FilterBank` of targets that share a state.
-
-    The fields of the `n_targets` targets add up.
-    """
+    """Stateless prediction and update of a `FilterBank` of `n_targets` targets that share a state,
+    and whose fields add up."""
 
     def __init__(self, network: SensorNetwork, model: SourceModel, settings: TrackSettings,
                  n_targets: int = 1) -> None:
@@ -84,8 +87,7 @@ class BankFilter:
             [kind.length for kind in settings.vehicle.kinds] if is_vehicle else [0.0]) > MAX_CAR_ROW
 
     def move(self, bank: FilterBank, dt: float) -> None:
-        """Predict a bank in place by `dt` seconds, without an update; negative values move it
-        backwards, without process noise."""
+        """Predict a bank in place by `dt` seconds; negative values add no process noise."""
         n = self._n_sensors
         empty_frame = FieldFrame(0, np.full((n, 3), np.nan), np.tile(np.eye(3), (n, 1, 1)),
                                  np.zeros(n, dtype=np.int64), np.zeros(n))
@@ -93,19 +95,18 @@ class BankFilter:
 
     def advance(self, bank: FilterBank, frame: FieldFrame, dt: float, keeps_prior: bool = False
                 ) -> tuple[FloatArray, FloatArray]:
-        """Predict a bank in place to the time of a frame and update it; return the predicted states
-        (n_hyp, n_x) and the log-likelihoods (n_hyp,), which are -inf if a dipole is at a sensor.
+        """Predict a bank in place to the time of a frame, if `dt` [s] is positive, and update it;
+        return the predicted states (n_hyp, n_x) and the log-likelihoods (n_hyp,), which are -inf if
+        a dipole is at a sensor.
 
-        The prediction over `dt` seconds is skipped unless `dt` is positive. The setting
-        `iterations` is the number of linearisations. With `keeps_prior`, new arrays replace
-        `bank.x` and `bank.P` instead of overwriting them, which is slower.
+        With `keeps_prior`, new arrays replace `bank.x` and `bank.P` instead of overwriting them,
+        which is slower.
         """
         return self._advance(bank, frame, dt, dt > 0.0, self._settings.iterations, keeps_prior)
 
     def _advance(self, bank: FilterBank, frame: FieldFrame, dt: float, moves: bool,
                  iterations: int, keeps_prior: bool = False) -> tuple[FloatArray, FloatArray]:
-        """Advance a bank like `advance`; skip the prediction unless `moves`, and the update with 0
-        iterations."""
+        """Advance a bank; skip the prediction unless `moves`, and the update with 0 iterations."""
         n_hyp = len(bank)
         decay, variance = self.observation.drift(np.asarray(dt), self._settings.background_drift)
         # With a thousand hypotheses the speed is limited by memory: writing to new arrays takes
@@ -126,10 +127,8 @@ class BankFilter:
                   intervals: Sequence[float], paths: FloatArray, *, passes: int, step: float,
                   first_is_updated: bool, rejects_outliers: bool = False,
                   wants_covariances: bool = False) -> PathResult:
-        """Filter and smooth each hypothesis along its path; the bank moves in place from the first
-        to the last of the n frames.
-
-        Each pass is linearised along the path of the previous pass.
+        """Filter and smooth each hypothesis along its path, and each pass along the path of the
+        previous one; the bank moves in place from the first to the last of the n frames.
 
         Parameters
         ----------
@@ -146,8 +145,14 @@ class BankFilter:
         out = PathResult(np.empty(n_hyp), np.empty(n_hyp), np.empty((n_hyp, n), dtype=bool),
                          np.empty((n_hyp, n, n_x, n_x) if wants_covariances else 0))
         new_x, new_P = np.empty_like(bank.x), np.empty_like(bank.P)
+        dt = np.array(intervals, dtype=float)
+        decay, variance = self.observation.drift(dt, self._settings.background_drift)
         self._compiled.run_along(
-            **self._frames(frames, intervals), first_is_updated=first_is_updated,
+            field=np.array([frame.field for frame in frames]),
+            covariance=known_covariance(np.array([f.covariance for f in frames])),
+            offset=np.array([self.time_offset(f, t)
+                             for f, t in zip(frames, intervals, strict=True)]),
+            dt=dt, decay=decay, variance=variance, first_is_updated=first_is_updated,
             max_nis=self._settings.end_nis if rejects_outliers else np.inf,
             iterations=self._settings.iterations, passes=passes, step=step,
             field_error=self._settings.field_error,
@@ -157,31 +162,17 @@ class BankFilter:
         bank.x, bank.P = new_x, new_P
         return out
 
-    def _frames(self, frames: Sequence[FieldFrame], intervals: Sequence[float]
-                ) -> dict[str, FloatArray]:
-        """Arrays of the frames for the compiled `run_along`, by the names of its arguments."""
-        dt = np.array(intervals, dtype=float)
-        decay, variance = self.observation.drift(dt, self._settings.background_drift)
-        return {'field': np.array([frame.field for frame in frames]),
-                'covariance': known_covariance(np.array([f.covariance for f in frames])),
-                'offset': np.array([self.time_offset(f, t)
-                                    for f, t in zip(frames, intervals, strict=True)]),
-                'dt': dt, 'decay': decay, 'variance': variance}
-
     def time_offset(self, frame: FieldFrame, dt: float) -> FloatArray:
         """Sampling time (n_sensors,) of each sensor relative to the timestamp of a frame, s, in
-        multiples of `TIME_RESOLUTION_S`; 0 if the frame is treated as simultaneous."""
+        multiples of `TIME_RESOLUTION_S`; 0 if simultaneous."""
         offset: FloatArray = frame.time_offset
         if dt <= 0.0 or offset.max() - offset.min() < SAME_TIME_FRACTION * dt:
             return self._zero_offset
         return np.round(offset / TIME_RESOLUTION_S) * TIME_RESOLUTION_S
 
     def model_error(self, bank: FilterBank, i: int, dt: float) -> FloatArray:
-        """Variance (n_sensors,) per axis of the model error in the field of hypothesis `i`, T²; 0
-        where a dipole is at the sensor.
-
-        Only the part of the error that is uncorrelated with the previous frame is included.
-        """
+        """Variance (n_sensors,) per axis of the part of the model error in the field of hypothesis
+        `i` that is uncorrelated with the previous frame, T²; 0 where a dipole is at the sensor."""
         error = self.observation.model_error(
             bank.x[i], self._lengths(bank.kind[i:i + 1])[0], self._settings.field_error)
         time = self._settings.model_error_time_s
@@ -191,29 +182,19 @@ class BankFilter:
     def predicted_field(self, bank: FilterBank, i: int, frame: FieldFrame,
                         dt: float) -> FloatArray:
         """Field (n_sensors, 3) that hypothesis `i` predicts for a frame, T, sensor frame, with
-        backgrounds.
-
-        The estimated model errors are excluded, because almost any field would fit with them.
-        """
-        x = self.observation.without_errors(bank.x[i:i + 1])
-        h, _, _ = self.observation.fields(
-            x, self.time_offset(frame, dt), self._lengths(bank.kind[i:i + 1]),
-            self._settings.field_error)
-        field: FloatArray = h[0] + x[0, -3 * self._n_sensors:].reshape(-1, 3)
-        return field
+        backgrounds, but without model errors, with which almost any field would fit."""
+        h, _ = self.fields_at(bank.x[i], bank.kind[i:i + 1], frame, dt)
+        return h + bank.x[i, -3 * self._n_sensors:].reshape(-1, 3)
 
     def fields_at(self, x: FloatArray, kind: IntArray, frame: FieldFrame, dt: float
                   ) -> tuple[FloatArray, FloatArray]:
-        """Fields (n_sensors, 3) of the targets of a state `x` (n_x,) at the sampling times of a
-        frame, T, sensor frame, and their derivatives (n_sensors, 3, n_target) with respect to the
-        target states.
-
-        Backgrounds and model errors are excluded. `kind` (1,) or (1, n_targets) is the kind of each
-        target.
-        """
-        h, H, _ = self.observation.fields(
-            self.observation.without_errors(x[None]), self.time_offset(frame, dt),
-            self._lengths(kind), self._settings.field_error)
+        """Fields (n_sensors, 3) of the targets of a state `x` (n_x,) with kinds `kind` (1,) or
+        (1, n_targets) at the sampling times of a frame, T, sensor frame, without backgrounds and
+        model errors, and their derivatives (n_sensors, 3, n_target)."""
+        without_errors = x[None].copy()
+        self.observation.own(without_errors)[..., self.observation.n_angles:] = 0.0
+        h, H, _ = self.observation.fields(without_errors, self.time_offset(frame, dt),
+                                          self._lengths(kind), self._settings.field_error)
         return h[0], H[0, :, :, :self.observation.n_target]
 
     def field_of_others(self, bank: FilterBank, i: int, target: int, frame: FieldFrame,
@@ -222,6 +203,12 @@ class BankFilter:
         times of a frame, T, sensor frame."""
         others = [k for k in range(self.observation.n_targets) if k != target]
         return self.observation.field_of(bank.x[i], others, self.time_offset(frame, dt))
+
+    def field_energies(self, target: int, x: FloatArray, frame: FieldFrame) -> FloatArray:
+        """Squared norm (n_sensors,) of the whitened field of a target of a state `x` (n_x,) at each
+        sensor."""
+        field = self.observation.field_of(x, [target], self._zero_offset)
+        return whitened_energy(np.where(np.isnan(frame.field), np.nan, field), frame.covariance)[0]
 
     def _lengths(self, kind: IntArray) -> FloatArray:
         """Near-field length (n, n_targets) [m] of each target, from its kind."""
@@ -246,21 +233,16 @@ class BankFilter:
 
 
 class NoTarget:
-    """Filter of the backgrounds without a target; its log-density is the reference for the evidence
-    of a target.
-
-    `background_std` [T] is the initial std of each background, per axis.
-    """
+    """Filter of the backgrounds without a target, the reference for the evidence of a target, with
+    an initial std of `background_std` [T] per axis."""
 
     def __init__(self, n_sensors: int, background_std: float) -> None:
         self._x = np.zeros((n_sensors, 3))
         self._P = np.tile(background_std**2 * np.eye(3), (n_sensors, 1, 1))
 
     def log_density(self, frame: FieldFrame, dt: float, background_drift: float) -> float:
-        """Update the backgrounds with a frame; return its log-density given the previous frames.
-
-        `background_drift` is a random walk [T/√s].
-        """
+        """Update the backgrounds, with a random walk of `background_drift` [T/√s], with a frame;
+        return its log-density given the previous frames."""
         self._P += background_drift**2 * dt * np.eye(3)
         is_present = ~np.isnan(frame.field)
         both_present = is_present[:, :, None] & is_present[:, None, :]

@@ -1,6 +1,7 @@
-"""Cross-check of a running track against a fit of the whole pass; see `rigid_pass`."""
+"""Fits of the whole passes of a running track, and the clock offsets that several passes show."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -9,52 +10,164 @@ from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.clock_comparison import ClockComparison
 from mag_tracking.stages.track.disturbances import field_magnitudes
-from mag_tracking.stages.track.plausibility import moves_too_far
-from mag_tracking.stages.track.rigid_pass import (
+from mag_tracking.stages.track.pass_samples import (
     LONG_LENGTH,
     MAX_MISFIT,
+    MAX_OFFSET,
     MIN_DISTANCE,
     RigidPass,
     fit_rigid_pass,
 )
+from mag_tracking.stages.track.plausibility import moves_too_far
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.units import NS
 
+SIGNIFICANT_STDS, PRIOR_STD_S = 4.0, 1e3
+"""Minimum number of standard deviations of a significant offset, and prior standard deviation [s]
+of the offset of each clock."""
+MEMORY_PASSES = 20
+"""Effective number of passes in the estimate; clocks drift and are adjusted."""
+FORGETTING_FACTOR, CONTRADICTED_FACTOR = 1.0 - 1.0 / MEMORY_PASSES, 0.5
+"""Factor on the previous information at a pass that agrees with the estimate, and at a pass that
+contradicts it."""
 PASSED_FRACTION = 0.6
 """A vehicle has passed when the field is below this fraction of its maximum."""
-
-FIRST_CHECK_S = 0.12
-"""Delay of the first fit after the maximum of the field [s]."""
-
-CHECK_INTERVAL_RATIO = 1.7
-"""Ratio of the delays of successive fits after the maximum of the field."""
-
+FIRST_CHECK_S, CHECK_INTERVAL_RATIO = 0.12, 1.7
+"""[s] Delay of the first fit after the maximum of the field, and ratio of the delays of successive
+fits."""
 BEFORE_S, AFTER_S = 4.0, 3.0
-"""Frames from `BEFORE_S` before to `AFTER_S` after the maximum of the field belong to the pass
-[s]."""
-
+"""[s] Duration of a pass before and after the maximum of the field."""
 MIN_FRAMES, MAX_FRAMES = 12, 128
 """Minimum and maximum number of frames in a fit. A longer pass is decimated."""
+STEADY_S, LATE_MISFIT = 1.5, 8.0
+"""[s] Time after the maximum of the field for which acceleration and turn rate are assumed to be
+constant, and maximum misfit (reduced chi-square) of a later fit."""
 
-STEADY_S = 1.5
-"""Time after the maximum of the field for which acceleration and turn rate of a vehicle are assumed
-to be constant [s]."""
 
-LATE_MISFIT = 8.0
-"""Maximum misfit (reduced chi-square) of a fit after `STEADY_S`. The turn rate of a car may have
-changed by then."""
+@dataclass(frozen=True)
+class ClockOffset:
+    """Clock with a significant offset."""
+
+    sensor: int
+    """Index of the sensor in the network."""
+    reference: int | None
+    """Index of the reference sensor; None if the clock is compared with all other sensors."""
+    offset_s: float
+    """Time by which the clock is ahead [s]; negative if it is slow."""
+    std_s: float
+    """Standard deviation of the offset [s]."""
+    n_passes: int
+    """Number of passes in which the clock was compared."""
+
+    def text(self, names: Sequence[str]) -> str:
+        """Message that states the offset and how to correct the network file."""
+        name = names[self.sensor]
+        reference = 'the other clocks' if self.reference is None \
+            else f'the clock of {names[self.reference]}'
+        relation = 'ahead of' if self.offset_s > 0.0 else 'behind'
+        correction = 'increase' if self.offset_s > 0.0 else 'decrease'
+        passes = f'{self.n_passes} passes' if self.n_passes > 1 else 'one pass'
+        return (f'the clock of {name} is {1e3 * abs(self.offset_s):.0f} ms {relation} {reference} '
+                f'(standard deviation {1e3 * self.std_s:.0f} ms, from {passes}), or a sensor '
+                'position in the network file is wrong. Tracks are ambiguous until this is fixed: '
+                f'{correction} clock_offset of {name} by {abs(self.offset_s):.3f} s')
+
+
+class ClockComparison:
+    """Clock offsets estimated from several passes by recursive least squares.
+
+    If all vehicles pass alike, a wrong sensor position has the same effect as a wrong clock.
+    """
+
+    def __init__(self, n_sensors: int) -> None:
+        # Information matrix of the clock offsets, and its product with their estimates.
+        self._information = np.zeros((n_sensors, n_sensors))
+        self._vector = np.zeros(n_sensors)
+        self._n_passes = np.zeros(n_sensors, dtype=np.int64)
+        # Weighted number of passes, and weighted sum of their inverse speeds.
+        self._weight, self._slowness = 0.0, 0.0
+        # [s] Significant offsets between the clocks, else 0; computed once per pass.
+        self._offset_s: FloatArray = np.zeros((n_sensors, n_sensors))
+
+    def largest_offset_s(self, rows: IntArray) -> float:
+        """Largest significant offset between the clocks of two of the sensors `rows` of the
+        network, else 0; a clock needs two passes, because one may contain two vehicles."""
+        repeated = rows[self._n_passes[rows] > 1]
+        return float(self._offset_s[np.ix_(repeated, repeated)].max(initial=0.0))
+
+    @property
+    def largest_offset(self) -> ClockOffset | None:
+        """Largest significant offset, attributed to a clock; None if no offset is significant."""
+        ahead, behind = map(int, np.unravel_index(np.argmax(self._offset_s), self._offset_s.shape))
+        if self._offset_s[ahead, behind] == 0.0:
+            return None
+        offset, std = self._offsets()
+        compared = np.flatnonzero(self._n_passes)
+        if len(compared) == 2:
+            return ClockOffset(ahead, behind, float(offset[ahead, behind]),
+                               float(std[ahead, behind]), int(self._n_passes[compared].min()))
+        # With more than two clocks, the wrong clock disagrees with most other clocks.
+        median = np.median(offset[np.ix_(compared, compared)], axis=1)
+        k = int(np.argmax(np.abs(median)))
+        j = int(compared[k])
+        behind_k = behind if j == ahead else ahead
+        return ClockOffset(j, None, float(median[k]), float(std[j, behind_k]),
+                           int(self._n_passes[j]))
+
+    def add(self, rigid_pass: RigidPass, rows: IntArray) -> None:
+        """Add a pass with the sensors `rows` of the network; it is ignored if no straight path
+        explains it, if a bent one is significantly better, or if the vehicle is too slow for the
+        clocks to matter."""
+        is_slow = rigid_pass.speed * MAX_OFFSET < MIN_DISTANCE
+        if is_slow or not (rigid_pass.is_explained and rigid_pass.is_straight):
+            return
+        is_known = np.abs(rigid_pass.offset) <= MAX_OFFSET
+        is_known[rigid_pass.reference] = False
+        compared, reference = np.flatnonzero(is_known), rows[rigid_pass.reference]
+        offset, std = self._offsets()
+        contradicts = any(abs(rigid_pass.offset[j] - offset[rows[j], reference])
+                          > SIGNIFICANT_STDS * np.sqrt(rigid_pass.clock_variance(j)
+                                                       + std[rows[j], reference]**2)
+                          for j in compared)
+        factor = CONTRADICTED_FACTOR if contradicts else FORGETTING_FACTOR
+        self._information *= factor
+        self._vector *= factor
+        for j in compared:
+            direction = np.zeros(len(self._vector))
+            direction[rows[j]], direction[reference] = 1.0, -1.0
+            self._information += np.outer(direction, direction) / rigid_pass.clock_variance(j)
+            self._vector += direction * rigid_pass.offset[j] / rigid_pass.clock_variance(j)
+        if len(compared):
+            self._n_passes[[*rows[compared], reference]] += 1
+        self._weight = 1.0 + factor * self._weight
+        self._slowness = 1.0 / rigid_pass.speed + factor * self._slowness
+        offset, std = self._offsets()
+        # An offset is harmless if a vehicle of average speed travels less than `MIN_DISTANCE` in
+        # this time.
+        min_offset = MIN_DISTANCE * self._slowness / self._weight
+        self._offset_s = np.where(
+            (offset > SIGNIFICANT_STDS * std) & (offset > min_offset), offset, 0.0)
+
+    def _offsets(self) -> tuple[FloatArray, FloatArray]:
+        """Time by which the clock of each row is ahead of the clock of each column, and its std,
+        infinite on the diagonal, both (n, n) [s]."""
+        # The common offset of all clocks is not observable; the prior fixes it.
+        prior = np.eye(len(self._vector)) / PRIOR_STD_S**2
+        covariance: FloatArray = np.linalg.inv(self._information + prior).astype(np.float64)
+        offset = covariance @ self._vector
+        variance = np.diagonal(covariance)
+        variance_of_difference = variance[:, None] + variance[None, :] - 2.0 * covariance
+        np.fill_diagonal(variance_of_difference, np.inf)
+        return offset[:, None] - offset[None, :], np.sqrt(variance_of_difference)
 
 
 class _FrameSummary(NamedTuple):
-    """Time, field and target state of a frame."""
+    """Time [ns], largest field [T] of any sensor, and position and velocity (6,) of a frame."""
 
     stamp_ns: int
     magnitude: float
-    """Largest field of any sensor [T]."""
     state: FloatArray
-    """Position and velocity (6,) of the best hypothesis at the time of the frame."""
 
 
 class CrossCheck:
@@ -92,58 +205,40 @@ class CrossCheck:
             self._has_risen = self._min_magnitude <= PASSED_FRACTION * magnitude
         self._min_magnitude = min(self._min_magnitude, magnitude)
         # Drop frames that belong neither to this pass nor to a later one.
-        earliest = frame.stamp_ns - BEFORE_S * NS
-        self._frames = [f for f in self._frames if f.stamp_ns >= earliest or self._is_in_pass(f)]
+        earliest, peak_ns = frame.stamp_ns - BEFORE_S * NS, self._peak.stamp_ns
+        self._frames = [f for f in self._frames if f.stamp_ns >= earliest
+                        or _is_in_pass(f.stamp_ns, peak_ns)]
         self._frames.append(frame)
 
-    def _is_in_pass(self, frame: FieldFrame) -> bool:
-        """Whether a frame is from `BEFORE_S` before to `AFTER_S` after the maximum of the field."""
-        assert self._peak is not None
-        return -BEFORE_S * NS <= frame.stamp_ns - self._peak.stamp_ns <= AFTER_S * NS
-
     def doubts(self, clocks_apart_s: float) -> set[str]:
-        """Fit the pass if a fit is due, and return the doubts about the track.
-
-        `clocks_apart_s` is the largest significant offset between the clocks, from earlier passes.
-        """
+        """Fit the pass if a fit is due, and return the doubts about the track; `clocks_apart_s` is
+        the largest significant offset between the clocks, from earlier passes."""
         if self._current is None:
             return set()
         self._fit_if_due(self._current.magnitude)
-        if self._covers(self._current.stamp_ns):
-            self.difference = self._difference_at(self._current.stamp_ns, self._current.state)
+        if self.latest is not None and self._covers(self._current.stamp_ns):
+            self.difference = self.latest.difference(self._current.stamp_ns, self._current.state)
         reasons = self._pass_doubts()
-        speed = float(np.hypot(self._current.state[3], self._current.state[4]))
-        if clocks_apart_s * speed > MIN_DISTANCE:
+        if clocks_apart_s * float(np.hypot(*self._current.state[3:5])) > MIN_DISTANCE:
             reasons.add(doubts.CLOCKS_APART)
         return reasons
 
     def differences(self, states: Sequence[TrackState]) -> list[FloatArray]:
-        """`RigidPass.difference` (6,) of each smoothed state, in chronological order, m and m/s.
-
-        States before or after the pass have the difference of the first or last state in the pass.
-        If no state is in the pass, all have `difference`.
-        """
+        """`RigidPass.difference` (6,) of each smoothed state, in chronological order, m and m/s;
+        before and after the pass that of its first and last state, `difference` without any."""
         covered = [k for k, (stamp_ns, _, _) in enumerate(states) if self._covers(stamp_ns)]
-        if not covered:
+        if self.latest is None or not covered:
             return [self.difference] * len(states)
         first, last = covered[0], covered[-1]
-        in_pass = [self._difference_at(stamp_ns, x[:6])
+        in_pass = [self.latest.difference(stamp_ns, x[:6])
                    for stamp_ns, x, _ in states[first:last + 1]]
         return [in_pass[min(max(k, first), last) - first] for k in range(len(states))]
 
     def _covers(self, stamp_ns: int) -> bool:
-        """Whether the latest fit determines the position of the vehicle at a time.
-
-        A track that begins at the maximum of the field contains only part of a pass, which many
-        paths would explain.
-        """
+        """Whether the latest fit determines the position of the vehicle at a time; the part of a
+        pass after the maximum of the field alone could be on many paths."""
         return self.latest is not None and self._is_whole_pass \
-            and -BEFORE_S * NS <= stamp_ns - self.latest.stamp_ns <= AFTER_S * NS
-
-    def _difference_at(self, stamp_ns: int, state: FloatArray) -> FloatArray:
-        """Difference (6,) of a state (6,) from the latest fit, at a time that the fit covers."""
-        assert self.latest is not None
-        return self.latest.difference(stamp_ns, state)
+            and _is_in_pass(stamp_ns, self.latest.stamp_ns)
 
     @property
     def is_doubtful(self) -> bool:
@@ -164,7 +259,7 @@ class CrossCheck:
                 or magnitude > PASSED_FRACTION * peak.magnitude:
             return
         elapsed_s = (current.stamp_ns - peak.stamp_ns) / NS
-        frames = [f for f in self._frames if self._is_in_pass(f)]
+        frames = [f for f in self._frames if _is_in_pass(f.stamp_ns, peak.stamp_ns)]
         if elapsed_s < self._due_s or len(frames) < MIN_FRAMES:
             return
         self._due_s = CHECK_INTERVAL_RATIO * elapsed_s
@@ -183,20 +278,19 @@ class CrossCheck:
 
     def _pass_doubts(self) -> set[str]:
         """Doubts about the track that follow from the latest fit."""
-        reasons: set[str] = set()
         latest = self.latest
         if latest is None:
-            return reasons
-        # The middle of a long vehicle is uncertain by up to its length.
-        if np.hypot(self.difference[0], self.difference[1]) > LONG_LENGTH:
-            reasons.add(doubts.ANOTHER_PLACE)
-        if self._is_misfit or latest.misfit > LATE_MISFIT:
-            reasons.add(doubts.NO_STEADY_PATH)
-        if not latest.is_explained:
-            return reasons
-        if latest.needs_clock_offsets:
-            reasons.add(doubts.CLOCKS_APART)
-        if moves_too_far(latest.closest(self._network.positions), latest.velocity,
-                         self._period_s, self._network.positions):
-            reasons.add(doubts.FRAMES_TOO_LONG)
-        return reasons
+            return set()
+        return doubts.applying({
+            # The middle of a long vehicle is uncertain by up to its length.
+            doubts.ANOTHER_PLACE: np.hypot(*self.difference[:2]) > LONG_LENGTH,
+            doubts.NO_STEADY_PATH: self._is_misfit or latest.misfit > LATE_MISFIT,
+            doubts.CLOCKS_APART: latest.needs_clock_offsets,
+            doubts.FRAMES_TOO_LONG: latest.is_explained and moves_too_far(
+                latest.closest(self._network.positions), latest.velocity, self._period_s,
+                self._network.positions)})
+
+
+def _is_in_pass(stamp_ns: int, peak_ns: int) -> bool:
+    """Whether a time belongs to the pass with the maximum of the field at `peak_ns`."""
+    return -BEFORE_S * NS <= stamp_ns - peak_ns <= AFTER_S * NS

@@ -1,6 +1,6 @@
 """Doubts: the published reasons why a pose is ambiguous, and their meanings."""
 
-from collections.abc import Set
+from collections.abc import Mapping, Set
 
 from mag_tracking.calibration.doubtful_times import (
     CONTRADICTS_EARTH_FIELD,
@@ -32,7 +32,6 @@ ANOTHER_VEHICLE = 'another_vehicle'
 PERMANENT = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
 """Doubts that persist until the end of a track, because they show that its path is distorted. Later
 frames may correct the causes of other doubts."""
-
 MEANINGS = {
     ANOTHER_PLACE: 'another position is still possible',
     ANOTHER_ARRIVAL: 'another arrival direction is still possible',
@@ -69,6 +68,11 @@ MEANINGS = {
     NO_STEADY_PATH: 'no path with steady acceleration and turning explains the whole pass',
 }
 """Meaning of each doubt, in the order of publication."""
+
+
+def applying(conditions: Mapping[str, object]) -> set[str]:
+    """Doubts whose conditions are true."""
+    return {name for name, applies in conditions.items() if applies}
 
 
 def ordered(doubts: Set[str]) -> tuple[str, ...]:

@@ -10,53 +10,40 @@ from mag_tracking.inference.sequential_tests import InnovationConsistency, Targe
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.approach import Approach
 from mag_tracking.stages.track.disturbances import field_magnitudes
+from mag_tracking.stages.track.plausibility import Approach
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
 MAX_SINGLE_SENSOR_S = 0.5
-"""Maximum total time in which only one of several sensors measures a target [s]. If this time is
-exceeded, the track stays ambiguous."""
-
-LOST = 'target lost'
-OUT_OF_REACH = 'out of reach'
-UNEXPLAINED = 'unexplained'
+"""[s] Maximum total time in which only one of several sensors measures the target of an unambiguous
+track."""
+LOST, OUT_OF_REACH, UNEXPLAINED = 'target lost', 'out of reach', 'unexplained'
 """Reasons to end a track."""
-
 UNEXPLAINED_S = 3.0
-"""A track ends when a disturbance has explained its frames better than a target for this time [s],
-unless a target explained them better at an earlier time."""
-
+"""[s] Time after which a track ends that a disturbance explains better than a target, unless a
+target explained it better earlier."""
 CONTRADICTION = 1e-5
-"""Probability below which a field contradicts the track of a vehicle. The filter is still updated
-with such a field. It may then follow a wrong path that agrees with all later frames."""
-
+"""Probability below which a field contradicts the track of a vehicle. The filter, which is still
+updated with it, may follow a wrong path that agrees with all later frames."""
 OVERFIT_NATS = float(np.log(1e4))
-"""Maximum excess of the log-likelihood in the filter over the log-likelihood along the path of the
-same hypothesis [nats]. An extended Kalman filter linearises each frame at a different state. It may
-therefore fit the frames better than any single path can."""
-
+"""[nats] Maximum excess of the log-likelihood in the filter over that along the path of the same
+hypothesis. A filter that linearises each frame at a different state may fit the frames better than
+any single path can."""
 MIN_OBSERVED_FRACTION = 0.5
-"""A track is ambiguous if the frames before its detection cover less than this fraction of the
-lookback."""
-
+"""Fraction of the lookback that the frames before the detection of an unambiguous track cover."""
 SENSED_LEVEL = 4.0
-"""A sensor has sensed the target if the energy of its fields exceeds the expected energy of its
-noise by this number of standard deviations."""
-
+"""Energy of the fields of a sensor that has sensed the target, in excess of the expected energy of
+its noise, in standard deviations."""
 TRANSIENT_DOUBTS = (doubts.OVERFIT, doubts.DISTURBANCE_MODEL, doubts.INNOVATIONS, doubts.MISFIT,
                     doubts.HEIGHT, doubts.BELOW_SENSORS, doubts.OFF_THE_ROAD,
                     doubts.NO_STEADY_PATH)
-"""Doubts about the state of the filter in single frames. Smoothing resolves them only in part."""
-
+"""Doubts about the state of the filter in single frames, which smoothing resolves only in part."""
 TRANSIENT_S = 0.1
-"""Time for which a transient doubt persists after the frame in which it was found [s]. A doubt that
-is absent from a single frame may reappear in the next."""
-
-MAX_SEGMENTS = 5000
-"""Maximum number of stored time segments with doubtful poses. A track that is short enough to be
-smoothed has fewer."""
+"""[s] Time for which a transient doubt persists, because one that is absent from a single frame may
+reappear in the next."""
+MAX_INTERVALS = 5000
+"""Maximum number of stored intervals with doubtful poses; a track that is smoothed has fewer."""
 
 
 class TrackEvidence:
@@ -64,28 +51,26 @@ class TrackEvidence:
 
     Attributes
     ----------
+    doubts : doubts about the whole track
     bayes_factor : evidence for a target against a disturbance
     innovations : consistency of the innovations with their covariance
     largest : (n_sensors,) array, magnitude of the largest field measured by each sensor, T
     """
 
     def __init__(self, n_sensors: int) -> None:
+        self.doubts: set[str] = set()
         self.bayes_factor = TargetBayesFactor()
         self.innovations = InnovationConsistency(n_sensors)
         self._approach = Approach()
-        # Doubts about the whole track.
-        self._doubts: set[str] = set()
         self._log_odds = 0.0
         self._single_sensor_s = 0.0
         self._n_consecutive_misfits = 0
         self._overfit_expiry_ns = -1
-        self._doubtful_times: DoubtfulTimes = ()
-        # Latest timestamp of each transient doubt.
-        self._last_found_ns: dict[str, int] = {}
-        # Expiry of each doubt that was flagged for a limited time.
+        # Expiry of each transient doubt, and of each doubt that was flagged for a limited time.
         self._expiry_ns: dict[str, int] = {}
-        # Time segments in which smoothed poses are also doubtful.
-        self._smoothed_segments: list[tuple[int, int]] = []
+        # Times with transient doubts, and intervals in which smoothed poses are also doubtful.
+        self._doubtful_times: DoubtfulTimes = ()
+        self._smoothed_intervals: list[tuple[int, int]] = []
         self._min_spread = np.inf
         # Per sensor: whitened energy of its fields in excess of noise, and number of axes.
         self._energy, self._n_axes = np.zeros(n_sensors), np.zeros(n_sensors)
@@ -94,58 +79,45 @@ class TrackEvidence:
     @property
     def is_doubtful(self) -> bool:
         """Whether the whole track is doubtful."""
-        return bool(self._doubts)
-
-    @property
-    def doubts(self) -> set[str]:
-        """Copy of the doubts about the whole track."""
-        return set(self._doubts)
+        return bool(self.doubts)
 
     def add(self, log_likelihood_ratio: float) -> None:
         """Add the log-likelihood ratio of a frame with versus without a target, nats."""
         self._log_odds += log_likelihood_ratio
 
-    def flag(self, reason: str) -> None:
-        """Mark the whole track as doubtful, for a reason from `doubts`."""
-        self._doubts.add(reason)
-
     def drop_explained_doubts(self) -> None:
         """Drop the doubts that the field of another vehicle explains."""
-        self._doubts -= {doubts.CONTRADICTION, doubts.INNOVATIONS, doubts.SENSORS_CONTRADICT,
-                         *doubts.PERMANENT}
+        self.doubts -= {doubts.CONTRADICTION, doubts.INNOVATIONS, doubts.SENSORS_CONTRADICT,
+                        *doubts.PERMANENT}
         self.innovations = InnovationConsistency(len(self.largest))
         self._n_consecutive_misfits, self._overfit_expiry_ns = 0, -1
-        self._last_found_ns.clear()
+        for reason in TRANSIENT_DOUBTS:
+            self._expiry_ns.pop(reason, None)
 
     def flag_start(self, approach_unobserved: bool, network: SensorNetwork, starts_anywhere: bool
                    ) -> None:
-        """Mark the track as doubtful if its start was not observed or its range is not observable.
-
-        A target that `starts_anywhere`, like a magnet, need not be seen approaching.
-        """
+        """Mark the track as doubtful if its start was not observed, unless it `starts_anywhere`, or
+        if its range is not observable."""
         # A target that was not seen approaching may already have passed.
         if approach_unobserved and not starts_anywhere:
-            self.flag(doubts.NOT_SEEN_APPROACHING)
+            self.doubts.add(doubts.NOT_SEEN_APPROACHING)
         # With a single sensor, the settings determine the range. With a few sensors at one place,
         # errors of the field model determine the range of a vehicle.
         if len(network) == 1 or network.is_compact and not starts_anywhere:
-            self.flag(doubts.SENSORS_AT_ONE_PLACE)
+            self.doubts.add(doubts.SENSORS_AT_ONE_PLACE)
 
     def flag_interval(self, reason: str, stamp_ns: int, seconds: float,
                       since_ns: int | None = None) -> None:
-        """Mark the poses within `seconds` after `stamp_ns` as doubtful, for a reason from `doubts`.
-
-        Smoothed poses are also doubtful, from the earlier time `since_ns` on, but only if it is
-        given.
-        """
+        """Mark the poses within `seconds` after `stamp_ns` as doubtful, for a reason from `doubts`;
+        from the earlier time `since_ns` on, if given, also the smoothed poses."""
         self._expiry_ns[reason] = until_ns = stamp_ns + round(seconds * NS)
         if since_ns is not None:
-            self._smoothed_segments.append((since_ns, until_ns))
+            self._smoothed_intervals.append((since_ns, until_ns))
 
     def check_approach(self, frame: FieldFrame) -> None:
         """Mark the track as doubtful if a frame makes the approach test fail."""
         if self._approach.add(frame):
-            self.flag(doubts.NOT_SEEN_APPROACHING)
+            self.doubts.add(doubts.NOT_SEEN_APPROACHING)
 
     def add_frame(self, frame: FieldFrame, rows: IntArray, nis: FloatArray) -> None:
         """Add the fields of the sensors `rows` of the network, and their normalised innovations
@@ -175,23 +147,21 @@ class TrackEvidence:
         persist."""
         transient = found.intersection(TRANSIENT_DOUBTS)
         self._doubtful_times = updated(
-            self._doubtful_times, stamp_ns, bool(transient), MAX_SEGMENTS)
-        self._last_found_ns |= dict.fromkeys(transient, stamp_ns)
-        return found | {reason for reason, found_ns in self._last_found_ns.items()
-                        if (stamp_ns - found_ns) / NS <= TRANSIENT_S} \
-            | {reason for reason, expiry_ns in self._expiry_ns.items()
-               if stamp_ns <= expiry_ns}
+            self._doubtful_times, stamp_ns, bool(transient), MAX_INTERVALS)
+        self._expiry_ns |= dict.fromkeys(transient, stamp_ns + round(TRANSIENT_S * NS))
+        return found | {reason for reason, expiry_ns in self._expiry_ns.items()
+                        if stamp_ns <= expiry_ns}
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
-        """Whether the innovations `nis` (n_sensors,) of a frame are too large for the target model;
-        NaN if missing.
+        """Whether the innovations `nis` (n_sensors,) of a frame, NaN if missing, are too large for
+        the target model.
 
-        If the track uses at most two sensors, a contradiction also marks the track as doubtful,
-        because many paths fit the fields. With more sensors, later frames correct the track.
+        With at most two sensors, this marks the track as doubtful, because many paths fit the
+        fields. With more, later frames correct the track.
         """
         is_contradiction = bool(np.nansum(nis) > chdtri(degrees_of_freedom, CONTRADICTION))
         if is_contradiction and len(nis) <= 2:
-            self.flag(doubts.CONTRADICTION)
+            self.doubts.add(doubts.CONTRADICTION)
         return is_contradiction
 
     def vehicle_doubts(self, nis: FloatArray, degrees_of_freedom: int,
@@ -200,25 +170,20 @@ class TrackEvidence:
 
         `nis` (n_sensors,) is the normalised innovation squared of each sensor; NaN if missing.
         """
-        reasons = set()
-        if self.bayes_factor.is_recently_disfavoured(min_bayes_factor):
-            reasons.add(doubts.DISTURBANCE_MODEL)
-        if self.contradicts(nis, degrees_of_freedom):
-            reasons.add(doubts.CONTRADICTION)
-        if self.is_sensed_by_one:
-            reasons.add(doubts.FELT_BY_ONE_SENSOR)
-        if self.innovations.excess > 1.0:
-            reasons.add(doubts.INNOVATIONS)
         if self.innovations.fails:
-            self.flag(doubts.INNOVATIONS)
-        return reasons
+            self.doubts.add(doubts.INNOVATIONS)
+        return doubts.applying({
+            doubts.DISTURBANCE_MODEL: self.bayes_factor.is_recently_disfavoured(min_bayes_factor),
+            doubts.CONTRADICTION: self.contradicts(nis, degrees_of_freedom),
+            doubts.FELT_BY_ONE_SENSOR: self.is_sensed_by_one,
+            doubts.INNOVATIONS: self.innovations.excess > 1.0})
 
     def update_filter_doubt(self, gain: float, stamp_ns: int, window_s: float) -> bool:
         """Update and return the doubt about the filter, which lasts from a frame with `gain` below
         `-OVERFIT_NATS` for the duration `window_s` of the compared frames.
 
         `gain` [nats] is the log-likelihood of these frames along the path of the hypothesis, minus
-        that in the filter. A doubtful filter fits the frames much better than the path does.
+        that in the filter.
         """
         if gain < -OVERFIT_NATS:
             self._overfit_expiry_ns = stamp_ns + round(window_s * NS)
@@ -226,18 +191,14 @@ class TrackEvidence:
 
     def was_filter_doubtful(self, stamp_ns: int) -> bool:
         """Whether a transient doubt or a flagged interval affects the smoothed pose at a time."""
-        return are_doubtful((*self._doubtful_times, *self._smoothed_segments), stamp_ns)
+        return are_doubtful((*self._doubtful_times, *self._smoothed_intervals), stamp_ns)
 
     def count_single_sensor_time(self, is_single_sensor: bool, dt: float) -> None:
         """Update the total time in which only one of several sensors measured; flag the track if it
-        is too long.
-
-        A single sensor determines neither the scale of a track nor which of two mirror images is
-        correct. The other sensors do not always correct the error when they measure again.
-        """
+        is too long for the others to correct its scale, or its choice between mirror images."""
         self._single_sensor_s += dt if is_single_sensor else 0.0
         if self._single_sensor_s > MAX_SINGLE_SENSOR_S:
-            self.flag(doubts.ONE_SENSOR)
+            self.doubts.add(doubts.ONE_SENSOR)
 
     @property
     def existence(self) -> float:

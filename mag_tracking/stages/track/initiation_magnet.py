@@ -15,13 +15,10 @@ from mag_tracking.settings import param
 
 START_MARGIN = 0.15
 """[m] Margin around the bounding box of the sensors within which the magnet may first appear."""
-GRID_POINTS = 4000
-"""Number of points of the coarse grid over the region in which the magnet may first appear."""
-MAX_STARTS = 24
-"""Number of best grid points that are refined."""
+GRID_POINTS, MAX_STARTS = 4000, 24
+"""Number of points of the coarse grid over that region, and of the best ones that are refined."""
 NEAR_FIELD_LENGTH = 5e-4
-"""[m] Near-field length of a magnet (lambda in [ICASSP11]_ eq. (9)). Near the magnet, the
-model error is the first neglected multipole term."""
+"""[m] Near-field length of a magnet (lambda in [ICASSP11]_ eq. (9))."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +44,8 @@ def magnet_model(settings: MagnetSettings) -> Magnet:
 
 
 def is_lost_after(settings: MagnetSettings, network: SensorNetwork, dt: float) -> bool:
-    """Whether a magnet may have moved anywhere near the sensors during a gap of `dt` seconds.
-
-    A prediction over such a gap does not help to find the magnet again, and an update linearised
-    there may diverge.
-    """
+    """Whether a magnet may have moved anywhere near the sensors during a gap of `dt` seconds, so
+    that an update linearised at the prediction may diverge."""
     std = settings.acceleration * np.sqrt(dt**3 / 3.0)
     extent = np.ptp(network.positions, axis=0).max()
     return bool(std > 2.0 * START_MARGIN + extent)
@@ -63,14 +57,10 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
     """Hypotheses of a magnet at its first frame, at any position near the sensors ([PHD15]_ Paper A
     eq. (3)); None if the frame has fewer than six axes or no fit has a finite cost.
 
-    The moment is projected out at each point of a coarse grid. The best grid points are refined.
-    Each distinct optimum becomes a hypothesis, weighted by its fit. All labels are 0.
-
-    Parameters
-    ----------
-    background_std : std of each background, per axis, T
-    own_covariance : (n_sensors, n_own, n_own) array, covariances of the states of each sensor
-    relative_std : model error relative to the field
+    The moment is projected out at each point of a coarse grid, and each distinct optimum refined
+    from the best points becomes a hypothesis, weighted by its fit. `background_std` [T] and
+    `own_covariance` are as for `start_vehicle`; `relative_std` is the model error relative to the
+    field.
     """
     is_present = ~np.isnan(frame.field)
     if np.count_nonzero(is_present) < 6:
@@ -99,11 +89,8 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
 
 
 def _start_grid(network: SensorNetwork) -> FloatArray:
-    """Grid (n, 3) [m] over the bounding box of the sensors with its margin.
-
-    A side that is shorter than half the spacing of the grid has one point, in its middle. The other
-    sides then share the number of points.
-    """
+    """Grid (n, 3) [m] over the bounding box of the sensors with its margin; a side that is shorter
+    than half the spacing has one point, in its middle."""
     low, high = network.positions.min(axis=0), network.positions.max(axis=0)
     extent, step, is_long = high - low + 2.0 * START_MARGIN, 0.0, np.full(3, True)
     while (extent[is_long] <= step / 2).any() or not step:

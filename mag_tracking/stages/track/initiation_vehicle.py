@@ -18,25 +18,19 @@ from mag_tracking.settings import USER, param
 
 REFERENCE_FIELD = 5e-5
 """Field for which `VehicleSettings.induced_share` is defined [T]."""
-
-LATERAL_STD = 1.5
-"""[m] Standard deviation of the lateral distance from a starting line."""
-ALONG_STD = 3.0
-"""[m] Standard deviation of the starting distance along the line."""
+MAX_CAR_ROW = 4.0
+"""[m] Maximum length of the row of dipoles of a car, beyond which the iron exceeds the row."""
+LATERAL_STD, ALONG_STD = 1.5, 3.0
+"""[m] Standard deviations of the starting position across and along a starting line."""
 MAX_START_DISTANCE = 30.0
 """[m] Maximum starting distance from the outermost sensor."""
-SPEED_STD = 0.3
-"""Standard deviation of each initial speed, relative to the speed."""
-CROSS_SPEED_STD = 0.1
-"""Standard deviation of the velocity across the heading, relative to the initial speed."""
+SPEED_STD, CROSS_SPEED_STD = 0.3, 0.1
+"""Standard deviations of the velocity along and across the heading, relative to the speed."""
 CLIMB_STD = 0.1
 """[m/s] Standard deviation of the vertical velocity."""
-TURN_SHARE = 0.5
-"""Fraction of vehicles that turn near the sensors."""
-
-START_TURN_RATIO = 0.5
-"""Initial standard deviation of the turn rate, relative to the standard deviation of a turning
-vehicle. The ratio is below 1, because vehicles arrive along straight lines."""
+TURN_SHARE, START_TURN_RATIO = 0.5, 0.5
+"""Fraction of vehicles that turn near the sensors, and initial standard deviation of their turn
+rate, relative to that during a turn, because vehicles arrive along straight lines."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +137,8 @@ def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehic
                                     f'{getattr(kind, name):g} for a point (its length is 0); '
                                     'use 0')
     horizontal, vertical = settings.acceleration**2, settings.climb_acceleration**2
-    return RowVehicle(_earth_field(network), np.array([horizontal, horizontal, vertical]),
+    earth_field = np.zeros(3) if network.earth_field is None else network.earth_field
+    return RowVehicle(earth_field, np.array([horizontal, horizontal, vertical]),
                       settings.moment_drift, settings.difference_drift,
                       _n_dipoles(settings), settings.turn_acceleration, settings.turn_time)
 
@@ -163,11 +158,6 @@ def soft_iron(settings: VehicleSettings, kind: int) -> float:
     return settings.induced_share * _soft_iron_per_share(settings, kind)
 
 
-def _earth_field(network: SensorNetwork) -> FloatArray:
-    """Earth field (3,) [T]; zero if unknown."""
-    return np.zeros(3) if network.earth_field is None else network.earth_field
-
-
 def moment_directions() -> FloatArray:
     """Unit vectors (14, 3) along the axes and diagonals of a cube, with both signs."""
     axes = np.vstack([np.eye(3), -np.eye(3)])
@@ -178,79 +168,61 @@ def moment_directions() -> FloatArray:
 def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: FieldFrame,
                   background_std: float, own_covariance: FloatArray) -> FilterBank:
     """Hypotheses of a vehicle at its first frame ([ICASSP11]_ section 2.2; [T10]_ Alg. 3, which has
-    one hypothesis per arrival).
+    one hypothesis per arrival), for a std of each background of `background_std` [T] and
+    covariances `own_covariance` (n_sensors, n_own, n_own) of the states of each sensor.
 
-    There is one hypothesis for each combination of kind, arrival line, moment direction, lateral
-    offset and speed, and a turning copy of each if turning is enabled. A hypothesis starts at the
-    first position on its line at which its field has the measured energy. Labels are indices into
-    `settings.arrival_names`, kinds are indices into `settings.kinds`.
-
-    Parameters
-    ----------
-    background_std : std of each background, per axis, T
-    own_covariance : (n_sensors, n_own, n_own) array, covariances of the states of each sensor
+    There is one hypothesis for each combination of kind, arrival line (its label), moment
+    direction, lateral offset and speed, and a turning copy of each if turning is enabled. A
+    hypothesis starts at the first position on its line at which its field has the measured energy.
     """
     states: list[FloatArray] = []
     covariances: list[FloatArray] = []
     labels: list[int] = []
     kinds: list[int] = []
-    measured = _MeasuredEnergy(network, frame)
+    model = vehicle_model(settings, network)
+    energy, whitening = _measured_energy(network, frame)
     for kind, of_kind in enumerate(settings.kinds):
         moments = of_kind.moment * moment_directions()
         for label, heading in enumerate(np.deg2rad(settings.arrival_headings_deg)):
             R = rotation_about_z(heading)
-            hard_iron = (moments - soft_iron(settings, kind) * _earth_field(network) / MU0) @ R
+            hard_iron = (moments - soft_iron(settings, kind) * model.earth_field / MU0) @ R
             velocities = np.array(settings.speeds)[:, None] * R[:, 0]
-            starts = _matching_positions(settings, network, measured, R, moments,
+            starts = _matching_positions(settings, network, energy, whitening, R, moments,
                                          of_kind.height)
             states.append(_initial_states(settings, kind, starts, velocities, hard_iron))
-            by_speed = np.array([
-                starting_covariance(settings, kind, R, v, of_kind.moment_std)
-                for v in settings.speeds])
+            by_speed = np.array([starting_covariance(settings, kind, R, v)
+                                 for v in settings.speeds])
             covariances.append(np.tile(by_speed.repeat(len(moments), 0), (len(starts), 1, 1)))
             labels += [label] * len(states[-1])
             kinds += [kind] * len(states[-1])
     bank = FilterBank.from_targets(np.vstack(states), np.vstack(covariances), np.array(labels),
                                    len(network), background_std, own_covariance, np.array(kinds))
-    return _add_turning_hypotheses(bank, vehicle_model(settings, network), TURN_SHARE)
-
-
-def _add_turning_hypotheses(bank: FilterBank, model: RowVehicle, fraction: float) -> FilterBank:
-    """Bank with a turning copy of each hypothesis, with a total weight of `fraction`; `bank` itself
-    if turning is disabled."""
     if not model.turn_acceleration:
         return bank
     n, w = len(bank), len(model.state_names) - 1
     doubled = bank.rows(np.tile(np.arange(n), 2))
     doubled.origin = np.arange(2 * n)
-    doubled.log_w = np.log(np.repeat([1.0 - fraction, fraction], n) / n)
-    doubled.P[n:, w, w] = START_TURN_RATIO**2 * model.turn_variance(np.hypot(bank.x[:, 3],
-                                                                             bank.x[:, 4]))
+    doubled.log_w = np.log(np.repeat([1.0 - TURN_SHARE, TURN_SHARE], n) / n)
+    doubled.P[n:, w, w] = START_TURN_RATIO**2 * model.turn_variance(np.hypot(*bank.x[:, 3:5].T))
     return doubled
 
 
-class _MeasuredEnergy:
-    """Energy of the whitened field of a frame, which determines the initial distance."""
-
-    def __init__(self, network: SensorNetwork, frame: FieldFrame) -> None:
-        is_present = ~np.isnan(frame.field)
-        energy = float(whitened_energy(frame.field, frame.covariance)[0].sum())
-        # The expected energy of noise is one per axis.
-        self.energy = max(energy - np.count_nonzero(is_present), 1.0)
-        std = np.sqrt(np.einsum('jii->ji', frame.covariance))
-        self.whitening = network.R_sw / np.where(is_present, std, np.inf)[:, :, None]
-        """Rotation (n_sensors, 3, 3) [1/T] from world to sensor, divided by the noise per axis."""
+def _measured_energy(network: SensorNetwork, frame: FieldFrame) -> tuple[float, FloatArray]:
+    """Energy of the whitened field of a frame in excess of noise, which determines the initial
+    distance, and rotations (n_sensors, 3, 3) from world to sensor divided by the noise [1/T]."""
+    is_present = ~np.isnan(frame.field)
+    energy = float(whitened_energy(frame.field, frame.covariance)[0].sum())
+    std = np.sqrt(np.einsum('jii->ji', frame.covariance))
+    # The expected energy of noise is one per axis.
+    return (max(energy - np.count_nonzero(is_present), 1.0),
+            network.R_sw / np.where(is_present, std, np.inf)[:, :, None])
 
 
-def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
-                        measured: _MeasuredEnergy, R: FloatArray, moments: FloatArray,
-                        height: float) -> FloatArray:
+def _matching_positions(settings: VehicleSettings, network: SensorNetwork, energy: float,
+                        whitening: FloatArray, R: FloatArray, moments: FloatArray, height: float
+                        ) -> FloatArray:
     """First position on each line at which the field of each moment reaches the measured energy,
-    (n_offsets, n_moments, 3).
-
-    If a field never reaches the energy, this is the last position of the line, next to the
-    outermost sensor.
-    """
+    (n_offsets, n_moments, 3); the last one, next to the outermost sensor, if it never does."""
     along = (network.positions - network.centre) @ R[:, 0]
     distance = np.linspace(MAX_START_DISTANCE, 0.0, 160) - along.min()
     line = np.array([network.centre[0], network.centre[1], height])
@@ -258,20 +230,16 @@ def _matching_positions(settings: VehicleSettings, network: SensorNetwork,
     points = line + offsets[:, None, None] * R[:, 1] - distance[:, None] * R[:, 0]
     # The field is linear in the moment, so its derivative gives the field of any moment.
     _, field_of_moment = dipole_jacobians(network.positions - points[:, :, None], np.zeros(3))
-    A = (measured.whitening @ field_of_moment).reshape(*points.shape[:2], -1, 3)
-    energy = np.einsum('lpmk,mk->lpm', moments @ (np.swapaxes(A, 2, 3) @ A), moments)
-    is_reached = energy >= measured.energy
+    A = (whitening @ field_of_moment).reshape(*points.shape[:2], -1, 3)
+    is_reached = np.einsum('lpmk,mk->lpm', moments @ (np.swapaxes(A, 2, 3) @ A), moments) >= energy
     first = np.where(is_reached.any(axis=1), is_reached.argmax(axis=1), len(distance) - 1)
     return np.take_along_axis(points, first[:, :, None], axis=1)
 
 
 def _initial_states(settings: VehicleSettings, kind: int, positions: FloatArray,
                     velocities: FloatArray, hard_iron: FloatArray) -> FloatArray:
-    """Initial states (n_offsets * n_speeds * n_moments, n_t) for the model `RowVehicle`.
-
-    `positions` is (n_offsets, n_moments, 3), `velocities` is (n_speeds, 3), and `hard_iron`
-    (n_moments, 3) is the total moment.
-    """
+    """Initial states (n_offsets * n_speeds * n_moments, n_t) for `positions` (n_offsets, n_moments,
+    3), `velocities` (n_speeds, 3), and total moments `hard_iron` (n_moments, 3)."""
     d = _n_dipoles(settings)
     n_turn = int(settings.turn_acceleration > 0.0)
     x = np.empty((len(positions), len(velocities), len(hard_iron), 8 + 3 * d + min(d, 2) + n_turn))
@@ -282,27 +250,23 @@ def _initial_states(settings: VehicleSettings, kind: int, positions: FloatArray,
     return x.reshape(-1, x.shape[-1])
 
 
-def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, speed: float,
-                        moment_std: float) -> FloatArray:
+def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, speed: float
+                        ) -> FloatArray:
     """Initial covariance (n_t, n_t) of a hypothesis that arrives along the x axis of `R` (3, 3), a
-    rotation to the world frame.
-
-    `moment_std` [A m²] is the std of the total hard iron moment, per axis.
-    """
-    d = _n_dipoles(settings)
+    rotation to the world frame."""
+    d, of_kind = _n_dipoles(settings), settings.kinds[kind]
     soft_index = 6 + 3 * d
     soft_iron_std = settings.induced_share_std * _soft_iron_per_share(settings, kind)
     n_t = soft_index + 2 + min(d, 2) + int(settings.turn_acceleration > 0.0)
     P = np.zeros((n_t, n_t))
-    P[:3, :3] = R @ np.diag([ALONG_STD**2, LATERAL_STD**2,
-                             settings.kinds[kind].height_std**2]) @ R.T
+    P[:3, :3] = R @ np.diag([ALONG_STD**2, LATERAL_STD**2, of_kind.height_std**2]) @ R.T
     P[3:6, 3:6] = R @ np.diag([(SPEED_STD * speed) ** 2, (CROSS_SPEED_STD * speed) ** 2,
                                CLIMB_STD**2]) @ R.T
     mean = np.full((d, d), 1.0 / d)
-    among_dipoles = (moment_std**2 / d * mean
-                     + settings.kinds[kind].difference_std**2 * (np.eye(d) - mean))
+    among_dipoles = of_kind.moment_std**2 / d * mean \
+        + of_kind.difference_std**2 * (np.eye(d) - mean)
     P[6:soft_index, 6:soft_index] = np.kron(among_dipoles, np.eye(3))
     P[soft_index:soft_index + 3, soft_index:soft_index + 3] = soft_iron_std**2 * (1.0 + np.eye(3))
     if d > 1:
-        P[soft_index + 3, soft_index + 3] = settings.kinds[kind].length_std**2
+        P[soft_index + 3, soft_index + 3] = of_kind.length_std**2
     return P

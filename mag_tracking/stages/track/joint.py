@@ -1,35 +1,88 @@
-"""Joint explanation of the latest frames of a track by several vehicles."""
+"""Other explanations of the latest frames: when to search for them, and which to accept."""
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtrc
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.filter_bank import FilterBank
-from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, field_energies
+from mag_tracking.inference.sequential_tests import SlidingSum
+from mag_tracking.stages.track.bank_filter import DETECTABLE_ENERGY, BankFilter
 from mag_tracking.stages.track.relinearisation import Window
+from mag_tracking.units import NS
 
-CONFIDENT_NATS = 15.0
-"""Log-odds below which an explanation is marked as doubtful for a limited time [nats]. The limit is
-high, because the evidence is overconfident: it treats model errors as independent between
-frames."""
-
-IMPLAUSIBLE_NATS = 60.0
-"""Limit that replaces `CONFIDENT_NATS` if a new vehicle crosses another vehicle, or if one vehicle
-overtakes another at a speed ratio above `OVERTAKING_RATIO` [nats]. Such traffic is rarer than a
-flipped axis or a train with a similar field."""
-
-CROSSING_COSINE = 0.9
-"""Two vehicles cross if the absolute cosine of the angle between their velocities is below this
-value."""
-
-OVERTAKING_RATIO = 1.8
-"""Maximum plausible speed ratio of two vehicles that move in the same direction."""
-
+FALSE_ALARM_PROBABILITY = 1e-3
+"""Probability per test that noise alone triggers a comparison with other explanations."""
+WINDOW_S, MIN_INTERVAL_S = 0.25, 0.15
+"""[s] Duration of the tested frames, and minimum interval between any comparison and the next one
+that improbable innovations trigger."""
+LONG_INTERVAL_S, INTERVAL_GROWTH = 0.3, 1.5
+"""[s] Interval after which a long vehicle is compared with two vehicles, and factor by which this
+interval grows with each comparison."""
+ACCEPT_NATS, REPEATED_NATS, UNDECIDED_NATS = 10.0, 5.0, -5.0
+"""[nats] Minimum log-odds of another explanation: to be accepted at once, to be accepted in two
+successive comparisons, and to mark the track as doubtful if it is not accepted."""
+IMPROBABLE, LONG_VEHICLE = 'improbable innovations', 'a long vehicle'
+"""Reasons to compare a track with other explanations."""
+CONFIDENT_NATS, IMPLAUSIBLE_NATS = 15.0, 60.0
+"""[nats] Log-odds below which an explanation is doubtful for a limited time: high, because the
+evidence treats model errors as independent between frames; and higher if a new vehicle crosses or
+overtakes another, which is rarer than a flipped axis or a train with a similar field."""
+CROSSING_COSINE, OVERTAKING_RATIO = 0.9, 1.8
+"""Absolute cosine of the angle between velocities below which two vehicles cross, and maximum
+plausible speed ratio of two vehicles that move in the same direction."""
 MIN_MOVING_SPEED = 1.0
-"""Minimum speed of vehicles whose directions are compared [m/s]. The heading of slower vehicles is
-unknown."""
+"""[m/s] Minimum speed of vehicles whose directions are compared."""
+
+
+class NewTargetEvidence:
+    """Decides when to compare a track with other explanations, and whether to accept one.
+
+    A comparison is due when the latest innovations are improbable, and at intervals for a long
+    vehicle, whose model may explain two short vehicles without improbable innovations.
+    """
+
+    def __init__(self) -> None:
+        self._latest = SlidingSum(WINDOW_S)
+        self._last_comparison_ns: int | None = None
+        self._was_probable = False
+        self._was_rejected = self._is_long = False
+        self._long_interval_s = LONG_INTERVAL_S
+
+    def add(self, nis: float, degrees_of_freedom: int, stamp_ns: int, rejected: bool,
+            is_long: bool) -> None:
+        """Add a frame with its normalised innovation squared `nis`; `is_long` refers to the best
+        hypothesis.
+
+        One `rejected` sensor of two triggers a comparison like improbable innovations do. With more
+        sensors, the majority shows that the rejected sensor is faulty.
+        """
+        self._latest.add(stamp_ns, [nis, degrees_of_freedom])
+        self._was_rejected, self._is_long = rejected, is_long
+
+    def due(self, stamp_ns: int) -> str | None:
+        """Return `IMPROBABLE` or `LONG_VEHICLE` if a comparison is due, and restart the interval;
+        else None."""
+        total, freedom = self._latest.total
+        elapsed_s = np.inf if self._last_comparison_ns is None \
+            else (stamp_ns - self._last_comparison_ns) / NS
+        reason = None
+        if self._was_rejected or chdtrc(max(freedom, 1.0), total) <= FALSE_ALARM_PROBABILITY:
+            reason = IMPROBABLE if elapsed_s >= MIN_INTERVAL_S else None
+        elif self._is_long and elapsed_s >= self._long_interval_s:
+            reason = LONG_VEHICLE
+            self._long_interval_s *= INTERVAL_GROWTH
+        if reason is not None:
+            self._last_comparison_ns = stamp_ns
+        return reason
+
+    def accepts(self, log_odds: float) -> bool:
+        """Record a comparison, and return whether the other explanation, with its log-odds [nats]
+        against the track, is accepted: immediately, or in two successive comparisons."""
+        accepts = log_odds > ACCEPT_NATS or self._was_probable and log_odds > REPEATED_NATS
+        self._was_probable = log_odds > REPEATED_NATS and not accepts
+        return accepts
 
 
 @dataclass(frozen=True)
@@ -53,10 +106,9 @@ class JointExplanation:
     def doubtful(self, n_one: int) -> tuple[int, ...]:
         """Indices of the vehicles whose states may be wrong; each vehicle has `n_one` states.
 
-        These are a relocated vehicle, and two vehicles that replace one and move in the same
-        direction, because a long vehicle with large model errors resembles two. All vehicles are
-        doubtful if the log-odds are below `CONFIDENT_NATS`, or below `IMPLAUSIBLE_NATS` if a new
-        vehicle crosses another vehicle, or one overtakes the other too fast.
+        These are all vehicles if the log-odds are low for them; otherwise a relocated vehicle, and
+        two vehicles that replace one and move in the same direction, because a long vehicle with
+        large model errors resembles two.
         """
         n = self.bank.label.shape[1] if self.bank.label.ndim > 1 else 1
         x = self.bank.x[self.bank.best()]
@@ -69,6 +121,17 @@ class JointExplanation:
         if not self.adds:
             return (n - 1,)
         return (n - 2, n - 1) if velocity[-2] @ velocity[-1] > 0.0 else ()
+
+    def is_sensed_by_two(self) -> bool:
+        """Whether at least two sensors sense each new vehicle; a field that only one sensor
+        measures may be a fault of this sensor."""
+        n, best = self.bank.label.shape[1], self.bank.best()
+        for i in range(n - (1 if self.replaced is None else 2), n):
+            energy = sum(self.bank_filter.field_energies(i, path[best], frame) for path, frame in
+                         zip(self.window.paths, self.window.frames, strict=True))
+            if np.count_nonzero(energy > DETECTABLE_ENERGY) < 2:
+                return False
+        return True
 
 
 def _are_implausible(velocity: FloatArray, n_new: int) -> bool:
@@ -83,17 +146,3 @@ def _are_implausible(velocity: FloatArray, n_new: int) -> bool:
                                                cosine > 0.0 and faster > OVERTAKING_RATIO * slower):
                 return True
     return False
-
-
-def are_sensed_by_two(joint: JointExplanation) -> bool:
-    """Whether at least two sensors sense each new vehicle.
-
-    A field that only one sensor measures may be a fault of this sensor.
-    """
-    n, best = joint.bank.label.shape[1], joint.bank.best()
-    for i in range(n - (1 if joint.replaced is None else 2), n):
-        energy = sum(field_energies(joint.bank_filter, i, path[best], frame) for path, frame in
-                     zip(joint.window.paths, joint.window.frames, strict=True))
-        if np.count_nonzero(energy > DETECTABLE_ENERGY) < 2:
-            return False
-    return True

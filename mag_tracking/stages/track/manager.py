@@ -1,8 +1,5 @@
-"""Track management: initiation, maintenance and deletion of tracks.
-
-The manager turns frames with a detection verdict into tracks. A track starts with a detection and
-is updated with each frame. It ends with the release of the detection, or when its target is lost.
-"""
+"""Track management: tracks are initiated with a detection, maintained with each frame, and deleted
+with the release of the detection, or when the target is lost."""
 
 from collections import Counter, deque
 
@@ -16,42 +13,35 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.bank_size import sensors_at_start
-from mag_tracking.stages.track.clock_comparison import ClockComparison
+from mag_tracking.stages.track.cross_check import ClockComparison
 from mag_tracking.stages.track.disturbances import Disturbances
-from mag_tracking.stages.track.low_rate import SampleRates
 from mag_tracking.stages.track.observation import MAX_ROTATION
+from mag_tracking.stages.track.plausibility import SampleRates
 from mag_tracking.stages.track.running_track import RunningTrack, TrackRecord
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.stages.track.target import target_of
+from mag_tracking.stages.track.target import sensors_at_start, target_of
+from mag_tracking.stages.track.track_bank import TrackBank
 from mag_tracking.units import NS
 
 NO_SCALE = 'detections not tracked (scale not observable with one sensor)'
 NO_SCALE_FRAMES = 'frames in which no track could start (scale not observable with one sensor)'
-
 TOO_SLOW = 'detections not tracked (the rate of the sensors is too low)'
-
 UNCERTAIN_ORIENTATIONS = ('sensors with an orientation uncertainty above '
                           f'{np.degrees(MAX_ROTATION):g} degrees')
-
-DISTURBANCE_TRACKS = 'tracks explained by a disturbance'
-
-STARTED_IN_TAIL = 'tracks started in a larger field after the target of a detection was lost'
-
+"""Keys of event counts that others use."""
 RESTART_ENERGY_RATIO = 4.0
 """Minimum energy of the frame in which a track starts after a lost track, relative to the maximum
-energy of the lost track. A ratio of 4 corresponds to twice the field. The field of a departing
-vehicle only decreases."""
+energy of the lost track: the field of a departing vehicle only decreases."""
 
 
 class TrackManager:
     """Track management: turns frames with a detection verdict into tracks.
 
-    While a target is present, the manager returns one `Track` per frame and target. Smoothed poses
-    follow with a fixed lag during the track, and for the whole track at its end. Vehicles that
-    appear during a track become members of the track. A given clock comparison is continued. Raises
-    SettingsError if the settings contradict each other.
+    While a target is present, the manager returns one `Track` per frame and target, smoothed poses
+    with a fixed lag, and at the end of a track those of the whole track. Vehicles that appear
+    during a track become its members. A given clock comparison is continued. Raises SettingsError
+    if the settings contradict each other.
 
     Attributes
     ----------
@@ -64,23 +54,21 @@ class TrackManager:
         self._clocks = clocks or ClockComparison(len(network))
         self._network, self._settings = network, settings
         self._target = target_of(settings, network)
-        self._tracks: list[RunningTrack] = []
+        self._track: RunningTrack | None = None
         self._next_id = 1
         self._recent: deque[FieldFrame] = deque()
         self._last_ns: int | None = None
         # [T^2] Maximum energy of the field since the start of the latest track.
         self._max_energy = 0.0
-        # [T^2] After a target was lost, a track starts only if the energy of the field exceeds this
-        # limit; None if no target was lost in the current detection.
+        # [T^2] Energy above which a track starts; None if no target was lost in the detection.
         self._restart_energy: float | None = None
         self._next_network: SensorNetwork | None = None
         self._disturbances = Disturbances(network.names)
         self._rates = SampleRates(network, settings)
         self._input_doubts: InputDoubts = {}
         self._doubtful_rows: dict[str, dict[int, DoubtfulTimes]] = {}
-        n_uncertain = sum(bool(s is not None and s.max() > MAX_ROTATION)
-                          for s in network.orientation_std)
-        if n_uncertain:
+        if n_uncertain := sum(bool(s is not None and s.max() > MAX_ROTATION)
+                              for s in network.orientation_std):
             self.counts[UNCERTAIN_ORIENTATIONS] = n_uncertain
 
     def use_network(self, network: SensorNetwork) -> None:
@@ -92,10 +80,10 @@ class TrackManager:
         self._next_network = network
 
     def configure(self, settings: TrackSettings) -> None:
-        """Apply new values of the live settings, also to running tracks."""
+        """Apply new values of the live settings, also to a running track."""
         self._settings = settings
-        for track in self._tracks:
-            track.configure(settings)
+        if self._track is not None:
+            self._track.configure(settings)
 
     def set_input_doubts(self, doubts: InputDoubts) -> None:
         """Replace the times {reason: {sensor: times}} at which readings are doubtful; tracks with
@@ -120,13 +108,13 @@ class TrackManager:
 
     @property
     def bank(self) -> FilterBank | None:
-        """Hypotheses of the first running track; None if no track is running."""
-        return self._tracks[0].bank if self._tracks else None
+        """Hypotheses of the running track; None if no track is running."""
+        return None if self._track is None else self._track.bank
 
     def feed(self, frame: FieldFrame) -> list[TrackRecord]:
         """Start, update or end tracks with a frame, and return the resulting records."""
         self.idle()
-        if self._next_network is not None and not self._tracks:
+        if self._next_network is not None and self._track is None:
             if not np.array_equal(self._next_network.clock_offset, self._network.clock_offset):
                 self._clocks = ClockComparison(len(self._network))
             self._network, self._next_network = self._next_network, None
@@ -134,41 +122,45 @@ class TrackManager:
         self._last_ns = frame.stamp_ns
         self.counts['frames'] += 1
         self._rates.add(frame)
-        if not self._tracks:
+        if self._track is None:
             self._disturbances.feed(frame)
         if not frame.target_present:
             out += self._end_all('released', frame.stamp_ns)
             self._restart_energy = None
             self._store_frame(frame)
-        elif self._tracks and previous is not None:
-            out += self._maintain(frame, (frame.stamp_ns - previous) / NS)
+        elif self._track is not None and previous is not None:
+            self._max_energy = max(self._max_energy, _energy(frame))
+            self._track.flag_doubtful_sensors(self._doubtful_sensors(frame))
+            out += self._track.step(frame, (frame.stamp_ns - previous) / NS)
+            out += self._delete_ended(frame.stamp_ns)
         elif self._restart_energy is None or _energy(frame) > self._restart_energy:
             out += self._initiate(frame)
         return out
 
     def idle(self) -> None:
         """Complete the deferred work: handovers and searches for new targets."""
-        for track in self._tracks:
-            track.hand_over()
-            joint = track.new_target()
-            if joint is not None:
-                track.admit(joint, self._next_id)
-                self.counts['tracks'] += joint.adds
-                self.counts['tracks of new targets' if joint.adds else 'tracks found again'] += 1
-                self._next_id += joint.adds
+        if self._track is None:
+            return
+        self._track.hand_over()
+        joint = self._track.new_target()
+        if joint is not None:
+            self._track.admit(joint, self._next_id)
+            self.counts['tracks'] += joint.adds
+            self.counts['tracks of new targets' if joint.adds else 'tracks found again'] += 1
+            self._next_id += joint.adds
 
     def end_tracks(self, reason: str) -> list[TrackRecord]:
-        """End all tracks and discard the recent frames, after an interruption of the frames."""
+        """End the track and discard the recent frames, after an interruption of the frames."""
         self._recent.clear()
         self._restart_energy = None
         return self._end_all(reason, self._last_ns)
 
     def flush(self) -> list[TrackRecord]:
-        """End all tracks at the end of the input."""
+        """End the track at the end of the input."""
         return self._end_all('input ended', self._last_ns)
 
     def _end_at_gap(self, frame: FieldFrame) -> list[TrackRecord]:
-        """End all tracks after a backward time jump or a long gap, and return their records."""
+        """End the track after a backward time jump or a long gap, and return its records."""
         if self._last_ns is None:
             return []
         dt = (frame.stamp_ns - self._last_ns) / NS
@@ -178,38 +170,26 @@ class TrackManager:
         return self.end_tracks('gap in the frames') if dt > self._settings.end_gap_s else []
 
     def _end_all(self, reason: str, stamp_ns: int | None) -> list[TrackRecord]:
-        """End all tracks and the current disturbance, and return their closing records."""
-        tracks, self._tracks = self._tracks, []
-        out = [record for track in tracks for record in track.end(reason)]
-        if stamp_ns is None:
-            return out
-        return [*out, *self._add_unexplained(tracks, stamp_ns), *self._disturbances.end(stamp_ns)]
-
-    def _add_unexplained(self, tracks: list[RunningTrack], stamp_ns: int) -> list[TrackRecord]:
-        """Start or extend a disturbance with unexplained fields of `tracks`; return its records."""
-        out: list[TrackRecord] = []
-        for found in (found for track in tracks for found in track.unexplained):
-            self.counts[DISTURBANCE_TRACKS] += 1
-            out += self._disturbances.begin(found, stamp_ns)
+        """End the track and the current disturbance, and return their closing records."""
+        out: list[TrackRecord] = [] if self._track is None else self._track.end(reason)
+        if stamp_ns is not None:
+            out += [*self._delete_ended(stamp_ns), *self._disturbances.end(stamp_ns)]
         return out
 
-    def _maintain(self, frame: FieldFrame, dt: float) -> list[TrackRecord]:
-        """Update the running tracks with a frame, delete the ended ones, and return the records."""
-        doubtful = self._doubtful_sensors(frame)
-        self._max_energy = max(self._max_energy, _energy(frame))
-        for track in self._tracks:
-            track.flag_doubtful_sensors(doubtful)
-        out = [record for track in self._tracks for record in track.step(frame, dt)]
-        return out + self._delete_ended(frame.stamp_ns)
-
     def _delete_ended(self, stamp_ns: int) -> list[TrackRecord]:
-        """Delete the ended tracks; return the records of disturbances that explain their fields."""
-        out = self._add_unexplained([track for track in self._tracks if track.ended is not None],
-                                    stamp_ns)
+        """Delete the track if it has ended; return the records of a disturbance that explains its
+        fields."""
+        track = self._track
+        if track is None or track.ended is None:
+            return []
+        self._track = None
         # A track that restarts while the vehicle departs would be placed on the wrong line.
-        if any(track.is_lost for track in self._tracks) and not self._target.starts_anywhere:
+        if track.is_lost and not self._target.starts_anywhere:
             self._restart_energy = RESTART_ENERGY_RATIO * self._max_energy
-        self._tracks = [track for track in self._tracks if track.ended is None]
+        out: list[TrackRecord] = []
+        for found in track.unexplained:
+            self.counts['tracks explained by a disturbance'] += 1
+            out += self._disturbances.begin(found, stamp_ns)
         return out
 
     def _store_frame(self, frame: FieldFrame) -> None:
@@ -245,12 +225,13 @@ class TrackManager:
         self.counts['tracks'] += 1
         is_in_tail = self._restart_energy is not None
         if is_in_tail:
-            self.counts[STARTED_IN_TAIL] += 1
+            self.counts['tracks started in a larger field after the target of a detection was '
+                        'lost'] += 1
         self._restart_energy, self._max_energy = None, _energy(frame)
-        track = RunningTrack(self._next_id, self._target, s, sensors, bank_filter, bank,
-                             self.counts, self._clocks, later_sensors)
+        track = self._track = RunningTrack(self._next_id, TrackBank(
+            self._target, s, sensors, bank_filter, bank, self.counts, later_sensors), self.counts,
+            self._clocks)
         self._next_id += 1
-        self._tracks.append(track)
         track.flag_doubtful_sensors(self._doubtful_sensors(*recent, frame))
         out = track.begin(
             frame, recent,
@@ -277,11 +258,8 @@ class TrackManager:
 
 
 def _energy(frame: FieldFrame) -> float:
-    """Squared norm of the field, summed over all sensors [T²].
-
-    It is not weighted with the noise, because the noise assumed by the detector increases during a
-    detection.
-    """
+    """Squared norm of the field, summed over all sensors [T²], not weighted with the noise, which
+    increases during a detection."""
     return float(np.nansum(np.square(frame.field)))
 
 

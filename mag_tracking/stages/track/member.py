@@ -2,7 +2,6 @@
 
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,51 +10,20 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.physics.bounds import impossible_reason
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.clock_comparison import ClockComparison
-from mag_tracking.stages.track.cross_check import CrossCheck
+from mag_tracking.stages.track.cross_check import ClockComparison, CrossCheck
 from mag_tracking.stages.track.disturbances import UnexplainedField
 from mag_tracking.stages.track.evidence import LOST, TrackEvidence
 from mag_tracking.stages.track.joint import JointExplanation
-from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.plausibility import Plausibility
 from mag_tracking.stages.track.published_pose import ambiguities, published_track, smoothed_pose
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.stages.track.target import Target
+from mag_tracking.stages.track.track_bank import TrackBank
 
 MAX_POSITIONS = 64
-"""Maximum number of stored recent positions. If two vehicles replace one, the positions show which
-of the two continues the track."""
-
-
-@dataclass(frozen=True)
-class BankUpdate:
-    """Bank of a running track after a frame."""
-
-    frame: FieldFrame
-    """Readings used for the update, from the sensors of the track."""
-    dt: float
-    """Time since the previous frame [s]."""
-    bank: FilterBank
-    """Hypotheses of all members."""
-    bank_filter: BankFilter
-    sensors: SensorSubset
-    settings: TrackSettings
-
-
-@dataclass(frozen=True)
-class MemberView:
-    """Bank of a running track, restricted to one member."""
-
-    bank: FilterBank
-    best: int
-    """Index of the published hypothesis."""
-    observation: Observation
-    gain: float
-    """Increase of the log-likelihood of the latest frames by relinearising the path of this
-    hypothesis, relative to the filter [nats]."""
+"""Maximum number of stored positions, which show which of two vehicles continues a track."""
 
 
 class Member:
@@ -67,7 +35,6 @@ class Member:
     ----------
     last : latest record
     ended : reason for the end; None while the target is tracked
-    is_lost : whether the member ended while the target was still detected
     early : smoothed states from the time before the target shared its state with other targets
     slot : index of the target in the joint states that are stored for smoothing
     """
@@ -75,12 +42,10 @@ class Member:
     def __init__(self, id: int, target: Target, sensors: SensorSubset, counts: 'Counter[str]',
                  clocks: ClockComparison, begin_ns: int) -> None:
         self.id, self._target, self._counts, self._clocks = id, target, counts, clocks
-        self.begin_ns, self._sensors = begin_ns, sensors
+        self.begin_ns, self.cross_check = begin_ns, CrossCheck(sensors.network)
         self.evidence, self._plausibility = TrackEvidence(len(sensors.full_network)), Plausibility()
-        self.cross_check = CrossCheck(sensors.network)
         self.last: Track | None = None
         self.ended: str | None = None
-        self.is_lost = False
         self.early: list[TrackState] = []
         self.slot = 0
         # Reason to end because the latest state is impossible; empty if it is possible.
@@ -92,25 +57,22 @@ class Member:
         self._recent_positions: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_POSITIONS)
 
     def use(self, sensors: SensorSubset) -> None:
-        """Switch to other sensors, and restart the cross-check."""
-        self._sensors = sensors
+        """Restart the cross-check with the sensors of the track."""
         self.cross_check = CrossCheck(sensors.network)
 
     def restart(self, sensors: SensorSubset) -> None:
-        """Switch to other sensors, drop the doubts caused by the field of another vehicle, and
-        restart the checks."""
+        """Drop the doubts caused by the field of another vehicle, and restart the checks."""
         self.evidence.drop_explained_doubts()
         self.use(sensors)
         self._plausibility = Plausibility()
 
-    def start_alongside(self, first: 'Member', stamp_ns: int, ratio: float) -> None:
-        """Start as a new target of a track, in addition to its first member.
-
-        The new target inherits from the first member the doubt that it was not seen approaching,
-        and the evidence for a target against a disturbance. `ratio` is the minimum Bayes factor.
-        """
+    def start_alongside(self, first: 'Member', sensors: SensorSubset, stamp_ns: int, ratio: float
+                        ) -> None:
+        """Start as a new target of a track; it inherits from the first member the doubt that it was
+        not seen approaching, and the evidence for a target against a disturbance, with the minimum
+        Bayes factor `ratio`."""
         self.evidence.flag_start(doubts.NOT_SEEN_APPROACHING in first.evidence.doubts,
-                                 self._sensors.full_network, False)
+                                 sensors.full_network, False)
         self.evidence.bayes_factor.add(first.evidence.bayes_factor.log_ratio, stamp_ns, ratio)
 
     def distance_from(self, stamps_ns: Sequence[int], path: FloatArray) -> float:
@@ -121,57 +83,58 @@ class Member:
                      for stamp_ns, position in self._recent_positions if stamp_ns in position_at]
         return float(np.mean(distances)) if distances else 0.0
 
-    def publish(self, update: BankUpdate, view: MemberView) -> list[Track]:
-        """Create and store the `Track` record of this member for a frame.
+    def publish(self, track: TrackBank, bank: FilterBank, best: int, frame: FieldFrame, dt: float
+                ) -> list[Track]:
+        """Create and store the `Track` record of this member for a frame of the sensors of `track`,
+        `dt` seconds after the previous one, from hypothesis `best` of the `bank` of this member.
 
         The result is empty if the state is impossible, which ends the member.
         """
-        record = self._create_record(update, view)
+        record = self._create_record(track, bank, best, frame, dt)
         self._impossible = impossible_reason(record.velocity, record.moment, record.mounting)
         if self._impossible:
-            if update.bank_filter.is_implausible(view.bank, view.best, update.frame):
+            if track.filter.is_implausible(bank, best, frame):
                 # The field contradicts the track, which is therefore lost, whatever its state.
                 self._impossible = LOST
             return []
         self.last = record
-        self._position_std = float(np.sqrt(np.trace(view.bank.P[view.best, :2, :2])))
-        self._was_unambiguous |= not self.last.ambiguous
-        self._recent_positions.append((self.last.stamp_ns, self.last.position[:2]))
+        self._position_std = float(np.sqrt(np.trace(bank.P[best, :2, :2])))
+        self._was_unambiguous |= not record.ambiguous
+        self._recent_positions.append((record.stamp_ns, record.position[:2]))
         self._counts['poses'] += 1
-        return [self.last]
+        return [record]
 
-    def _create_record(self, update: BankUpdate, view: MemberView) -> Track:
+    def _create_record(self, track: TrackBank, bank: FilterBank, best: int, frame: FieldFrame,
+                       dt: float) -> Track:
         """Update the evidence with a frame, and return the `Track` record for this frame."""
-        frame, dt, sensors, best = update.frame, update.dt, update.sensors, view.best
+        sensors, x, P = track.sensors, bank.x[best], bank.P[best]
         measured: BoolArray = ~np.isnan(frame.field)
         measuring = np.flatnonzero(measured.any(axis=1))
         is_single_sensor = len(sensors.network) > 1 and len(measuring) == 1
         self.evidence.count_single_sensor_time(is_single_sensor, dt)
         if self._unobserved_length is not None:
             self._unobserved_length.update(
-                view.bank.x[best], view.bank.P[best], sensors.network.positions[measuring],
+                x, P, sensors.network.positions[measuring],
                 self.last is not None and (self.evidence.is_doubtful or not self.last.ambiguous))
         reasons = self.evidence.update_doubts(
-            self._doubts(update, view, is_single_sensor), frame.stamp_ns)
+            self._doubts(track, bank, best, frame, dt, is_single_sensor), frame.stamp_ns)
         excess = 1.0 if self._target.starts_anywhere else self.evidence.innovations.excess
         return sensors.for_whole_network(published_track(
-            view.bank, best, self._target.model, self._target.orientation, self._target.arrivals,
+            bank, best, self._target.model, self._target.orientation, self._target.arrivals,
             self._target.kinds, stamp_ns=frame.stamp_ns, id=self.id, ended=False,
             existence=self.evidence.existence, degrees_of_freedom=int(measured.sum()),
             found=reasons, excess=excess, unobserved_length=self._unobserved_length,
-            difference=self.cross_check.difference,
-            ambiguous_poses=update.settings.ambiguous_poses,
-            predicted=update.bank_filter.predicted_field(update.bank, best, frame, dt),
-            mounting=view.observation.angles(view.bank.x[best].copy()),
-            mounting_covariance=view.observation.angle_covariances(view.bank.P[best])),
-            update.settings)
+            difference=self.cross_check.difference, ambiguous_poses=track.settings.ambiguous_poses,
+            predicted=track.filter.predicted_field(track.bank, best, frame, dt),
+            mounting=track.single_target.angles(x.copy()),
+            mounting_covariance=track.single_target.angle_covariances(P)), track.settings)
 
     @property
     def passed_below(self) -> bool:
-        """Whether the target passed below the sensors, and everything else about it is plausible.
+        """Whether the target passed below the sensors, and all else about it is plausible.
 
-        The field of a dipole is the same at opposite points. If two sensors are exchanged, a
-        vehicle therefore fits well on the opposite side of the centre, below the sensors.
+        If two sensors are exchanged, a vehicle fits well at the opposite point, where the field of
+        a dipole is the same.
         """
         if self.last is None or self._target.starts_anywhere \
                 or set(self.last.doubts) - {doubts.HEIGHT, doubts.BELOW_SENSORS}:
@@ -184,11 +147,12 @@ class Member:
             or not self.evidence.bayes_factor.is_favoured(settings.min_bayes_factor) \
             or not self._target.starts_anywhere and self.evidence.is_sensed_by_one
 
-    def _doubts(self, update: BankUpdate, view: MemberView, is_single_sensor: bool) -> set[str]:
+    def _doubts(self, track: TrackBank, bank: FilterBank, best: int, frame: FieldFrame, dt: float,
+                is_single_sensor: bool) -> set[str]:
         """Update the checks of the member, and return the doubts about its latest pose."""
-        bank, best, evidence, settings = view.bank, view.best, self.evidence, update.settings
+        evidence, settings = self.evidence, track.settings
         reasons = evidence.doubts | ({doubts.ONE_SENSOR} if is_single_sensor else set())
-        if update.bank_filter.is_implausible(bank, best, update.frame):
+        if track.filter.is_implausible(bank, best, frame):
             reasons.add(doubts.MISFIT)
         if not evidence.bayes_factor.is_favoured(settings.min_bayes_factor):
             reasons.add(doubts.DISTURBANCE_MODEL)
@@ -196,25 +160,18 @@ class Member:
         if self._target.starts_anywhere:
             return reasons
         reasons |= evidence.vehicle_doubts(
-            bank.nis[best], int(np.count_nonzero(~np.isnan(update.frame.field))),
+            bank.nis[best], int(np.count_nonzero(~np.isnan(frame.field))),
             settings.min_bayes_factor)
-        if self._overfits(update, view):
-            reasons.add(doubts.OVERFIT)
-        reasons |= self.cross_check.doubts(self._clocks.largest_offset_s(update.sensors.rows))
-        reasons |= self._plausibility.evaluate(
-            view.observation, bank, best, settings.vehicle,
-            np.deg2rad(settings.mounting_std_deg), update.dt)
-        for reason in reasons & doubts.PERMANENT:
-            evidence.flag(reason)
-        return reasons | evidence.doubts
-
-    def _overfits(self, update: BankUpdate, view: MemberView) -> bool:
-        """Update and return the doubt that the filter fits the frames better than its path."""
-        overfits = self.evidence.update_filter_doubt(view.gain, update.frame.stamp_ns,
-                                                     update.settings.relinearise_window_s)
-        if overfits:
+        if evidence.update_filter_doubt(track.relinearisation.gain(int(bank.origin[best])),
+                                        frame.stamp_ns, settings.relinearise_window_s):
             self._counts['doubtful poses: the filter fits better than its path'] += 1
-        return overfits
+            reasons.add(doubts.OVERFIT)
+        reasons |= self.cross_check.doubts(self._clocks.largest_offset_s(track.sensors.rows))
+        reasons |= self._plausibility.evaluate(
+            track.single_target, bank, best, settings.vehicle,
+            np.deg2rad(settings.mounting_std_deg), dt)
+        evidence.doubts |= reasons & doubts.PERMANENT
+        return reasons | evidence.doubts
 
     def reason_to_end(self, sensors: SensorSubset, settings: TrackSettings) -> str | None:
         """Update the end conditions with the latest record; return the reason to end the track, or
@@ -227,10 +184,7 @@ class Member:
 
     def unexplained(self, uniform: float) -> UnexplainedField | None:
         """Field of the track, if all its poses were ambiguous and a disturbance explains it better;
-        else None.
-
-        `uniform` is the probability that the field is the same at all sensors of the network.
-        """
+        `uniform` is the probability of a common field over the network."""
         if self._was_unambiguous or self.last is None \
                 or self.evidence.bayes_factor.disfavoured_s(self.last.stamp_ns) <= 0.0:
             return None
@@ -248,11 +202,8 @@ class Member:
     def smoothed(self, bank: FilterBank, best: int, complete: bool, states: list[TrackState],
                  doubtful: bool) -> list[SmoothedPose]:
         """Smoothed poses for the states of hypothesis `best` in the bank of this member; `complete`
-        if they cover the whole track, all ambiguous if `doubtful`.
-
-        Poses at times at which the filter was doubtful are marked as ambiguous, because smoothing
-        corrects its errors only in part.
-        """
+        if they cover the whole track, all ambiguous if `doubtful`, and ambiguous where the filter
+        was, because smoothing corrects its errors only in part."""
         ambiguous = doubtful or bool(ambiguities(bank, best, bank.is_separated(best)))
         poses = [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,
@@ -269,11 +220,7 @@ class Member:
 def members_in_order(members: Sequence[Member], new: Member | None, joint: JointExplanation,
                      n_one: int) -> list[Member]:
     """The members and a new target, ordered like the states in a joint explanation, with `n_one`
-    per vehicle.
-
-    If two vehicles replace one member, this member continues as the vehicle whose path is nearer to
-    its published positions.
-    """
+    per vehicle; a member that two vehicles replace continues as the one nearer to its positions."""
     others = list(members)
     replaced = others.pop(joint.replaced) if joint.replaced is not None else None
     if new is None or replaced is None:

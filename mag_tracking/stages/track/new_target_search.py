@@ -1,9 +1,9 @@
 """Search for a new vehicle in the frames of a running track.
 
 Three other explanations of the frames in the relinearisation window are tried: an additional
-vehicle; two vehicles in place of one, because two vehicles may have misled the filter of a single
-vehicle; and one of the vehicles at another position. Each explanation is filtered and smoothed
-along its path like any hypothesis. Its evidence is compared with the evidence of the current track.
+vehicle; two vehicles in place of one, which may have misled its filter; and one of the vehicles at
+another position. Each is filtered and smoothed along its path like any hypothesis, and its evidence
+is compared with that of the current track.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,19 +16,17 @@ from scipy.linalg import block_diag
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
-from mag_tracking.stages.track.bank_filter import BankFilter
+from mag_tracking.stages.track.bank_filter import DETECTABLE_ENERGY, BankFilter
 from mag_tracking.stages.track.initiation_vehicle import TURN_SHARE, moment_directions
-from mag_tracking.stages.track.joint import JointExplanation, are_sensed_by_two
-from mag_tracking.stages.track.new_target_evidence import IMPROBABLE
-from mag_tracking.stages.track.reach import DETECTABLE_ENERGY, field_energy
+from mag_tracking.stages.track.joint import IMPROBABLE, JointExplanation
 from mag_tracking.stages.track.relinearisation import Window
-from mag_tracking.stages.track.vehicle_state import VehicleState
-from mag_tracking.stages.track.window_search import WindowSearch
-from mag_tracking.stages.track.window_start import (
+from mag_tracking.stages.track.steady_search import in_order_of
+from mag_tracking.stages.track.window_search import (
     DEPTH_STD,
-    KnownVehicleHypothesis,
+    KnownVehicles,
+    VehicleState,
+    WindowSearch,
     WindowStart,
-    in_order_of,
     inserted,
     labels_of,
     overlap_depth,
@@ -36,42 +34,28 @@ from mag_tracking.stages.track.window_start import (
 
 PASSES, STEP = 3, 0.5
 """Number of Gauss-Newton steps along each path, and their damping factor."""
-
 MAX_KNOWN, MAX_FIRST, MAX_SECOND = 2, 3, 2
-"""Maximum numbers of tried hypotheses of a single tracked vehicle, of first new vehicles for each
-hypothesis, and of second new vehicles for each first one. If several vehicles are tracked, only the
-best hypothesis is tried."""
-
+"""Maximum numbers of tried hypotheses of a single tracked vehicle (only the best of several), of
+first new vehicles for each hypothesis, and of second new vehicles for each first one."""
 MAX_LOSS_NATS, MAX_EXPLANATIONS = 10.0, 12
 """Maximum difference in log-probability between the best and another retained explanation [nats],
 and maximum number of retained explanations."""
-
-LOG_P_ARRIVAL = np.log(0.05)
-"""Log-probability that another vehicle arrives during a pass."""
-
-MIN_DISPLACEMENT_M = 2.0
-"""Minimum distance from the track at which a vehicle counts as found at another position [m]."""
-
-MAX_RATIO = 5.0
-"""Maximum speed and moment of a new vehicle, relative to the largest values in the settings."""
-
-LOG_P_LOST = np.log(0.01)
-"""Log-probability that the track of a vehicle was at a wrong position during the whole window."""
-
-N_DISTANCES = 10
-"""Number of possible positions of a new target on its line at the start of the window."""
+LOG_P_ARRIVAL, LOG_P_LOST = np.log(0.05), np.log(0.01)
+"""Log-probabilities that another vehicle arrives during a pass, and that the track of a vehicle was
+at a wrong position during the whole window."""
+MIN_DISPLACEMENT_M, MAX_RATIO, N_DISTANCES = 2.0, 5.0, 10
+"""Minimum distance [m] of a vehicle at another position from its track, maximum speed and moment of
+a new vehicle relative to the largest ones in the settings, and number of its possible positions on
+a line at the start of the window."""
 
 
 class NewTargetSearch:
-    """Search for explanations by an additional vehicle, or by a vehicle at another position.
+    """Search for explanations by an additional vehicle, if it `may_add` one, or by a vehicle at
+    another position.
 
-    Parameters
-    ----------
-    filter_of : function that returns the `BankFilter` for a number of vehicles
-    n_targets : number of vehicles of the track
-    reason : reason from `NewTargetEvidence.due`; without improbable innovations, the search is
-        restricted to two vehicles in place of one
-    may_add : whether a vehicle may be added
+    For a `reason` from `NewTargetEvidence.due` other than improbable innovations, the search is
+    restricted to two vehicles in place of one. `filter_of` returns the filter for a number of
+    vehicles; the track has `n_targets`.
     """
 
     def __init__(self, bank: FilterBank, window: Window, filter_of: Callable[[int], BankFilter],
@@ -104,18 +88,20 @@ class NewTargetSearch:
         track_evidence = float(log_sum_exp(log_w))
         joints = [self._best_of(starts, track_evidence) for starts in explanations.values()]
         return max((joint for joint in joints if joint is not None
-                    and (are_sensed_by_two(joint) if joint.adds
-                         else self._is_elsewhere(joint))),
+                    and (joint.is_sensed_by_two() if joint.adds else self._is_elsewhere(joint))),
                    key=lambda joint: joint.log_odds, default=None)
 
-    def _all_starts(self, known: KnownVehicleHypothesis) -> list[WindowStart]:
+    def _all_starts(self, known: KnownVehicles) -> list[WindowStart]:
         """Starts of the explanations that are derived from one hypothesis of the track."""
         starts = self._starts_beside(known) if self._may_add and self._is_improbable else []
         for i in range(self._n_targets):
-            others = self._remove_vehicle(known, i)
-            if self._is_improbable and self._is_sensed(known, i):
+            others, is_long = self._remove_vehicle(known, i), self._filter.are_long(
+                np.array([known.kind[i]]))[0]
+            if self._is_improbable and self._filter.field_energies(
+                    i, known.path[-1], self._window.frames[-1]).sum() > DETECTABLE_ENERGY:
                 starts += self._starts_beside(others, i)
-            if self._may_add and self._may_be_two(known, i):
+            # Only a long vehicle, or the only one, may be two vehicles.
+            if self._may_add and (self._n_targets == 1 or is_long):
                 starts += self._pair_starts(others, i)
         return starts
 
@@ -125,11 +111,30 @@ class NewTargetSearch:
 
         `track_evidence` is the log-evidence of the track.
         """
-        refined = self._add_turning_starts(self._refine_starts(starts))
-        prior = LOG_P_ARRIVAL if len(refined[0].kind) > self._n_targets else LOG_P_LOST
-        bank, log_likelihood, log_w, paths = self._run_starts(refined)
-        return self._joint_of(refined, bank, log_likelihood, log_w, paths,
-                              float(log_sum_exp(log_w)) + prior - track_evidence)
+        _, _, log_w, paths = self._run_starts(starts)
+        order = np.argsort(-log_w, kind='stable')[:MAX_EXPLANATIONS]
+        starts = self._add_turning_starts([replace(starts[k], path=paths[k]) for k in order.tolist()
+                                           if log_w[k] >= log_w.max() - MAX_LOSS_NATS])
+        bank, log_likelihood, log_w, paths = self._run_starts(starts)
+        rows = np.flatnonzero(np.isfinite(log_w))
+        if not len(rows):
+            return None
+        n, n_targets, n_frames = len(rows), len(starts[0].kind), len(self._window.frames)
+        evidence = float(log_sum_exp(log_w[rows]))
+        latest = replace(bank.rows(rows), log_w=log_w[rows] - evidence, origin=np.arange(n))
+        anchor = replace(latest.copy(), x=np.array([starts[k].x for k in rows]),
+                         P=np.array([starts[k].P for k in rows]), log_w=np.full(n, -np.log(n)))
+        per_frame = log_likelihood[rows] / n_frames
+        window = Window(anchor, self._window.is_updated, self._window.max_hypotheses,
+                        self._window.frames, self._window.intervals,
+                        [np.ascontiguousarray(paths[rows, k]) for k in range(n_frames)],
+                        [per_frame.copy() for _ in range(n_frames)],
+                        [evidence / n_frames] * n_frames)
+        adds = n_targets > self._n_targets
+        log_odds = float(log_sum_exp(log_w)) + (LOG_P_ARRIVAL if adds else LOG_P_LOST) \
+            - track_evidence
+        return JointExplanation(latest, window, self._filter_of(n_targets), log_odds,
+                                starts[0].replaced, adds)
 
     def _current_track(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
         """Run the leading hypotheses of the current track along their paths.
@@ -139,17 +144,22 @@ class NewTargetSearch:
         """
         window, bank = self._window, self._bank
         order = np.argsort(-bank.log_w, kind='stable')[:window.max_hypotheses]
-        rows = np.searchsorted(window.anchor.origin, bank.origin[order])
+        rows = window.rows_of(bank)[order]
         anchor, paths = window.anchor.rows(rows), np.stack([p[rows] for p in window.paths], axis=1)
         begin = int(window.is_updated)
         anchor_log_w = bank.log_w[order] + window.evidence \
             - np.sum([values[rows] for values in window.log_likelihoods[begin:]], axis=0)
-        path_result = self._filter.run_along(anchor, window.frames, window.intervals, paths,
-                                             passes=PASSES, step=STEP,
-                                             first_is_updated=window.is_updated)
-        is_usable = np.isfinite(path_result.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
-        track_log_likelihood = np.where(is_usable, path_result.log_likelihood, -np.inf)
-        return order, track_log_likelihood, anchor_log_w + track_log_likelihood, paths
+        log_likelihood = self._run_along(anchor, paths, self._n_targets)
+        return order, log_likelihood, anchor_log_w + log_likelihood, paths
+
+    def _run_along(self, bank: FilterBank, paths: FloatArray, n_targets: int) -> FloatArray:
+        """Filter and smooth a bank along its paths, both in place; return the log-likelihoods (n,)
+        of the window, -inf for unusable paths."""
+        result = self._filter_of(n_targets).run_along(
+            bank, self._window.frames, self._window.intervals, paths, passes=PASSES, step=STEP,
+            first_is_updated=self._window.is_updated)
+        is_usable = np.isfinite(result.log_likelihood) & np.isfinite(paths).all(axis=(1, 2))
+        return np.where(is_usable, result.log_likelihood, -np.inf)
 
     def _leading_indices(self, rows: IntArray, log_w: FloatArray) -> list[int]:
         """Indices into `rows` of the hypotheses to be tried: the best of each arrival and kind."""
@@ -164,55 +174,45 @@ class NewTargetSearch:
                 chosen.append(k)
         return chosen
 
-    def _known_vehicles(self, row: int, log_w: float, path: FloatArray) -> KnownVehicleHypothesis:
+    def _known_vehicles(self, row: int, log_w: float, path: FloatArray) -> KnownVehicles:
         """Vehicles of hypothesis `row` of the track; `log_w` is its log-weight at the anchor."""
-        at = np.searchsorted(self._window.anchor.origin, self._bank.origin[[row]])
-        at_anchor = self._window.anchor.rows(at)
+        at_anchor = self._window.anchor.rows(self._window.rows_of(self._bank)[[row]])
         label, kind = (tuple(np.ravel(of[row]).tolist())
                        for of in (self._bank.label, self._bank.kind))
-        return KnownVehicleHypothesis(at_anchor.x[0], at_anchor.P[0], path, label, kind, log_w,
-                                      self._filter)
-
-    def _may_be_two(self, known: KnownVehicleHypothesis, i: int) -> bool:
-        """Whether vehicle `i` may be two vehicles: it is long, or the only vehicle."""
-        return self._n_targets == 1 or bool(
-            self._filter.are_long(np.array([known.kind[i]]))[0])
-
-    def _is_sensed(self, known: KnownVehicleHypothesis, i: int) -> bool:
-        """Whether the field of vehicle `i` is detectable in the last frame."""
-        return field_energy(
-            self._filter, i, known.path[-1], self._window.frames[-1]) > DETECTABLE_ENERGY
+        return KnownVehicles(at_anchor.x[0], at_anchor.P[0], path, label, kind, log_w, self._filter)
 
     def _is_elsewhere(self, joint: JointExplanation) -> bool:
         """Whether the relocated vehicle is more than `MIN_DISPLACEMENT_M` from its track."""
-        n, current = self._n_one, self._bank.x[self._bank.best()]
         assert joint.replaced is not None
-        found = joint.bank.x[joint.bank.best()]
-        last = n * (self._n_targets - 1)
-        before = current[joint.replaced * n:joint.replaced * n + 2]
-        return bool(np.hypot(*(found[last:last + 2] - before)) > MIN_DISPLACEMENT_M)
+        first, last = (k * self._n_one for k in (joint.replaced, self._n_targets - 1))
+        before, found = (bank.x[bank.best()] for bank in (self._bank, joint.bank))
+        return bool(np.hypot(*(found[last:last + 2] - before[first:first + 2]))
+                    > MIN_DISPLACEMENT_M)
 
-    def _remove_vehicle(self, known: KnownVehicleHypothesis, i: int) -> KnownVehicleHypothesis:
-        """Known vehicles without vehicle `i`; only the sensor states if no vehicle remains."""
+    def _remove_vehicle(self, known: KnownVehicles, i: int) -> KnownVehicles:
+        """Known vehicles without vehicle `i`; only the sensor states, as at the start of a track,
+        if no vehicle remains."""
         n = self._n_one
         if self._n_targets == 1:
-            sensor_P = self._sensors_at_start()
+            observation, std = self._filter.observation, self._vehicles.background_std
+            sensor_P = block_diag(*observation.own_covariance,
+                                  std**2 * np.eye(3 * len(observation.positions)))
             sensor_path = np.zeros((len(self._search.times), len(sensor_P)))
-            return KnownVehicleHypothesis(sensor_path[0], sensor_P, sensor_path, (), (), 0.0, None)
+            return KnownVehicles(sensor_path[0], sensor_P, sensor_path, (), (), 0.0, None)
         rows = np.delete(np.arange(known.path.shape[1]), np.arange(i * n, (i + 1) * n))
-        return KnownVehicleHypothesis(
+        return KnownVehicles(
             known.x[rows], known.P[np.ix_(rows, rows)], known.path[:, rows],
             known.label[:i] + known.label[i + 1:], known.kind[:i] + known.kind[i + 1:],
             known.log_w, self._filter_of(self._n_targets - 1))
 
-    def _starts_beside(self, known: KnownVehicleHypothesis, replaced: int | None = None
+    def _starts_beside(self, known: KnownVehicles, replaced: int | None = None
                        ) -> list[WindowStart]:
         """Starts with an additional vehicle, which is new or replaces vehicle `replaced`."""
         search = self._search.beside(known)
         return [start for theta in search.best(self._search.grid, MAX_FIRST)
                 for start in self._starts_on(known, theta[None], search.moments(theta), replaced)]
 
-    def _pair_starts(self, others: KnownVehicleHypothesis, i: int) -> list[WindowStart]:
+    def _pair_starts(self, others: KnownVehicles, i: int) -> list[WindowStart]:
         """Starts of two vehicles in place of vehicle `i`."""
         search = self._search.beside(others)
         starts: list[WindowStart] = []
@@ -221,7 +221,7 @@ class NewTargetSearch:
             starts += self._starts_on(others, pair, search.moments(pair.ravel()), i)
         return starts
 
-    def _starts_on(self, known: KnownVehicleHypothesis, paths: FloatArray, moments: FloatArray,
+    def _starts_on(self, known: KnownVehicles, paths: FloatArray, moments: FloatArray,
                    replaced: int | None) -> list[WindowStart]:
         """One start for each combination of kinds of k new vehicles on `paths` (k, 7) with
         `moments` (k, 3, 3), which join the known vehicles."""
@@ -237,31 +237,18 @@ class NewTargetSearch:
                 path.append(self._vehicles.along(theta, m, times, kind))
             starts.append(WindowStart(
                 x, P, np.hstack([*path, known.path[:, n_known:]]), (*known.label, *labels),
-                (*known.kind, *kinds), known.log_w + len(paths) * self._log_prior, len(paths),
-                replaced))
+                (*known.kind, *kinds), known.log_w + len(paths) * self._log_prior,
+                range(len(known.kind), len(known.kind) + len(paths)), replaced))
         return starts
-
-    def _sensors_at_start(self) -> FloatArray:
-        """Prior covariance of the sensor states, as at the start of a track."""
-        observation, std = self._filter.observation, self._vehicles.background_std
-        return block_diag(*observation.own_covariance,
-                          std**2 * np.eye(3 * len(observation.positions)))
-
-    def _refine_starts(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
-        """Refine the paths of the starts; return the starts about as probable as the best one."""
-        _, _, log_w, paths = self._run_starts(starts)
-        order = np.argsort(-log_w, kind='stable')[:MAX_EXPLANATIONS]
-        return [replace(starts[k], path=paths[k]) for k in order.tolist()
-                if log_w[k] >= log_w.max() - MAX_LOSS_NATS]
 
     def _add_turning_starts(self, starts: Sequence[WindowStart]) -> list[WindowStart]:
         """Return the starts and copies of them, in each of which one new vehicle turns."""
         out = []
         for start in starts:
             turning = [P for P in (self._vehicles.turning(start.x, start.P, i)
-                                   for i in start.new_indices) if P is not None]
-            out.append(replace(start, log_w=start.log_w + float(np.log(1.0 - TURN_SHARE))
-                               if turning else start.log_w))
+                                   for i in start.new) if P is not None]
+            out.append(start if not turning else replace(
+                start, log_w=start.log_w + float(np.log(1.0 - TURN_SHARE))))
             out += [replace(start, P=P, log_w=start.log_w + float(
                 np.log(TURN_SHARE / len(turning)))) for P in turning]
         return out
@@ -273,57 +260,29 @@ class NewTargetSearch:
         Returns the bank at the last frame, log-likelihoods (n,), log-weights (n,) and paths
         (n, n_frames, n_x).
         """
-        window, n = self._window, len(starts)
+        n = len(starts)
         bank = FilterBank(
             np.array([s.x for s in starts]), np.array([s.P for s in starts]), np.zeros(n),
             labels_of([s.label for s in starts]), labels_of([s.kind for s in starts]), np.arange(n),
             np.full((n, len(self._vehicles.network)), np.nan))
         paths = np.array([s.path for s in starts])
-        path_result = self._filter_of(len(starts[0].kind)).run_along(
-            bank, window.frames, window.intervals, paths, passes=PASSES, step=STEP,
-            first_is_updated=window.is_updated)
-        is_usable: BoolArray = np.isfinite(path_result.log_likelihood) \
-            & np.isfinite(paths).all(axis=(1, 2)) & np.isfinite(bank.x).all(axis=1) \
+        log_likelihood = self._run_along(bank, paths, len(starts[0].kind))
+        is_usable: BoolArray = np.isfinite(log_likelihood) & np.isfinite(bank.x).all(axis=1) \
             & [self._are_plausible(s, x) for s, x in zip(starts, bank.x, strict=True)]
-        log_likelihood = np.where(is_usable, path_result.log_likelihood, -np.inf)
+        log_likelihood = np.where(is_usable, log_likelihood, -np.inf)
         log_w = log_likelihood + [s.log_w for s in starts] - 0.5 * np.square(
             [overlap_depth(path, self._n_one, len(s.kind), self._vehicles.length_column) / DEPTH_STD
              for s, path in zip(starts, paths, strict=True)])
         return bank, log_likelihood, log_w, paths
 
     def _are_plausible(self, start: WindowStart, x: FloatArray) -> bool:
-        """Whether the new vehicles in the state `x` (n_x,) have plausible speeds and moments.
-
-        A stationary vehicle cannot have arrived during the window.
-        """
+        """Whether the new vehicles in the state `x` (n_x,) have plausible speeds and moments; a
+        stationary vehicle cannot have arrived during the window."""
         settings, n = self._vehicles.settings, self._n_one
-        for i in start.new_indices:
+        for i in start.new:
             speed = np.hypot(*x[i * n + 3:i * n + 5])
             moment = np.linalg.norm(self._vehicles.hard_moments(x[i * n:]).sum(axis=0))
             if not self._search.prior.min_speed <= speed <= MAX_RATIO * max(settings.speeds) \
                     or moment > MAX_RATIO * max(kind.moment for kind in settings.kinds):
                 return False
         return True
-
-    def _joint_of(self, starts: Sequence[WindowStart], bank: FilterBank, log_likelihood: FloatArray,
-                  log_w: FloatArray, paths: FloatArray, log_odds: float) -> JointExplanation | None:
-        """`JointExplanation` of the usable starts; None if no start is usable."""
-        rows = np.flatnonzero(np.isfinite(log_w))
-        if not len(rows):
-            return None
-        n = len(rows)
-        anchor = FilterBank(
-            np.array([starts[k].x for k in rows]), np.array([starts[k].P for k in rows]),
-            np.full(n, -np.log(n)), bank.label[rows], bank.kind[rows], np.arange(n), bank.nis[rows])
-        latest = FilterBank(bank.x[rows], bank.P[rows], log_w[rows] - log_sum_exp(log_w[rows]),
-                            anchor.label.copy(), anchor.kind.copy(), np.arange(n), bank.nis[rows])
-        n_frames = len(self._window.frames)
-        per_frame = log_likelihood[rows] / n_frames
-        window = Window(anchor, self._window.is_updated, self._window.frames,
-                        self._window.intervals,
-                        [np.ascontiguousarray(paths[rows, k]) for k in range(n_frames)],
-                        [per_frame.copy() for _ in range(n_frames)],
-                        float(log_sum_exp(log_w[rows])), self._window.max_hypotheses)
-        n_targets = len(starts[0].kind)
-        return JointExplanation(latest, window, self._filter_of(n_targets), log_odds,
-                                starts[0].replaced, n_targets > self._n_targets)

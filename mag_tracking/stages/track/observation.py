@@ -12,7 +12,6 @@ from mag_tracking.physics.sources import SourceModel
 MAX_ROTATION = np.deg2rad(15.0)
 """[rad] Maximum standard deviation of a mounting angle. Larger values are reduced to this maximum,
 because rotations are approximated to first order. `TrackManager` counts the affected sensors."""
-
 TIME_RESOLUTION_S = 1e-3
 """[s] Resolution of sampling times. At 20 m/s, a target moves two centimetres in this time."""
 
@@ -33,16 +32,13 @@ class Observation:
 
     The state begins with the states of `n_targets` targets of one model, one after the other; the
     fields of the targets are added. The states of each sensor follow: three mounting angles [rad]
-    if they are estimated, and three model errors in units of their std if `error_time` is not 0.
-    The backgrounds of all sensors [T] come last, as described in `inference/hypothesis.hpp`.
+    unless `mounting_std` [rad], which applies to sensors without `orientation_std`, is 0, and three
+    model errors in units of their std unless `error_time` is 0. The backgrounds of all sensors [T]
+    come last, as described in `inference/hypothesis.hpp`.
 
     The model errors represent the field that the target model neglects near a vehicle. They are
     first-order Gauss-Markov processes with the correlation time `error_time` [s], so that their
-    weight does not depend on the frame period. If `error_time` is 0, the error is independent noise
-    in every frame.
-
-    `mounting_std` [rad] applies to sensors without `orientation_std`; if it is 0, the mounting
-    angles of no sensor are estimated.
+    weight does not depend on the frame period; if it is 0, they are noise in every frame.
 
     Attributes
     ----------
@@ -89,48 +85,30 @@ class Observation:
         return self.n_target + (self.n_own + 3) * n_sensors
 
     def own(self, x: FloatArray) -> FloatArray:
-        """Mounting angles and model errors (..., n_sensors, n_own) of each sensor, from states
-        (..., n_x)."""
+        """Mounting angles and model errors (..., n_sensors, n_own) of states (..., n_x), a view."""
         n = len(self.positions)
         own = x[..., self.n_target:x.shape[-1] - 3 * n]
         return own.reshape(*own.shape[:-1], n, self.n_own)
 
     def angles(self, x: FloatArray) -> FloatArray:
-        """Mounting angles (..., n_sensors, 3) from states (..., n_x), rad; (..., 0, 3) if not
-        estimated."""
+        """Mounting angles (..., n_sensors, 3) of states (..., n_x), rad; none if not estimated."""
         return self.own(x)[..., :3] if self.n_angles else np.zeros((*x.shape[:-1], 0, 3))
 
     def angle_covariances(self, P: FloatArray) -> FloatArray:
-        """Covariances (n_sensors, 3, 3) of the mounting angles, rad²; (0, 3, 3) if not
-        estimated."""
+        """Covariances (n_sensors, 3, 3) of the mounting angles, rad²; none if not estimated."""
         first = self.n_target + self.n_own * np.arange(len(self.positions))
         rows = first[:, None] + np.arange(3)
         return P[rows[:, :, None], rows[:, None, :]] if self.n_angles else np.zeros((0, 3, 3))
 
-    def without_errors(self, x: FloatArray) -> FloatArray:
-        """Copy of states (n_hyp, n_x) with the model errors set to zero."""
-        x = x.copy()
-        self.own(x)[..., self.n_angles:] = 0.0
-        return x
-
     def distance_to_nearest(self, x: FloatArray) -> FloatArray:
         """Smallest distance (n_hyp,) between a target and a sensor, m."""
-        distances = np.linalg.norm(self.target_positions(x)[:, :, None] - self.positions, axis=3)
-        nearest: FloatArray = distances.min(axis=(1, 2))
+        targets = x[:, :self.n_target].reshape(len(x), self.n_targets, self.n_one)[:, :, None, :3]
+        nearest: FloatArray = np.linalg.norm(targets - self.positions, axis=3).min(axis=(1, 2))
         return nearest
-
-    def target_positions(self, x: FloatArray) -> FloatArray:
-        """Positions (n_hyp, n_targets, 3) of the targets, m, world frame."""
-        positions: FloatArray = x[:, :self.n_target].reshape(
-            len(x), self.n_targets, self.n_one)[:, :, :3]
-        return positions
 
     def drift(self, dt: FloatArray, background_density: float) -> tuple[FloatArray, FloatArray]:
         """Decay factor and added variance of the sensor states over intervals `dt` (...) [s], both
-        (..., (n_own + 3) n_sensors).
-
-        `background_density` [T/s^0.5] is the random walk of each background.
-        """
+        (..., (n_own + 3) n_sensors), with a random walk of `background_density` [T/s^0.5]."""
         decay = np.exp(-np.abs(dt) / self._error_time) if self._error_time else np.ones(dt.shape)
         variance: FloatArray = np.multiply.outer(1.0 - decay**2, self._is_error) \
             + np.multiply.outer(background_density**2 * np.maximum(dt, 0.0), self._is_background)
@@ -138,14 +116,10 @@ class Observation:
 
     def target_fields(self, x: FloatArray, time_offset: FloatArray, near_field_length: FloatArray
                       ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Target fields at the sampling time of each sensor, without mounting and model errors.
-
-        The fields (n_hyp, n_sensors, 3) [T] are in the sensor frame; their derivatives
-        (n_hyp, n_sensors, 3, n_target) are with respect to the states of the targets. The variance
-        (n_hyp, n_sensors) [T²] is that of the model error near the targets; the errors of different
-        targets are independent. `near_field_length` (n_hyp, n_targets) [m] scales it with the field
-        gradient.
-        """
+        """Target fields (n_hyp, n_sensors, 3) [T] in the sensor frame at the sampling time of each
+        sensor, without mounting and model errors, their derivatives
+        (n_hyp, n_sensors, 3, n_target), and the variance (n_hyp, n_sensors) [T²] of the model error
+        near the targets, of the field gradient times `near_field_length` (n_hyp, n_targets) [m]."""
         h, H, gradients = zip(*(
             self._single_target_field(x[:, first:first + self.n_one], time_offset)
             for first in range(0, self.n_target, self.n_one)), strict=True)
@@ -175,7 +149,7 @@ class Observation:
     def field_of(self, x: FloatArray, targets: Iterable[int], time_offset: FloatArray
                  ) -> FloatArray:
         """Field (n_sensors, 3) of selected targets of a state `x` (n_x,), with mounting errors, T,
-        sensor frame, at `time_offset` [s] from the timestamp for each sensor."""
+        sensor frame, at the sampling time of each sensor."""
         n = self.n_one
         h, H = np.zeros((1, *self.positions.shape)), np.zeros((1, *self.positions.shape, 0))
         for target in targets:
@@ -187,17 +161,14 @@ class Observation:
 
     def fields(self, x: FloatArray, time_offset: FloatArray, near_field_length: FloatArray,
                field_error: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fields at the sensors, without the backgrounds.
+        """Fields h (n_hyp, n_sensors, 3) [T] in the sensor frame, without the backgrounds, their
+        derivatives H (n_hyp, n_sensors, 3, n_target + n_own), and the variance (n_hyp, n_sensors)
+        of the model error [T²], 0 if the model errors are states.
 
-        The fields h (n_hyp, n_sensors, 3) [T] are in the sensor frame; the derivatives H
-        (n_hyp, n_sensors, 3, n_target + n_own) are with respect to the states of the targets and of
-        the sensor. The variance (n_hyp, n_sensors) of the model error [T²] is 0 if the model errors
-        are states. `field_error` is the model error relative to the field, and `near_field_length`
-        (n_hyp, n_targets) [m] relative to the field gradient.
-
-        H neglects that the std of the model error depends on the state. This dependence is a few
-        per cent of the derivative where the error is large. The std follows [ICASSP11]_ eq. (9),
-        which treats the error as noise.
+        `field_error` is the model error relative to the field, and `near_field_length`
+        (n_hyp, n_targets) [m] relative to the field gradient, as in [ICASSP11]_ eq. (9), which
+        treats the error as noise. H neglects that the std of the model error depends on the state:
+        a few per cent of the derivative where the error is large.
         """
         h, H, variance = self.target_fields(x, time_offset, near_field_length)
         variance = variance + _proportional_variance(h, field_error)
@@ -213,11 +184,8 @@ class Observation:
 
     def model_error(self, x: FloatArray, near_field_length: FloatArray, field_error: float
                     ) -> FloatArray:
-        """Variance (n_sensors,) of the model error on each axis for one state `x` (n_x,), T²; NaN
-        if a dipole is at a sensor.
-
-        `field_error` and `near_field_length` (n_targets,) are as for `fields`.
-        """
+        """Variance (n_sensors,) of the model error on each axis for one state `x` (n_x,), T², with
+        parameters as for `fields`; NaN if a dipole is at a sensor."""
         h, _, variance = self.target_fields(x[None], np.zeros(len(self.positions)),
                                             near_field_length[None])
         return np.asarray(variance[0] + _proportional_variance(h, field_error)[0])

@@ -1,38 +1,53 @@
-"""Plausibility of the state of a vehicle: mounting, height, road and speed."""
+"""Plausibility of a vehicle: its approach, its states, and the rate of its readings."""
 
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-from mag_tracking.arrays import BoolArray, FloatArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.calibration.level_change import growth_of
+from mag_tracking.inference.covariances import whitened_energy
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
+from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.initiation_vehicle import LATERAL_STD, VehicleSettings
 from mag_tracking.stages.track.observation import Observation
+from mag_tracking.stages.track.settings import TrackSettings
+from mag_tracking.units import NEVER, NS
 
-P_MOUNTING = 0.05
-"""Probability that the estimated mounting angles of correctly mounted sensors are flagged."""
-
-P_HEIGHT = 1e-3
-"""Probability that the height of a vehicle is flagged, although it follows the distribution of its
-kind."""
-
+P_MOUNTING, P_HEIGHT = 0.05, 1e-3
+"""Probabilities that the mounting angles of correctly mounted sensors, and the height of a vehicle
+of its kind, are flagged."""
 LANE_STDS, LANE_STDS_LATER = 1.645, 3.0
 """Maximum distance of a vehicle from the outermost configured lane, in standard deviations: at its
-closest point to any sensor, and at later times, when it may have turned off. One in twenty vehicles
-on that lane exceeds the first limit."""
-
+closest point to any sensor, which one in twenty vehicles on that lane exceeds, and later, when it
+may have turned off."""
 MAX_ONE_SIDED_WIDTH = 2.0
-"""[m] Maximum lateral extent of sensors that are assumed to stand on one side of a road, because no
-lane fits between them."""
-
+"""[m] Maximum lateral extent of sensors on one side of a road: no lane fits between them."""
 MIN_SPEED = 1.0
 """[m/s] Minimum speed of a vehicle at which its heading is defined."""
-
 MAX_RELATIVE_MOVE = 0.75
-"""Maximum motion of a target within a frame, relative to its distance to the second nearest sensor.
-Fields are averaged over the frame, with a relative error of about half the square of this ratio.
-The nearest sensor is ignored, because the error of a single sensor does not mislead a track."""
+"""Maximum motion of a target within a frame, relative to its distance to the second nearest sensor,
+because the error of a single sensor does not mislead a track. The relative error of the average
+over the frame is about half the square of this ratio."""
+SENSED_LEVEL, GROWTH_RATIO = 2.5, 10.0
+"""RMS of the whitened field above which the target counts as sensed, and ratio of the highest level
+in the approach test to this one."""
+MIN_LOG2_RATIO = -0.25
+"""Minimum log2 ratio of the durations of the first and the second half of the growth. In theory it
+is 0.55 for an approach at constant speed, -0.83 for a start from rest next to a sensor, and near 0
+for a sudden jump of the field."""
+FALL_FRACTION = 0.85
+"""Fraction of its previous maximum below which the field of a sensed target falls if the target has
+passed its first sensor, which passes the test."""
+LEVEL_TIME_STD, MAX_FRAMES = 0.5, 1000
+"""Uncertainty of the time at which the field reached a level, in frame periods, and number of
+frames after which the test is skipped if the field has not grown enough."""
+N_INTERVALS, MIN_INTERVALS = 8, 2
+"""Number of latest intervals of a sensor, most of which are too long if it is slow, and minimum
+number of these; single lost readings do not matter."""
+N_PATHS = 41
+"""Number of paths between the outermost lanes that are compared."""
 
 
 class Plausibility:
@@ -49,25 +64,19 @@ class Plausibility:
         """Update the closest approach of all hypotheses; return the doubts about the published
         hypothesis `best`, in a frame of duration `dt` [s].
 
-        `mounting_std` [rad] is the minimum std of the mounting angles. It also applies to
-        accurately mounted sensors, because a model error also rotates the field.
+        `mounting_std` [rad] is the minimum std of the mounting angles of all sensors, because a
+        model error also rotates the field.
         """
-        x, kind = bank.x[best], int(bank.kind[best])
-        self._update_road_check(bank, settings, observation.positions)
-        reasons = set()
-        if _needs_rotated_sensors(observation, x, mounting_std):
-            reasons.add(doubts.SENSORS_ROTATED)
-        height_error = abs(float(x[2]) - settings.kinds[kind].height)
-        if height_error > -ndtri(P_HEIGHT / 2.0) * settings.kinds[kind].height_std:
-            reasons.add(doubts.HEIGHT)
-        if x[2] < 0.0 < settings.kinds[kind].height:
-            reasons.add(doubts.BELOW_SENSORS)
-        if self._was_off_road[bank.origin[best]] or _is_off_road(
-                x[None], settings, observation.positions, LANE_STDS_LATER)[0]:
-            reasons.add(doubts.OFF_THE_ROAD)
-        if moves_too_far(x[:3], x[3:6], dt, observation.positions):
-            reasons.add(doubts.FRAMES_TOO_LONG)
-        return reasons
+        x, kind, positions = bank.x[best], settings.kinds[bank.kind[best]], observation.positions
+        self._update_road_check(bank, settings, positions)
+        return doubts.applying({
+            doubts.SENSORS_ROTATED: _needs_rotated_sensors(observation, x, mounting_std),
+            doubts.HEIGHT:
+                abs(float(x[2]) - kind.height) > -ndtri(P_HEIGHT / 2.0) * kind.height_std,
+            doubts.BELOW_SENSORS: x[2] < 0.0 < kind.height,
+            doubts.OFF_THE_ROAD: self._was_off_road[bank.origin[best]]
+            or _is_off_road(x[None], settings, positions, LANE_STDS_LATER)[0],
+            doubts.FRAMES_TOO_LONG: moves_too_far(x[:3], x[3:6], dt, positions)})
 
     def _update_road_check(self, bank: FilterBank, settings: VehicleSettings,
                            positions: FloatArray) -> None:
@@ -89,12 +98,8 @@ def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray
     """Whether states (n, n_x) pass all sensors (n_sensors, 3) on one side, beyond the lanes.
 
     The distance of such a vehicle is hardly observable: a train on another line resembles a truck
-    nearby, and a truck beyond a sensor resembles a car on the near side of a sensor with an
-    inverted axis.
-
-    Lanes are on both sides of the centre of the network. A network that extends beyond the road
-    covers an area. A vehicle may then be as far outside the outermost sensors as a lane is from the
-    centre.
+    nearby. Lanes are on both sides of the centre of the network. In a network that extends beyond
+    the road, a vehicle may be as far outside the outermost sensors as a lane is from the centre.
     """
     speed = np.maximum(np.hypot(x[:, 3], x[:, 4]), MIN_SPEED)
     offsets = positions[:, :2, None] - x[:, :2].T
@@ -109,11 +114,8 @@ def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray
 
 
 def lane_note(settings: VehicleSettings, network: SensorNetwork) -> str | None:
-    """Explanation of which lanes are covered if the sensors stand on one side of the road.
-
-    None for one sensor, for a compact network, and unless the sensors are in a line along most of
-    the arrival directions.
-    """
+    """Explanation of which lanes are covered if the sensors are in a line along most of the arrival
+    directions, else None; also None for one sensor and for a compact network."""
     headings = np.deg2rad(settings.arrival_headings_deg)
     across = np.array([-np.sin(headings), np.cos(headings)])
     is_one_sided = np.ptp(network.positions[:, :2] @ across, axis=0) < MAX_ONE_SIDED_WIDTH
@@ -149,3 +151,114 @@ def _needs_rotated_sensors(observation: Observation, x: FloatArray, mounting_std
     variance = np.einsum('jii->ji', observation.own_covariance[:, :3, :3])
     squared_norm = float((angles**2 / np.maximum(variance, mounting_std**2)).sum())
     return bool(squared_norm > chdtri(angles.size, P_MOUNTING))
+
+
+class Approach:
+    """Approach test on the first frames of a track, until the field has grown by `GROWTH_RATIO`."""
+
+    def __init__(self) -> None:
+        self._times: list[float] = []
+        self._levels: list[float] = []
+        self._is_open = True
+
+    def add(self, frame: FieldFrame) -> bool:
+        """Add a frame, and return whether it completes the test and the test fails."""
+        if not self._is_open:
+            return False
+        self._times.append(frame.stamp_ns / NS)
+        energy, n_axes = whitened_energy(frame.field, frame.covariance)
+        # The RMS of pure noise is 1; smaller values carry no information.
+        self._levels.append(float(np.sqrt(max(energy.sum() / max(n_axes.sum(), 1), 1.0))))
+        self._is_open = self._levels[-1] <= GROWTH_RATIO * SENSED_LEVEL \
+            and len(self._levels) < MAX_FRAMES
+        if self._is_open:
+            return False
+        time, levels = np.array(self._times), np.array(self._levels)
+        growth = growth_of(time, levels, SENSED_LEVEL, GROWTH_RATIO * SENSED_LEVEL)
+        # If the field falls before it reaches the highest level, the target has passed its first
+        # sensor.
+        is_falling = levels < FALL_FRACTION * np.maximum.accumulate(levels)
+        if growth is None or (is_falling & (levels > SENSED_LEVEL)).any():
+            return False
+        std = LEVEL_TIME_STD * float(np.median(np.diff(time)))
+        return bool(np.log2((growth.early + std) / (growth.late + std)) < MIN_LOG2_RATIO)
+
+
+def typical_speed(settings: TrackSettings) -> float:
+    """Median of the initial speeds of a vehicle, m/s."""
+    return float(np.median(settings.vehicle.speeds))
+
+
+def required_rate(network: SensorNetwork, settings: TrackSettings) -> float:
+    """Minimum rate of readings that shows the pass of a vehicle, Hz; 0 for a magnet, which may be
+    at rest.
+
+    Between two readings, a vehicle at `typical_speed` must not move further than
+    `MAX_RELATIVE_MOVE` times its distance d from the nearest sensor: the spectrum of its field
+    decreases like exp(-2 pi f d / v). The distance is that of the path between the outermost lanes
+    that keeps furthest from all sensors, plus `LATERAL_STD`: a lower rate is too low in every lane.
+    """
+    if settings.target != 'vehicle':
+        return 0.0
+    vehicle = settings.vehicle
+    offsets = np.linspace(min(vehicle.lateral_offsets), max(vehicle.lateral_offsets), N_PATHS)
+    relative = network.positions - network.positions.mean(axis=0)
+    z = network.positions[:, 2] - min(kind.height for kind in vehicle.kinds)
+    distances = []
+    for heading in np.deg2rad(vehicle.arrival_headings_deg):
+        lateral = np.cos(heading) * relative[:, 1] - np.sin(heading) * relative[:, 0]
+        nearest = np.hypot(lateral - offsets[:, None], z).min(axis=1)
+        distances.append(np.hypot(nearest.max(), LATERAL_STD))
+    return typical_speed(settings) / (MAX_RELATIVE_MOVE * float(np.median(distances)))
+
+
+def low_rate_fault(rate: float, network: SensorNetwork, settings: TrackSettings) -> str | None:
+    """Message about a rate [Hz] that is too low for tracks; None if sufficient or unknown (NaN)."""
+    required = required_rate(network, settings)
+    if not rate < required:
+        return None
+    speed = typical_speed(settings)
+    return (f'{rate:.3g} Hz is too slow: a car moves {speed / rate:.3g} m between readings (at '
+            f'{speed:g} m/s); at least {np.ceil(10.0 * required) / 10.0:g} Hz are needed for '
+            'tracks')
+
+
+class SampleRates:
+    """Rates of the sensors, from the frames in which they have samples."""
+
+    def __init__(self, network: SensorNetwork, settings: TrackSettings) -> None:
+        required = required_rate(network, settings)
+        self._max_interval_s = 1.0 / required if required else np.inf
+        n = len(network)
+        self._last_ns: IntArray = np.full(n, NEVER, dtype=np.int64)
+        self._intervals_s: FloatArray = np.zeros((n, N_INTERVALS))
+        self._next = np.zeros(n, dtype=np.int64)
+        # Whether all stored intervals of all sensors are short; latest frame with all sensors.
+        self._are_short, self._complete_ns = False, NEVER
+
+    def add(self, frame: FieldFrame, first: int = 0) -> None:
+        """Update the rates with a frame whose first sensor has the index `first` in the network."""
+        is_complete = len(frame.n_samples) == len(self._last_ns) and bool(frame.n_samples.all())
+        interval_ns, self._complete_ns = frame.stamp_ns - self._complete_ns, \
+            frame.stamp_ns if is_complete else NEVER
+        if self._are_short and is_complete and 0 < interval_ns <= self._max_interval_s * NS:
+            # Another short interval of each sensor changes nothing.
+            self._last_ns[:] = frame.stamp_ns
+            return
+        measuring = np.flatnonzero(frame.n_samples)
+        rows = measuring + first
+        interval_s = (frame.stamp_ns - self._last_ns[rows]) / NS / frame.n_samples[measuring]
+        is_known = (self._last_ns[rows] != NEVER) & (interval_s > 0.0)
+        self._last_ns[rows] = frame.stamp_ns
+        rows, interval_s = rows[is_known], interval_s[is_known]
+        self._intervals_s[rows, self._next[rows] % N_INTERVALS] = interval_s
+        self._next[rows] += 1
+        self._are_short = bool((self._next >= N_INTERVALS).all()
+                               and (self._intervals_s <= self._max_interval_s).all())
+
+    def are_slow(self) -> BoolArray:
+        """Whether most of the latest intervals of each sensor are too long, (n_sensors,)."""
+        n_long = np.count_nonzero(self._intervals_s > self._max_interval_s, axis=1)
+        n_known = np.minimum(self._next, N_INTERVALS)
+        are_slow: BoolArray = (n_long >= MIN_INTERVALS) & (2 * n_long > n_known)
+        return are_slow

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias, TypedDict
+from typing import TypeAlias, TypedDict
 
 import numpy as np
 
@@ -19,63 +19,78 @@ from mag_tracking.physics.bounds import are_possible
 from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import Hypotheses, PoseUncertainty, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
+from mag_tracking.stages.track.initiation_vehicle import MAX_CAR_ROW
+from mag_tracking.stages.track.sensor_selection import offset_from_nearest
 from mag_tracking.stages.track.settings import BEST, MIXTURE
-from mag_tracking.stages.track.unobserved_length import UnobservedLength
 
+MIN_SPEED_STDS = 3.0
+"""A vehicle has a heading if its speed exceeds this number of standard deviations."""
 UNOBSERVED_VARIANCE = np.pi**2
 """[rad^2] Variance of an angle that is not observable from the field."""
-
-NEGLIGIBLE_WEIGHT = 1e-6
-"""Weight relative to the heaviest hypothesis below which a hypothesis is excluded from
-covariances."""
-
-AMBIGUOUS_WEIGHT = 0.05
-"""A track is ambiguous if the total weight of the hypotheses at other positions, or with other
-arrival directions, exceeds this value."""
-
-
+NEGLIGIBLE_WEIGHT, AMBIGUOUS_WEIGHT = 1e-6, 0.05
+"""Weight relative to the heaviest hypothesis below which a hypothesis is excluded from covariances,
+and total weight of the hypotheses at other positions, or with other arrival directions, above which
+a track is ambiguous."""
 Flags: TypeAlias = tuple[bool, bool, bool]
 """Whether the rotation about the x, y and z axis of the body is unobservable."""
-
 OrientationEstimate: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, Flags]
-"""Quaternion, derivative, variance of the unobservable part, and flags; see `Orientation`."""
+"""Quaternion (4,), derivative (3, n_t) of the small rotation about the world axes with respect to
+the target state, variance (3, 3) [rad²] of the unobservable part, to be added, and flags."""
 
 
-class Orientation(Protocol):
-    """Interface that computes an orientation from a target state."""
+class UnobservedLength:
+    """Uncertainty of the middle of a vehicle due to the part that no sensor has observed yet.
 
-    def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
-        """Orientation of one state.
+    Until its rear has passed a sensor, an apparent car may be the engine of a truck; both models
+    are too inaccurate for a reliable comparison. The iron of a long vehicle is at its engine, axles
+    and load, so the row of dipoles is shorter than the vehicle. Until the rear has been observed,
+    the rest is assumed to be behind the row; afterwards, the middle is uniformly distributed
+    between the cases that it is at either end.
 
-        Parameters
-        ----------
-        x : (n_t,) array
-            Target state that begins with position and velocity.
-        P : (n_t, n_t) array
-            Covariance of the state.
+    All kinds of vehicle, with `lengths` and `length_stds` in m, are equally frequent.
+    """
 
-        Returns
-        -------
-        q : (4,) array, xyzw
-        T : (3, n_t) array
-            Derivative of the small rotation about the world axes with respect to the state.
-        unobserved : (3, 3) array, rad^2
-            Variance of the unobservable part, to be added.
-        flags : (3,) tuple of bool
-            Whether the rotation about the x, y and z axis of the body is unobservable.
-        """
+    def __init__(self, lengths: Sequence[float], length_stds: Sequence[float]) -> None:
+        self._lengths, self._stds = np.array(lengths), np.array(length_stds)
+        self._forward: FloatArray = np.zeros(2)
+        self._distance_travelled = -np.inf
+        self._last_position: FloatArray = np.zeros(2)
 
-    def quaternions(self, x: FloatArray) -> FloatArray:
-        """Quaternions of several states.
+    def update(self, x: FloatArray, P: FloatArray, positions: FloatArray, is_certain: bool) -> None:
+        """Update the direction of travel and, if the position is certain (unambiguous), the
+        distance travelled, with a target state `x` (n_t,) and the `positions` (n_sensors, 3) of the
+        sensors that measured."""
+        self._forward = self._direction(x, P)
+        if not is_certain or not len(positions):
+            return
+        if self._distance_travelled > 0.0:
+            # After the first sensor, the distance along the path is also valid in a turn.
+            self._distance_travelled += float(np.linalg.norm(x[:2] - self._last_position))
+        else:
+            self._distance_travelled = float(offset_from_nearest(x[:2], positions) @ self._forward)
+        self._last_position = x[:2].copy()
 
-        Parameters
-        ----------
-        x : (n, n_t) array
+    def covariance(self, x: FloatArray, P: FloatArray, length: float, kind: int) -> FloatArray:
+        """Covariance (2, 2) of the middle, to be added to that of the horizontal position, m², for
+        a row of dipoles of a given length [m]."""
+        half_hidden = 0.5 * (self._lengths - length)
+        second_moment = np.maximum(half_hidden, 0.0)**2 + 0.25 * self._stds**2
+        # A longer vehicle would have been observed once its middle has passed a sensor.
+        is_possible = ((self._lengths > self._lengths[kind]) & (half_hidden > 0.0)
+                       & (self._distance_travelled < half_hidden))
+        variance = second_moment[is_possible].sum() / len(self._lengths)
+        if self._lengths[kind] > MAX_CAR_ROW:
+            is_sensed = self._distance_travelled >= half_hidden[kind]
+            variance += second_moment[kind] / (3.0 if is_sensed else 1.0)
+        forward = self._direction(x, P)
+        covariance: FloatArray = variance * np.outer(forward, forward)
+        return covariance
 
-        Returns
-        -------
-        (n, 4) array
-        """
+    def _direction(self, x: FloatArray, P: FloatArray) -> FloatArray:
+        """Unit vector (2,) of the motion; the previous one if the target hardly moves."""
+        speed = float(np.hypot(x[3], x[4]))
+        is_moving = speed > MIN_SPEED_STDS * np.sqrt(max(0.0, P[3, 3] + P[4, 4]))
+        return x[3:5] / speed if is_moving else self._forward
 
 
 class PoseFields(TypedDict):
@@ -97,7 +112,7 @@ class VehicleOrientation:
     """Orientation along the velocity; roll and pitch are unobservable."""
 
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
-        """Orientation of one state, as for `Orientation`."""
+        """Orientation of a target state `x` (n_t,) with covariance `P` (n_t, n_t)."""
         squared_speed = x[3] ** 2 + x[4] ** 2
         T = np.zeros((3, len(x)))
         if squared_speed > 0.0:
@@ -118,11 +133,11 @@ class MagnetOrientation:
     """Orientation along the moment; the rotation about the moment is unobservable."""
 
     axis: FloatArray
-    """(3,) Direction of the moment in the frame of the magnet. The flag of the unobservable
-    rotation is set for the body axis nearest to it."""
+    """(3,) Direction of the moment in the frame of the magnet; the rotation about the body axis
+    nearest to it is flagged as unobservable."""
 
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
-        """Orientation of one state, as for `VehicleOrientation`."""
+        """Orientation of a target state `x` (n_t,)."""
         m = x[6:9]
         squared_norm = m @ m
         T = np.zeros((3, len(x)))
@@ -138,6 +153,10 @@ class MagnetOrientation:
         return np.array([quaternion_between(self.axis, m) for m in x[:, 6:9]])
 
 
+Orientation: TypeAlias = VehicleOrientation | MagnetOrientation
+"""Function that computes the orientation from a target state."""
+
+
 def published_track(bank: FilterBank, best: int, model: SourceModel, orientation: Orientation,
                     arrivals: Sequence[str], kinds: Sequence[str], found: Set[str],
                     unobserved_length: UnobservedLength | None, *, excess: float = 1.0,
@@ -148,16 +167,10 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     """Track record of hypothesis `best` of a bank; the keyword parameters from `stamp_ns` are
     entries of `Track`.
 
-    Parameters
-    ----------
-    arrivals : name of the arrival direction for each label
-    kinds : name of each kind of target
-    found : doubts about the pose, without the ambiguities of the bank
-    unobserved_length : uncertainty of the middle of a vehicle; None for a magnet
-    excess : ratio of the actual to the expected variance of the innovations, by which the
-        covariance is multiplied
-    difference : (6,) array, difference from another possible position and velocity, which the
-        covariance must cover, m and m/s
+    `arrivals` and `kinds` are the names for each label and kind, and `found` the doubts about the
+    pose without the ambiguities of the bank. The covariance is multiplied by `excess`, the ratio of
+    the actual to the expected variance of the innovations, and covers the `difference` (6,) [m,
+    m/s] from another possible position and velocity.
     """
     n_t = len(model.state_names)
     is_separated = bank.is_separated(best)
@@ -165,7 +178,9 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     fields, flags = _pose_fields(model, orientation, bank.x[best, :n_t], excess * P,
                                  int(bank.kind[best]), unobserved_length, difference)
     reasons = doubts.ordered({*found, *ambiguities(bank, best, is_separated)})
-    uncertainty: PoseUncertainty | None = pose_uncertainty(fields)
+    uncertainty: PoseUncertainty | None = PoseUncertainty(
+        fields['covariance'], fields['orientation_covariance'],
+        fields['position_orientation_covariance'])
     if reasons and ambiguous_poses != BEST:
         uncertainty = mixture_uncertainty(
             bank, best, is_separated, model, orientation, fields, P, excess) \
@@ -194,12 +209,8 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
 def covariance_about(bank: FilterBank, best: int, model: SourceModel, is_separated: BoolArray
                      ) -> FloatArray:
     """Covariance (n_t, n_t) about the state of hypothesis `best`, from all hypotheses at the same
-    position.
-
-    Hypotheses at the same position differ in linearisation, kind of target and motion; these
-    differences are part of the error. Hypotheses at other positions (`is_separated`) make the track
-    ambiguous instead.
-    """
+    position, which differ in linearisation, kind and motion; hypotheses at other positions
+    (`is_separated`) make the track ambiguous instead."""
     return _second_moment(bank, best, model, np.where(is_separated, -np.inf, bank.log_w))
 
 
@@ -220,12 +231,11 @@ def _second_moment(bank: FilterBank, best: int, model: SourceModel,
 
 def mixture_uncertainty(bank: FilterBank, best: int, is_separated: BoolArray, model: SourceModel,
                         orientation: Orientation, published: PoseFields, P_unwidened: FloatArray,
-                        excess: float = 1.0) -> PoseUncertainty:
+                        excess: float) -> PoseUncertainty:
     """Uncertainty of a pose if any of the hypotheses may be correct.
 
     `published` is the pose from the hypotheses at the same position as `best`, with a wider
-    covariance than `P_unwidened`, the result of `covariance_about`. `is_separated` is that of
-    `FilterBank`, and `excess` that of `published_track`.
+    covariance than `P_unwidened`, the result of `covariance_about`.
     """
     n_t = len(model.state_names)
     widening = published['covariance'] - excess * P_unwidened[:6, :6]
@@ -247,21 +257,12 @@ def mixture_uncertainty(bank: FilterBank, best: int, is_separated: BoolArray, mo
         + np.einsum('n,ni,nj->ij', weight, displacement, rotations))
 
 
-def pose_uncertainty(fields: PoseFields) -> PoseUncertainty:
-    """Uncertainty of a published pose."""
-    return PoseUncertainty(fields['covariance'], fields['orientation_covariance'],
-                           fields['position_orientation_covariance'])
-
-
 def ambiguities(bank: FilterBank, best: int, is_separated: BoolArray) -> set[str]:
-    """Doubts about the position and the arrival direction of the best hypothesis; `is_separated` is
-    that of `FilterBank`."""
-    reasons = set()
-    if bank.weight(is_separated) > AMBIGUOUS_WEIGHT:
-        reasons.add(doubts.ANOTHER_PLACE)
-    if 1.0 - np.exp(bank.log_w).sum(where=bank.label == bank.label[best]) > AMBIGUOUS_WEIGHT:
-        reasons.add(doubts.ANOTHER_ARRIVAL)
-    return reasons
+    """Doubts about the position and the arrival direction of the best hypothesis."""
+    arrival_weight = np.exp(bank.log_w).sum(where=bank.label == bank.label[best])
+    return doubts.applying({
+        doubts.ANOTHER_PLACE: bank.weight(is_separated) > AMBIGUOUS_WEIGHT,
+        doubts.ANOTHER_ARRIVAL: 1.0 - arrival_weight > AMBIGUOUS_WEIGHT})
 
 
 def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P: FloatArray, *,

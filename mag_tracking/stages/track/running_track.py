@@ -1,8 +1,7 @@
 """A running track: its members, their published poses, and the evidence for and against them.
 
 A track usually has one target. Targets whose fields overlap at the sensors are members of one track
-and share a state. Otherwise, a field could be attributed to the wrong target, and would be missing
-from the evidence for the correct target.
+and share a state, so that no field is attributed to the wrong target.
 
 Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
 """
@@ -18,30 +17,23 @@ from mag_tracking.event_records import Disturbance
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.bank_filter import BankFilter, NoTarget
-from mag_tracking.stages.track.clock_comparison import ClockComparison
-from mag_tracking.stages.track.disturbance_model import DisturbanceModel
-from mag_tracking.stages.track.disturbances import UnexplainedField
+from mag_tracking.stages.track.bank_filter import NEGLIGIBLE_ENERGY, WEAK_ENERGY, NoTarget
+from mag_tracking.stages.track.cross_check import ClockComparison
+from mag_tracking.stages.track.disturbances import DisturbanceModel, UnexplainedField
 from mag_tracking.stages.track.evidence import MIN_OBSERVED_FRACTION, OUT_OF_REACH
-from mag_tracking.stages.track.joint import JointExplanation
-from mag_tracking.stages.track.member import BankUpdate, Member, MemberView, members_in_order
-from mag_tracking.stages.track.new_target_evidence import UNDECIDED_NATS, NewTargetEvidence
+from mag_tracking.stages.track.joint import UNDECIDED_NATS, JointExplanation, NewTargetEvidence
+from mag_tracking.stages.track.member import Member, members_in_order
 from mag_tracking.stages.track.new_target_search import NewTargetSearch
-from mag_tracking.stages.track.reach import NEGLIGIBLE_ENERGY, WEAK_ENERGY, field_energy
 from mag_tracking.stages.track.sensor_selection import SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import TrackState
-from mag_tracking.stages.track.target import Target
 from mag_tracking.stages.track.track_bank import FrameUpdate, TrackBank
-from mag_tracking.stages.track.vehicle_state import VehicleState
+from mag_tracking.stages.track.window_search import VehicleState
 from mag_tracking.units import NS
 
-UNDECIDED_S = 1.0
-"""[s] Duration of the doubt after another explanation was about as probable as the track."""
-
-DOUBTED_S = 3.0
-"""[s] Duration of the doubt about the uncertain vehicles of an accepted explanation."""
-
+UNDECIDED_S, DOUBTED_S = 1.0, 3.0
+"""[s] Duration of the doubt after another explanation was about as probable as the track, and of
+that about the uncertain vehicles of an accepted explanation."""
 BELOW_SENSORS = 'vehicles that appear to pass below the sensors'
 
 TrackRecord = Track | SmoothedPose | Disturbance
@@ -51,8 +43,7 @@ TrackRecord = Track | SmoothedPose | Disturbance
 class RunningTrack:
     """Track of a single target, or of several targets that share a state.
 
-    Event counts of the stage are updated in place. `later_sensors` are used as soon as the bank is
-    small enough.
+    The event counts of the stage are updated in place.
 
     Attributes
     ----------
@@ -61,15 +52,13 @@ class RunningTrack:
     is_lost : whether the last member ended while it was still detected
     """
 
-    def __init__(self, id: int, target: Target, settings: TrackSettings, sensors: SensorSubset,
-                 bank_filter: BankFilter, bank: FilterBank, counts: 'Counter[str]',
-                 clocks: ClockComparison, later_sensors: SensorSubset) -> None:
+    def __init__(self, id: int, bank: TrackBank, counts: 'Counter[str]', clocks: ClockComparison
+                 ) -> None:
         self.counts, self._clocks = counts, clocks
         self.ended: str | None = None
         self.is_lost = False
-        self._target, self._settings = target, settings
-        self._bank = TrackBank(target, settings, sensors, bank_filter, bank, counts, later_sensors)
-        self.members = [Member(id, target, sensors, counts, clocks, 0)]
+        self._bank, self._target, self._settings = bank, bank.target, bank.settings
+        self.members = [Member(id, bank.target, bank.sensors, counts, clocks, 0)]
         self._new_target_evidence = NewTargetEvidence()
         # Whether the track had the maximum number of members at the last search.
         self._is_at_limit = False
@@ -104,40 +93,36 @@ class RunningTrack:
                 member.use(self._bank.sensors)
 
     def flag_doubtful_sensors(self, sensors: Mapping[str, Sequence[int]]) -> None:
-        """Mark the track as doubtful if it uses a sensor with doubtful readings; `sensors` has
-        their indices by reason."""
+        """Mark the track as doubtful if it uses one of the `sensors` with doubtful readings, given
+        as indices by reason."""
         for reason, rows in sensors.items():
             if not np.isin(self._final_sensors.rows, rows).any():
                 continue
             for member in self.members:
                 if reason not in member.evidence.doubts:
                     self.counts[f'tracks with doubtful readings: {reason}'] += 1
-                    member.evidence.flag(reason)
+                    member.evidence.doubts.add(reason)
 
     def begin(self, frame: FieldFrame, recent: list[FieldFrame], approach_unobserved: bool = False
               ) -> list[TrackRecord]:
-        """Process the `recent` frames (oldest first) and the frame of the detection, all with the
-        sensors of the whole network; return the records of the detection frame.
-
-        `approach_unobserved` means that the recent frames do not show the approach of the target.
-        """
-        observed_ns = frame.stamp_ns - recent[0].stamp_ns if recent else 0
-        first = self.members[0]
+        """Process the `recent` frames (oldest first), which do not show the approach of the target
+        if `approach_unobserved`, and the frame of the detection, all of the whole network; return
+        the records of the detection frame."""
+        frames, first = [*recent, frame], self.members[0]
         first.evidence.flag_start(
-            approach_unobserved
-            or observed_ns < MIN_OBSERVED_FRACTION * self._settings.lookback_s * NS,
+            approach_unobserved or frame.stamp_ns - frames[0].stamp_ns
+            < MIN_OBSERVED_FRACTION * self._settings.lookback_s * NS,
             self._final_sensors.full_network, self._target.starts_anywhere)
         first.begin_ns = frame.stamp_ns
-        self._bank.begin(recent[0] if recent else frame, frame)
+        self._bank.begin(frames[0], frame)
         dt = 0.0
-        for before, after in pairwise([*recent, frame]):
+        for before, after in pairwise(frames):
             self.step(before, dt, publish=False)
             dt = (after.stamp_ns - before.stamp_ns) / NS
-        if self.ended is None:
-            before_rows = self._bank.sensors.rows
-            if self._bank.widen(dt):
-                first.cross_check.finish(self._clocks, before_rows)
-                self._use_bank_sensors(True)
+        rows = self._bank.sensors.rows
+        if self.ended is None and self._bank.widen(dt):
+            first.cross_check.finish(self._clocks, rows)
+            self._use_bank_sensors(True)
         return self.step(frame, dt)
 
     def step(self, frame: FieldFrame, dt: float, publish: bool = True) -> list[TrackRecord]:
@@ -148,43 +133,37 @@ class RunningTrack:
         for member in () if self._target.starts_anywhere else self.members:
             member.evidence.check_approach(self._final_sensors.part_of(frame))
         used = self._bank.sensors.part_of(frame)
-        frame_update = self._bank.advance(used, 0.0 if self._restart_after_gap(used, dt) else dt)
+        before_gap = self._bank.restart_after_gap(used, dt)
+        # The path before the gap was smoothed on its own.
+        self.members[0].early += before_gap or []
+        frame_update = self._bank.advance(used, dt if before_gap is None else 0.0)
         if not self._update_evidence(frame_update, dt):
             return self.end('no hypothesis explains the field')
         self._bank.store_and_prune(frame_update, publish)
-        best = self.bank.best()
-        self._update_new_target_evidence(frame_update, best)
-        if not publish and not self._bank.is_lagged:
+        frame, bank, best = frame_update.frame, self.bank, self.bank.best()
+        self._new_target_evidence.add(
+            float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
+            frame.stamp_ns, frame_update.n_rejected > 0 and len(frame.field) == 2,
+            bool(self._bank.filter.are_long(bank.kind[best:best + 1])[0]))
+        if not publish and not self._settings.smoothing_lag_s:
             return []
         views = [self._view(i, best) for i in range(len(self.members))]
-        lagged = self._bank.lagged(best, frame_update.frame, dt, publish)
+        lagged = self._bank.lag.smoothed(self._bank.filter, bank, best, frame, dt, publish)
         lagged_poses = [pose for i, view in enumerate(views) for pose in self._smoothed(
             i, view, False, lagged, self.members[i].is_doubtful(self._settings))]
         if not publish:
             return []
-        update = BankUpdate(frame_update.frame, dt, self.bank, self._bank.filter,
-                            self._bank.sensors, self._settings)
         out: list[TrackRecord] = [
             record for member, view in zip(self.members, views, strict=True)
-            for record in member.publish(update, view)]
+            for record in member.publish(self._bank, *view, frame, dt)]
         self._handover_due = best if self._bank.sensors.is_part else None
-        return [*out, *lagged_poses, *self._end_lost_members(frame_update.frame)]
+        return [*out, *lagged_poses, *self._end_lost_members(frame)]
 
-    def _view(self, i: int, best: int) -> MemberView:
-        """View of member `i` alone; `best` is the index of the best joint hypothesis."""
+    def _view(self, i: int, best: int) -> tuple[FilterBank, int]:
+        """Bank of member `i` alone, and the index of its published hypothesis; `best` is that of
+        the joint hypotheses."""
         bank = self.bank.extract_target(i, self._bank.single_target.n_target)
-        row = best if bank is self.bank else bank.best()
-        return MemberView(bank, row, self._bank.single_target, self._bank.gain(row))
-
-    def _restart_after_gap(self, frame: FieldFrame, dt: float) -> bool:
-        """Start the hypotheses again if the target was lost in a gap; return whether they were."""
-        states = self._bank.smoothed(self.bank.best(), False) \
-            if self._target.is_lost_after(self._settings, self._bank.sensors.network, dt) else []
-        if not self._bank.restart_after_gap(frame, dt):
-            return False
-        # The path before the gap was smoothed on its own.
-        self.members[0].early += states
-        return True
+        return bank, best if bank is self.bank else bank.best()
 
     def _update_evidence(self, frame_update: FrameUpdate, dt: float) -> bool:
         """Update the evidence of the members; return False if no hypothesis explains the frame."""
@@ -192,7 +171,7 @@ class RunningTrack:
         if frame_update.n_rejected and np.count_nonzero(frame.n_samples) <= frame_update.n_rejected:
             # Without a majority of sensors, the track itself may be wrong.
             for member in self.members:
-                member.evidence.flag(doubts.SENSORS_CONTRADICT)
+                member.evidence.doubts.add(doubts.SENSORS_CONTRADICT)
         if not np.isfinite(frame_update.evidence):
             self.counts['frames that no hypothesis explains'] += 1
             return False
@@ -200,65 +179,45 @@ class RunningTrack:
         no_target = self._no_target.log_density(frame, dt, self._settings.background_drift)
         disturbance_model = self._disturbance_model.log_density(
             frame, dt, self._bank.filter.model_error(self.bank, best, dt))
+        n = self._bank.single_target.n_target
         for i, member in enumerate(self.members):
             member.evidence.add(frame_update.evidence - no_target)
             if disturbance_model is not None:
                 member.evidence.bayes_factor.add(
                     frame_update.evidence - disturbance_model, frame.stamp_ns,
                     self._settings.min_bayes_factor)
-            own_frame, first = self._member_frame(i, best, frame, dt), \
-                i * self._bank.single_target.n_target
+            own_frame = frame if len(self.members) == 1 else replace(
+                frame, field=frame.field - self._bank.filter.field_of_others(
+                    self.bank, best, i, frame, dt))
             member.evidence.add_frame(own_frame, self._bank.sensors.rows, self.bank.nis[best])
             if self._settings.cross_check and not self._target.starts_anywhere:
-                member.cross_check.add(
-                    own_frame, self.bank.x[best, first:first + self._bank.single_target.n_target])
+                member.cross_check.add(own_frame, self.bank.x[best, i * n:(i + 1) * n])
         return True
-
-    def _update_new_target_evidence(self, frame_update: FrameUpdate, best: int) -> None:
-        """Update the evidence for new targets with the innovations of hypothesis `best`."""
-        bank, frame = self.bank, frame_update.frame
-        self._new_target_evidence.add(
-            float(np.nansum(bank.nis[best])), np.count_nonzero(~np.isnan(frame.field)),
-            frame.stamp_ns, frame_update.n_rejected > 0 and len(frame.field) == 2,
-            bool(self._bank.filter.are_long(bank.kind[best:best + 1])[0]))
-
-    def _member_frame(self, i: int, best: int, frame: FieldFrame, dt: float) -> FieldFrame:
-        """Frame without the fields that hypothesis `best` predicts for the other members."""
-        if len(self.members) == 1:
-            return frame
-        others = self._bank.filter.field_of_others(self.bank, best, i, frame, dt)
-        return replace(frame, field=frame.field - others)
 
     def _is_out_of_reach(self, i: int, frame: FieldFrame) -> bool:
         """Whether the field of member `i` is weak and the member does not approach a sensor."""
         last = self.members[i].last
         assert last is not None
-        energy = field_energy(self._bank.filter, i, self.bank.x[self.bank.best()], frame)
-        return energy < (WEAK_ENERGY if self._is_at_limit else NEGLIGIBLE_ENERGY) \
+        energy = self._bank.filter.field_energies(i, self.bank.x[self.bank.best()], frame).sum()
+        return bool(energy < (WEAK_ENERGY if self._is_at_limit else NEGLIGIBLE_ENERGY)) \
             and not self._bank.sensors.is_approached_by(last)
 
     def _end_lost_members(self, frame: FieldFrame) -> list[TrackRecord]:
         """End the members that are lost or out of reach, and return their closing records."""
         out: list[TrackRecord] = []
         for member in list(self.members):
-            reason = member.reason_to_end(self._bank.sensors, self._settings)
-            if reason is None and len(self.members) > 1 \
-                    and self._is_out_of_reach(self.members.index(member), frame):
+            reason, i = member.reason_to_end(self._bank.sensors, self._settings), \
+                self.members.index(member)
+            if reason is None and len(self.members) > 1 and self._is_out_of_reach(i, frame):
                 reason = OUT_OF_REACH
-            if reason is not None:
-                member.is_lost = True
-                out += self._end_member(member, reason)
-        return out
-
-    def _end_member(self, member: Member, reason: str) -> list[TrackRecord]:
-        """End one member, remove its states from the joint state, and return closing records."""
-        if len(self.members) == 1:
-            self.is_lost = member.is_lost
-            return self.end(reason)
-        i = self.members.index(member)
-        out = self._close_member(i, reason)
-        self._bank.without_target(i)
-        del self.members[i]
+            if reason is None:
+                continue
+            if len(self.members) == 1:
+                self.is_lost = True
+                return out + self.end(reason)
+            out += self._close_member(i, reason)
+            self._bank.without_target(i)
+            del self.members[i]
         return out
 
     def end(self, reason: str) -> list[TrackRecord]:
@@ -279,20 +238,21 @@ class RunningTrack:
             return []
         if member.passed_below:
             self.counts[BELOW_SENSORS] += 1
-            member.evidence.flag(doubts.BELOW_SENSORS)
+            member.evidence.doubts.add(doubts.BELOW_SENSORS)
         best = self.bank.best()
         view = self._view(i, best)
         doubtful = member.evidence.ends_in_misfit or member.is_doubtful(self._settings)
         return [replace(member.last, ended=True),
-                *self._smoothed(i, view, False, self._bank.remaining_lagged(best), doubtful),
+                *self._smoothed(i, view, False, self._bank.lag.remaining(
+                    self._bank.filter, self.bank, best), doubtful),
                 *self._smoothed(i, view, True, self._bank.smoothed(best), doubtful)]
 
-    def _smoothed(self, i: int, view: MemberView, complete: bool, states: list[TrackState],
-                  doubtful: bool) -> list[SmoothedPose]:
+    def _smoothed(self, i: int, view: tuple[FilterBank, int], complete: bool,
+                  states: list[TrackState], doubtful: bool) -> list[SmoothedPose]:
         """Smoothed poses of member `i`; if `complete`, also those before other members joined."""
         member, n = self.members[i], self._bank.single_target.n_target
         own_states = member.states_of(member.slot if complete else i, n, states)
-        return member.smoothed(view.bank, view.best, complete,
+        return member.smoothed(*view, complete,
                                [*member.early, *own_states] if complete else own_states, doubtful)
 
     @property
@@ -302,13 +262,11 @@ class RunningTrack:
         return [u for u in found if u is not None]
 
     def new_target(self) -> JointExplanation | None:
-        """Search for another explanation of the latest frames, if a search is due; None if none is
-        sufficiently probable.
+        """Search for another explanation of the latest frames, if due; None if none is probable.
 
-        If one is nearly as probable as the track, the track is marked as doubtful for a limited
-        time.
+        One that is nearly as probable as the track marks it as doubtful for a limited time.
         """
-        window, n = self._bank.window, len(self.members)
+        window, n = self._bank.relinearisation.window, len(self.members)
         if self.ended is not None or self._target.starts_anywhere or window is None \
                 or self.members[0].last is None:
             return None
@@ -349,7 +307,7 @@ class RunningTrack:
         if joint.adds:
             new = Member(id, self._target, sensors, self.counts, self._clocks,
                          now_ns - round(self._settings.lookback_s * NS))
-            new.start_alongside(self.members[0], now_ns, ratio)
+            new.start_alongside(self.members[0], sensors, now_ns, ratio)
         doubtful = joint.doubtful(n)
         self._bank.resume(joint)
         self.members, self._is_at_limit = members_in_order(self.members, new, joint, n), False

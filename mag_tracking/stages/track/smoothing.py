@@ -1,21 +1,19 @@
 """Smoothing of a track with the frames before and after each of its poses.
 
 The best hypothesis at the end of a track is filtered again through all frames, smoothed backward,
-and relinearised once. Hypotheses are independent, so a single one can be smoothed alone. Frames
-that contradict it are excluded, because one such frame would distort the whole track. The last
-smoothed pose may differ from the last published pose, because the two are linearised at different
-states.
+and relinearised once. Frames that contradict it are excluded, because one such frame would distort
+the whole track. The last smoothed pose may differ from the last published pose, because the two are
+linearised at different states.
 """
 
 from collections import deque
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank, InitialBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
@@ -24,21 +22,16 @@ from mag_tracking.units import NS
 
 NOT_SMOOTHED = 'tracks without smoothing'
 """Key of the number of tracks that could not be smoothed as a whole."""
-
 State: TypeAlias = tuple[FloatArray, FloatArray]
 """State (n_x,) and covariance (n_x, n_x)."""
-
 TrackState: TypeAlias = tuple[int, FloatArray, FloatArray]
 """Timestamp [ns], state (n_x,) and covariance (n_x, n_x)."""
-
 RELINEARISATIONS = 1
-"""Number of relinearisations of a track along its previous result. They correct for inaccurate
-predictions far from the sensors. One relinearisation does not reach convergence. Four improve the
-tracks of turning cars and trucks, but degrade the track of a car along a corridor of sensors."""
-
+"""Number of relinearisations of a track along its previous result, for inaccurate predictions far
+from the sensors. Four would converge and improve the tracks of turning cars and trucks, but degrade
+the track of a car along a corridor of sensors."""
 MAX_ELEMENTS = 10_000_000
-"""Maximum product of frames and squared number of states. It corresponds to 80 MB of memory, and to
-less than a second of computing time."""
+"""Maximum product of frames and squared number of states: 80 MB, less than a second."""
 
 
 def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[FieldFrame],
@@ -48,14 +41,10 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     """Smoothed states of the only hypothesis of a bank at each frame, and the number of frames
     excluded because they contradict it.
 
-    Parameters
-    ----------
-    bank : bank of this hypothesis alone, at the first frame
-    intervals : time from the previous frame to each frame, s
-    updated : whether the bank has already been updated with the first frame
-    relinearisations : number of further passes, each linearised along the result of the previous
-        pass
-    path : known states (n_x,) at the first frames, at which the first pass is linearised
+    `intervals` [s] are the times since the previous frame, `updated` tells whether the bank at the
+    first frame has been updated with it, each of the `relinearisations` is a pass along the result
+    of the previous one, and `path` contains known states (n_x,) at the first frames, at which the
+    first pass is linearised.
     """
     paths = np.full((1, len(frames), bank.x.shape[1]), np.nan)
     for at, known in zip(paths[0], path, strict=False):
@@ -65,22 +54,6 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
         first_is_updated=updated, rejects_outliers=True, wants_covariances=True)
     n_excluded = np.count_nonzero(~path_result.used[0, int(updated):])
     return list(zip(paths[0], path_result.covariances[0], strict=True)), int(n_excluded)
-
-
-@dataclass
-class _TrackStart:
-    """Bank at the start of a track, and its filter."""
-
-    bank_filter: BankFilter
-    bank: FilterBank | InitialBank
-    paths: tuple[FloatArray, ...] = ()
-    """(n_hyp, n_x) Known states of all hypotheses at the first frames."""
-    origin: IntArray | None = None
-    """(n_hyp,) Origins of the hypotheses of `paths`."""
-
-    def path_of(self, origin: int) -> list[FloatArray]:
-        """Known path of a hypothesis through the first frames."""
-        return [path[self.origin == origin][0] for path in self.paths]
 
 
 class WholeTrack:
@@ -94,40 +67,36 @@ class WholeTrack:
 
     def __init__(self, max_duration_s: float) -> None:
         self._max_duration_s = max_duration_s
-        self.clear()
+        self.abandon(False)
 
-    def clear(self) -> None:
-        """Discard all stored frames."""
-        self._start: _TrackStart | None = None
+    def abandon(self, is_abandoned: bool = True) -> None:
+        """Discard all stored frames, and mark the track as not smoothable as a whole."""
+        self.is_abandoned = is_abandoned
+        self._start: tuple[BankFilter, FilterBank | InitialBank] | None = None
         self._frames: list[FieldFrame] = []
         self._intervals: list[float] = []
         self._is_published: list[bool] = []
-        self._duration_s, self.is_abandoned = 0.0, False
-        self._is_updated = False
+        self._duration_s, self._is_updated = 0.0, False
+        # Known states (n_hyp, n_x) at the first frames, of the hypotheses with these origins.
+        self._paths: list[FloatArray] = []
+        self._origin: IntArray = np.zeros(0, dtype=np.int64)
 
     def begin(self, bank: FilterBank | InitialBank, bank_filter: BankFilter) -> None:
         """Discard all frames, and start with a bank at the first frame and a copy of its filter;
         the caller must not modify the bank afterwards."""
-        self.clear()
+        self.abandon(False)
         if self._max_duration_s:
-            self._start = _TrackStart(copy(bank_filter), bank)
+            self._start = copy(bank_filter), bank
 
     def resume(self, window: Window, bank_filter: BankFilter) -> None:
         """Restart with a window of another filter; the frames of the window count as published."""
         anchor = window.anchor.rows(np.arange(len(window.anchor)))
         self.begin(anchor, bank_filter)
-        if self._start is not None:
-            # The paths are copied, because the window modifies them.
-            self._start = replace(self._start, origin=anchor.origin.copy(),
-                                  paths=tuple(path.copy() for path in window.paths))
-        self._is_updated = window.is_updated
+        self._is_updated, self._origin = window.is_updated, anchor.origin.copy()
+        # The paths are copied, because the window modifies them.
+        self._paths = [path.copy() for path in window.paths]
         for frame, dt in zip(window.frames, window.intervals, strict=True):
             self.add(anchor, frame, dt, True)
-
-    def abandon(self) -> None:
-        """Discard all stored frames, and mark the track as not smoothable as a whole."""
-        self.clear()
-        self.is_abandoned = True
 
     def add(self, bank: FilterBank, frame: FieldFrame, dt: float, published: bool) -> None:
         """Add a frame with which the bank has been updated, and whether a pose was published for
@@ -142,8 +111,9 @@ class WholeTrack:
         self._frames.append(frame)
         self._intervals.append(dt)
         self._is_published.append(published)
-        if len(bank) < len(self._start.bank) // 2:
-            self._start.bank.keep(np.isin(self._start.bank.origin, bank.origin))
+        start = self._start[1]
+        if len(bank) < len(start) // 2:
+            start.keep(np.isin(start.origin, bank.origin))
 
     def smoothed(self, bank: FilterBank, best: int) -> tuple[list[TrackState], int]:
         """Smoothed states of the published frames for hypothesis `best`, and the number of frames
@@ -151,14 +121,14 @@ class WholeTrack:
 
         The states are empty if the track cannot be smoothed as a whole.
         """
-        start = self._start
-        if start is None or not self._frames:
+        if self._start is None or not self._frames:
             return [], 0
+        bank_filter, start = self._start
         origin = int(bank.origin[best])
-        single = start.bank.rows(np.flatnonzero(start.bank.origin == origin))
         states, n_excluded = smoothed_track(
-            start.bank_filter, single, self._frames, self._intervals, self._is_updated,
-            path=start.path_of(origin))
+            bank_filter, start.rows(np.flatnonzero(start.origin == origin)), self._frames,
+            self._intervals, self._is_updated,
+            path=[path[self._origin == origin][0] for path in self._paths])
         return [(frame.stamp_ns, x, P) for frame, (x, P), published in zip(
             self._frames, states, self._is_published, strict=True) if published], n_excluded
 
@@ -173,13 +143,10 @@ class _LaggedFrame(NamedTuple):
     x: FloatArray
     P: FloatArray
 
-    def rows(self, mask: BoolArray) -> '_LaggedFrame':
-        """Copy with only the hypotheses in `mask` (n_hyp,)."""
-        return self._replace(origin=self.origin[mask], x=self.x[mask], P=self.P[mask])
-
 
 class FixedLag:
-    """Fixed-lag smoother, with the latest frames of a track and the bank after each frame."""
+    """Fixed-lag smoother, with the latest frames of a track and the bank after each frame; a
+    `lag_s` of 0 disables it."""
 
     def __init__(self, lag_s: float) -> None:
         self._lag_s = lag_s
@@ -193,29 +160,30 @@ class FixedLag:
                  dt: float, published: bool) -> list[TrackState]:
         """Add a frame with which the bank has been updated; return the states of hypothesis `best`
         at the published frames older than the lag: usually none or one."""
+        if not self._lag_s:
+            return []
         self._frames.append(_LaggedFrame(
             frame, dt, published, bank.origin, bank.x.copy(), bank.P.copy()))
         if len(bank) < len(self._frames[0].origin) // 2:
-            self._frames = deque(k.rows(np.isin(k.origin, bank.origin)) for k in self._frames)
+            masks = [np.isin(k.origin, bank.origin) for k in self._frames]
+            self._frames = deque(k._replace(origin=k.origin[mask], x=k.x[mask], P=k.P[mask])
+                                 for k, mask in zip(self._frames, masks, strict=True))
         out: list[TrackState] = []
         while (frame.stamp_ns - self._frames[0].frame.stamp_ns) / NS >= self._lag_s:
             if self._frames[0].published:
-                out.append((self._frames[0].frame.stamp_ns,
-                            *self._states(bank_filter, bank, best)[0]))
+                out += self.remaining(bank_filter, bank, best)[:1]
             self._frames.popleft()
         return out
 
     def remaining(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[TrackState]:
-        """Smoothed states of hypothesis `best` at the frames that remain at the end of a track."""
+        """Smoothed states of hypothesis `best` at the published frames that have not been returned,
+        without relinearisation."""
         if not self._frames:
             return []
-        return [(lagged.frame.stamp_ns, *state) for lagged, state in zip(
-            self._frames, self._states(bank_filter, bank, best), strict=True) if lagged.published]
-
-    def _states(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[State]:
-        """Smoothed states of hypothesis `best` at the stored frames, without relinearisation."""
         oldest = self._frames[0]
         single, row = bank.alone(best), np.flatnonzero(oldest.origin == bank.origin[best])
         single.x, single.P = oldest.x[row].copy(), oldest.P[row].copy()
-        return smoothed_track(bank_filter, single, [k.frame for k in self._frames],
-                              [k.dt for k in self._frames], updated=True, relinearisations=0)[0]
+        states, _ = smoothed_track(bank_filter, single, [k.frame for k in self._frames],
+                                   [k.dt for k in self._frames], updated=True, relinearisations=0)
+        return [(k.frame.stamp_ns, *state) for k, state in zip(self._frames, states, strict=True)
+                if k.published]

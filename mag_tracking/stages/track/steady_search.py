@@ -1,8 +1,7 @@
 """Search for vehicles on straight paths in the frames of a window, given known vehicles.
 
 The terms in which the field is linear have Gaussian priors and are marginalised: the moments of the
-vehicle, the backgrounds, and the errors of known vehicles. The remaining parameters describe the
-path. They are searched from a grid of start values.
+vehicle, the backgrounds, and the errors of known vehicles. The path is searched from a grid.
 
 Source: TSP14 sections III.A and V for the row of dipoles; variable projection with priors.
 """
@@ -13,11 +12,12 @@ from functools import cached_property
 
 import numpy as np
 
-from mag_tracking.arrays import BoolArray, FloatArray, IntArray
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.inference.least_squares import distinct, refine
 from mag_tracking.inference.matrices import MarginalWhitener, ignoring_overflow, pseudo_inverse
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.passes import N_STRAIGHT, PATH, SteadyPass
+from mag_tracking.stages.track.bank_filter import DETECTABLE_ENERGY
 from mag_tracking.stages.track.initiation_vehicle import (
     CLIMB_STD,
     CROSS_SPEED_STD,
@@ -27,37 +27,27 @@ from mag_tracking.stages.track.initiation_vehicle import (
     VehicleSettings,
 )
 from mag_tracking.stages.track.pass_samples import PassSamples
-from mag_tracking.stages.track.reach import DETECTABLE_ENERGY
-from mag_tracking.stages.track.window_start import in_order_of
 
 N_DIPOLES = 3
 """Number of dipoles of the rows in the search; sufficient for a car near a sensor."""
-
 GRID_STEP, GRID_MARGIN = 3.0, 12.0
 """[m] Spacing of the grid along an arrival line, and its range beyond the last sensor."""
-
 SPEED_COLUMN = PATH.index('speed')
 """Column of the speed in a path."""
-
 MIN_STD = 1e-3
-"""[m], [m/s], [A m^2] Minimum standard deviation of a parameter. It applies to parameters without a
-spread in the settings, such as the length of a point."""
-
+"""[m], [m/s], [A m^2] Minimum standard deviation of a parameter without a spread in the settings,
+such as the length of a point."""
 MIN_SPEED_RATIO = 0.2
 """Minimum speed of an arriving vehicle, relative to the lowest starting speed."""
-
 N_STARTS, N_STEPS, TOLERANCE = 10, 12, 1e-3
-"""Maximum number of distinct starts that are refined, maximum number of steps, and the relative
-improvement of the cost below which the refinement ends."""
-
+"""Maximum numbers of refined distinct starts and of steps, and relative improvement of the cost
+below which the refinement ends."""
 START_TOLERANCE: FloatArray = np.array([4.0, 2.5, 1.0, 5.0, 0.3, 1.0, 3.0])
 PATH_TOLERANCE: FloatArray = np.array([1.0, 1.0, 1.0, 2.0, 0.3, 1.0, 9.0])
-"""[m], [m/s], [rad] Differences of path parameters up to which two starts, or two refined paths,
-are treated as identical."""
-
+"""[m], [m/s], [rad] Differences up to which two starts, or two refined paths, are identical."""
 FIRST_PATH_STD: FloatArray = np.array([2.0, 1.5, 0.2, 3.0, 0.1, 0.1, 1.5])
-"""[m], [m/s], [rad] Standard deviations of the path of the first vehicle in the search for a
-second vehicle."""
+"""[m], [m/s], [rad] Standard deviations of the path of the first vehicle in a search for a second
+one."""
 
 
 @dataclass(frozen=True)
@@ -147,9 +137,8 @@ class PathPrior:
 
 
 class StartGrid:
-    """Grid of start paths, with the field of a point target on each path.
-
-    Arrays that do not depend on known vehicles are computed once for all searches of a window.
+    """Grid of start paths, with the field of a point target on each path, for all searches of a
+    window.
 
     Attributes
     ----------
@@ -172,9 +161,8 @@ class StartGrid:
 class SteadySearch:
     """Search for vehicles in the samples of a window, given the known vehicles.
 
-    In a joint search for m vehicles, a row of 7 m parameters describes their paths, and a row of 9
-    m parameters their moments. In shapes, n is the number of rows and y the number of whitened
-    measurements.
+    In shapes, n is the number of joint paths of m vehicles, with 7 m parameters and 9 m moments,
+    and y the number of whitened measurements.
     """
 
     samples: PassSamples
@@ -182,8 +170,8 @@ class SteadySearch:
     known: FloatArray
     """(y,) Whitened field of the known vehicles."""
     columns: FloatArray
-    """(y, q) Whitened field of each nuisance term at one standard deviation. The nuisance terms are
-    the backgrounds and the errors of the known vehicles."""
+    """(y, q) Whitened field of each nuisance term (backgrounds and errors of the known vehicles) at
+    one standard deviation."""
 
     @cached_property
     def _model(self) -> SteadyPass:
@@ -201,12 +189,9 @@ class SteadySearch:
         return self._marginal_whitener(self.samples.y - self.known)
 
     def _solve(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Estimate the moments of vehicles on given paths.
-
-        Returns the whitened fields of unit moments (n, y, 9 m), the information matrices of the
-        moments (n, 9 m, 9 m), their inverses, and the moments (n, 9 m). The inverse is NaN or
-        meaningless for a path through a sensor.
-        """
+        """Whitened fields of unit moments (n, y, 9 m) of vehicles on given paths, the information
+        matrices of the moments (n, 9 m, 9 m), their inverses, which are NaN or meaningless for a
+        path through a sensor, and the estimated moments (n, 9 m)."""
         basis = self._model.basis(theta.reshape(-1, N_STRAIGHT))
         A = self._marginal_whitener(_joined_columns(basis, _n_vehicles(theta)))
         At = np.swapaxes(A, 1, 2)
@@ -250,16 +235,18 @@ class SteadySearch:
 
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
         """Paths (n, 7 m) refined by Levenberg-Marquardt steps, and their costs (n,): infinite if a
-        vehicle is too slow, moves backwards, or is not detectable.
-
-        The prior does not constrain the position along the arrival line. A vehicle that explains no
-        field may therefore move arbitrarily far away.
-        """
+        vehicle is too slow, moves backwards, or is not detectable because its position along the
+        arrival line, which the prior does not constrain, is far away."""
         if not len(theta):
             return theta, np.zeros(0)
         path, cost, _, _ = refine(self.residual_and_jacobian, theta, n_steps, TOLERANCE)
         are_moving = (path[:, SPEED_COLUMN::N_STRAIGHT] >= self.prior.min_speed).all(axis=1)
-        return path, np.where(are_moving & self._are_detectable(path), cost, np.inf)
+        with ignoring_overflow():
+            # Energies in the window that the prior of the moments predicts.
+            energy = np.einsum('nii->ni', self._information_of_moments(path)) - 1.0
+        vehicle_energy = energy.reshape(len(path), -1, 3 * N_DIPOLES).sum(axis=2)
+        are_detectable = (vehicle_energy > DETECTABLE_ENERGY).all(axis=1)
+        return path, np.where(are_moving & are_detectable, cost, np.inf)
 
     def best(self, grid: StartGrid, max_paths: int) -> FloatArray:
         """At most `max_paths` paths (n, 7) of a single vehicle that explain the frames best, the
@@ -276,22 +263,20 @@ class SteadySearch:
         return moments
 
     def beside(self, path: FloatArray) -> 'SteadySearch':
-        """Search for another vehicle, given the approximate path (7,) of a vehicle that was
-        found."""
+        """Search for another vehicle beside a found one on an approximate path (7,)."""
         _, _, _, p = self._solve(path[None])
         return replace(self, columns=np.hstack([
             self.columns, self._model.basis(path[None])[0] * self.prior.moment_std,
             self._model.derivative(path[None], p)[0] * FIRST_PATH_STD]))
 
     def pairs(self, grid: StartGrid, max_paths: int, max_second: int) -> list[FloatArray]:
-        """Pairs of paths (2, 7) that explain the frames best, the best first.
-
-        At most `max_paths` first paths and `max_second` second paths for each are tried.
-        """
+        """Pairs of paths (2, 7) that explain the frames best, the best first; at most `max_paths`
+        first paths, and `max_second` second paths for each, are tried."""
         starts = [np.append(first, second) for first in self.best(grid, max_paths)
                   for second in self.beside(first).best(grid, max_second)]
         pairs, cost = self.refined(np.array(starts).reshape(-1, 2 * N_STRAIGHT))
-        cost = cost + self._log_determinant_of_moments(pairs)
+        with ignoring_overflow():
+            cost = cost + _log_determinant(self._information_of_moments(pairs))
         is_usable = np.isfinite(cost)
         if not is_usable.any():
             return []
@@ -301,19 +286,6 @@ class SteadySearch:
         pairs = np.array([in_order_of(best, pair.reshape(2, -1)).ravel() for pair in pairs])
         return list(_best_distinct(pairs, cost, np.tile(PATH_TOLERANCE, 2), len(pairs)).reshape(
             -1, 2, N_STRAIGHT))
-
-    def _log_determinant_of_moments(self, theta: FloatArray) -> FloatArray:
-        """Log-determinants (n,) of the matrices that `_information_of_moments` returns."""
-        with ignoring_overflow():
-            return _log_determinant(self._information_of_moments(theta))
-
-    def _are_detectable(self, theta: FloatArray) -> BoolArray:
-        """Whether all vehicles of each row (n,) are detectable if the moments follow the prior."""
-        with ignoring_overflow():
-            energy = np.einsum('nii->ni', self._information_of_moments(theta)) - 1.0
-        vehicle_energy = energy.reshape(len(theta), -1, 3 * N_DIPOLES).sum(axis=2)
-        are_detectable: BoolArray = (vehicle_energy > DETECTABLE_ENERGY).all(axis=1)
-        return are_detectable
 
     def _information_of_moments(self, theta: FloatArray) -> FloatArray:
         """Information matrices (n, 9 m, 9 m) of the moments, in units of the prior information."""
@@ -334,7 +306,7 @@ def _n_vehicles(theta: FloatArray) -> int:
 
 
 def _joined_columns(A: FloatArray, m: int) -> FloatArray:
-    """Join the columns of `m` successive matrices of `A` (n m, k, c); return (n, k, m c)."""
+    """Columns (n, k, m c) of `m` successive matrices of `A` (n m, k, c), side by side."""
     n, k, c = len(A) // m, *A.shape[1:]
     return A.reshape(n, m, k, c).swapaxes(1, 2).reshape(n, k, m * c)
 
@@ -354,3 +326,9 @@ def _best_distinct(theta: FloatArray, cost: FloatArray, tolerance: FloatArray, n
     is_usable = np.isfinite(cost)
     paths: FloatArray = theta[is_usable]
     return paths[distinct(paths, cost[is_usable], tolerance, n_max)]
+
+
+def in_order_of(first: FloatArray, pair: FloatArray) -> FloatArray:
+    """Pair of paths (2, 7) in the order that matches another pair best, by distance."""
+    d = np.linalg.norm(pair[:, None, :2] - first[:, :2], axis=2)
+    return pair if d[0, 0] + d[1, 1] <= d[0, 1] + d[1, 0] else pair[::-1].copy()

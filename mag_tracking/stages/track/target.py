@@ -1,6 +1,7 @@
-"""Kinds of target: source model, published orientation, and start of a track."""
+"""Kinds of target: source model, published orientation, start of a track and its memory limits."""
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -12,16 +13,39 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track.bank_size import check_magnet_bank, check_vehicle_bank
-from mag_tracking.stages.track.initiation_magnet import is_lost_after, magnet_model, start_magnet
-from mag_tracking.stages.track.initiation_vehicle import start_vehicle, vehicle_model
+from mag_tracking.stages.track.initiation_magnet import (
+    MAX_STARTS,
+    is_lost_after,
+    magnet_model,
+    start_magnet,
+)
+from mag_tracking.stages.track.initiation_vehicle import (
+    moment_directions,
+    start_vehicle,
+    vehicle_model,
+)
+from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.published_pose import (
     MagnetOrientation,
     Orientation,
+    UnobservedLength,
     VehicleOrientation,
 )
 from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.stages.track.unobserved_length import UnobservedLength
+
+MAX_BYTES = 4 << 30
+"""[bytes] Memory for the covariances of all starting hypotheses above which settings are rejected;
+the peak memory is 1.5 times as large."""
+START_BYTES = 250_000_000
+"""[bytes] Memory for the covariances with which a track starts. Sensors that need more are added
+after the frames before the detection if few hypotheses are then probable, otherwise later."""
+MIN_SENSORS_AT_START = 4
+"""Minimum number of sensors at the start of a track, those nearest to the strongest field."""
+WIDER_BYTES, MIN_HYPOTHESES, MIN_WEIGHT = 100_000_000, 100, 0.999
+"""Limits when the remaining sensors are added: maximum memory of the covariances [bytes], minimum
+number of retained hypotheses even beyond it, and minimum total weight of these, so that the track
+does not appear more certain than the frames justify."""
+_FLOAT_BYTES = 8
 
 
 @dataclass(frozen=True)
@@ -35,11 +59,10 @@ class Target:
     kinds: Sequence[str]
     """Name of each kind of target."""
     unobserved_length: Callable[[], UnobservedLength | None]
-    """Factory that is called for each track. It returns the uncertainty of the middle of a vehicle
-    due to its unobserved length; None for a magnet."""
+    """Factory, for each track, of the uncertainty of the middle of a vehicle due to its unobserved
+    length; None for a magnet."""
     starts_anywhere: bool
-    """Whether a track may start anywhere. A lost magnet may be found at any position, but a vehicle
-    starts on an arrival line."""
+    """Whether a track may start anywhere, like a magnet, or on an arrival line, like a vehicle."""
     start: Callable[[TrackSettings, SensorNetwork, FieldFrame, FloatArray], FilterBank | None]
     """Function that returns the first hypotheses from the settings, a network, a frame and the
     covariances (n_sensors, n_own, n_own) of mounting angles and model errors; None if the frame
@@ -58,34 +81,103 @@ def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
     if settings.target == 'vehicle':
         vehicle = settings.vehicle
         row = vehicle_model(vehicle, network)
-        check_vehicle_bank(settings, network, row)
+        _check_vehicle_bank(settings, network, row)
         return Target(row, VehicleOrientation(), vehicle.arrival_names,
                       [kind.name for kind in vehicle.kinds],
                       partial(UnobservedLength, [kind.length for kind in vehicle.kinds],
                               [kind.length_std for kind in vehicle.kinds]),
-                      False, _start_vehicle)
+                      False, lambda s, network, frame, own_covariance: start_vehicle(
+                          s.vehicle, network, frame, s.background_std, own_covariance))
     if settings.target == 'magnet':
         magnet = settings.magnet
         if not any(magnet.axis):
             raise SettingsError('track.magnet.axis: the zero vector has no direction')
         model = magnet_model(magnet)
-        check_magnet_bank(settings, network, model)
-        return Target(model,
-                      MagnetOrientation(np.array(magnet.axis)),
-                      ('',), ('',), lambda: None, True, _start_magnet,
+        _check_bank('track.magnet', {'optima': MAX_STARTS}, settings, _n_sensors(settings, network),
+                    model)
+        return Target(model, MagnetOrientation(np.array(magnet.axis)), ('',), ('',), lambda: None,
+                      True, lambda s, network, frame, own_covariance: start_magnet(
+                          s.magnet, network, frame, s.background_std, own_covariance,
+                          s.field_error),
                       lambda s, network, dt: is_lost_after(s.magnet, network, dt))
     raise SettingsError(f'track.target: expected vehicle or magnet, got {settings.target!r}')
 
 
-def _start_vehicle(settings: TrackSettings, network: SensorNetwork, frame: FieldFrame,
-                   own_covariance: FloatArray) -> FilterBank | None:
-    """First hypotheses of a vehicle; None if the frame does not allow a start."""
-    return start_vehicle(settings.vehicle, network, frame, settings.background_std,
-                         own_covariance)
+def _check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
+                        model: SourceModel) -> None:
+    """Raise SettingsError if the starting hypotheses of a vehicle, or `MIN_HYPOTHESES` with the
+    maximum number of sensors, exceed `MAX_BYTES`."""
+    _check_bank('track.vehicle', _vehicle_factors(settings), settings,
+                sensors_at_start(settings, network, model), model)
+    n = _n_sensors(settings, network)
+    size = MIN_HYPOTHESES * _FLOAT_BYTES * (
+        len(model.state_names) + _states_per_sensor(settings) * n)**2
+    if size > MAX_BYTES:
+        raise SettingsError(f'track.max_sensors: {MIN_HYPOTHESES} hypotheses with the states of '
+                            f'{n} sensors need {_in_gigabytes(size)} of memory; the limit is '
+                            f'{_in_gigabytes(MAX_BYTES)}. Reduce track.max_sensors')
 
 
-def _start_magnet(settings: TrackSettings, network: SensorNetwork, frame: FieldFrame,
-                  own_covariance: FloatArray) -> FilterBank | None:
-    """First hypotheses of a magnet; None if the frame does not allow a start."""
-    return start_magnet(settings.magnet, network, frame, settings.background_std, own_covariance,
-                        settings.field_error)
+def _vehicle_factors(settings: TrackSettings) -> dict[str, int]:
+    """Number of alternatives by property; their product is the number of starting hypotheses."""
+    vehicle = settings.vehicle
+    return {**{name: len(getattr(vehicle, name))
+               for name in ('kinds', 'arrival_names', 'lateral_offsets', 'speeds')},
+            'moment directions': len(moment_directions()),
+            'straight or turning': 2 if vehicle.turn_acceleration else 1}
+
+
+def sensors_at_start(settings: TrackSettings, network: SensorNetwork, model: SourceModel) -> int:
+    """Number of sensors with which a track starts, limited by `START_BYTES` for a vehicle."""
+    n_max = _n_sensors(settings, network)
+    if settings.target != 'vehicle':
+        return n_max
+    return min(n_max, _max_affordable_sensors(math.prod(_vehicle_factors(settings).values()),
+                                              len(model.state_names), _states_per_sensor(settings)))
+
+
+def max_sensors(observation: Observation, n_hyp: int) -> int:
+    """Maximum number of sensors for which a bank of `n_hyp` hypotheses stays within `START_BYTES`,
+    but at least `MIN_SENSORS_AT_START`."""
+    return _max_affordable_sensors(n_hyp, observation.n_target, observation.n_own + 3)
+
+
+def _max_affordable_sensors(n_hyp: int, n_target: int, n_per_sensor: int) -> int:
+    """Maximum number of sensors of a bank, as `max_sensors`."""
+    n_states = math.isqrt(START_BYTES // (_FLOAT_BYTES * n_hyp))
+    return max((n_states - n_target) // n_per_sensor, MIN_SENSORS_AT_START)
+
+
+def max_hypotheses(observation: Observation, n_sensors: int) -> int:
+    """Maximum number of hypotheses that a track retains when it changes to `n_sensors` sensors:
+    those within `WIDER_BYTES`, but at least `MIN_HYPOTHESES`."""
+    return max(MIN_HYPOTHESES, WIDER_BYTES // (_FLOAT_BYTES * observation.n_states(n_sensors)**2))
+
+
+def _check_bank(group: str, factors: Mapping[str, int], settings: TrackSettings, n: int,
+                model: SourceModel) -> None:
+    """Raise SettingsError if the covariances of all starting hypotheses exceed `MAX_BYTES`."""
+    n_hyp = math.prod(factors.values())
+    n_x = len(model.state_names) + _states_per_sensor(settings) * n
+    size = n_hyp * n_x**2 * _FLOAT_BYTES
+    if size > MAX_BYTES:
+        product = ' x '.join(f'{name} ({number})' for name, number in factors.items())
+        raise SettingsError(
+            f'{group}: {n_hyp} starting hypotheses, {product}, with {n_x} states each for {n} '
+            f'sensors (track.max_sensors) need {_in_gigabytes(size)} of memory; the limit is '
+            f'{_in_gigabytes(MAX_BYTES)}. Reduce the number of hypotheses or track.max_sensors')
+
+
+def _n_sensors(settings: TrackSettings, network: SensorNetwork) -> int:
+    """Maximum number of sensors of a track."""
+    return min(len(network), settings.max_sensors)
+
+
+def _states_per_sensor(settings: TrackSettings) -> int:
+    """Number of states of a sensor: background, and mounting angles and model errors if enabled."""
+    return 3 * (1 + bool(settings.mounting_std_deg) + bool(settings.model_error_time_s))
+
+
+def _in_gigabytes(size: int) -> str:
+    """Format a number of bytes in decimal gigabytes."""
+    return f'{size / 1e9:.3g} GB'

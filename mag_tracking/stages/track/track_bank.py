@@ -2,7 +2,7 @@
 
 from collections import Counter
 from copy import copy
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,21 +10,17 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.filter_bank import FilterBank, InitialBank
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.bank_size import MIN_WEIGHT, max_hypotheses, max_sensors
 from mag_tracking.stages.track.joint import JointExplanation
 from mag_tracking.stages.track.observation import Observation
-from mag_tracking.stages.track.reach import first_weak_frame
-from mag_tracking.stages.track.relinearisation import Relinearisation, Window
-from mag_tracking.stages.track.sensor_rejection import SensorRejection
-from mag_tracking.stages.track.sensor_selection import SensorSubset, exchange_sensor_states
-from mag_tracking.stages.track.settings import TrackSettings
-from mag_tracking.stages.track.smoothing import (
-    NOT_SMOOTHED,
-    FixedLag,
-    TrackState,
-    WholeTrack,
+from mag_tracking.stages.track.relinearisation import Relinearisation
+from mag_tracking.stages.track.sensor_selection import (
+    SensorRejection,
+    SensorSubset,
+    exchange_sensor_states,
 )
-from mag_tracking.stages.track.target import Target
+from mag_tracking.stages.track.settings import TrackSettings
+from mag_tracking.stages.track.smoothing import NOT_SMOOTHED, FixedLag, TrackState, WholeTrack
+from mag_tracking.stages.track.target import MIN_WEIGHT, Target, max_hypotheses, max_sensors
 from mag_tracking.units import NS
 
 PRUNE_RATIO = 1e-12
@@ -32,16 +28,12 @@ PRUNE_RATIO = 1e-12
 Alg. 3)."""
 MAX_INITIAL_HYPOTHESES = 1200
 """Maximum number of hypotheses in the frames before the detection, if larger than `max_hypotheses`.
-With fewer, the correct hypothesis is often lost, because these frames contain little information
-about the origin of a target."""
-RELINEARISE_INTERVAL_S = 0.15
-"""[s] Interval between relinearisations, whose cost grows with the number of sensors."""
-MAX_RELINEARISED = 20
-"""Maximum number of hypotheses that are relinearised."""
+With fewer, the correct one is often lost, because these frames hardly show a target's origin."""
+RELINEARISE_INTERVAL_S, MAX_RELINEARISED = 0.15, 20
+"""[s] Interval between relinearisations, and maximum number of relinearised hypotheses."""
 
 
-@dataclass(frozen=True)
-class FrameUpdate:
+class FrameUpdate(NamedTuple):
     """Result of the prediction and update of a bank with a frame."""
 
     frame: FieldFrame
@@ -68,49 +60,35 @@ class TrackBank:
     sensors : sensors in use
     later_sensors : sensors that will be used as soon as the bank is small enough; None after the
         switch to them
+    lag : fixed-lag smoother
     """
 
     def __init__(self, target: Target, settings: TrackSettings, sensors: SensorSubset,
                  bank_filter: BankFilter, bank: FilterBank, counts: 'Counter[str]',
                  later_sensors: SensorSubset) -> None:
-        self._target, self._settings, self._counts = target, settings, counts
+        self.target, self.settings, self._counts = target, settings, counts
         self.bank, self.filter, self.sensors = bank, bank_filter, sensors
         self.later_sensors: SensorSubset | None = later_sensors
         self._rejection = SensorRejection(sensors.network.names)
-        self._relinearisation = Relinearisation(
+        self.relinearisation = Relinearisation(
             RELINEARISE_INTERVAL_S, settings.relinearise_window_s, MAX_RELINEARISED)
         self._whole_track = WholeTrack(settings.max_smoothing_s)
-        self._fixed_lag = FixedLag(settings.smoothing_lag_s) if settings.smoothing_lag_s else None
+        self.lag = FixedLag(settings.smoothing_lag_s)
 
     @property
     def single_target(self) -> Observation:
         """Measurement model of a single target."""
         return self.filter.observation.single_target
 
-    @property
-    def window(self) -> Window | None:
-        """The latest frames with the paths of the hypotheses; None if empty or about to restart."""
-        return self._relinearisation.window
-
-    @property
-    def is_lagged(self) -> bool:
-        """Whether poses are smoothed with a fixed lag."""
-        return self._fixed_lag is not None
-
-    def gain(self, row: int) -> float:
-        """Increase of the window's log-likelihood by relinearising the path of hypothesis `row`,
-        nats; see `Relinearisation.gain`."""
-        return self._relinearisation.gain(int(self.bank.origin[row]))
-
     def filter_of(self, n_targets: int) -> BankFilter:
         """Filter for a given number of targets."""
-        return BankFilter(self.sensors.network, self._target.model, self._settings, n_targets)
+        return BankFilter(self.sensors.network, self.target.model, self.settings, n_targets)
 
     def configure(self, settings: TrackSettings) -> None:
         """Apply new values of the live settings."""
-        self._settings = settings
+        self.settings = settings
         self.filter.configure(settings)
-        self._relinearisation.restart()
+        self.relinearisation.restart()
 
     def begin(self, first: FieldFrame, detection: FieldFrame) -> None:
         """Move the bank back from the frame of the detection, at which it was created, to the first
@@ -119,7 +97,7 @@ class TrackBank:
             self.filter.move(self.bank, (first.stamp_ns - detection.stamp_ns) / NS)
         start = InitialBank.of(self.bank, self.filter.observation.n_target)
         self._whole_track.begin(copy(start), self.filter)
-        self._relinearisation.begin(start)
+        self.relinearisation.begin(start)
 
     def advance(self, frame: FieldFrame, dt: float) -> FrameUpdate:
         """Predict and update the bank with a frame of the sensors in use, and weight the
@@ -130,52 +108,38 @@ class TrackBank:
         return FrameUpdate(used, dt, predicted, log_likelihood, self.bank.reweight(log_likelihood),
                            len(rejected))
 
-    def restart_after_gap(self, frame: FieldFrame, dt: float) -> bool:
+    def restart_after_gap(self, frame: FieldFrame, dt: float) -> list[TrackState] | None:
         """Start the hypotheses again at the time of `frame` if the target was lost in the gap
-        before it; return whether they were started again."""
+        before it, and return the smoothed states before the gap; None if not started again."""
         network = self.sensors.network
-        if not self._target.is_lost_after(self._settings, network, dt):
-            return False
-        bank = self._target.start(self._settings, network, frame,
+        if not self.target.is_lost_after(self.settings, network, dt):
+            return None
+        bank = self.target.start(self.settings, network, frame,
                                   self.filter.observation.own_covariance)
         if bank is None:
-            return False
+            return None
+        states = self.smoothed(self.bank.best(), False)
         self.bank = bank
         self._counts['hypotheses started again after a gap'] += 1
-        self._clear_lag()
+        self.lag.clear()
         self.begin(frame, frame)
-        return True
+        return states
 
-    def store_and_prune(self, frame_update: FrameUpdate, publish: bool) -> None:
+    def store_and_prune(self, update: FrameUpdate, publish: bool) -> None:
         """Store a frame, drop improbable hypotheses, and relinearise the leading ones if due;
         `publish` if a pose is published for the frame."""
-        s, bank = self._settings, self.bank
-        self._relinearisation.add(bank, frame_update.predicted, frame_update.log_likelihood,
-                                  frame_update.evidence, frame_update.frame, frame_update.dt)
+        s, bank = self.settings, self.bank
+        self.relinearisation.add(bank, update.predicted, update.log_likelihood, update.evidence,
+                                 update.frame, update.dt)
         self._counts['hypotheses dropped'] += bank.prune(
             -np.log(PRUNE_RATIO),
             s.max_hypotheses if publish else max(s.max_hypotheses, MAX_INITIAL_HYPOTHESES))
-        self._counts.update(self._relinearisation.relinearise_leading(self.filter, bank))
-        self._whole_track.add(bank, frame_update.frame, frame_update.dt, publish)
-
-    def lagged(self, best: int, frame: FieldFrame, dt: float, publish: bool) -> list[TrackState]:
-        """Add a frame to the fixed-lag smoother; return the states of hypothesis `best` for frames
-        older than the lag."""
-        return [] if self._fixed_lag is None else self._fixed_lag.smoothed(
-            self.filter, self.bank, best, frame, dt, publish)
-
-    def remaining_lagged(self, best: int) -> list[TrackState]:
-        """Smoothed states of hypothesis `best` for the frames that remain in the fixed-lag smoother
-        at the track's end."""
-        return [] if self._fixed_lag is None else self._fixed_lag.remaining(
-            self.filter, self.bank, best)
+        self._counts.update(self.relinearisation.relinearise_leading(self.filter, bank))
+        self._whole_track.add(bank, update.frame, update.dt, publish)
 
     def smoothed(self, best: int, counts: bool = True) -> list[TrackState]:
-        """Smoothed states of hypothesis `best` at the published frames; empty if smoothing is
-        disabled or impossible.
-
-        `counts` tells whether excluded frames are counted.
-        """
+        """Smoothed states of hypothesis `best` at the published frames, empty if smoothing is
+        disabled or impossible; excluded frames are counted if `counts`."""
         states, n_excluded = self._whole_track.smoothed(self.bank, best)
         if counts:
             self._counts['frames left out of smoothing'] += n_excluded
@@ -184,37 +148,30 @@ class TrackBank:
 
     def without_target(self, i: int) -> None:
         """Remove target `i` from the hypotheses, the filter and the relinearisation window."""
-        best, n_targets = self.bank.best(), self.filter.observation.n_targets
-        n = first_weak_frame(self.filter, i, self.window, int(self.bank.origin[best]))
-        self._relinearisation.without_target(self.filter, self.bank, i, n)
+        self.relinearisation.without_target(self.filter, self.bank, i)
         self.bank = self.bank.without_target(i, self.single_target.n_target)
-        self.filter = self.filter_of(n_targets - 1)
+        self.filter = self.filter_of(self.filter.observation.n_targets - 1)
         self._rejection.clear()
-        self._clear_lag()
+        self.lag.clear()
 
     def resume(self, joint: JointExplanation) -> None:
         """Continue with another explanation of the latest frames."""
         self.bank, self.filter = joint.bank, joint.bank_filter
-        self._relinearisation.resume(joint.window)
+        self.relinearisation.resume(joint.window)
         self._whole_track.resume(joint.window, self.filter)
         self._rejection.clear()
-        self._clear_lag()
-
-    def _clear_lag(self) -> None:
-        """Drop the frames of the fixed-lag smoother, because the state layout has changed."""
-        if self._fixed_lag is not None:
-            self._fixed_lag.clear()
+        self.lag.clear()
 
     def hand_over(self, best: int) -> bool:
         """Switch to the sensors near the predicted position of hypothesis `best`; return whether
         they have changed."""
         sensors = self.sensors.ahead_of(self.bank.x[best], min(
-            self._settings.max_sensors, max_sensors(self.filter.observation, len(self.bank))))
+            self.settings.max_sensors, max_sensors(self.filter.observation, len(self.bank))))
         if sensors is self.sensors:
             return False
         self._switch_sensors(sensors)
         self._whole_track.abandon()
-        self._relinearisation.restart()
+        self.relinearisation.restart()
         self._counts['tracks handed over to other sensors'] += 1
         return True
 
@@ -233,7 +190,7 @@ class TrackBank:
         anchor = self.bank.copy()
         self.filter.move(anchor, dt)
         self._whole_track.begin(anchor, self.filter)
-        self._relinearisation.begin(anchor.copy())
+        self.relinearisation.begin(anchor.copy())
         return True
 
     def _switch_sensors(self, sensors: SensorSubset) -> None:
@@ -243,5 +200,5 @@ class TrackBank:
         self._rejection = SensorRejection(sensors.network.names)
         exchange_sensor_states(
             self.bank, before, sensors.rows, self.filter.observation.own_covariance,
-            self._settings.background_std)
-        self._clear_lag()
+            self.settings.background_std)
+        self.lag.clear()

@@ -1,6 +1,6 @@
 """Traffic: count tracked vehicles that cross counting lines, and summarise intervals."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
@@ -10,12 +10,13 @@ import numpy as np
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import Disturbance, TrafficSummary, VehiclePassage
 from mag_tracking.geometry import heading_of, speed_of
-from mag_tracking.inference.identification import (
-    UNKNOWN,
-    ClassPosterior,
-    Feature,
-    class_posterior,
+from mag_tracking.inference.driving_direction import (
+    MAX_CONFIDENCE,
+    fused_log_odds,
+    horizontal_field,
+    rotation_of_pass,
 )
+from mag_tracking.inference.identification import UNKNOWN, ClassPosterior, Feature, class_posterior
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.counting_line import (
     CountingLine,
@@ -25,7 +26,6 @@ from mag_tracking.network.counting_line import (
     counting_lines,
 )
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
-from mag_tracking.stages.traffic.field_direction import FieldDirection
 from mag_tracking.stages.traffic.intervals import TrafficIntervals
 from mag_tracking.stages.traffic.settings import TrafficSettings, VehicleClass
 from mag_tracking.units import NS
@@ -33,33 +33,32 @@ from mag_tracking.units import NS
 AMBIGUOUS, CONTRADICTED, EXTRAPOLATED = 'ambiguous', 'direction_contradicted', 'extrapolated'
 """Doubts about a passage: the track is ambiguous at the line; the rotation of the fields
 contradicts the direction of the crossing; the track does not reach the line."""
-
 MAX_DIRECTION_ERROR = 0.9
 """Error probability above which the fields contradict the direction of a crossing."""
-
-INTERFERENCE_S = 2.0
-"""[s] A direction is not checked if another vehicle is tracked within this time of the crossing."""
-
+INTERFERENCE_S, SMOOTHED_LEAD_S, MAX_WAIT_S = 2.0, 3.0, 120.0
+"""[s] Time around a crossing in which another tracked vehicle prevents the check of its direction,
+maximum time from the first smoothed to the first published pose of a track, and maximum time that
+passages and summaries wait for a running track."""
 REACQUIRED_S, REACQUIRED_M = 1.0, 3.0
-"""[s], [m] Maximum separation in time and along the line of two crossings that belong to one
-vehicle, whose track was lost and reacquired near the line."""
-
-SMOOTHED_LEAD_S = 3.0
-"""[s] Maximum time from the first pose of a smoothed path to the first published pose of its
-track."""
-
-MAX_WAIT_S = 120.0
-"""[s] Maximum time that passages and summaries wait for a running track."""
-
+"""[s], [m] Maximum separation in time and along the line of two crossings of one vehicle, whose
+track was lost and reacquired near the line."""
 TrafficRecord: TypeAlias = VehiclePassage | TrafficSummary
 """Output of the stage."""
+MAX_AGE_S = 70.0
+"""[s] Maximum age of stored frames; longer than any smoothed track."""
+MIN_LATERAL, MAX_ALONG = 1.5, 12.0
+"""[m] Minimum distance of a sensor that observes the direction from the path, and maximum distance
+from the crossing to its closest point of approach."""
+WINDOW_RATIO = 3.0
+"""Distance that the vehicle travels in half the window, relative to that of the sensor from it."""
+MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S = 0.5, 4.0
+"""[s] Bounds of half the duration of the window."""
+MAX_LOG_ODDS = float(np.log(MAX_CONFIDENCE / (1.0 - MAX_CONFIDENCE)))
+"""Largest log odds from one sensor."""
 
 
 class TrackedFrame(NamedTuple):
-    """A frame and the records that the tracker returned for it.
-
-    If `frame` is None, the records belong to tracks that end because the frames have ended.
-    """
+    """A frame, None after the last one, and the records that the tracker returned for it."""
 
     frame: FieldFrame | None
     records: Sequence[Track | SmoothedPose | Disturbance]
@@ -93,10 +92,10 @@ class _PendingCrossing(NamedTuple):
 class Traffic:
     """Converts tracked frames to passages and summaries.
 
-    A vehicle is counted when its track has ended, from its smoothed poses if available. Passages
-    are returned in chronological order, unless a track lasts longer than `MAX_WAIT_S`. Without
-    `counts_vehicles`, as for other targets, nothing is counted. Raises SettingsError if a class has
-    the name of vehicles that match no class.
+    A vehicle is counted when its track has ended, from its smoothed poses if available, and only
+    with `counts_vehicles`. Passages are returned in chronological order, unless a track lasts
+    longer than `MAX_WAIT_S`. Raises SettingsError if a class has the name of vehicles that match no
+    class.
     """
 
     def __init__(self, network: SensorNetwork, settings: TrafficSettings,
@@ -184,10 +183,8 @@ class Traffic:
             path.add(track)
 
     def _count_ended(self, now_ns: int | None) -> list[VehiclePassage]:
-        """Find the crossings of ended tracks, and return the passages that are due.
-
-        A passage is due when no earlier passage can follow, or if `now_ns` is None.
-        """
+        """Find the crossings of ended tracks, and return the passages that are due: all that no
+        earlier passage can follow, or all if `now_ns` is None."""
         ended = {id: track for id, track in self._open.items() if track.ended}
         self._ended += ended.values()
         for id, track in ended.items():
@@ -250,8 +247,8 @@ class Traffic:
 def _are_same_vehicle(one: _PendingCrossing, other: _PendingCrossing) -> bool:
     """Whether two crossings belong to one vehicle whose track was lost near the line."""
     separation_s = abs(other.crossing.stamp_ns - one.crossing.stamp_ns) / NS
-    separation_m = abs(one.line.lateral_offset(one.crossing.position) - one.line.lateral_offset(
-        other.crossing.position))
+    separation_m = abs(one.line.lateral_offset(one.crossing.position)
+                       - one.line.lateral_offset(other.crossing.position))
     return ((one.crossing.is_extrapolated or other.crossing.is_extrapolated)
             and separation_s < REACQUIRED_S and separation_m < REACQUIRED_M
             and not one.track.overlaps(other.track.begin_ns, other.track.last_ns))
@@ -263,7 +260,7 @@ def _is_running(record: Track | SmoothedPose | Disturbance) -> bool:
 
 
 def _class_of(pose: Pose, classes: Sequence[VehicleClass]) -> ClassPosterior:
-    """Classify a vehicle by the magnitude of its moment, and by its length if available."""
+    """Class of a vehicle by the magnitude of its moment, and by its length if available."""
     magnitude, shares = float(np.linalg.norm(pose.moment)), [c.share for c in classes]
     if not magnitude > 0.0:
         prior = np.array(shares)
@@ -275,3 +272,62 @@ def _class_of(pose: Pose, classes: Sequence[VehicleClass]) -> ClassPosterior:
         features.append(Feature(pose.length, pose.length_std, [c.length for c in classes],
                                 [c.length_spread for c in classes]))
     return class_posterior([c.name for c in classes], shares, features)
+
+
+class FieldDirection:
+    """Estimates, from the latest frames, the probability that a crossing direction is wrong."""
+
+    def __init__(self, network: SensorNetwork) -> None:
+        self._network = network
+        self._frames: deque[FieldFrame] = deque()
+
+    def add(self, frame: FieldFrame, since_ns: int) -> None:
+        """Store a frame, and drop frames not needed for crossings from `since_ns` on, and all if
+        time jumps back."""
+        if self._frames and frame.stamp_ns <= self._frames[-1].stamp_ns:
+            self._frames.clear()
+        self._frames.append(frame)
+        oldest = max(since_ns - round(MAX_HALF_WINDOW_S * NS),
+                     frame.stamp_ns - round(MAX_AGE_S * NS))
+        while self._frames[0].stamp_ns < oldest:
+            self._frames.popleft()
+
+    def error_probability(self, crossing: Crossing) -> float:
+        """Probability that the direction of a crossing is wrong; NaN if it is not observable, or if
+        the sensors contradict each other."""
+        velocity = crossing.pose.velocity[:2]
+        speed = float(np.hypot(*velocity))
+        if not self._frames or speed < 0.1:
+            return float('nan')
+        u = velocity / speed
+        r = self._network.positions[:, :2] - crossing.position[:2]
+        along, left = r @ u, u[0] * r[:, 1] - u[1] * r[:, 0]
+        odds, same_side = [], []
+        for j in np.flatnonzero(
+                (np.abs(left) >= MIN_LATERAL) & (np.abs(along) <= MAX_ALONG)).tolist():
+            half_window_s = np.clip(WINDOW_RATIO * abs(left[j]) / speed,
+                                    MIN_HALF_WINDOW_S, MAX_HALF_WINDOW_S)
+            log_odds = self._log_odds(j, crossing.stamp_ns + round(along[j] / speed * NS),
+                                      round(half_window_s * NS))
+            if log_odds is not None:
+                odds.append(float(np.clip(log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS)))
+                # From a sensor to the left of the path, the vehicle moves from right to left.
+                same_side.append(bool(left[j] < 0.0))
+        fused = fused_log_odds(odds, same_side)
+        if not odds or len(odds) > 1 and abs(fused) < 0.5 * max(map(abs, odds)):
+            return float('nan')
+        return float(1.0 / (1.0 + np.exp(fused)))
+
+    def _log_odds(self, j: int, middle_ns: int, half_ns: int) -> float | None:
+        """Log odds of motion from left to right as seen from sensor `j`; None if unobservable."""
+        frames = [f for f in self._frames if abs(f.stamp_ns - middle_ns) <= half_ns]
+        field = horizontal_field(np.array([f.field[j] for f in frames]).reshape(-1, 3),
+                                 self._network.R_ws[j])
+        is_measured = ~np.isnan(field).any(axis=1)
+        if not is_measured.any():
+            return None
+        variance = [np.nanmean(np.diagonal(frames[k].covariance[j]))
+                    for k in np.flatnonzero(is_measured).tolist()]
+        noise = float(np.sqrt(np.median(variance)))
+        rotation = rotation_of_pass(field[is_measured], noise, len(frames) // 4)
+        return None if rotation is None else rotation.log_odds

@@ -16,8 +16,7 @@ from mag_tracking.pipeline import settings_for
 from mag_tracking.records import Readings
 from mag_tracking.results.columns import EVENTS, names_of
 from mag_tracking.stages.calibrate.stage import Calibrate
-from mag_tracking.stages.events.single_sensor_pass import closest_point
-from mag_tracking.stages.events.stage import Events
+from mag_tracking.stages.events.stage import Events, closest_point
 from mag_tracking.stages.track.manager import NO_SCALE_FRAMES
 from mag_tracking.units import NS
 from support import spoiler

@@ -6,7 +6,7 @@ import pytest
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.approach import GROWTH_RATIO, SENSED_LEVEL, Approach
+from mag_tracking.stages.track.plausibility import GROWTH_RATIO, SENSED_LEVEL, Approach
 from support.situations import simulated_world
 
 STD = 1e-8

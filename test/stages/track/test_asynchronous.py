@@ -8,7 +8,7 @@ import pytest
 from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
-from mag_tracking.simulation.scenario import Path, point_body
+from mag_tracking.simulation.scenario import Path
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.target import target_of
@@ -16,6 +16,7 @@ from support.bundled import POINT
 from support.counters import count_of
 from support.networks import line_network
 from support.samples import one, simulate
+from support.scenario import point_body
 from support.track_runs import magnet_frames
 
 

@@ -6,7 +6,7 @@ import pytest
 from mag_tracking.errors import SettingsError
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track import bank_size
+from mag_tracking.stages.track import target
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.target import target_of
 from support.bundled import POINT
@@ -57,9 +57,9 @@ def bytes_at_start(n, settings):
 def test_the_limit_applies_to_the_size_of_the_actual_bank(monkeypatch, n, changes):
     network, settings = line_network(n), settings_for('vehicle', changes).track
     size = bytes_at_start(n, settings)
-    monkeypatch.setattr(bank_size, 'MAX_BYTES', size)
+    monkeypatch.setattr(target, 'MAX_BYTES', size)
     target_of(settings, network)
-    monkeypatch.setattr(bank_size, 'MAX_BYTES', size - 1)
+    monkeypatch.setattr(target, 'MAX_BYTES', size - 1)
     with pytest.raises(SettingsError, match='starting hypotheses'):
         target_of(settings, network)
 
@@ -68,29 +68,29 @@ def test_the_limit_applies_to_the_size_of_the_actual_bank(monkeypatch, n, change
 def test_the_number_of_sensors_at_the_start_is_limited_by_memory(monkeypatch, changes):
     settings = settings_for('vehicle', changes).track
     model = target_of(settings, line_network(2)).model
-    monkeypatch.setattr(bank_size, 'START_BYTES', bytes_at_start(6, settings))
+    monkeypatch.setattr(target, 'START_BYTES', bytes_at_start(6, settings))
     for n, expected in ((2, 2), (6, 6), (7, 6), (40, 6)):
-        assert bank_size.sensors_at_start(settings, line_network(n), model) == expected
-    monkeypatch.setattr(bank_size, 'START_BYTES', bank_size.START_BYTES - 1)
-    assert bank_size.sensors_at_start(settings, line_network(40), model) == 5
-    monkeypatch.setattr(bank_size, 'START_BYTES', 1)
-    assert bank_size.sensors_at_start(settings, line_network(40), model) == 4
-    assert bank_size.sensors_at_start(settings, line_network(3), model) == 3
+        assert target.sensors_at_start(settings, line_network(n), model) == expected
+    monkeypatch.setattr(target, 'START_BYTES', target.START_BYTES - 1)
+    assert target.sensors_at_start(settings, line_network(40), model) == 5
+    monkeypatch.setattr(target, 'START_BYTES', 1)
+    assert target.sensors_at_start(settings, line_network(40), model) == 4
+    assert target.sensors_at_start(settings, line_network(3), model) == 3
 
 
 def test_a_magnet_starts_with_max_sensors():
     settings, network = settings_for('magnet').track, line_network(40)
     model = target_of(settings, network).model
-    assert bank_size.sensors_at_start(settings, network, model) == settings.max_sensors
+    assert target.sensors_at_start(settings, network, model) == settings.max_sensors
 
 
 @pytest.mark.parametrize('n', [2, 16, 32, 90])
 def test_the_number_of_retained_hypotheses_is_limited_by_memory(n):
     settings, network = settings_for('vehicle').track, line_network(2)
     observation = BankFilter(network, target_of(settings, network).model, settings).observation
-    n_hyp, size = bank_size.max_hypotheses(observation, n), 8 * observation.n_states(n)**2
-    assert (n_hyp == bank_size.MIN_HYPOTHESES if n == 90
-            else n_hyp * size <= bank_size.WIDER_BYTES < (n_hyp + 1) * size)
+    n_hyp, size = target.max_hypotheses(observation, n), 8 * observation.n_states(n)**2
+    assert (n_hyp == target.MIN_HYPOTHESES if n == 90
+            else n_hyp * size <= target.WIDER_BYTES < (n_hyp + 1) * size)
 
 
 def test_more_sensors_than_fit_into_memory_are_rejected():

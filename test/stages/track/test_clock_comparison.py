@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mag_tracking.stages.track.clock_comparison import MEMORY_PASSES, ClockComparison
-from mag_tracking.stages.track.rigid_pass import RigidPass
+from mag_tracking.stages.track.cross_check import MEMORY_PASSES, ClockComparison
+from mag_tracking.stages.track.pass_samples import RigidPass
 
 FIRST_TWO = np.arange(2)
 

@@ -8,9 +8,8 @@ import pytest
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.stages.track import doubts
-from mag_tracking.stages.track.clock_comparison import ClockComparison
-from mag_tracking.stages.track.cross_check import CrossCheck
-from mag_tracking.stages.track.rigid_pass import RigidPass
+from mag_tracking.stages.track.cross_check import ClockComparison, CrossCheck
+from mag_tracking.stages.track.pass_samples import RigidPass
 from support import spoiler
 from support.bundled import LINEARISED_ONCE
 from support.passes import network_of

@@ -7,7 +7,7 @@ import pytest
 
 from mag_tracking.physics.dipole import dipole_field
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track.disturbance_model import DisturbanceModel
+from mag_tracking.stages.track.disturbances import DisturbanceModel
 from support.networks import line_network
 
 NOISE = 4e-9

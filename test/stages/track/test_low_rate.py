@@ -9,8 +9,8 @@ import mag_tracking as mt
 from mag_tracking.pipeline import settings_for
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.initiation_vehicle import LATERAL_STD
-from mag_tracking.stages.track.low_rate import low_rate_fault, required_rate
 from mag_tracking.stages.track.manager import TOO_SLOW
+from mag_tracking.stages.track.plausibility import low_rate_fault, required_rate
 from support.bundled import NETWORK_FILE
 from support.networks import line_network
 from support.spoiler import apply, thinned

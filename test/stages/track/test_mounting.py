@@ -11,12 +11,13 @@ from mag_tracking.geometry import quaternion_from_rotation_vector, rotation_from
 from mag_tracking.physics.dipole import dipole_field, rotated_fields
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, Track
-from mag_tracking.simulation.scenario import Path, SensorErrorModel, point_body
+from mag_tracking.simulation.scenario import Path
 from mag_tracking.stages.track.initiation_vehicle import vehicle_model
 from mag_tracking.stages.track.observation import Observation
 from support.bundled import POINT
 from support.networks import line_network
 from support.samples import one, simulate
+from support.scenario import SensorErrorModel, point_body
 from support.track_runs import NOISE, drive
 
 

@@ -9,18 +9,20 @@ import pytest
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import SmoothedPose, Track
-from mag_tracking.stages.track.joint import CONFIDENT_NATS, JointExplanation
-from mag_tracking.stages.track.member import members_in_order
-from mag_tracking.stages.track.new_target_evidence import (
+from mag_tracking.stages.track.joint import (
     ACCEPT_NATS,
+    CONFIDENT_NATS,
     IMPROBABLE,
     LONG_INTERVAL_S,
     LONG_VEHICLE,
     MIN_INTERVAL_S,
     REPEATED_NATS,
+    JointExplanation,
     NewTargetEvidence,
 )
-from mag_tracking.stages.track.window_start import in_order_of, inserted, overlap_depth
+from mag_tracking.stages.track.member import members_in_order
+from mag_tracking.stages.track.steady_search import in_order_of
+from mag_tracking.stages.track.window_search import inserted, overlap_depth
 from mag_tracking.units import NS
 from support import busy_worlds
 from support.busy_worlds import NETWORKS, passing, world

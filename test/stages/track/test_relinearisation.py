@@ -197,8 +197,6 @@ def test_the_gain_is_the_log_likelihood_ratio_of_the_path(bonus):
     assert relinearisation.gain(1) == 0.0
     relinearisation.begin(bank.copy())
     assert relinearisation.gain(0) == 0.0
-    relinearisation.clear()
-    assert relinearisation.gain(0) == 0.0
 
 
 def test_a_path_with_an_invalid_covariance_is_rejected():

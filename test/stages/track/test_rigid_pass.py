@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from mag_tracking.physics.passes import N_PATH
-from mag_tracking.stages.track import rigid_pass
-from mag_tracking.stages.track.pass_samples import MODEL_ERROR
-from mag_tracking.stages.track.rigid_pass import fit_rigid_pass
+from mag_tracking.stages.track import pass_samples
+from mag_tracking.stages.track.pass_samples import MODEL_ERROR, fit_rigid_pass
 from mag_tracking.units import NS
 from support.steady_frames import FOUR, ROAD, STRAIGHT, TURNS, state_at, steady_frames
 
@@ -125,11 +124,11 @@ def test_paths_that_explain_a_pass_are_near_the_true_path():
 @pytest.mark.parametrize('limit, value', [('MAX_DISTANCE', 3.0), ('MAX_SPEED', 15.0)])
 def test_paths_that_are_too_far_or_too_fast_are_rejected(monkeypatch, limit, value):
     """The vehicle passes one sensor at 3.5 m and the other at 5.5 m, at 20 m/s."""
-    monkeypatch.setattr(rigid_pass, limit, value)
+    monkeypatch.setattr(pass_samples, limit, value)
     fit = fit_of(steady_frames(np.random.default_rng(9)))
     assert fit.misfit < 1.3 and not len(fit.straight_paths)
 
 
 def test_a_path_near_one_sensor_is_accepted(monkeypatch):
-    monkeypatch.setattr(rigid_pass, 'MAX_DISTANCE', 4.5)
+    monkeypatch.setattr(pass_samples, 'MAX_DISTANCE', 4.5)
     assert len(fit_of(steady_frames(np.random.default_rng(9))).straight_paths) == 2

@@ -15,7 +15,7 @@ from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.evidence import MAX_SINGLE_SENSOR_S
 from mag_tracking.stages.track.initiation_vehicle import vehicle_model
 from mag_tracking.stages.track.manager import TrackManager
-from mag_tracking.stages.track.sensor_rejection import SENSORS_PER_REJECTION, SensorRejection
+from mag_tracking.stages.track.sensor_selection import SENSORS_PER_REJECTION, SensorRejection
 from support.bundled import POINT
 from support.counters import assert_counts, count_of
 from support.faulty_streams import NS, stream

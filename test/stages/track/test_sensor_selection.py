@@ -8,10 +8,10 @@ import pytest
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
-from mag_tracking.simulation.scenario import Path, point_body
-from mag_tracking.stages.track import bank_size, manager, track_bank
-from mag_tracking.stages.track.approach import Approach
+from mag_tracking.simulation.scenario import Path
+from mag_tracking.stages.track import manager, target, track_bank
 from mag_tracking.stages.track.doubts import DOUBTFUL_BACKGROUND
+from mag_tracking.stages.track.plausibility import Approach
 from mag_tracking.stages.track.sensor_selection import (
     exchange_sensor_states,
     nearest_sensors,
@@ -22,6 +22,7 @@ from support.bundled import POINT
 from support.counters import count_of
 from support.networks import line_network
 from support.samples import one, simulate
+from support.scenario import point_body
 
 
 def bank_of(rng, n_hyp, n_t, n_own, n_sensors):
@@ -189,7 +190,7 @@ def test_no_hypothesis_is_dropped_without_frames_before_the_detection(monkeypatc
     """The ranking of the hypotheses is unknown until the other sensors join."""
     monkeypatch.setattr(manager, 'sensors_at_start', lambda *_: 4)
     for name, value in (('WIDER_BYTES', 1), ('MIN_HYPOTHESES', 20)):
-        monkeypatch.setattr(bank_size, name, value)
+        monkeypatch.setattr(target, name, value)
     first = next(k for k, f in enumerate(frames[1]) if f.target_present)
     tracker, _ = track_frames(frames, {}, start=slice(first, first + 1))
     assert len(tracker.bank) == track_bank.MAX_INITIAL_HYPOTHESES

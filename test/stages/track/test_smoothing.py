@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
-from mag_tracking.simulation.scenario import Path, point_body, random_vehicle
+from mag_tracking.simulation.scenario import Path, random_vehicle
 from mag_tracking.stages.track import smoothing as smooth_module
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.smoothing import NOT_SMOOTHED
@@ -20,6 +20,7 @@ from support.marks import studied
 from support.networks import line_network
 from support.plain_smoother import Step, smoothed_covariances, smoothed_states
 from support.samples import one, simulate
+from support.scenario import point_body
 
 
 def batch_solution(F, Q, H, R, y, x0, P0, missing):

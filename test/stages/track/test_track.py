@@ -10,7 +10,7 @@ from mag_tracking.geometry import rotation_from_quaternion
 from mag_tracking.messages.schema import pose_covariance
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import Track
-from mag_tracking.simulation.scenario import Path, SensorErrorModel, point_body, random_vehicle
+from mag_tracking.simulation.scenario import Path, random_vehicle
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.relinearisation import Relinearisation
 from mag_tracking.stages.track.target import target_of
@@ -18,6 +18,7 @@ from support.bundled import POINT
 from support.counters import count_of
 from support.networks import line_network
 from support.samples import one, simulate
+from support.scenario import SensorErrorModel, point_body
 from support.track_runs import drive, magnet_frames
 
 OVERFITS = 'doubtful poses: the filter fits better than its path'

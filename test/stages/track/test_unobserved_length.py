@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from mag_tracking.physics.vehicles import RowVehicle
-from mag_tracking.stages.track.published_pose import VehicleOrientation, smoothed_pose
-from mag_tracking.stages.track.unobserved_length import UnobservedLength
+from mag_tracking.stages.track.published_pose import (
+    UnobservedLength,
+    VehicleOrientation,
+    smoothed_pose,
+)
 
 SENSORS = np.array([[0.0, 4.0, 0.0], [1.0, -4.0, 0.0]])
 P = 0.04 * np.eye(19)
