@@ -1,14 +1,17 @@
 """One way to play readings through the stages: a source, a pipeline, sinks and one report."""
 
+import html
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
-from mag_tracking.errors import OutputError
+from tqdm.auto import tqdm
+
+from mag_tracking.errors import MissingDependencyError, OutputError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline
-from mag_tracking.record_receiver import Step
+from mag_tracking.pipeline import Pipeline, Step
 from mag_tracking.recording.interruptible import Progress, ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
@@ -340,3 +343,41 @@ def no_track_reason(counts: Mapping[str, int]) -> str | None:
                 'replay --tables events` to describe the passes without scale, or set '
                 'track.single_sensor_prior: true if the vehicles match the settings')
     return None
+
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MAX_ROWS = 20
+"""Maximum number of rows of a table in a notebook."""
+
+
+class DisplayedResult:
+    """Result that a notebook shows as its summary and the first rows of its table."""
+
+    def to_dataframe(self) -> 'pd.DataFrame':
+        """Convert the result to a table.
+
+        Returns
+        -------
+        pandas.DataFrame
+        """
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        summary = f'<p>{html.escape(repr(self))}</p>'
+        try:
+            return summary + self.to_dataframe().to_html(max_rows=MAX_ROWS)
+        except MissingDependencyError:
+            return summary
+
+
+@contextmanager
+def shown_progress(source: Source) -> Iterator[Progress]:
+    """Show a progress bar for a recording in a terminal or notebook; yield its function."""
+    if not isinstance(source, RecordingSource):
+        yield lambda n: None
+        return
+    with tqdm(total=source.recording.size, unit='B', unit_scale=True, desc=source.name,
+              disable=None, leave=False) as bar:
+        yield bar.update

@@ -9,9 +9,8 @@ from mag_tracking.analysis.pass_mounting import MountingEvidence, fuse_mounting,
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, Settings
+from mag_tracking.pipeline import Pipeline, RecordReceiver, Settings
 from mag_tracking.quantities import quantity
-from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader

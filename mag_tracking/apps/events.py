@@ -8,17 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
 from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.event_records import PassEvent
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, Settings, settings_for
+from mag_tracking.pipeline import Pipeline, RecordReceiver, Settings, Step, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.record_receiver import RecordReceiver, Step
 from mag_tracking.records import Readings
 from mag_tracking.results.columns import EVENTS, row_of
 from mag_tracking.results.dataframes import rows_dataframe
-from mag_tracking.run import RunReport, Source, run
+from mag_tracking.run import DisplayedResult, RunReport, Source, run, shown_progress
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.events.stage import Events
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mag_tracking.analysis.fitted_pass import FittedPass
-from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
-from mag_tracking.apps.pass_fitter import PassFitter
+from mag_tracking.apps.passes import PassFitter
 from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.errors import SettingsError, UnknownTrackError
 from mag_tracking.network import SensorNetwork
@@ -18,7 +17,7 @@ from mag_tracking.quantities import quantity
 from mag_tracking.results.columns import FITS, names_of
 from mag_tracking.results.dataframes import dataframe
 from mag_tracking.results.fit_folder import pass_rows
-from mag_tracking.run import RunReport, run
+from mag_tracking.run import DisplayedResult, RunReport, run, shown_progress
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,8 +16,7 @@ from mag_tracking.errors import OutputError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.geometry import heading_of, speed_of
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, Settings
-from mag_tracking.record_receiver import RecordReceiver
+from mag_tracking.pipeline import Pipeline, RecordReceiver, Settings
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.truth import read_truth_table
 from mag_tracking.records import FieldFrame, SmoothedPose, Track

@@ -5,23 +5,21 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
-from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
 from mag_tracking.apps.readings import RecordedReadings, UserSource, network_of, source_of
 from mag_tracking.apps.replay import TrackHistory, errors_against_truth
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.errors import UnknownTrackError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, Settings, settings_for
+from mag_tracking.pipeline import Pipeline, RecordReceiver, Settings, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.records import Detection, SmoothedPose, Track
 from mag_tracking.report.metrics import Truth, interpolate_truth
 from mag_tracking.report.track_log import TrackLog
 from mag_tracking.results.columns import COMPLETE, DETECTIONS, POSES, SMOOTHED
 from mag_tracking.results.dataframes import array_dataframe, with_time_index
 from mag_tracking.results.result_arrays import detection_array, pose_array, smoothed_array
-from mag_tracking.run import RecordingSource, RunReport, run
+from mag_tracking.run import DisplayedResult, RecordingSource, RunReport, run, shown_progress
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,19 +14,17 @@ from mag_tracking.analysis.correlated_motion import (
     correlated_motion,
 )
 from mag_tracking.analysis.pass_data import PassData
-from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
 from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import TrafficSummary, VehiclePassage
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, Settings, settings_for
+from mag_tracking.pipeline import Pipeline, RecordReceiver, Settings, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.records import FieldFrame, Track
 from mag_tracking.results.columns import traffic_tables
 from mag_tracking.results.dataframes import rows_dataframe
 from mag_tracking.results.traffic_tables import passage_row
-from mag_tracking.run import RunReport, Source, run
+from mag_tracking.run import DisplayedResult, RunReport, Source, run, shown_progress
 from mag_tracking.units import NS
 
 if TYPE_CHECKING:

@@ -13,11 +13,12 @@ from mag_tracking.cli.options import (
     add_command,
     add_recorded_network,
     add_report,
+    add_settings,
     check_report,
     progress_bar,
     recorded_network,
+    settings_of,
 )
-from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.recording.reader import Recording

@@ -14,7 +14,7 @@ from mag_tracking.analysis.correlated_motion import contradicts_delays
 from mag_tracking.analysis.fitted_pass import FittedPass
 from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, Bearing, PassFit
 from mag_tracking.apps.fit import check_cpa_range, check_orders
-from mag_tracking.apps.pass_fitter import PassFitter
+from mag_tracking.apps.passes import PassFitter
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import (
     Commands,
@@ -26,7 +26,7 @@ from mag_tracking.cli.options import (
     progress_bar,
     recorded_network,
 )
-from mag_tracking.cli.vehicle_rows import HEADER, UNKNOWN, time_of, vehicle_row
+from mag_tracking.cli.tables import HEADER, UNKNOWN, time_of, vehicle_row
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.inference.iron import Iron, hard_and_soft_iron

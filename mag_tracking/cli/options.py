@@ -1,4 +1,4 @@
-"""Options shared by several commands; see `tracking_options` for the options of the tracker."""
+"""Options shared by several commands, and what they select."""
 
 import argparse
 import dataclasses
@@ -13,11 +13,15 @@ from mag_tracking.cli.commands import COMMANDS
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
+from mag_tracking.network.sensor_network import MAX_BOARD_EXTENT
 from mag_tracking.network.topics import checked_namespace
+from mag_tracking.settings import read_parameter_file
 from mag_tracking.stages.health.diagnosis import Diagnosis
 
 if TYPE_CHECKING:
     # Not every command loads the stages.
+    from mag_tracking.pipeline import Settings
+    from mag_tracking.recording.field_table import TableOptions
     from mag_tracking.run import RecordingSource
 
 # Quoted because the class is not generic at run time.
@@ -95,6 +99,19 @@ def add_verbose(parser: argparse.ArgumentParser) -> None:
                         help='print the details of each vehicle')
 
 
+def add_page(parser: argparse._ActionsContainer, port: bool = True) -> None:
+    """Add --host and --port, or only --host."""
+    # Not every command loads the server.
+    from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK
+
+    if port:
+        parser.add_argument('--port', type=int, default=DEFAULT_PORT, metavar='PORT',
+                            help=f'port of the page (default: {DEFAULT_PORT}; 0 selects a free '
+                            'port)')
+    parser.add_argument('--host', default=LOOPBACK, metavar='ADDRESS', help='local address of '
+                        f'the page (default: {LOOPBACK})')
+
+
 def check_writable(path: Path | None) -> None:
     """Check that an output file can be created; raises OutputError if its folder is missing, or if
     it is a folder."""
@@ -144,3 +161,91 @@ def print_diagnoses(diagnoses: Iterable[Diagnosis]) -> None:
     """Print one line per diagnosis."""
     for diagnosis in diagnoses:
         print(f'  {"warning: " if diagnosis.serious else ""}{diagnosis}')
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Add --target and --params."""
+    from mag_tracking.pipeline import TARGET_DEFAULTS
+
+    parser.add_argument('--params', type=Path, metavar='FILE',
+                        help='YAML file with the settings to override')
+    parser.add_argument('--target', choices=list(TARGET_DEFAULTS),
+                        help='type of target: a vehicle, a magnet in a hand, or a magnet on a '
+                        'bench (default: magnet for a board of sensors, otherwise vehicle)')
+
+
+def settings_of(args: argparse.Namespace, network: SensorNetwork) -> 'Settings':
+    """Settings of --target and --params; raises SettingsError if the parameter file is invalid.
+
+    Without both, a board of sensors selects a magnet, and a line is printed.
+    """
+    from mag_tracking.pipeline import settings_for
+
+    changes = read_parameter_file(args.params) if args.params else {}
+    if args.target is not None:
+        return settings_for(args.target, changes)
+    if 'track.target' in changes or not network.is_board:
+        return settings_for(changes.get('track.target', 'vehicle'), changes)
+    print(f'{args.network}: {len(network)} sensors within {MAX_BOARD_EXTENT:g} m: the settings for '
+          'a magnet are used; --target vehicle selects those for vehicles')
+    return settings_for('magnet', changes)
+
+
+def add_table_options(parser: argparse.ArgumentParser, sensor: bool = True) -> None:
+    """Add the options that describe a table of readings, with or without --sensor."""
+    p = parser.add_argument_group('table of readings', 'properties that are found if not given')
+    p.add_argument('--columns', nargs='+', metavar='KEY=COLUMN',
+                   help='columns, by name or number (from 1): time=, and x= y= z= with sensor=, or '
+                   'for each sensor NAME.x= NAME.y= NAME.z=')
+    p.add_argument('--unit', default='', metavar='UNIT',
+                   help='unit of the field: T, mT, uT, nT, G or mG, counts per unit such as '
+                   '1090/G, or tesla per count')
+    p.add_argument('--time-unit', default='', metavar='UNIT',
+                   help='unit of times that are numbers: s, ms, us, ns, min, h, d, ticks per unit '
+                   'such as 32768/s, or seconds per tick')
+    if sensor:
+        p.add_argument('--sensor', default='', metavar='NAME',
+                       help='name of the only sensor (default: mag_1)')
+    p.add_argument('--sensors', nargs='+', default=[], metavar='TEXT=NAME',
+                   help='names of the sensors by the text in their column, or - to ignore it')
+    p.add_argument('--separator', default='', metavar='CHARACTER',
+                   help='comma, semicolon, tab, spaces, bar, or another character')
+    p.add_argument('--decimal', default='', metavar='MARK', help="decimal mark, . or ','")
+    p.add_argument('--header', type=int, metavar='LINE',
+                   help='number of the header line; 0 without a header')
+    p.add_argument('--encoding', default='', metavar='NAME', help='such as utf-16 or latin-1')
+    p.add_argument('--date-order', default='', metavar='ORDER',
+                   help='order of a date of three numbers: dmy, mdy or ymd')
+    p.add_argument('--rate', type=float, metavar='HZ',
+                   help='rate of the readings, for tables without times or with coarse times')
+    p.add_argument('--wrap', type=int, default=0, metavar='N',
+                   help='number at which the time returns to 0')
+    p.add_argument('--jumps', default='', metavar='split|sort',
+                   help='meaning of a time that runs backwards: the clock restarted (split into '
+                   'recordings), or the rows are out of order (sort)')
+
+
+def table_options(args: argparse.Namespace, sensor: str | None = None) -> 'TableOptions':
+    """Collect the options of `add_table_options`; raises SettingsError if --sensors is not valid.
+
+    `sensor` is the name of the only sensor, if --sensor is not one of the options.
+    """
+    from mag_tracking.recording.field_table import TableOptions
+
+    sensors = dict(text.rpartition('=')[::2] for text in args.sensors)
+    if '' in sensors or not all(sensors.values()):
+        raise SettingsError('--sensors: expected TEXT=NAME such as A=mag_1')
+    return TableOptions(
+        args.columns or (), args.unit, args.time_unit,
+        args.sensor if sensor is None else sensor, sensors,
+        args.separator, args.decimal, args.header, args.encoding, args.date_order, args.rate,
+        args.wrap, args.jumps)
+
+
+def print_notes(table: Path, notes: Iterable[str]) -> None:
+    """Print what was found out about a table, with each warning on its own line."""
+    notes = list(notes)
+    print(f'{table}: {"; ".join(n for n in notes if not n.startswith("warning"))}')
+    for note in notes:
+        if note.startswith('warning'):
+            print(f'  {note}')

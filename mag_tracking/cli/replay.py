@@ -3,6 +3,7 @@
 import argparse
 import signal
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
@@ -16,22 +17,21 @@ from mag_tracking.apps.replay import Run, replay, write_figures, write_trajector
 from mag_tracking.apps.replay_notes import notes_of
 from mag_tracking.apps.replay_report import write_report
 from mag_tracking.apps.traffic import check_vehicles
-from mag_tracking.cli.events import Events
 from mag_tracking.cli.fit import ORDERS, Fits
-from mag_tracking.cli.live_page import add_page, show_recording
 from mag_tracking.cli.options import (
     Commands,
     add_command,
+    add_page,
     add_recorded_network,
+    add_settings,
     add_verbose,
     distinct_names,
     print_diagnoses,
     progress_bar,
     recorded_network,
+    settings_of,
 )
-from mag_tracking.cli.passages import Passages
-from mag_tracking.cli.tracking_options import add_settings, settings_of
-from mag_tracking.cli.vehicle_rows import HEADER, time_of, vehicle_row
+from mag_tracking.cli.tables import HEADER, Events, Passages, time_of, vehicle_row
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.files import output_folder
 from mag_tracking.geometry import speed_of
@@ -45,6 +45,7 @@ from mag_tracking.report.track_log import TrackLog
 from mag_tracking.results.rerun_file import RERUN_FILE, check_rerun, write_rerun
 from mag_tracking.run import RecordingSource, Sink, output_error, run
 from mag_tracking.stages.track.doubts import MEANINGS
+from mag_tracking.web.page_server import PageServer
 
 _REPLAY_HELP = '''
 Reads the magnetic fields on the topics of the network, learns the background of each sensor
@@ -163,7 +164,7 @@ def _replay(args: argparse.Namespace) -> int:
     settings = settings_of(args, network)
     _check(args, settings)
     if args.live:
-        return show_recording(args.recordings[0], network, settings, args.rate, args.host,
+        return _show(args.recordings[0], network, settings, args.rate, args.host,
                               args.port)
     names = distinct_names(args.recordings)
     sources = [RecordingSource(Recording(path), network) for path in args.recordings]
@@ -186,6 +187,29 @@ def _replay(args: argparse.Namespace) -> int:
         elif signals:
             print('interrupted: the results cover only the part read so far')
     return 130 if signals else 0 if is_complete else 1
+
+
+def _show(path: Path, network: SensorNetwork, settings: Settings, rate: float,
+                   host: str, port: int) -> int:
+    """Track a recording in real time on the live page until Ctrl-C; return the exit status."""
+    # Imported here because the pipeline is slow to import.
+    from mag_tracking.apps.view import view
+    from mag_tracking.web.live_scene import LiveScene
+
+    if not 0.0 < rate < float('inf'):
+        raise SettingsError(f'--rate: expected a number above 0, got {rate:g}')
+    recording, scene = Recording(path), LiveScene(path.name, network)
+    scene.subtitle = f'{quantity(len(network), "sensor")}, frame {network.frame}'
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals, \
+            PageServer(scene, host, port) as server:
+        print(f'live page: {server.url}')
+        view(recording, network, settings, scene, rate,
+             lambda: bool(signals) or not server.is_serving)
+        if not signals:
+            print('end of the recording; the page remains available until Ctrl-C')
+        while not signals and server.is_serving:
+            time.sleep(0.1)
+        return 0 if server.is_serving else 1
 
 
 def _check(args: argparse.Namespace, settings: Settings) -> None:

@@ -1,28 +1,110 @@
-"""Table `passages` of `mag-tracking replay`: vehicles that cross a line, and traffic counts."""
+"""Tables `passages` and `events` of `mag-tracking replay`, and the rows of vehicles."""
 
 import argparse
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mag_tracking.apps.events import EventSink
 from mag_tracking.apps.fleet import Fleet, earth_field_strength, pass_of
 from mag_tracking.apps.traffic import CountedVehicle, TrafficResult, TrafficSink
 from mag_tracking.cli.options import check_writable
-from mag_tracking.cli.vehicle_rows import time_of
 from mag_tracking.errors import SettingsError
+from mag_tracking.event_records import PassEvent
 from mag_tracking.inference.identification import Identification
-from mag_tracking.inference.log_normal_classes import UNKNOWN
+from mag_tracking.inference.log_normal_classes import UNKNOWN as UNKNOWN_CLASS
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline
 from mag_tracking.quantities import quantity
 from mag_tracking.results.columns import DIRECTIONS, traffic_tables
+from mag_tracking.results.event_tables import write_events
 from mag_tracking.results.fleet_file import FleetPass, read_fleet, write_fleet
 from mag_tracking.results.traffic_tables import passage_row, summary_rows, write_traffic
 from mag_tracking.run import RunReport
+from mag_tracking.stages.events.stage import MAX_DURATION_S
+from mag_tracking.units import NS
+
+Estimate = tuple[float, float]
+"""Value and standard deviation; NaN if unknown."""
+UNKNOWN = (np.nan, np.nan)
+
+
+def time_of(stamp_ns: float) -> str:
+    """Format the time of day of a timestamp (UTC)."""
+    time = datetime.fromtimestamp(stamp_ns / NS, tz=UTC)
+    return f'{time:%H:%M:%S}.{time.microsecond // 10000:02d}'
+
+
+def vehicle_row(label: str, time: str, kind: str, direction: str, speed: Estimate,
+                closest: Estimate, verdict: str) -> str:
+    """Format a row; `closest` is the distance from the centre of the sensors [m]."""
+    return _row(label, time, kind, direction, _text(speed), _text(closest), verdict)
+
+
+def _text(estimate: Estimate) -> str:
+    """Format a value and its standard deviation, as far as they are known."""
+    value, std = estimate
+    return '-' if np.isnan(value) else f'{value:.2f}' if np.isnan(std) else \
+        f'{value:.2f} ± {std:.2f}'
+
+
+def _row(*cells: str) -> str:
+    """Align the cells of a row."""
+    label, time, kind, direction, speed, closest, verdict = (cell or '-' for cell in cells)
+    return (f'  {label:<9}  {time:<11}  {kind:<9}  {direction:<10}  {speed:>14}  {closest:>14}  '
+            f'{verdict}')
+
+
+HEADER = _row('vehicle', 'time', 'kind', 'direction', 'speed [m/s]', 'closest [m]', 'verdict')
+"""Header of the table."""
+
+
+class Events:
+    """Events of each recording, written to the folder of the recording."""
+
+    upto = 'calibrate'
+    """Last stage of the pipeline that the table needs."""
+
+    def __init__(self, args: argparse.Namespace, network: SensorNetwork,
+                 stopped: Callable[[], bool], stack: ExitStack) -> None:
+        self._names = network.names
+
+    def sink(self, name: str, pipeline: Pipeline) -> EventSink:
+        """Return the sink of a recording."""
+        self._sink = EventSink(pipeline)
+        return self._sink
+
+    def finish(self, name: str, report: RunReport, out: Path | None) -> None:
+        """Print one line per event and the number of events of each sensor; write the tables."""
+        result = self._sink.result(report)
+        for event in result.events:
+            print(_event_line(event))
+        counts = result.counts()
+        print(', '.join(f'{name}: {quantity(counts.get(name, 0), "event")}'
+                        for name in self._names))
+        if out is not None:
+            write_events(out, result.events)
+
+
+def _event_line(event: PassEvent) -> str:
+    """Describe an event in one line."""
+    p = event.left_to_right
+    direction = f'left to right ({p:.0%})' if p > 0.9 else f'right to left ({1.0 - p:.0%})' \
+        if p < 0.1 else 'direction unknown'
+    duration = (event.release_ns - event.onset_ns) / NS
+    time = time_of(event.closest_ns)
+    closest = f'closest {time} ± {event.closest_std:.2f} s' if np.isfinite(event.closest_std) \
+        else f'peak at {time}, closest point unknown'
+    if duration > MAX_DURATION_S:
+        closest = f'from {time_of(event.onset_ns)} to {time_of(event.release_ns)}'
+    return (f'{event.sensor} {event.number}: {closest}, duration {duration:.2f} s, peak '
+            f'{1e9 * np.sqrt(np.nansum(event.peak**2)):.0f} nT on {event.axes}, {direction}'
+            + ('' if event.ended else ', not ended'))
 
 
 class Passages:
@@ -69,7 +151,7 @@ def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
     if args.enrol is not None:
         if args.fleet is None:
             raise SettingsError('--enrol requires a fleet file: add --fleet FILE')
-        if args.enrol.strip() in ('', UNKNOWN):
+        if args.enrol.strip() in ('', UNKNOWN_CLASS):
             raise SettingsError(f'--enrol: {args.enrol!r} is not a valid name of a vehicle')
         earth_field_strength(network)
         check_writable(args.fleet)
@@ -101,7 +183,7 @@ def _print(name: str, result: TrafficResult,
     """Print one line per vehicle, the counts, and warnings."""
     for vehicle, identification in zip(result.vehicles, identifications, strict=True):
         identity = '' if identification is None else f', vehicle {identification.name}'
-        print(f'{line_of(vehicle)}{identity}')
+        print(f'{_passage_line(vehicle)}{identity}')
     counts = Counter((v.passage.line, DIRECTIONS[v.passage.forward], v.passage.vehicle_class)
                      for v in result.vehicles)
     print(f'{name}: {quantity(len(result.vehicles), "vehicle")}')
@@ -117,7 +199,7 @@ def _print(name: str, result: TrafficResult,
         print(f'  {result.report.no_track_reason}')
 
 
-def line_of(vehicle: CountedVehicle) -> str:
+def _passage_line(vehicle: CountedVehicle) -> str:
     """Describe a passage in one line."""
     p = vehicle.passage
     error = '' if np.isnan(p.direction_error) else f' (error probability {p.direction_error:.3f})'
