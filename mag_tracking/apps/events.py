@@ -11,13 +11,12 @@ import numpy as np
 from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.event_records import PassEvent
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, RecordReceiver, Settings, Step, settings_for
+from mag_tracking.pipeline import Pipeline, RecordReceiver, Step, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.records import Readings
 from mag_tracking.results.columns import EVENTS, row_of
 from mag_tracking.results.dataframes import rows_dataframe
-from mag_tracking.run import DisplayedResult, RunReport, Source, run, shown_progress
-from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.run import DisplayedResult, RunReport, progress_bar, run
 from mag_tracking.stages.events.stage import Events
 
 if TYPE_CHECKING:
@@ -51,11 +50,6 @@ class EventsResult(DisplayedResult):
         -------
         pandas.DataFrame
             Columns of `events.csv`, indexed by the time of the closest point (UTC).
-
-        Raises
-        ------
-        MissingDependencyError
-            If pandas is not installed.
         """
         return rows_dataframe(EVENTS, [row_of(EVENTS, event) for event in self.events],
                               'closest_ns')
@@ -87,16 +81,12 @@ def events(source: UserSource, network: SensorNetwork | str | PathLike[str],
     Parameters
     ----------
     source : path, Readings, RecordedReadings, DataFrame or mapping
-        A recording is read in batches and need not fit into memory. A DataFrame, in tesla, has one
-        row per reading (columns `sensor`, x, y, z) or per time (columns such as `mag_1_x`), and the
-        times in a column `time` or `stamp_ns` or in the index. A mapping is {sensor: (times (n,),
-        fields (n, 3), T)}.
+        As for `track`.
     network : SensorNetwork or path of a network file
     settings : {name: value}, optional
         Settings that differ from the defaults for a vehicle.
     time_unit : 's', 'ms', 'us' or 'ns', optional
-        Unit of the times of a DataFrame or mapping; required for floats. The default for integers
-        is 'ns'.
+        As for `track`.
 
     Returns
     -------
@@ -106,24 +96,17 @@ def events(source: UserSource, network: SensorNetwork | str | PathLike[str],
     ------
     ReadingsError
         If a table or arrays are incomplete, not in order, or of a wrong type.
-    RecordingError
-        If the recording cannot be read, or has none of the network's topics.
-    NetworkError
-        If the network file is invalid.
+    RecordingError, NetworkError
+        As for `track`.
     SettingsError
         If a setting is invalid.
     """
     network = network_of(network)
-    return find_events(source_of(source, network, time_unit), network,
-                       settings_for('vehicle', settings))
-
-
-def find_events(source: Source, network: SensorNetwork, settings: Settings) -> EventsResult:
-    """Describe the passes in a source."""
-    pipeline = Pipeline(network, settings, 'calibrate')
+    opened = source_of(source, network, time_unit)
+    pipeline = Pipeline(network, settings_for('vehicle', settings), 'calibrate')
     sink = EventSink(pipeline)
-    with shown_progress(source) as progress:
-        return sink.result(run(source, pipeline, [sink], progress))
+    with progress_bar(opened, leave=False) as bar:
+        return sink.result(run(opened, pipeline, [sink], bar.update))
 
 
 class EventSink(RecordReceiver):
@@ -148,12 +131,10 @@ class EventSink(RecordReceiver):
 
     def result(self, report: RunReport) -> EventsResult:
         """Return the events after a run."""
-        return EventsResult(tuple(_with_timestamp_error(event, self._calibrate)
-                                  for event in self._events), report)
-
-
-def _with_timestamp_error(event: PassEvent, calibrate: Calibrate) -> PassEvent:
-    """Event whose `closest_std` includes the error of the timestamps of its sensor."""
-    fault = calibrate.timestamps.worst_fault(event.sensor)
-    return event if fault is None else replace(
-        event, closest_std=float(np.hypot(event.closest_std, fault.error_s)))
+        events = []
+        for event in self._events:
+            # `closest_std` includes the error of the timestamps.
+            fault = self._calibrate.timestamps.worst_fault(event.sensor)
+            events.append(event if fault is None else replace(
+                event, closest_std=float(np.hypot(event.closest_std, fault.error_s))))
+        return EventsResult(tuple(events), report)

@@ -1,8 +1,8 @@
 """Passes of vehicles: their measurements, the tracks during them, and their fits."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -31,6 +31,11 @@ MAX_PLATEAU_S = 0.5
 """Maximum time for which a target that passes saturates a sensor [s]."""
 MAX_PASS_S = 60.0
 """Maximum duration of a pass; a longer detection is truncated [s]."""
+MAX_TRAILER_DISTANCE = 8.0
+"""Maximum distance between a car and its trailer [m]."""
+
+Pass: TypeAlias = tuple[PassData, tuple[str, ...]]
+"""Measurements of a pass, and notes for the user."""
 
 
 class PassCollector:
@@ -49,8 +54,8 @@ class PassCollector:
         self._onset_ns: int | None = None
         self._last_ns: int | None = None
 
-    def passes(self, step: Step) -> list[tuple[PassData, tuple[str, ...]]]:
-        """Return (measurements, notes for the user) of each pass that ends with a step."""
+    def passes(self, step: Step) -> list[Pass]:
+        """Passes that end with a step."""
         passes, readings = [], step.readings
         if len(readings) and (self._calibrate.n_held
                               or any(isinstance(r, Readings) for r in step.records)):
@@ -73,7 +78,7 @@ class PassCollector:
                                     'the recording ends before the target has passed'))
         return passes
 
-    def _add_frame(self, frame: FieldFrame) -> list[tuple[PassData, tuple[str, ...]]]:
+    def _add_frame(self, frame: FieldFrame) -> list[Pass]:
         """Truncate a pass that is too long at a frame, and forget earlier readings."""
         passes = []
         if self._onset_ns is not None and frame.stamp_ns - self._onset_ns > MAX_PASS_S * NS:
@@ -86,9 +91,8 @@ class PassCollector:
                 buffer.popleft()
         return passes
 
-    def _cut(self, onset_ns: int, end_ns: int,
-             *remarks: str) -> tuple[PassData, tuple[str, ...]]:
-        """End the current pass; return (PassData up to `end_ns`, notes including `remarks`)."""
+    def _cut(self, onset_ns: int, end_ns: int, *remarks: str) -> Pass:
+        """End the current pass at `end_ns`; its notes include `remarks`."""
         begin = onset_ns - int(PAD_S * NS)
         readings = Readings.joined(self._calibrated)
         readings = readings.part((begin <= readings.stamp_ns) & (readings.stamp_ns <= end_ns))
@@ -156,8 +160,7 @@ def _common_covariance(covariances: FloatArray) -> FloatArray:
     return common
 
 
-@dataclass(frozen=True)
-class _Pose:
+class _Pose(NamedTuple):
     """Position and velocity of a track at one time."""
 
     stamp_ns: int
@@ -180,15 +183,16 @@ class PassTracks:
     def add(self, records: Iterable[object]) -> None:
         """Store the poses and the ends of tracks from the outputs of a tracker."""
         for record in records:
-            if isinstance(record, Track) and record.stamp_ns < self._last_stamp_ns:
+            if not isinstance(record, Track):
+                continue
+            if record.stamp_ns < self._last_stamp_ns:
                 # The time jumped back: earlier poses belong to another pass.
                 self._poses.clear()
                 self._ended.clear()
-            if isinstance(record, Track):
-                self._last_stamp_ns = record.stamp_ns
-            if isinstance(record, Track) and record.ended:
+            self._last_stamp_ns = record.stamp_ns
+            if record.ended:
                 self._ended.add(record.id)
-            elif isinstance(record, Track):
+            else:
                 self._poses.setdefault(record.id, []).append(_Pose(
                     record.stamp_ns, np.concatenate([record.position, record.velocity]),
                     float(np.trace(record.covariance[:3, :3]))))
@@ -242,10 +246,6 @@ def ground_prior(settings: TrackSettings) -> GroundPrior:
     return GroundPrior((float(height.mean()), height_std), CLIMB_STD)
 
 
-MAX_TRAILER_DISTANCE = 8.0
-"""Maximum distance between a car and its trailer [m]."""
-
-
 class PassFitter:
     """Sink that fits every pass as a row of dipoles, for each number of dipoles in `orders`.
 
@@ -260,32 +260,28 @@ class PassFitter:
         track = pipeline.settings.track
         self._tracks, self._ground = PassTracks(track), ground_prior(track)
         self._orders, self._cpa_range = tuple(orders), cpa_range
-        self._report, self._stopped, self._n_passes = report, stopped, 0
+        self._report, self._n_passes = report, 0
+        self._stopped = stopped or (lambda: False)
 
     def add(self, step: Step) -> None:
-        """Fit the passes that end with a step; fitting ends when `stopped` returns true."""
+        """Fit the passes that end with a step, until `stopped` returns true."""
         if not step.is_last:
             # A vehicle that still approaches at the end of the source does not belong to a pass.
             self._tracks.add(step.records)
-        for fitted_pass in self._fit_passes(self._collector.passes(step), self._stopped):
-            self._report(fitted_pass)
-
-    def _fit_passes(self, passes: Iterable[tuple[PassData, tuple[str, ...]]],
-                    stopped: Callable[[], bool] | None) -> Iterator[FittedPass]:
-        """Fit passes; discard a pass whose fitting is stopped."""
-        for data, notes in passes:
+        for data, notes in self._collector.passes(step):
             fits = []
             for n_dipoles in self._orders:
-                if stopped is not None and stopped():
+                if self._stopped():
                     return
                 fits.append(fit_pass(data, n_dipoles, self._cpa_range))
             self._n_passes += 1
             vehicles = fitted_vehicles(
                 self._recording, self._n_passes, data, fits, self._tracks.paths(data),
-                self._ground, self._orders, notes, stopped)
-            if stopped is not None and stopped():
+                self._ground, self._orders, notes, self._stopped)
+            if self._stopped():
                 return
-            yield from vehicles
+            for vehicle in vehicles:
+                self._report(vehicle)
 
 
 def fitted_vehicles(recording: str, number: int, data: PassData, single_fits: Sequence[PassFit],

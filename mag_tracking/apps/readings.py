@@ -4,7 +4,7 @@ import re
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,10 +21,18 @@ from mag_tracking.report.metrics import Truth
 from mag_tracking.run import ArraySource, RecordingSource, Source
 from mag_tracking.units import LATEST_NS, NS
 
-UserSource: TypeAlias = Any
-"""Readings, RecordedReadings, path of a recording, DataFrame, or {sensor: (times, fields)}."""
+if TYPE_CHECKING:
+    import pandas as pd
+
 MAX_DELAY_S = 10.0
 """Delay above which a reading is considered unsorted rather than delayed [s]."""
+UNITS_NS = {'s': 1_000_000_000, 'ms': 1_000_000, 'us': 1_000, 'ns': 1}
+"""Nanoseconds per unit of time."""
+TIME_COLUMNS = ('stamp_ns', 'time', 'timestamp', 't')
+"""Accepted names of the column with the times; without one, the index must contain datetimes."""
+AXES = ('x', 'y', 'z')
+_AXIS = re.compile(r'[ ._/-]?(?:b|mag)?([xyz])', re.IGNORECASE)
+_WIDE = re.compile(r'(.+)[ ._/-](?:b|mag)?([xyz])', re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -46,6 +54,11 @@ class RecordedReadings:
     def __repr__(self) -> str:
         return (f'RecordedReadings({quantity(len(self.readings), "reading")} of '
                 f'{", ".join(self.readings.names)}; truth: {", ".join(self.truth) or "none"})')
+
+
+UserSource: TypeAlias = ('Readings | RecordedReadings | str | PathLike[str] | pd.DataFrame'
+                         ' | Mapping[str, tuple[ArrayLike, ArrayLike]]')
+"""A mapping is {sensor: (times, fields)}."""
 
 
 def network_of(network: SensorNetwork | str | PathLike[str]) -> SensorNetwork:
@@ -79,20 +92,15 @@ def read_recording(path: str | PathLike[str],
     reader = SampleReader(recording, network)
     recorded = Readings.joined(reader.readings())
     sensor = recorded.rows({name: i for i, name in enumerate(network.names)})
-    return recorded_readings(recording, reader, Readings(
-        network.names, sensor, recorded.stamp_ns, recorded.field, recorded.covariance))
-
-
-def recorded_readings(recording: Recording, reader: SampleReader,
-                      readings: Readings) -> RecordedReadings:
-    """Combine readings with the ground truth, losses and rejections of a recording at its end."""
-    return RecordedReadings(readings, reader.truth_arrays(), dict(reader.rejected),
-                            dict(recording.losses), tuple(reader.missing_topics()))
+    return RecordedReadings(
+        Readings(network.names, sensor, recorded.stamp_ns, recorded.field, recorded.covariance),
+        reader.truth_arrays(), dict(reader.rejected), dict(recording.losses),
+        tuple(reader.missing_topics()))
 
 
 def source_of(source: UserSource, network: SensorNetwork, time_unit: str | None = None) -> Source:
     """Source for `run`: a recording, which need not fit into memory, or readings."""
-    if is_table(source):
+    if _is_table(source):
         source = readings_of_table(source, time_unit, network.names)
     elif isinstance(source, Mapping):
         source = readings_of_arrays(source, time_unit)
@@ -100,13 +108,13 @@ def source_of(source: UserSource, network: SensorNetwork, time_unit: str | None 
         raise ReadingsError('time_unit: only for the times of a DataFrame or of arrays')
     if isinstance(source, Readings):
         check_order(source)
-        readings = checked_readings(source, network)
+        readings = _checked_readings(source, network)
         present = {readings.names[j] for j in np.unique(readings.sensor)}
         return ArraySource(readings, topics=[topic for name, topic in zip(
             network.names, network.absolute_topics, strict=True) if name not in present])
     if isinstance(source, RecordedReadings):
-        return ArraySource(checked_readings(source.readings, network), rejected=source.rejected,
-                           lost=source.lost, topics=source.missing_topics)
+        return ArraySource(_checked_readings(source.readings, network), source.rejected,
+                           source.lost, source.missing_topics, source.truth)
     if isinstance(source, str | PathLike):
         return RecordingSource(Recording(source), network)
     raise ReadingsError('source: expected a path, Readings, a DataFrame or {sensor: (times, '
@@ -143,15 +151,20 @@ def readings_from_arrays(sensor: Sequence[str], stamp_ns: ArrayLike, field: Arra
     """
     if isinstance(sensor, str):
         raise ReadingsError(f'sensor: expected one name per reading, got the string {sensor!r}')
-    names = tuple(dict.fromkeys(str(name) for name in sensor))
-    index_of = {name: i for i, name in enumerate(names)}
+    names, index = _numbered(sensor)
     fields, C = _with_nan(field), None if covariance is None else _with_nan(covariance)
     readings = _to_standard_types(Readings(
-        names, np.array([index_of[str(name)] for name in sensor], dtype=np.int64),
-        nanoseconds(stamp_ns, time_unit, 'stamp_ns'),
+        names, index, nanoseconds(stamp_ns, time_unit, 'stamp_ns'),
         fields if fields.size else fields.reshape(0, 3), C))
     check_order(readings, 0.0)
     return readings
+
+
+def _numbered(sensors: Iterable[object]) -> tuple[tuple[str, ...], IntArray]:
+    """Distinct names, and the index of each sensor in them."""
+    named = [str(sensor) for sensor in sensors]
+    index = {name: i for i, name in enumerate(dict.fromkeys(named))}
+    return tuple(index), np.array([index[name] for name in named], dtype=np.int64)
 
 
 def _with_nan(values: ArrayLike) -> NDArray[Any]:
@@ -161,7 +174,7 @@ def _with_nan(values: ArrayLike) -> NDArray[Any]:
     return np.asarray(values)
 
 
-def checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
+def _checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
     """Check readings and convert them to the array types that the stages expect.
 
     Raises ReadingsError if shapes or types are wrong, or no reading belongs to the network.
@@ -220,19 +233,7 @@ def check_order(readings: Readings, tolerance: float = MAX_DELAY_S) -> None:
             "(np.argsort(stamp_ns, kind='stable')), and track separate recordings separately")
 
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-UNITS_NS = {'s': 1_000_000_000, 'ms': 1_000_000, 'us': 1_000, 'ns': 1}
-"""Nanoseconds per unit of time."""
-TIME_COLUMNS = ('stamp_ns', 'time', 'timestamp', 't')
-"""Accepted names of the column with the times; without one, the index must contain datetimes."""
-AXES = ('x', 'y', 'z')
-_AXIS = re.compile(r'[ ._/-]?(?:b|mag)?([xyz])', re.IGNORECASE)
-_WIDE = re.compile(r'(.+)[ ._/-](?:b|mag)?([xyz])', re.IGNORECASE)
-
-
-def is_table(source: object) -> bool:
+def _is_table(source: object) -> TypeGuard['pd.DataFrame']:
     """Whether `source` is a pandas DataFrame, which is recognised without importing pandas."""
     return hasattr(source, 'columns') and hasattr(source, 'index')
 
@@ -241,42 +242,35 @@ def nanoseconds(times: ArrayLike, unit: str | None, name: str) -> IntArray:
     """Convert times (n,) to ns since 1970; datetimes without a time zone are in UTC.
 
     `unit` is required for floats; integers are in ns by default. Raises ReadingsError, which names
-    the column or argument `name`.
+    the column or argument `name`, also for times that ROS cannot represent: their unit is wrong.
     """
     if unit is not None and unit not in UNITS_NS:
         raise ReadingsError(f'time_unit: expected {" or ".join(UNITS_NS)}, got {unit!r}')
     # Times of pandas with a time zone have a dtype of this name, too, and become UTC.
-    if str(getattr(times, 'dtype', '')).startswith('datetime64'):
-        if unit is not None:
-            raise ReadingsError(f'time_unit: {name} contains datetimes, which need no unit')
-        seconds = np.asarray(times, dtype='datetime64[s]')
-        if np.isnat(seconds).any():
-            raise ReadingsError(f'{name}: row {int(np.argmax(np.isnat(seconds)))} has no time')
-        _check_range(seconds.astype(np.int64), 's', name)
-        return np.asarray(times, dtype='datetime64[ns]').astype(np.int64)
-    values = np.asarray(times)
-    if values.dtype.kind in 'iu':
-        _check_range(values, unit or 'ns', name)
-        return values.astype(np.int64) * UNITS_NS[unit or 'ns']
-    if values.dtype.kind != 'f':
+    are_dates = str(getattr(times, 'dtype', '')).startswith('datetime64')
+    values = np.asarray(times, dtype='datetime64[s]' if are_dates else None)
+    if are_dates and unit is not None:
+        raise ReadingsError(f'time_unit: {name} contains datetimes, which need no unit')
+    if not are_dates and values.dtype.kind not in 'iuf':
         raise ReadingsError(f'{name}: expected datetimes of one time zone, integers or floats, got '
                             f'{values.dtype}; pandas.to_datetime(..., utc=True) converts text')
-    if unit is None and values.size:
+    if values.dtype.kind == 'f' and unit is None and values.size:
         raise ReadingsError(f'{name}: the unit of floats is unknown; add time_unit, one of '
                             f'{", ".join(UNITS_NS)}')
+    # NaT is not finite.
     if not np.isfinite(values).all():
         raise ReadingsError(f'{name}: row {int(np.argmin(np.isfinite(values)))} has no time')
-    _check_range(values, unit or 'ns', name)
-    return np.round(values * UNITS_NS[unit or 'ns']).astype(np.int64)
-
-
-def _check_range(values: NDArray[Any], unit: str, name: str) -> None:
-    """Raise ReadingsError for times that ROS cannot represent, which a wrong unit produces."""
+    unit, numbers = ('s', values.astype(np.int64)) if are_dates else (unit or 'ns', values)
     limit = LATEST_NS // UNITS_NS[unit]
-    if values.size and not -limit <= values.min() <= values.max() <= limit:
-        raise ReadingsError(f'{name}: {values.min()} .. {values.max()} {unit} is outside '
+    if numbers.size and not -limit <= numbers.min() <= numbers.max() <= limit:
+        raise ReadingsError(f'{name}: {numbers.min()} .. {numbers.max()} {unit} is outside '
                             f'{-limit} .. {limit} {unit} since 1970; check the unit of the '
                             'times (time_unit)')
+    if are_dates:
+        return np.asarray(times, dtype='datetime64[ns]').astype(np.int64)
+    if values.dtype.kind == 'f':
+        return np.round(values * UNITS_NS[unit]).astype(np.int64)
+    return values.astype(np.int64) * UNITS_NS[unit]
 
 
 def readings_of_arrays(arrays: Mapping[str, tuple[ArrayLike, ArrayLike]],
@@ -317,12 +311,8 @@ def readings_of_table(table: 'pd.DataFrame', time_unit: str | None,
     columns = [c for c in table.columns if c != time_column]
     if 'sensor' in columns:
         _check_axes(columns, '', columns)
-        names = [str(name) for name in table['sensor']]
-        unique = tuple(dict.fromkeys(names))
-        index = {name: j for j, name in enumerate(unique)}
-        field = np.column_stack([_numbers(table, axis) for axis in AXES])
-        return _in_order(unique, np.array([index[name] for name in names], dtype=np.int64),
-                         stamp_ns, field)
+        return _in_order(*_numbered(table['sensor']), stamp_ns,
+                         np.column_stack([_numbers(table, axis) for axis in AXES]))
     found: dict[str, dict[str, Any]] = {}
     for column in columns:
         name, axis = _sensor_axis(column, columns, sensors)

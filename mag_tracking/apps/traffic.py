@@ -24,7 +24,7 @@ from mag_tracking.records import FieldFrame, Track
 from mag_tracking.results.columns import traffic_tables
 from mag_tracking.results.dataframes import rows_dataframe
 from mag_tracking.results.traffic_tables import passage_row
-from mag_tracking.run import DisplayedResult, RunReport, Source, run, shown_progress
+from mag_tracking.run import DisplayedResult, RunReport, progress_bar, run
 from mag_tracking.units import NS
 
 if TYPE_CHECKING:
@@ -79,11 +79,6 @@ class TrafficResult(DisplayedResult):
         -------
         pandas.DataFrame
             Columns of the table `passages`, indexed by time (UTC).
-
-        Raises
-        ------
-        MissingDependencyError
-            If pandas is not installed.
         """
         columns = [c for c in traffic_tables(self.class_names, False)['passages']
                    if c.name != 'recording']
@@ -120,17 +115,13 @@ def traffic(source: UserSource, network: SensorNetwork | str | PathLike[str],
     Parameters
     ----------
     source : path, Readings, RecordedReadings, DataFrame or mapping
-        A recording is read in batches and need not fit into memory. A DataFrame, in tesla, has one
-        row per reading (columns `sensor`, x, y, z) or per time (columns such as `mag_1_x`), and the
-        times in a column `time` or `stamp_ns` or in the index. A mapping is {sensor: (times (n,),
-        fields (n, 3), T)}.
+        As for `track`.
     network : SensorNetwork or path of a network file
     settings : {name: value}, optional
         Settings that differ from the defaults for a vehicle; `traffic.lines` is the table of the
         counting lines.
     time_unit : 's', 'ms', 'us' or 'ns', optional
-        Unit of the times of a DataFrame or mapping; required for floats. The default for integers
-        is 'ns'.
+        As for `track`.
 
     Returns
     -------
@@ -140,24 +131,17 @@ def traffic(source: UserSource, network: SensorNetwork | str | PathLike[str],
     ------
     ReadingsError
         If a table or arrays are incomplete, not in order, or of a wrong type.
-    RecordingError
-        If the recording cannot be read, or has none of the network's topics.
-    NetworkError
-        If the network file is invalid.
+    RecordingError, NetworkError
+        As for `track`.
     SettingsError
         If a setting is invalid, or the target is not a vehicle.
     """
     network = network_of(network)
-    return count_traffic(source_of(source, network, time_unit), network,
-                         settings_for('vehicle', settings))
-
-
-def count_traffic(source: Source, network: SensorNetwork, settings: Settings) -> TrafficResult:
-    """Count the vehicles in a source; raises SettingsError if the target is not a vehicle."""
-    pipeline = Pipeline(network, settings)
+    opened = source_of(source, network, time_unit)
+    pipeline = Pipeline(network, settings_for('vehicle', settings))
     sink = TrafficSink(pipeline)
-    with shown_progress(source) as progress:
-        return sink.result(run(source, pipeline, [sink], progress))
+    with progress_bar(opened, leave=False) as bar:
+        return sink.result(run(opened, pipeline, [sink], bar.update))
 
 
 def check_vehicles(settings: Settings) -> None:

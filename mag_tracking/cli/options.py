@@ -5,9 +5,7 @@ import dataclasses
 import datetime
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, TypeAlias
-
-from tqdm import tqdm
+from typing import TYPE_CHECKING, TypeAlias
 
 from mag_tracking.cli.commands import COMMANDS
 from mag_tracking.errors import OutputError, SettingsError
@@ -22,27 +20,24 @@ if TYPE_CHECKING:
     # Not every command loads the stages.
     from mag_tracking.pipeline import Settings
     from mag_tracking.recording.field_table import TableOptions
-    from mag_tracking.run import RecordingSource
 
 # Quoted because the class is not generic at run time.
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 """Subparsers of the main parser or of a command, to which each command is added."""
 
 FIGURE_SUFFIXES = ('.png', '.pdf', '.svg')
-"""File name extensions accepted for figures."""
 
 
 def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace], int],
                 text: str = '') -> argparse.ArgumentParser:
     """Add the parser of a command or subcommand; `name` is a key in `COMMANDS`.
 
-    `run` takes the parsed arguments and returns the exit status. `text`, with the description and
-    examples, is printed after the options.
+    `run` returns the exit status. `text`, with examples, is printed after the options.
     """
     summary = COMMANDS[name].summary
-    parser = commands.add_parser(name.rpartition(' ')[2], help=summary, description=summary,
-                                 epilog=text,
-                                 formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = commands.add_parser(
+        name.rpartition(' ')[2], help=summary, description=summary, epilog=text,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.set_defaults(run_command=run, ros_arguments=[])
     return parser
 
@@ -70,10 +65,8 @@ def recorded_network(args: argparse.Namespace) -> SensorNetwork:
 
 
 def distinct_names(paths: Iterable[Path]) -> list[str]:
-    """Names without extension under which the results of the recordings are stored.
-
-    Raises OutputError if two names are equal, so that the results would overwrite each other.
-    """
+    """Names without extension under which the results of the recordings are stored; raises
+    OutputError if two are equal."""
     names = [path.resolve().stem for path in paths]
     duplicates = sorted({name for name in names if names.count(name) > 1})
     if duplicates:
@@ -113,8 +106,7 @@ def add_page(parser: argparse._ActionsContainer, port: bool = True) -> None:
 
 
 def check_writable(path: Path | None) -> None:
-    """Check that an output file can be created; raises OutputError if its folder is missing, or if
-    it is a folder."""
+    """Raise OutputError if the folder of an output file is missing, or if it is a folder."""
     if path is not None and not path.absolute().parent.is_dir():
         raise OutputError(f'cannot write {path}: the folder {path.parent} does not exist')
     if path is not None and path.is_dir():
@@ -122,11 +114,8 @@ def check_writable(path: Path | None) -> None:
 
 
 def check_report(args: argparse.Namespace, *others: Path | None) -> None:
-    """Check that the report can be written without replacing another file of the command.
-
-    Raises OutputError if the folder is missing, the path is a folder, the name ends in neither
-    .html nor .htm, or the file is one of `others`.
-    """
+    """Raise OutputError if the report cannot be written, does not end in .html or .htm, or would
+    replace one of `others`."""
     path = args.report
     if path is None:
         return
@@ -139,22 +128,13 @@ def check_report(args: argparse.Namespace, *others: Path | None) -> None:
 
 
 def check_outputs(args: argparse.Namespace) -> None:
-    """Check that the files of --out and --figure can be written.
-
-    Raises OutputError if the folder of a file is missing or the file is a folder, and SettingsError
-    if the file type of the figure is not supported.
-    """
+    """Raise OutputError if the files of --out and --figure cannot be written, and SettingsError if
+    the file type of the figure is not supported."""
     for path in (args.out, args.figure):
         check_writable(path)
     if args.figure is not None and args.figure.suffix.lower() not in FIGURE_SUFFIXES:
         raise SettingsError(f'--figure: expected a file name ending in '
                             f'{", ".join(FIGURE_SUFFIXES)}; got {args.figure.name}')
-
-
-def progress_bar(source: 'RecordingSource') -> 'tqdm[NoReturn]':
-    """Progress bar of the bytes of a recording, shown only in a terminal."""
-    return tqdm(total=source.recording.size, unit='B', unit_scale=True, desc=source.name,
-                disable=None)
 
 
 def print_diagnoses(diagnoses: Iterable[Diagnosis]) -> None:
@@ -226,10 +206,8 @@ def add_table_options(parser: argparse.ArgumentParser, sensor: bool = True) -> N
 
 
 def table_options(args: argparse.Namespace, sensor: str | None = None) -> 'TableOptions':
-    """Collect the options of `add_table_options`; raises SettingsError if --sensors is not valid.
-
-    `sensor` is the name of the only sensor, if --sensor is not one of the options.
-    """
+    """Collect the options of `add_table_options`, with the name `sensor` of the only sensor if
+    --sensor is not one of them; raises SettingsError if --sensors is not valid."""
     from mag_tracking.recording.field_table import TableOptions
 
     sensors = dict(text.rpartition('=')[::2] for text in args.sensors)

@@ -27,7 +27,6 @@ from mag_tracking.cli.options import (
     add_verbose,
     distinct_names,
     print_diagnoses,
-    progress_bar,
     recorded_network,
     settings_of,
 )
@@ -43,9 +42,8 @@ from mag_tracking.recording.reader import Recording
 from mag_tracking.report.page import WARNING
 from mag_tracking.report.track_log import TrackLog
 from mag_tracking.results.rerun_file import RERUN_FILE, check_rerun, write_rerun
-from mag_tracking.run import RecordingSource, Sink, output_error, run
+from mag_tracking.run import RecordingSource, Sink, output_error, progress_bar, run
 from mag_tracking.stages.track.doubts import MEANINGS
-from mag_tracking.web.page_server import PageServer
 
 _REPLAY_HELP = '''
 Reads the magnetic fields on the topics of the network, learns the background of each sensor
@@ -164,8 +162,7 @@ def _replay(args: argparse.Namespace) -> int:
     settings = settings_of(args, network)
     _check(args, settings)
     if args.live:
-        return _show(args.recordings[0], network, settings, args.rate, args.host,
-                              args.port)
+        return _show(args, network, settings)
     names = distinct_names(args.recordings)
     sources = [RecordingSource(Recording(path), network) for path in args.recordings]
     folders = [args.out / name if args.out and len(names) > 1 else args.out for name in names]
@@ -189,21 +186,22 @@ def _replay(args: argparse.Namespace) -> int:
     return 130 if signals else 0 if is_complete else 1
 
 
-def _show(path: Path, network: SensorNetwork, settings: Settings, rate: float,
-                   host: str, port: int) -> int:
+def _show(args: argparse.Namespace, network: SensorNetwork, settings: Settings) -> int:
     """Track a recording in real time on the live page until Ctrl-C; return the exit status."""
-    # Imported here because the pipeline is slow to import.
+    # Imported here because only --live needs them.
     from mag_tracking.apps.view import view
     from mag_tracking.web.live_scene import LiveScene
+    from mag_tracking.web.page_server import PageServer
 
-    if not 0.0 < rate < float('inf'):
-        raise SettingsError(f'--rate: expected a number above 0, got {rate:g}')
+    if not 0.0 < args.rate < float('inf'):
+        raise SettingsError(f'--rate: expected a number above 0, got {args.rate:g}')
+    path = args.recordings[0]
     recording, scene = Recording(path), LiveScene(path.name, network)
     scene.subtitle = f'{quantity(len(network), "sensor")}, frame {network.frame}'
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals, \
-            PageServer(scene, host, port) as server:
+            PageServer(scene, args.host, args.port) as server:
         print(f'live page: {server.url}')
-        view(recording, network, settings, scene, rate,
+        view(recording, network, settings, scene, args.rate,
              lambda: bool(signals) or not server.is_serving)
         if not signals:
             print('end of the recording; the page remains available until Ctrl-C')
@@ -266,43 +264,31 @@ def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Setti
                             tqdm.write, args.truth, sinks_of)
         report = result.report
         _print_summary(source.name, result, network, args.verbose)
+        if args.tum and not report.failures:
+            write_trajectories(result, out)
+        if args.rerun and not report.failures:
+            write_rerun(out / RERUN_FILE, network, result.logs, result.smoothed)
         if not report.failures:
-            _write(result, network, out, stopped, args)
+            write_report(result, network, out)
+        if not (args.no_figures or report.failures):
+            write_figures(result, network, out, stopped)
     else:
         pipeline = Pipeline(network, settings,
                             max((table.upto for table in tables), key=STAGES.index))
         with progress_bar(source) as bar:
             report = run(source, pipeline, sinks_of(pipeline), bar.update, stopped)
         print_diagnoses(report.diagnoses)
-    for failure in report.failures:
-        _print_incomplete(failure.error)
-    is_complete = not report.failures
+    errors = [failure.error for failure in report.failures]
     for table, sink in zip(tables, sinks, strict=True):
         if report.has_failed(sink):
             continue
         try:
             table.finish(source.stem, report, out)
         except (OutputError, OSError) as error:
-            _print_incomplete(output_error(error, table))
-            is_complete = False
-    return is_complete
-
-
-def _print_incomplete(error: OutputError) -> None:
-    """Print why results are incomplete."""
-    print(f'mag-tracking: incomplete results: {error}', file=sys.stderr)
-
-
-def _write(result: Run, network: SensorNetwork, out: Path, stopped: Callable[[], bool],
-           args: argparse.Namespace) -> None:
-    """Write the optional files of the tracks, the report and the figures."""
-    if args.tum:
-        write_trajectories(result, out)
-    if args.rerun:
-        write_rerun(out / RERUN_FILE, network, result.logs, result.smoothed)
-    write_report(result, network, out)
-    if not args.no_figures:
-        write_figures(result, network, out, stopped=stopped)
+            errors.append(output_error(error, table))
+    for reason in errors:
+        print(f'mag-tracking: incomplete results: {reason}', file=sys.stderr)
+    return not errors
 
 
 def _print_summary(name: str, result: Run, network: SensorNetwork, verbose: bool) -> None:

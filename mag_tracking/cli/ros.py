@@ -100,11 +100,7 @@ def _param(args: argparse.Namespace) -> int:
 
 def _lifecycle(args: argparse.Namespace) -> int:
     """Run `mag-tracking ros lifecycle`."""
-    from mag_tracking.nodes.graph_tools import (
-        change_lifecycle_state,
-        lifecycle_state,
-        observer,
-    )
+    from mag_tracking.nodes.graph_tools import change_lifecycle_state, lifecycle_state, observer
 
     with observer(args.ros_arguments) as graph:
         if args.transition is not None:

@@ -40,27 +40,24 @@ def time_of(stamp_ns: float) -> str:
     return f'{time:%H:%M:%S}.{time.microsecond // 10000:02d}'
 
 
-def vehicle_row(label: str, time: str, kind: str, direction: str, speed: Estimate,
-                closest: Estimate, verdict: str) -> str:
+def vehicle_row(label: str, time: str, kind: str, direction: str, speed: str | Estimate,
+                closest: str | Estimate, verdict: str) -> str:
     """Format a row; `closest` is the distance from the centre of the sensors [m]."""
-    return _row(label, time, kind, direction, _text(speed), _text(closest), verdict)
+    return (f'  {label:<9}  {time:<11}  {kind or "-":<9}  {direction or "-":<10}  '
+            f'{_text(speed):>14}  {_text(closest):>14}  {verdict or "-"}')
 
 
-def _text(estimate: Estimate) -> str:
+def _text(estimate: str | Estimate) -> str:
     """Format a value and its standard deviation, as far as they are known."""
+    if isinstance(estimate, str):
+        return estimate
     value, std = estimate
     return '-' if np.isnan(value) else f'{value:.2f}' if np.isnan(std) else \
         f'{value:.2f} ± {std:.2f}'
 
 
-def _row(*cells: str) -> str:
-    """Align the cells of a row."""
-    label, time, kind, direction, speed, closest, verdict = (cell or '-' for cell in cells)
-    return (f'  {label:<9}  {time:<11}  {kind:<9}  {direction:<10}  {speed:>14}  {closest:>14}  '
-            f'{verdict}')
-
-
-HEADER = _row('vehicle', 'time', 'kind', 'direction', 'speed [m/s]', 'closest [m]', 'verdict')
+HEADER = vehicle_row('vehicle', 'time', 'kind', 'direction', 'speed [m/s]', 'closest [m]',
+                     'verdict')
 """Header of the table."""
 
 
