@@ -189,21 +189,18 @@ def _checked_readings(readings: Readings, network: SensorNetwork) -> Readings:
 
 def _to_standard_types(readings: Readings) -> Readings:
     """Convert readings to int64 and float64; raises ReadingsError for a wrong shape or type."""
-    n, kinds = len(readings), {'sensor': 'iu', 'stamp_ns': 'iu', 'field': 'iuf',
-                               'covariance': 'iuf'}
-    for name, allowed in kinds.items():
+    n = len(readings)
+    for name, kinds, expected in (
+            ('sensor', 'iu', 'integers, indices into names'),
+            ('stamp_ns', 'iu', 'integers, nanoseconds'), ('field', 'iuf', 'floats'),
+            ('covariance', 'iuf', 'floats')):
         values = getattr(readings, name)
-        if values is None:
-            continue
         if isinstance(values, np.ma.MaskedArray):
             raise ReadingsError(f'{name}: masked arrays are not supported; use NaN for missing '
                                 'values')
-        values = np.asarray(values)
         # NumPy converts an empty list to float.
-        if values.dtype.kind not in allowed and values.size:
-            expected = 'floats' if 'f' in allowed else (
-                'integers, nanoseconds' if name == 'stamp_ns' else 'integers, indices into names')
-            raise ReadingsError(f'{name}: expected {expected}, got {values.dtype}')
+        if values is not None and np.size(values) and np.asarray(values).dtype.kind not in kinds:
+            raise ReadingsError(f'{name}: expected {expected}, got {np.asarray(values).dtype}')
     stamps = np.asarray(readings.stamp_ns)
     if n and not -LATEST_NS <= int(stamps.min()) <= int(stamps.max()) <= LATEST_NS:
         raise ReadingsError(f'stamp_ns: {stamps.min()} .. {stamps.max()} is outside '
@@ -323,15 +320,14 @@ def readings_of_table(table: 'pd.DataFrame', time_unit: str | None,
     if not found:
         raise ReadingsError('no columns of sensors: expected columns such as mag_1_x, or a column '
                             'sensor with x, y and z')
+    parts = {}
     for name, axes in found.items():
         _check_axes(axes, f'{name}: ', columns)
-    fields = {name: np.column_stack([_numbers(table, axes[axis]) for axis in AXES])
-              for name, axes in found.items()}
-    # A row without a value of a sensor is no reading.
-    rows = [np.flatnonzero(~np.isnan(field).all(axis=1)) for field in fields.values()]
-    return _in_order(tuple(fields), np.repeat(np.arange(len(fields)), [len(r) for r in rows]),
-                     np.concatenate([stamp_ns[r] for r in rows]),
-                     np.concatenate([f[r] for f, r in zip(fields.values(), rows, strict=True)]))
+        field = np.column_stack([_numbers(table, axes[axis]) for axis in AXES])
+        # A row without a value of a sensor is no reading.
+        rows = ~np.isnan(field).all(axis=1)
+        parts[name] = stamp_ns[rows], field[rows]
+    return readings_of_arrays(parts, None)
 
 
 def _check_axes(present: Container[Any], label: str, columns: Iterable[Any]) -> None:

@@ -115,19 +115,13 @@ def _watch(args: argparse.Namespace) -> int:
     # Imported here because it needs ROS.
     from mag_tracking.nodes import page_node
 
-    end_of_input = _end_of_input_event() if args.until_eof else None
-    return page_node.watch(args.host, args.port, print, args.ros_arguments,
-                           end_of_input.is_set if end_of_input is not None
-                           else lambda: False)
-
-
-def _end_of_input_event() -> threading.Event:
-    """Return an event that is set at the end of stdin, when the parent process has ended."""
     end_of_input = threading.Event()
 
     def read() -> None:
+        # Stdin ends when the parent process has ended.
         sys.stdin.read()
         end_of_input.set()
 
-    threading.Thread(target=read, daemon=True).start()
-    return end_of_input
+    if args.until_eof:
+        threading.Thread(target=read, daemon=True).start()
+    return page_node.watch(args.host, args.port, print, args.ros_arguments, end_of_input.is_set)

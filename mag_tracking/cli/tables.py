@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from mag_tracking.apps.events import EventSink
 from mag_tracking.apps.fleet import Fleet, earth_field_strength, pass_of
-from mag_tracking.apps.traffic import CountedVehicle, TrafficResult, TrafficSink
+from mag_tracking.apps.traffic import CountedVehicle, EventSink, TrafficResult, TrafficSink
 from mag_tracking.cli.options import check_writable
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import PassEvent

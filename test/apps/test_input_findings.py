@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from mag_tracking.apps.doctor import examine
-from mag_tracking.apps.events import events
 from mag_tracking.apps.replay import replay
-from mag_tracking.apps.traffic import traffic
+from mag_tracking.apps.traffic import events, traffic
 from mag_tracking.messages.schema import magnetic_field_dicts
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.file import read_network
