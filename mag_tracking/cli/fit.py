@@ -25,7 +25,7 @@ from mag_tracking.cli.options import (
     print_diagnoses,
     recorded_network,
 )
-from mag_tracking.cli.tables import HEADER, UNKNOWN, time_of, vehicle_row
+from mag_tracking.cli.tables import HEADER, time_of, vehicle_row
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.inference.iron import Iron, hard_and_soft_iron
@@ -99,7 +99,6 @@ class Fits:
     """Fits of the passes of all recordings, written and printed during the run."""
 
     upto = 'track'
-    """Last stage of the pipeline that the table needs."""
 
     def __init__(self, args: argparse.Namespace, network: SensorNetwork,
                  stopped: Callable[[], bool], stack: ExitStack) -> None:
@@ -117,9 +116,19 @@ class Fits:
         """Write and print a fitted pass; draw it for the command `fit`."""
         self.folder.add(fitted_pass)
         self.passes.append(fitted_pass)
-        _print_pass(fitted_pass, self._args.verbose)
-        if self._args.command == 'fit' and not self._args.no_figures:
-            _draw(fitted_pass, self._args.out)
+        fit, drawn = fitted_pass.chosen, fitted_pass.drawn
+        # The progress bar is moved down.
+        with tqdm.external_write_mode():
+            print(_row(fitted_pass))
+            if self._args.verbose:
+                _print_details(fitted_pass)
+            if fit is not None and contradicts_delays(fit.speed, fit.heading,
+                                                      fitted_pass.correlated):
+                print('    warning: the velocities of the fit and from the delay contradict each '
+                      'other; rely on neither. Check clock offsets, positions in the network '
+                      'file, and whether the target turned')
+        if self._args.command == 'fit' and not self._args.no_figures and drawn is not None:
+            _draw(fitted_pass, drawn, self._args.out)
 
     def finish(self, name: str, report: RunReport, out: Path | None) -> None:
         """Complete the content of `fits.json`, which is written at the end of all recordings."""
@@ -173,34 +182,21 @@ def _fit(args: argparse.Namespace) -> int:
     return 130 if signals else 0
 
 
-def _print_pass(fitted_pass: FittedPass, verbose: bool) -> None:
-    """Print the row of a fitted pass above the progress bar, warnings and, on request, details."""
-    fit = fitted_pass.chosen
-    with tqdm.external_write_mode():
-        print(_row(fitted_pass))
-        if verbose:
-            _print_details(fitted_pass)
-        if fit is not None and contradicts_delays(fit.speed, fit.heading, fitted_pass.correlated):
-            print('    warning: the velocities of the fit and from the delay contradict each '
-                  'other; rely on neither. Check clock offsets, positions in the network file, and '
-                  'whether the target turned')
-
-
 def _row(fitted_pass: FittedPass) -> str:
     """Format the row of a fitted pass, with the quantities that are trusted."""
     label = f'pass {fitted_pass.number}' + f'.{fitted_pass.vehicle}' * (fitted_pass.n_vehicles > 1)
     fit = fitted_pass.reported
     if fit is None:
-        return vehicle_row(label, time_of(fitted_pass.fits[0].data.stamp_ns), '', '', UNKNOWN,
-                           UNKNOWN, fitted_pass.fits[-1].reason)
+        return vehicle_row(label, time_of(fitted_pass.fits[0].data.stamp_ns), '', '', '-', '-',
+                           fitted_pass.fits[-1].reason)
     time, _, *closest = _closest_approach(fit)
     known = {*fit.trusted} if fit.reason else {'speed', 'direction', 'time', 'position'}
     return vehicle_row(
         label, time_of(fit.data.stamp_ns + (NS * time if 'time' in known else 0)),
         quantity(fit.n_dipoles, 'dipole'),
         f'{np.degrees(fit.heading[0]):.0f} deg' if 'direction' in known else '',
-        fit.speed if 'speed' in known else UNKNOWN,
-        (closest[0], closest[1]) if 'position' in known else UNKNOWN,
+        fit.speed if 'speed' in known else '-',
+        (closest[0], closest[1]) if 'position' in known else '-',
         fit.reason or ('ambiguous' if fit.ambiguous else 'unique')
         + (', poor fit' if fit.normalised_cost > MAX_NORMALISED_COST else ''))
 
@@ -341,11 +337,8 @@ def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
         yield 'soft iron is negative, which is impossible; check the headings of the fits'
 
 
-def _draw(fitted_pass: FittedPass, out: Path) -> None:
+def _draw(fitted_pass: FittedPass, fit: PassFit, out: Path) -> None:
     """Draw the fit of a pass."""
-    fit = fitted_pass.drawn
-    if fit is None:
-        return
     from mag_tracking.report.figure_file import save_figure
     from mag_tracking.report.fit_figures import pass_figure
 

@@ -97,8 +97,12 @@ def _info(args: argparse.Namespace) -> int:
     by_topic: dict[str, dict[str, Timing]] = {}
     for source, timing in timings.items():
         by_topic.setdefault(source.topic, {})[source.sensor] = timing
-    for topic in sorted(recording.types):
-        _print_topic(topic, recording.types[topic], counts[topic], by_topic.get(topic, {}))
+    for topic, kind in sorted(recording.types.items()):
+        sensors = by_topic.get(topic, {})
+        rate = next(iter(sensors.values())).describe() if len(sensors) == 1 else ''
+        print(f'  {topic}  {kind}  {counts[topic]}' + (f'  {rate}' if rate else ''))
+        for sensor, timing in sensors.items() if len(sensors) > 1 else ():
+            print(f'    {sensor or "no frame_id"}  {timing.n_messages}  {timing.describe()}')
     for cause, n in {**faults, **recording.losses}.items():
         print(f'  warning: {cause}: {n}')
     if args.network:
@@ -115,15 +119,6 @@ def _print_duration(recording: Recording, timings: Sequence[Timing]) -> None:
               'timestamps are')
     elif recording.start_ns is not None and recording.end_ns is not None:
         print(f'  {(recording.end_ns - recording.start_ns) / 1e9:.2f} s')
-
-
-def _print_topic(topic: str, kind: str, n: int, timings: Mapping[str, Timing]) -> None:
-    """Print a topic of `n` messages with rate and gaps, by sensor if there are several."""
-    rate = next(iter(timings.values())).describe() if len(timings) == 1 else ''
-    print(f'  {topic}  {kind}  {n}' + (f'  {rate}' if rate else ''))
-    if len(timings) > 1:
-        for sensor, timing in timings.items():
-            print(f'    {sensor or "no frame_id"}  {timing.n_messages}  {timing.describe()}')
 
 
 def _print_sensors(network: SensorNetwork, recording: Recording,

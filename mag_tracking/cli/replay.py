@@ -264,14 +264,8 @@ def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Setti
                             tqdm.write, args.truth, sinks_of)
         report = result.report
         _print_summary(source.name, result, network, args.verbose)
-        if args.tum and not report.failures:
-            write_trajectories(result, out)
-        if args.rerun and not report.failures:
-            write_rerun(out / RERUN_FILE, network, result.logs, result.smoothed)
         if not report.failures:
-            write_report(result, network, out)
-        if not (args.no_figures or report.failures):
-            write_figures(result, network, out, stopped)
+            _write(result, network, out, stopped, args)
     else:
         pipeline = Pipeline(network, settings,
                             max((table.upto for table in tables), key=STAGES.index))
@@ -289,6 +283,18 @@ def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Setti
     for reason in errors:
         print(f'mag-tracking: incomplete results: {reason}', file=sys.stderr)
     return not errors
+
+
+def _write(result: Run, network: SensorNetwork, out: Path, stopped: Callable[[], bool],
+           args: argparse.Namespace) -> None:
+    """Write the optional files of the tracks, the report and the figures."""
+    if args.tum:
+        write_trajectories(result, out)
+    if args.rerun:
+        write_rerun(out / RERUN_FILE, network, result.logs, result.smoothed)
+    write_report(result, network, out)
+    if not args.no_figures:
+        write_figures(result, network, out, stopped)
 
 
 def _print_summary(name: str, result: Run, network: SensorNetwork, verbose: bool) -> None:

@@ -16,7 +16,7 @@ from mag_tracking.cli.options import check_writable
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import PassEvent
 from mag_tracking.inference.identification import Identification
-from mag_tracking.inference.log_normal_classes import UNKNOWN as UNKNOWN_CLASS
+from mag_tracking.inference.log_normal_classes import UNKNOWN
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline
 from mag_tracking.quantities import quantity
@@ -30,7 +30,6 @@ from mag_tracking.units import NS
 
 Estimate = tuple[float, float]
 """Value and standard deviation; NaN if unknown."""
-UNKNOWN = (np.nan, np.nan)
 
 
 def time_of(stamp_ns: float) -> str:
@@ -61,10 +60,12 @@ HEADER = vehicle_row('vehicle', 'time', 'kind', 'direction', 'speed [m/s]', 'clo
 
 
 class Events:
-    """Events of each recording, written to the folder of the recording."""
+    """Events of each recording, written to the folder of the recording.
+
+    Each table names the last stage that it needs, `upto`.
+    """
 
     upto = 'calibrate'
-    """Last stage of the pipeline that the table needs."""
 
     def __init__(self, args: argparse.Namespace, network: SensorNetwork,
                  stopped: Callable[[], bool], stack: ExitStack) -> None:
@@ -107,7 +108,6 @@ class Passages:
     """Passages of all recordings; the table is written after each recording."""
 
     upto = 'traffic'
-    """Last stage of the pipeline that the table needs."""
 
     def __init__(self, args: argparse.Namespace, network: SensorNetwork,
                  stopped: Callable[[], bool], stack: ExitStack) -> None:
@@ -130,8 +130,9 @@ class Passages:
                            for v in result.vehicles]
         _print(name, result, identifications)
         self._tables['passages'] += [
-            passage_row(name, v.passage, result.class_names, v.delays, _vehicle(identification))
-            for v, identification in zip(result.vehicles, identifications, strict=True)]
+            passage_row(name, v.passage, result.class_names, v.delays, {} if i is None else {
+                'vehicle': i.name, 'p_vehicle': i.probabilities.get(i.name, np.nan)})
+            for v, i in zip(result.vehicles, identifications, strict=True)]
         self._tables['intervals'] += [row for s in result.summaries
                                       for row in summary_rows(name, s)]
         if self._args.out is not None:
@@ -147,7 +148,7 @@ def _fleet(args: argparse.Namespace, network: SensorNetwork) -> Fleet | None:
     if args.enrol is not None:
         if args.fleet is None:
             raise SettingsError('--enrol requires a fleet file: add --fleet FILE')
-        if args.enrol.strip() in ('', UNKNOWN_CLASS):
+        if args.enrol.strip() in ('', UNKNOWN):
             raise SettingsError(f'--enrol: {args.enrol!r} is not a valid name of a vehicle')
         earth_field_strength(network)
         check_writable(args.fleet)
@@ -165,13 +166,6 @@ def _enrol(args: argparse.Namespace, network: SensorNetwork, passes: list[FleetP
     at = 'any heading' if vehicle.iron is not None else \
         f'a heading of {np.degrees(vehicle.heading):.0f} degrees only'
     print(f'{args.fleet}: {args.enrol} is recognised at {at} (passes: {len(fleet[args.enrol])})')
-
-
-def _vehicle(identification: Identification | None) -> dict[str, Any]:
-    """Return the table columns of the identified vehicle; an empty dict without a fleet file."""
-    return {} if identification is None else {
-        'vehicle': identification.name,
-        'p_vehicle': identification.probabilities.get(identification.name, np.nan)}
 
 
 def _print(name: str, result: TrafficResult,
