@@ -14,11 +14,6 @@ from mag_tracking.quantities import quantity
 if TYPE_CHECKING:
     from mag_tracking.recording.recorder import Recorder
 
-RESULT_PREFIXES = ('calibration_node/', 'detection_node/', 'tracker_node/')
-"""Prefixes of result topics, relative to the namespace of the recorder."""
-OTHER_RESULT_TOPICS = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
-"""Result topics that do not begin with a prefix in `RESULT_PREFIXES`."""
-
 
 class Selection(NamedTuple):
     """Topics to record; names may be relative, but are absolute in the result of `resolved`."""
@@ -35,8 +30,10 @@ class Selection(NamedTuple):
     """Whether to record all topics."""
     readings: str = RAW_READINGS
     """Topic with the readings of many sensors."""
-    result_prefixes: tuple[str, ...] = RESULT_PREFIXES
-    result_topics: tuple[str, ...] = OTHER_RESULT_TOPICS
+    result_prefixes: tuple[str, ...] = ('calibration_node/', 'detection_node/', 'tracker_node/')
+    """Prefixes of result topics."""
+    result_topics: tuple[str, ...] = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
+    """Other result topics."""
 
     def resolved(self, resolve: Callable[[str], str]) -> 'Selection':
         """Selection with absolute names of topics, which `resolve` returns."""
