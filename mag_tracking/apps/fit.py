@@ -39,7 +39,7 @@ class FitResult(DisplayedResult):
                 + (f'; {"; ".join(notes)}' if notes else '') + ')')
 
     def to_dataframe(self) -> 'pd.DataFrame':
-        """Convert the fits to a table.
+        """Convert the fits to a table, which requires pandas.
 
         Returns
         -------

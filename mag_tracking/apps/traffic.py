@@ -74,7 +74,7 @@ class TrafficResult(DisplayedResult):
     passages, tracks that crossed no line, and other events."""
 
     def to_dataframe(self) -> 'pd.DataFrame':
-        """Convert the counted vehicles to a table.
+        """Convert the counted vehicles to a table, which requires pandas.
 
         Returns
         -------
@@ -236,7 +236,7 @@ class EventsResult(DisplayedResult):
         return dict(Counter(event.sensor for event in self.events))
 
     def to_dataframe(self) -> 'pd.DataFrame':
-        """Convert the events to a table.
+        """Convert the events to a table, which requires pandas.
 
         Returns
         -------
