@@ -168,6 +168,14 @@ def _fit(args: argparse.Namespace) -> int:
         passes = fits.passes
         iron = _iron(passes, earth) if args.same_vehicle and earth is not None else None
         fits.folder.summary = {'iron': iron, 'interrupted': bool(signals)}
+    _write_report(passes, network, warnings, args)
+    print(f'{"interrupted; partial results" if signals else "results"} in {args.out}')
+    return 130 if signals else 0
+
+
+def _write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
+                  args: argparse.Namespace) -> None:
+    """Write the report of all passes, and draw their cost over the number of dipoles."""
     # Imported here, as in `_draw`, because it loads matplotlib.
     from mag_tracking.apps.fit_report import write_report
     from mag_tracking.report.figure_file import save_figure
@@ -178,8 +186,6 @@ def _fit(args: argparse.Namespace) -> int:
         print('no passes: nothing was detected')
     elif not args.no_figures:
         save_figure(order_figure(passes), args.out / 'orders.png')
-    print(f'{"interrupted; partial results" if signals else "results"} in {args.out}')
-    return 130 if signals else 0
 
 
 def _row(fitted_pass: FittedPass) -> str:
