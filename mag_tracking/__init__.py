@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mag_tracking.analysis.fitted_pass import FittedPass
     from mag_tracking.analysis.placement import PlannedTarget, Sampling
-    from mag_tracking.apps.events import EventsResult, events
     from mag_tracking.apps.fit import FitResult, fit
     from mag_tracking.apps.plan import Plan
     from mag_tracking.apps.plan_inputs import plan
     from mag_tracking.apps.readings import RecordedReadings, read_recording, readings_from_arrays
     from mag_tracking.apps.track import TrackingResult, track
-    from mag_tracking.apps.traffic import TrafficResult, traffic
+    from mag_tracking.apps.traffic import EventsResult, TrafficResult, events, traffic
     from mag_tracking.errors import (
         MagTrackingError,
         MissingDependencyError,
@@ -51,13 +50,12 @@ __all__ = [
 _MODULES = {
     'analysis.fitted_pass': ('FittedPass',),
     'analysis.placement': ('PlannedTarget', 'Sampling'),
-    'apps.events': ('EventsResult', 'events'),
     'apps.fit': ('FitResult', 'fit'),
     'apps.plan': ('Plan',),
     'apps.plan_inputs': ('plan',),
     'apps.readings': ('RecordedReadings', 'read_recording', 'readings_from_arrays'),
     'apps.track': ('TrackingResult', 'track'),
-    'apps.traffic': ('TrafficResult', 'traffic'),
+    'apps.traffic': ('EventsResult', 'TrafficResult', 'events', 'traffic'),
     'errors': ('MagTrackingError', 'MissingDependencyError', 'NetworkError', 'ReadingsError',
                'RecordingError', 'SettingsError', 'UnknownTrackError'),
     'network': ('SensorNetwork',),

@@ -1,10 +1,9 @@
 """The settings tree and the chain of processing stages, shared by nodes and offline programs."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from mag_tracking.calibration.survey import SurveySettings
 from mag_tracking.errors import SettingsError
@@ -16,7 +15,7 @@ from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.settings import AlignSettings, CalibrateSettings, DetectSettings
-from mag_tracking.stages.stage import Stage, rejected
+from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.manager import TrackManager
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.traffic.settings import TrafficSettings
@@ -99,19 +98,8 @@ STAGES = ('calibrate', 'align', 'detect', 'track', 'traffic')
 class Pipeline:
     """Chain of stages that converts raw readings to frames, detections, tracks and passages.
 
-    The chain depends neither on ROS nor on a clock. The stages after `upto` are not used.
-
-    Parameters
-    ----------
-    network : SensorNetwork
-    settings : Settings
-    upto : str
-        Last stage, one of `STAGES`.
-
-    Raises
-    ------
-    SettingsError
-        If `upto` is unknown, or the settings do not suit the network.
+    The chain depends neither on ROS nor on a clock. The stages after `upto`, one of `STAGES`, are
+    missing. Raises SettingsError if `upto` is unknown, or the settings do not suit the network.
     """
 
     def __init__(self, network: SensorNetwork, settings: Settings, upto: str = 'traffic') -> None:
@@ -119,43 +107,22 @@ class Pipeline:
             raise SettingsError(f'upto: expected {" or ".join(STAGES)}, got {upto!r}')
         self.network, self.settings = network, settings
         self._names = STAGES[:STAGES.index(upto) + 1]
-        # Settings that do not suit the network are reported before the first reading.
-        self._stages()
-
-    @cached_property
-    def calibrate(self) -> Calibrate:
-        """Stage from raw to calibrated readings."""
-        return Calibrate(self.network, self.settings.calibrate, survey=self.settings.survey)
-
-    @cached_property
-    def align(self) -> Align:
-        """Stage from calibrated readings to frames."""
-        return Align(self.network, self.settings.align)
-
-    @cached_property
-    def detect(self) -> Detect:
-        """Stage from frames to frames with the result of the detection."""
-        return Detect(self.network, self.settings.detect)
-
-    @cached_property
-    def track(self) -> TrackManager:
-        """Stage from frames to poses."""
-        return TrackManager(self.network, self.settings.track)
-
-    @cached_property
-    def traffic(self) -> Traffic:
-        """Stage from poses to passages of vehicles."""
-        return Traffic(self.network, self.settings.traffic,
-                       self.settings.track.target == 'vehicle')
+        self.calibrate = Calibrate(network, settings.calibrate, survey=settings.survey)
+        if 'align' in self._names:
+            self.align = Align(network, settings.align)
+        if 'detect' in self._names:
+            self.detect = Detect(network, settings.detect)
+        if 'track' in self._names:
+            self.track = TrackManager(network, settings.track)
+        if 'traffic' in self._names:
+            self.traffic = Traffic(network, settings.traffic, settings.track.target == 'vehicle')
 
     def feed(self, readings: Readings) -> list[Output]:
         """Process raw readings; return the resulting records in order of processing.
 
         The records do not depend on how the readings are split into batches.
         """
-        batches = self.calibrate.feed(readings)
-        self._pass_doubts()
-        return [record for batch in batches for record in self._process_calibrated(batch)]
+        return self._process_calibrated(self.calibrate.feed(readings))
 
     def flush(self) -> list[Output]:
         """Process all records that are still buffered at the end of the input."""
@@ -163,9 +130,7 @@ class Pipeline:
 
     def drain(self) -> list[Output]:
         """Process the readings and frames that are still buffered at the end of the input."""
-        batches = self.calibrate.flush()
-        self._pass_doubts()
-        out = [record for batch in batches for record in self._process_calibrated(batch)]
+        out = self._process_calibrated(self.calibrate.flush())
         if 'align' in self._names:
             out += [r for frame in self.align.flush() for r in self._process_frame(frame)]
         if 'detect' in self._names:
@@ -180,21 +145,17 @@ class Pipeline:
             out += [*self.traffic.feed(TrackedFrame(None, tracked)), *self.traffic.flush()]
         return out
 
-    def _pass_doubts(self) -> None:
-        """Tell the tracker when the readings of sensors are doubtful."""
+    def _process_calibrated(self, batches: Iterable[Readings]) -> list[Output]:
+        """Tell the tracker which readings are doubtful; return the calibrated batches, each with
+        the records that result from it."""
         if 'track' in self._names:
             self.track.set_input_doubts(self.calibrate.input_doubts())
-
-    def _stages(self) -> dict[str, Stage[Any, Any]]:
-        """Used stages by name, in order of processing."""
-        return {name: getattr(self, name) for name in self._names}
-
-    def _process_calibrated(self, batch: Readings) -> Iterator[Output]:
-        """Yield a batch of calibrated readings and the records that result from it."""
-        yield batch
-        if 'align' in self._names:
-            for frame in self.align.feed(batch):
-                yield from self._process_frame(frame)
+        out: list[Output] = []
+        for batch in batches:
+            out.append(batch)
+            for frame in self.align.feed(batch) if 'align' in self._names else ():
+                out += self._process_frame(frame)
+        return out
 
     def _process_frame(self, frame: FieldFrame) -> Iterator[Output]:
         """Yield the records that result from a frame."""
@@ -216,11 +177,68 @@ class Pipeline:
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Counters of the stages: {stage: {event: number}}."""
-        return {name: dict(sorted(stage.counts.items())) for name, stage in self._stages().items()}
+        return {name: dict(sorted(getattr(self, name).counts.items())) for name in self._names}
 
     def rejections(self) -> dict[str, int]:
         """Number of rejections, summed over the stages: {cause: number}."""
         total: Counter[str] = Counter()
-        for stage in self._stages().values():
-            total.update(rejected(stage.counts))
+        for counts in self.counts().values():
+            total.update(rejected(counts))
         return dict(total)
+
+
+class Step(NamedTuple):
+    """A batch of raw readings and what the pipeline made of it."""
+
+    readings: Readings
+    """Raw readings; empty at the end of the source."""
+    received_ns: int | None
+    """Time of receipt [ns]; None if unknown."""
+    records: Sequence[object]
+    """Records in order of processing."""
+    is_last: bool = False
+    """Whether the records follow from the end of the source; all frames precede them."""
+
+
+_RECEIVERS = {
+    Readings: 'add_calibrated', FieldFrame: 'add_frame', Detection: 'add_detection',
+    Track: 'add_track', SmoothedPose: 'add_smoothed', Disturbance: 'add_disturbance',
+    VehiclePassage: 'add_passage', TrafficSummary: 'add_traffic'}
+
+
+class RecordReceiver:
+    """Sink that passes each record to the method for its type; subclasses override some."""
+
+    def add(self, step: Step) -> None:
+        """Receive the records of a step."""
+        self.receive(step.records)
+
+    def receive(self, records: Iterable[object]) -> None:
+        """Receive records in order of processing."""
+        for record in records:
+            if name := _RECEIVERS.get(type(record)):
+                getattr(self, name)(record)
+
+    def add_calibrated(self, readings: Readings) -> None:
+        """Receive a batch of calibrated readings."""
+
+    def add_frame(self, frame: FieldFrame) -> None:
+        """Receive a frame, which precedes its tracks."""
+
+    def add_detection(self, detection: Detection) -> None:
+        """Receive the onset or release of a detection."""
+
+    def add_track(self, track: Track) -> None:
+        """Receive a pose, or the closing record of a track."""
+
+    def add_smoothed(self, pose: SmoothedPose) -> None:
+        """Receive a smoothed pose."""
+
+    def add_disturbance(self, disturbance: Disturbance) -> None:
+        """Receive a disturbance, when it is detected and again when it has ended."""
+
+    def add_passage(self, passage: VehiclePassage) -> None:
+        """Receive the passage of a vehicle."""
+
+    def add_traffic(self, summary: TrafficSummary) -> None:
+        """Receive the summary of the traffic in an interval."""

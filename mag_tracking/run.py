@@ -1,14 +1,17 @@
 """One way to play readings through the stages: a source, a pipeline, sinks and one report."""
 
+import html
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, NoReturn, Protocol, TypeAlias
 
-from mag_tracking.errors import OutputError
+from tqdm.auto import tqdm
+
+from mag_tracking.analysis.track_errors import Truth
+from mag_tracking.errors import MissingDependencyError, OutputError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline
-from mag_tracking.record_receiver import Step
+from mag_tracking.pipeline import Pipeline, Step
 from mag_tracking.recording.message_block import Progress, ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
@@ -24,64 +27,22 @@ from mag_tracking.stages.health.findings import (
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.track.manager import NO_SCALE, NO_SCALE_FRAMES
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 ARRAY_BATCH = 4096
 """Number of readings per batch when arrays are processed, to bound the memory for outputs."""
-
-
-class Source(Protocol):
-    """Readings in the order of their receipt, with an account of what could not be read."""
-
-    name: str
-    """Name for messages."""
-    stem: str
-    """Name for tables and files."""
-
-    @property
-    def rejected(self) -> Mapping[str, int]:
-        """Messages without a usable reading so far: {cause: number}."""
-
-    @property
-    def lost(self) -> Mapping[str, int]:
-        """Unreadable parts so far: {damage: number}."""
-
-    @property
-    def clocks(self) -> Mapping[str, ClockSpan]:
-        """Timestamps and times of receipt so far: {sensor: ClockSpan}; empty if unknown."""
-
-    def missing_topics(self) -> Sequence[str]:
-        """List the topics of the network without messages.
-
-        Returns
-        -------
-        sequence of str
-        """
-
-    def beginning(self) -> 'Source':
-        """Return the source at its beginning, for a first pass that counts nothing.
-
-        Returns
-        -------
-        Source
-        """
-
-    def batches(self, progress: Progress | None = None) -> Iterator[tuple[Readings, int | None]]:
-        """Iterate over the readings.
-
-        Parameters
-        ----------
-        progress : callable, optional
-            Called with the number of bytes read since the last call.
-
-        Yields
-        ------
-        readings : Readings
-        received_ns : int, ns, or None
-            Time of receipt; None if the batch contains several messages.
-        """
+MAX_ROWS = 20
+"""Maximum number of rows of a table in a notebook."""
 
 
 class RecordingSource:
-    """Readings of a recording; with `by_message`, each message is a batch."""
+    """Readings of a recording in the order of logging; with `by_message`, each message is a batch.
+
+    `name` is for messages, `stem` for tables and files. The accounts cover what was read so far:
+    `rejected` messages without a usable reading by cause, `lost` unreadable parts by damage, and
+    the `clocks` of the sensors, with timestamps and log times.
+    """
 
     def __init__(self, recording: Recording, network: SensorNetwork, truth: str | None = None,
                  by_message: bool = False) -> None:
@@ -89,21 +50,13 @@ class RecordingSource:
         self.stem = recording.path.resolve().stem
         self._network, self._by_message = network, by_message
         self.reader = SampleReader(recording, network, truth)
+        self.rejected: Mapping[str, int] = self.reader.rejected
+        self.lost: Mapping[str, int] = recording.losses
+        self.clocks: Mapping[str, ClockSpan] = self.reader.clocks
 
-    @property
-    def rejected(self) -> Mapping[str, int]:
-        """Messages without a usable reading so far: {cause: number}."""
-        return self.reader.rejected
-
-    @property
-    def lost(self) -> Mapping[str, int]:
-        """Unreadable parts so far: {damage: number}."""
-        return self.recording.losses
-
-    @property
-    def clocks(self) -> Mapping[str, ClockSpan]:
-        """Timestamps and log times so far: {sensor: ClockSpan}."""
-        return self.reader.clocks
+    def truth(self) -> dict[str, Truth]:
+        """True poses so far, by target."""
+        return self.reader.truth_arrays()
 
     def missing_topics(self) -> Sequence[str]:
         """List the topics of the network that are not in the recording."""
@@ -114,7 +67,7 @@ class RecordingSource:
         return RecordingSource(Recording(self.recording.path), self._network)
 
     def batches(self, progress: Progress | None = None) -> Iterator[tuple[Readings, int | None]]:
-        """Iterate over batches of messages, or over single messages with their log times."""
+        """Iterate over batches of messages, or over single messages with their log times [ns]."""
         if self._by_message:
             yield from self.reader.readings_as_received(progress)
         else:
@@ -127,13 +80,17 @@ class ArraySource:
     """Readings in memory, and the account of the recording from which they were read."""
 
     readings: Readings
-    name: str = 'readings'
-    stem: str = 'readings'
     rejected: Mapping[str, int] = field(default_factory=dict)
     lost: Mapping[str, int] = field(default_factory=dict)
-    clocks: Mapping[str, ClockSpan] = field(default_factory=dict)
     topics: Sequence[str] = ()
     """Topics of the network that were not recorded."""
+    true_poses: dict[str, Truth] = field(default_factory=dict)
+    name = stem = 'readings'
+    clocks: ClassVar[Mapping[str, ClockSpan]] = {}
+
+    def truth(self) -> dict[str, Truth]:
+        """True poses, by target."""
+        return self.true_poses
 
     def missing_topics(self) -> Sequence[str]:
         """List the topics of the network that were not recorded."""
@@ -147,6 +104,9 @@ class ArraySource:
         """Iterate over batches of at most `ARRAY_BATCH` readings."""
         for i in range(0, len(self.readings), ARRAY_BATCH):
             yield self.readings.part(slice(i, i + ARRAY_BATCH)), None
+
+
+Source: TypeAlias = RecordingSource | ArraySource
 
 
 class Sink(Protocol):
@@ -231,35 +191,14 @@ class RunReport:
 def run(source: Source, pipeline: Pipeline, sinks: Sequence[Sink],
         progress: Progress | None = None, stopped: Callable[[], bool] | None = None,
         look_ahead: bool = True) -> RunReport:
-    """Play a source through a pipeline into sinks.
+    """Play a source through a pipeline that has processed nothing into sinks.
 
     With `look_ahead`, the source is read twice: first up to `LOOK_AHEAD_S`, to find the backgrounds
-    of sensors near a target that is present at the start.
-
-    Parameters
-    ----------
-    source : Source
-    pipeline : Pipeline
-        Pipeline that has processed nothing.
-    sinks : sequence of Sink
-        If one cannot write its results, the others receive the rest.
-    progress : callable, optional
-        Called with the number of bytes read since the last call.
-    stopped : callable, optional
-        Called after every batch and every progress report. When it returns true, reading ends; the
-        sinks still receive what the stages have buffered.
-    look_ahead : bool
-
-    Returns
-    -------
-    RunReport
-
-    Raises
-    ------
-    RecordingError
-        If the source cannot be read.
-    OutputError
-        If all sinks have failed.
+    of sensors near a target that is present at the start. If a sink cannot write its results, the
+    others receive the rest. `progress` is called with the number of bytes read since the last call.
+    `stopped` is called after every batch and every progress report; when it returns true, reading
+    ends, and the sinks still receive what the stages have buffered. Raises RecordingError if the
+    source cannot be read, OutputError if all sinks have failed.
     """
     first_pass = prescan_of(source, pipeline, stopped) if look_ahead else Prescan({}, {}, {})
     first_pass.apply(pipeline.calibrate)
@@ -343,3 +282,25 @@ def no_track_reason(counts: Mapping[str, int]) -> str | None:
                 'replay --tables events` to describe the passes without scale, or set '
                 'track.single_sensor_prior: true if the vehicles match the settings')
     return None
+
+
+def progress_bar(source: Source, leave: bool = True) -> 'tqdm[NoReturn]':
+    """Progress bar of the bytes of a recording in a terminal or notebook; hidden for arrays."""
+    size = source.recording.size if isinstance(source, RecordingSource) else None
+    return tqdm(total=size, unit='B', unit_scale=True, desc=source.name, leave=leave,
+                disable=True if size is None else None)
+
+
+class DisplayedResult:
+    """Result that a notebook shows as its summary and the first rows of its table."""
+
+    def to_dataframe(self) -> 'pd.DataFrame':
+        """Convert the result to a table."""
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        summary = f'<p>{html.escape(repr(self))}</p>'
+        try:
+            return summary + self.to_dataframe().to_html(max_rows=MAX_ROWS)
+        except MissingDependencyError:
+            return summary

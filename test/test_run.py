@@ -5,9 +5,8 @@ import json
 
 import pytest
 
-from mag_tracking.apps.events import EventSink
 from mag_tracking.apps.readings import source_of
-from mag_tracking.apps.traffic import TrafficSink
+from mag_tracking.apps.traffic import EventSink, TrafficSink
 from mag_tracking.cli import main
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.pipeline import STAGES, Pipeline, settings_for

@@ -8,10 +8,9 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.analysis.pass_fit import fit_pass
 from mag_tracking.analysis.track_log import SmoothedLog, TrackLog
 from mag_tracking.apps.archive_segments import FrameChunk
-from mag_tracking.apps.pass_fitter import fitted_vehicles
-from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
+from mag_tracking.apps.passes import PassTracks, fitted_vehicles, ground_prior
 from mag_tracking.apps.replay import TrackHistory
-from mag_tracking.record_receiver import RecordReceiver
+from mag_tracking.pipeline import RecordReceiver
 from mag_tracking.records import SmoothedPose, Track
 from mag_tracking.results.archive_folder import TABLES, common_columns
 from mag_tracking.results.columns import MOMENT, names_of, row_of

@@ -24,12 +24,11 @@ from mag_tracking.apps.archive_result import (
 )
 from mag_tracking.apps.archive_segments import SegmentWriter, read_segment, work_file_errors
 from mag_tracking.apps.archive_tracks import SEGMENT_TABLES, SegmentTables
-from mag_tracking.apps.pass_collector import PassCollector
+from mag_tracking.apps.passes import PassCollector
 from mag_tracking.errors import OutputError
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, Settings
-from mag_tracking.record_receiver import Step
+from mag_tracking.pipeline import Pipeline, Settings, Step
 from mag_tracking.recording.reader import Recording
 from mag_tracking.records import FieldFrame
 from mag_tracking.results.archive_folder import TABLES, common_columns, join_tables, recording_key

@@ -14,9 +14,8 @@ from mag_tracking.calibration.orientation import (
 from mag_tracking.calibration.survey import NetworkSurvey, Survey, with_measured_noise
 from mag_tracking.errors import RecordingError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, Settings
+from mag_tracking.pipeline import Pipeline, RecordReceiver, Settings
 from mag_tracking.quantities import quantity
-from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.recording.message_block import ReadingStopped, until_stopped
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader

@@ -20,8 +20,7 @@ from mag_tracking.analysis.signature_classifier import (
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import LabelsError
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.record_receiver import RecordReceiver
+from mag_tracking.pipeline import Pipeline, RecordReceiver, settings_for
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.signature_tables import (
     LabelledInterval,

@@ -9,8 +9,7 @@ from mag_tracking.apps.host_stalls import HostStalls
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.survey import SurveySettings
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, Settings
-from mag_tracking.record_receiver import Step
+from mag_tracking.pipeline import Pipeline, Settings, Step
 from mag_tracking.recording.message_block import Progress
 from mag_tracking.records import Readings
 from mag_tracking.run import RecordingSource, run

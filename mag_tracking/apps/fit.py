@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mag_tracking.analysis.fitted_pass import FittedPass
-from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
-from mag_tracking.apps.pass_fitter import PassFitter
+from mag_tracking.apps.passes import PassFitter
 from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.errors import SettingsError, UnknownTrackError
 from mag_tracking.network import SensorNetwork
@@ -18,7 +17,7 @@ from mag_tracking.quantities import quantity
 from mag_tracking.results.columns import FITS, names_of
 from mag_tracking.results.dataframes import dataframe
 from mag_tracking.results.fit_folder import pass_rows
-from mag_tracking.run import RunReport, run
+from mag_tracking.run import DisplayedResult, RunReport, progress_bar, run
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,23 +39,17 @@ class FitResult(DisplayedResult):
                 + (f'; {"; ".join(notes)}' if notes else '') + ')')
 
     def to_dataframe(self) -> 'pd.DataFrame':
-        """Convert the fits to a table.
+        """Convert the fits to a table, which requires pandas.
 
         Returns
         -------
         pandas.DataFrame
             One row per pass and number of dipoles, with the columns of `fits.csv`.
-
-        Raises
-        ------
-        MissingDependencyError
-            If pandas is not installed.
         """
         rows = [row for fitted in self.passes for row in pass_rows(fitted)]
         # A fit without an estimate has an empty string in this column.
         return dataframe(FITS, {c: [np.nan if c == 'ambiguous' and row[c] == '' else row[c]
                                     for row in rows] for c in names_of(FITS)})
-
 
     def figure(self, number: int = 0) -> 'Figure':
         """Draw the measured and fitted field of a pass.
@@ -94,10 +87,7 @@ def fit(source: UserSource, network: SensorNetwork | str | PathLike[str],
     Parameters
     ----------
     source : path, Readings, RecordedReadings, DataFrame or mapping
-        A recording is read in batches and need not fit into memory. A DataFrame, in tesla, has one
-        row per reading (columns `sensor`, x, y, z) or per time (columns such as `mag_1_x`), and the
-        times in a column `time` or `stamp_ns` or in the index. A mapping is {sensor: (times (n,),
-        fields (n, 3), T)}.
+        As for `track`.
     network : SensorNetwork or path of a network file
     settings : {name: value}, optional
         Settings that differ from the defaults for a vehicle.
@@ -107,8 +97,7 @@ def fit(source: UserSource, network: SensorNetwork | str | PathLike[str],
         Range at the closest point of approach, only for a network of one sensor; see
         `analysis.pass_fit.fit_pass`.
     time_unit : 's', 'ms', 'us' or 'ns', optional
-        Unit of the times of a DataFrame or mapping; required for floats. The default for integers
-        is 'ns'.
+        As for `track`.
 
     Returns
     -------
@@ -118,10 +107,8 @@ def fit(source: UserSource, network: SensorNetwork | str | PathLike[str],
     ------
     ReadingsError
         If a table or arrays are incomplete, not in order, or of a wrong type.
-    RecordingError
-        If the recording cannot be read, or has none of the network's topics.
-    NetworkError
-        If the network file is invalid.
+    RecordingError, NetworkError
+        As for `track`.
     SettingsError
         If a setting or an argument is invalid.
     """
@@ -132,8 +119,8 @@ def fit(source: UserSource, network: SensorNetwork | str | PathLike[str],
     opened = source_of(source, network, time_unit)
     pipeline = Pipeline(network, settings_for('vehicle', settings), 'track')
     fitter = PassFitter(opened.stem, pipeline, orders, cpa_range, passes.append)
-    with shown_progress(opened) as progress:
-        report = run(opened, pipeline, [fitter], progress)
+    with progress_bar(opened, leave=False) as bar:
+        report = run(opened, pipeline, [fitter], bar.update)
     return FitResult(tuple(passes), report)
 
 

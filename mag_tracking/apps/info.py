@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mag_tracking.arrays import IntArray
+from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.message_arrays import magnetic_fields
 from mag_tracking.messages.schema import readings_of, stamp_ns
@@ -50,7 +50,8 @@ class Timing:
         self._last: IntArray = np.zeros(0, dtype=np.int64)
         self._longest = self._longest_begin = self._n_steps = 0
         # Histogram of the intervals: number and sum [ns] by logarithm.
-        self._bins: dict[int, tuple[int, int]] = {}
+        self._counts: IntArray = np.zeros(64 * _BINS_PER_OCTAVE, dtype=np.int64)
+        self._sums: FloatArray = np.zeros(64 * _BINS_PER_OCTAVE)
 
     def add(self, times_ns: IntArray, log_times_ns: IntArray) -> None:
         """Add messages in the order of the recording, by timestamp, or by log time if all stamps
@@ -74,14 +75,10 @@ class Timing:
             self._longest = int(steps.max())
             # The end of the step is in this batch.
             self._longest_begin = int(times_ns[int(steps.argmax()) - len(steps)]) - self._longest
-        forward = np.sort(steps[steps > 0])
+        forward = steps[steps > 0]
         bins = (np.log2(forward) * _BINS_PER_OCTAVE).astype(np.int64)
-        numbers, first = np.unique(bins, return_index=True)
-        sums = np.add.reduceat(forward, first) if len(first) else forward
-        for k, n, total in zip(numbers.tolist(), np.diff([*first, len(bins)]).tolist(),
-                               sums.tolist(), strict=True):
-            earlier_n, earlier_total = self._bins.get(k, (0, 0))
-            self._bins[k] = earlier_n + n, earlier_total + total
+        self._counts += np.bincount(bins, minlength=len(self._counts))
+        self._sums += np.bincount(bins, forward, minlength=len(self._sums))
 
     @property
     def span_s(self) -> float:
@@ -101,24 +98,21 @@ class Timing:
             _MIN_CLOCK_DIFFERENCE_S, _MAX_CLOCK_DIFFERENCE * min(abs(self.span_s),
                                                                  abs(self.log_span_s)))
 
-    def _longest_regular_bin(self) -> int:
-        """Largest bin of intervals that are not gaps."""
-        bins = sorted(self._bins)
-        cumulated = np.cumsum([self._bins[k][0] for k in bins])
-        median_bin = bins[int(np.searchsorted(cumulated, (cumulated[-1] + 1) // 2))] if bins else 0
-        longest_bin = median_bin + int(np.log2(GAP_INTERVALS) * _BINS_PER_OCTAVE)
-        n_longer = sum(n for k, (n, _) in self._bins.items() if k > longest_bin)
-        if bins and n_longer > MAX_GAP_FRACTION * cumulated[-1]:
-            return max(longest_bin, int(np.log2(MIN_GAP_S * NS) * _BINS_PER_OCTAVE))
-        return longest_bin
+    def _n_regular_bins(self) -> int:
+        """Number of bins of intervals that are not gaps."""
+        n = int(self._counts.sum())
+        median_bin = int(np.searchsorted(np.cumsum(self._counts), (n + 1) // 2))
+        n_bins = median_bin + int(np.log2(GAP_INTERVALS) * _BINS_PER_OCTAVE) + 1
+        if self._counts[n_bins:].sum() > MAX_GAP_FRACTION * n:
+            return max(n_bins, int(np.log2(MIN_GAP_S * NS) * _BINS_PER_OCTAVE) + 1)
+        return n_bins
 
     def describe(self) -> str:
         """Format rate, gaps and steps backward; empty for fewer than two messages."""
         if self.n_messages < 2:
             return ''
-        longest_bin = self._longest_regular_bin()
-        n_gaps = sum(n for k, (n, _) in self._bins.items() if k > longest_bin)
-        total = sum(total for k, (_, total) in self._bins.items() if k <= longest_bin)
+        n_bins = self._n_regular_bins()
+        n_gaps, total = int(self._counts[n_bins:].sum()), self._sums[:n_bins].sum()
         # Messages with equal times belong to the same intervals.
         n = self._n_steps - n_gaps - self.n_backward
         parts = [f'{n * NS / total:.4g} Hz'] if total else []

@@ -1,9 +1,7 @@
 """Topic selection, progress and summary of the command `mag-tracking record`."""
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 from mag_tracking.messages.types import (
     CALIBRATED_READINGS,
@@ -13,27 +11,8 @@ from mag_tracking.messages.types import (
 )
 from mag_tracking.quantities import quantity
 
-RESULT_PREFIXES = ('calibration_node/', 'detection_node/', 'tracker_node/')
-"""Prefixes of result topics, relative to the namespace of the recorder."""
-OTHER_RESULT_TOPICS = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
-"""Result topics that do not begin with a prefix in `RESULT_PREFIXES`."""
-
-
-class RecorderState(Protocol):
-    """State of a recorder, as needed by `progress_line` and `summary`."""
-
-    counts: Counter[str]
-    """Number of messages written per topic."""
-    dropped: Counter[str]
-    """Number of messages dropped per topic while the disk was full."""
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the recording."""
-
-    @property
-    def size(self) -> int:
-        """Number of bytes written."""
+if TYPE_CHECKING:
+    from mag_tracking.recording.recorder import Recorder
 
 
 class Selection(NamedTuple):
@@ -51,10 +30,10 @@ class Selection(NamedTuple):
     """Whether to record all topics."""
     readings: str = RAW_READINGS
     """Topic with the readings of many sensors."""
-    result_prefixes: tuple[str, ...] = RESULT_PREFIXES
+    result_prefixes: tuple[str, ...] = ('calibration_node/', 'detection_node/', 'tracker_node/')
     """Prefixes of result topics."""
-    result_topics: tuple[str, ...] = OTHER_RESULT_TOPICS
-    """Result topics that do not begin with a prefix in `result_prefixes`."""
+    result_topics: tuple[str, ...] = (CALIBRATED_READINGS, CALIBRATION_STATE, NETWORK_FRAME)
+    """Other result topics."""
 
     def resolved(self, resolve: Callable[[str], str]) -> 'Selection':
         """Selection with absolute names of topics, which `resolve` returns."""
@@ -76,7 +55,7 @@ class Selection(NamedTuple):
                                  or topic.removesuffix('_calibrated') in self.fields)
 
 
-def progress_line(recorder: RecorderState, seconds: float) -> str:
+def progress_line(recorder: 'Recorder', seconds: float) -> str:
     """Describe the progress of a recording in one line, `seconds` after the start."""
     dropped = recorder.dropped.total()
     messages = quantity(recorder.counts.total(), 'message')
@@ -84,7 +63,7 @@ def progress_line(recorder: RecorderState, seconds: float) -> str:
             + (f', dropped: {dropped}' if dropped else ''))
 
 
-def summary(recorder: RecorderState, selection: Selection, lost: Mapping[str, int],
+def summary(recorder: 'Recorder', selection: Selection, lost: Mapping[str, int],
             refused: Mapping[str, str]) -> Iterator[str]:
     """Summarise a recording: its content, the messages lost before they were recorded, by topic,
     and the reasons for refused topics."""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,12 +21,12 @@ from mag_tracking.analysis.track_errors import (
     unflagged_poses,
 )
 from mag_tracking.analysis.track_log import SmoothedLog, TrackLog
+from mag_tracking.arrays import IntArray
 from mag_tracking.errors import OutputError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.geometry import heading_of, speed_of
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, Settings
-from mag_tracking.record_receiver import RecordReceiver
+from mag_tracking.pipeline import Pipeline, RecordReceiver, Settings
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.truth import read_truth_table
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
@@ -47,18 +47,8 @@ from mag_tracking.stages.track.settings import acceleration_density
 
 SUSPECT_MOUNTING_RATIO = 2.0
 """Mounting error above which a sensor is reported, in prior standard deviations."""
-
-
-class Configured(Protocol):
-    """Object with a sensor network and settings, such as a `Pipeline`."""
-
-    @property
-    def network(self) -> SensorNetwork:
-        """Sensor network."""
-
-    @property
-    def settings(self) -> Settings:
-        """Settings of all stages."""
+MAX_FIGURES = 6
+"""Maximum number of tracks that are drawn."""
 
 
 @dataclass
@@ -84,26 +74,23 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
            more_sinks: Callable[[Pipeline], Sequence[Sink]] = lambda pipeline: ()) -> Run:
     """Track the targets in a recording and write the results to the folder `out`.
 
+    `progress` is called with the number of bytes read since the last call. `stopped` is called
+    after every batch of readings and every progress report; when it returns true, partial results
+    are written and the summary is marked as interrupted. `report` is called with a message if the
+    results of an earlier run are replaced. `truth` is a CSV file (`recording.truth`), or a topic
+    with messages of type PoseStamped, PoseWithCovarianceStamped or Odometry, by default all topics
+    below /ground_truth. `more_sinks` is called with the pipeline and returns more sinks of the run.
+
     Raises RecordingError if the recording has none of the network's topics or the ground truth
     cannot be read, OutputError if `out` is the folder of the recording.
-
-    Parameters
-    ----------
-    progress : called with the number of bytes read since the last call
-    stopped : called after every batch of readings and every progress report; when it returns true,
-        partial results are written and the summary is marked as interrupted
-    report : called with a message if the results of an earlier run are replaced
-    truth : a CSV file (`recording.truth`), or a topic with messages of type PoseStamped,
-        PoseWithCovarianceStamped or Odometry; by default all topics below /ground_truth
-    more_sinks : called with the pipeline; returns more sinks of the run
     """
     if recording.lies_in(out):
         raise OutputError(f'{out} is the folder of the recording; choose another output folder')
+    table = None
     # Topic names contain no dot: a name with a dot is a file, even if it does not exist.
-    is_table = truth is not None and (Path(truth).is_file() or '.' in truth)
-    table = read_truth_table(truth, settings.track.magnet.axis) \
-        if truth is not None and is_table else None
-    source = RecordingSource(recording, network, truth if table is None else None)
+    if truth is not None and ('.' in truth or Path(truth).is_file()):
+        table, truth = read_truth_table(truth, settings.track.magnet.axis), None
+    source = RecordingSource(recording, network, truth)
     pipeline, history = Pipeline(network, settings), TrackHistory()
     results, summary = ResultFolder(out, network), None
     if results.replaces_earlier and report is not None:
@@ -112,8 +99,8 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
         with results:
             run_report = run(source, pipeline, [results, history, *more_sinks(pipeline)],
                              progress, stopped)
-            truth_arrays = source.reader.truth_arrays() if table is None else table
-            summary = summarise(source, pipeline, history, truth_arrays, run_report)
+            true_poses = source.truth() if table is None else table
+            summary = summarise(source, pipeline, history, true_poses, run_report)
             results.write_summary(summary)
     except OSError as error:
         # The files are written and closed even on a full disk; other sinks have their results.
@@ -121,21 +108,12 @@ def replay(recording: Recording, network: SensorNetwork, settings: Settings,
             raise
         run_report = replace(run_report, failures=(
             *run_report.failures, Failure(results, output_error(error, results))))
-    return Run(summary, run_report, history.logs, history.smoothed, truth_arrays)
+    return Run(summary, run_report, history.logs, history.smoothed, true_poses)
 
 
 class TrackHistory(RecordReceiver):
-    """Stores the history of each track.
-
-    Attributes
-    ----------
-    logs : dict of int to TrackLog
-        History of each track.
-    smoothed : dict of int to SmoothedLog
-        History of each smoothed track.
-    disturbances : dict of int to Disturbance
-        Latest record of each disturbance.
-    """
+    """Stores the history of each track and smoothed track, and the latest record of each
+    disturbance, by their numbers."""
 
     def __init__(self) -> None:
         # The first frame, which precedes every track, sets this attribute.
@@ -203,18 +181,21 @@ def _track_entry(log: TrackLog, smoothed: SmoothedLog | None, pipeline: Pipeline
                  truth: Mapping[str, Truth]) -> dict[str, Any]:
     """Create the entry of a track in the summary."""
     entry: dict[str, Any] = log.summary()
-    entry['nis_by_sensor'] = log.nis_of(pipeline.network.names)
-    entry['mounting'] = _mounting(log, pipeline)
-    if pipeline.settings.track.target == 'vehicle':
-        entry['delay'] = _delay_entry(log, pipeline.network)
-    errors = errors_against_truth(log, pipeline, truth)
-    if errors:
+    network, settings = pipeline.network, pipeline.settings
+    entry['nis_by_sensor'] = log.nis_of(network.names)
+    max_angle = SUSPECT_MOUNTING_RATIO * settings.track.mounting_std_deg
+    entry['mounting'] = {
+        name: {'angles_deg': angles.tolist(), 'std_deg': std.tolist(),
+               'suspicious': bool(np.abs(angles).max() > max_angle)}
+        for name, (angles, std) in log.mounting_of(network.names).items()}
+    if settings.track.target == 'vehicle':
+        entry['delay'] = _delay_entry(log, network)
+    if errors := errors_against_truth(log, network, settings, truth):
         entry['truth'] = errors
         entry['truth']['error_over_bound'] = _bound_ratio(log, pipeline, truth[errors['name']])
     if smoothed is not None:
         entry['smoothed'] = smoothed.summary()
-        errors = errors_against_truth(smoothed, pipeline, truth)
-        if errors:
+        if errors := errors_against_truth(smoothed, network, settings, truth):
             entry['smoothed']['truth'] = errors
     return entry
 
@@ -233,54 +214,34 @@ def _delay_entry(log: TrackLog, network: SensorNetwork) -> dict[str, Any]:
             'contradicts': contradicts_delays(speed_of(*velocity), heading_of(*velocity), motion)}
 
 
-def _mounting(log: TrackLog, pipeline: Pipeline) -> dict[str, dict[str, Any]]:
-    """Estimated mounting error of each sensor; empty if mounting errors are not estimated."""
-    max_angle = SUSPECT_MOUNTING_RATIO * pipeline.settings.track.mounting_std_deg
-    return {name: {'angles_deg': angles.tolist(), 'std_deg': std.tolist(),
-                   'suspicious': bool(np.abs(angles).max() > max_angle)}
-            for name, (angles, std) in log.mounting_of(pipeline.network.names).items()}
-
-
-def errors_against_truth(log: TrackLog | SmoothedLog, pipeline: Configured,
+def errors_against_truth(log: TrackLog | SmoothedLog, network: SensorNetwork, settings: Settings,
                          truth: Mapping[str, Truth]) -> dict[str, Any] | None:
     """Errors of a track relative to the best-matching target of the ground truth.
 
     The result is the entry `truth` of the track in `summary.json`; None if no ground truth covers
     it.
     """
-    best_match: tuple[float, dict[str, Any]] | None = None
-    for name, truth_arrays in truth.items():
-        errors = _errors_of(log, pipeline, truth_arrays)
-        if errors is not None and (best_match is None or errors[0] < best_match[0]):
-            best_match = errors[0], {'name': name, **errors[1]}
-    return None if best_match is None else best_match[1]
-
-
-def _errors_of(log: TrackLog | SmoothedLog, pipeline: Configured,
-               truth: Truth) -> tuple[float, dict[str, Any]] | None:
-    """Return (error [m] for the selection of the best-matching target, all errors).
-
-    The result is None if the ground truth does not cover the track.
-    """
-    if pipeline.settings.track.target == 'magnet':
-        magnet = magnet_errors(log, truth, pipeline.settings.track.magnet.axis)
-        return (magnet['position_mean'], {**magnet}) if magnet else None
-    vehicle = pass_errors(log, truth, pipeline.network.centre)
-    return (vehicle['closest'], {**vehicle}) if vehicle else None
+    found: list[tuple[float, dict[str, Any]]] = []
+    for name, true in truth.items():
+        if settings.track.target == 'magnet':
+            if magnet := magnet_errors(log, true, settings.track.magnet.axis):
+                found.append((magnet['position_mean'], {'name': name, **magnet}))
+        elif vehicle := pass_errors(log, true, network.centre):
+            found.append((vehicle['closest'], {'name': name, **vehicle}))
+    return min(found, key=lambda errors: errors[0])[1] if found else None
 
 
 def _bound_ratio(log: TrackLog, pipeline: Pipeline, truth: Truth) -> float | None:
     """Ratio of the error of a track to its Cramér-Rao bound; None if it cannot be computed."""
-    track = pipeline.settings.track
+    network, track = pipeline.network, pipeline.settings.track
+    rows: IntArray
     if track.target == 'magnet':
         # Between two poses, the magnet may have rotated arbitrarily.
-        return error_over_bound(pipeline.network, log, truth, acceleration_density(track), 1.0,
-                                track.field_error, track.background_std,
-                                np.arange(MAGNET_SKIP, len(log.stamp_ns)), 3)
-    rows = near_poses(log, truth, pipeline.network.centre)
-    return error_over_bound(pipeline.network, log, truth, acceleration_density(track),
-                            track.vehicle.moment_drift, track.field_error, track.background_std,
-                            rows, 2)
+        rows, drift, n_axes = np.arange(MAGNET_SKIP, len(log.stamp_ns)), 1.0, 3
+    else:
+        rows, drift, n_axes = near_poses(log, truth, network.centre), track.vehicle.moment_drift, 2
+    return error_over_bound(network, log, truth, acceleration_density(track), drift,
+                            track.field_error, track.background_std, rows, n_axes)
 
 
 def write_trajectories(run: Run, out: Path) -> list[Path]:
@@ -293,19 +254,15 @@ def write_trajectories(run: Run, out: Path) -> list[Path]:
     return paths
 
 
-def write_figures(run: Run, network: SensorNetwork, out: Path, max_tracks: int = 6,
-                  stopped: Callable[[], bool] | None = None) -> list[Path]:
-    """Draw the figures of the first `max_tracks` tracks, and return the files.
-
-    `stopped` is called before each track.
-    """
+def write_figures(run: Run, network: SensorNetwork, out: Path,
+                  stopped: Callable[[], bool]) -> None:
+    """Draw the figures of the first `MAX_FIGURES` tracks; `stopped` is called before each track."""
     # Imported here because it loads matplotlib.
     from mag_tracking.report.figures import field_figure, map_figure, weights_figure
     from mag_tracking.report.style import save_figure
 
-    paths = []
-    for log in list(run.logs.values())[:max_tracks]:
-        if stopped is not None and stopped():
+    for log in list(run.logs.values())[:MAX_FIGURES]:
+        if stopped():
             break
         entry = next(t for t in run.summary['tracks'] if t['id'] == log.id)
         truth = None
@@ -315,7 +272,4 @@ def write_figures(run: Run, network: SensorNetwork, out: Path, max_tracks: int =
         for name, figure in (('map', map_figure(log, network, truth, smoothed)),
                              ('weights', weights_figure(log)),
                              ('field', field_figure(log, network))):
-            path = out / figure_name(name, log.id)
-            save_figure(figure, path)
-            paths.append(path)
-    return paths
+            save_figure(figure, out / figure_name(name, log.id))

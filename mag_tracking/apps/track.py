@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mag_tracking.analysis.track_errors import Truth, interpolate_truth
 from mag_tracking.analysis.track_log import TrackLog
-from mag_tracking.apps.displayed_result import DisplayedResult, shown_progress
-from mag_tracking.apps.readings import RecordedReadings, UserSource, network_of, source_of
+from mag_tracking.apps.readings import UserSource, network_of, source_of
 from mag_tracking.apps.replay import TrackHistory, errors_against_truth
 from mag_tracking.arrays import FloatArray, StructArray
 from mag_tracking.errors import UnknownTrackError
@@ -16,7 +15,6 @@ from mag_tracking.event_records import Disturbance
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings, settings_for
 from mag_tracking.quantities import quantity
-from mag_tracking.record_receiver import RecordReceiver
 from mag_tracking.records import Detection, SmoothedPose, Track
 from mag_tracking.results.columns import COMPLETE, DETECTIONS, POSES, SMOOTHED
 from mag_tracking.results.dataframes import (
@@ -26,7 +24,7 @@ from mag_tracking.results.dataframes import (
     smoothed_array,
     with_time_index,
 )
-from mag_tracking.run import RecordingSource, RunReport, run
+from mag_tracking.run import DisplayedResult, RunReport, progress_bar, run
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,6 +36,8 @@ class TrackingResult(DisplayedResult):
     """Tracks, poses and detections of a recording or of readings.
 
     Arrays are structured, in SI units and in chronological order; they are empty without targets.
+    Tables raise MissingDependencyError if pandas is not installed. Figures and errors are those of
+    one track, by default the first one, and raise UnknownTrackError if there is no such track.
     """
 
     network: SensorNetwork
@@ -78,11 +78,6 @@ class TrackingResult(DisplayedResult):
         -------
         pandas.DataFrame
             Columns of `poses.csv`, indexed by time (UTC).
-
-        Raises
-        ------
-        MissingDependencyError
-            If pandas is not installed.
         """
         return with_time_index(self.poses_dataframe(), 'stamp_ns')
 
@@ -92,14 +87,9 @@ class TrackingResult(DisplayedResult):
         Returns
         -------
         matplotlib.figure.Figure
-
-        Raises
-        ------
-        UnknownTrackError
-            If nothing was tracked.
         """
-        return self.pass_figure() if self.settings.track.target == 'vehicle' \
-            else self.map_figure()
+        is_vehicle = self.settings.track.target == 'vehicle'
+        return self.pass_figure() if is_vehicle else self.map_figure()
 
     def poses_dataframe(self) -> 'pd.DataFrame':
         """Convert `poses` to a table.
@@ -107,12 +97,7 @@ class TrackingResult(DisplayedResult):
         Returns
         -------
         pandas.DataFrame
-            Table with the columns of `poses.csv`.
-
-        Raises
-        ------
-        MissingDependencyError
-            If pandas is not installed.
+            Columns of `poses.csv`.
         """
         return array_dataframe(POSES, self.poses)
 
@@ -123,11 +108,6 @@ class TrackingResult(DisplayedResult):
         -------
         pandas.DataFrame
             Table with the columns of `poses_smoothed.csv`, and `complete`.
-
-        Raises
-        ------
-        MissingDependencyError
-            If pandas is not installed.
         """
         return array_dataframe((*SMOOTHED, *COMPLETE), self.smoothed)
 
@@ -138,11 +118,6 @@ class TrackingResult(DisplayedResult):
         -------
         pandas.DataFrame
             Table with the columns of `detections.csv`.
-
-        Raises
-        ------
-        MissingDependencyError
-            If pandas is not installed.
         """
         return array_dataframe(DETECTIONS, self.detections)
 
@@ -152,19 +127,14 @@ class TrackingResult(DisplayedResult):
         Parameters
         ----------
         track_id : int, optional
-            Default: the first track.
 
         Returns
         -------
         dict or None
             Entry `truth` of a track in `summary.json`; None if no ground truth covers the track.
-
-        Raises
-        ------
-        UnknownTrackError
-            If there is no such track.
         """
-        return errors_against_truth(self._track_log(track_id), self, self.truth)
+        return errors_against_truth(self._track_log(track_id), self.network, self.settings,
+                                    self.truth)
 
     def map_figure(self, track_id: int | None = None) -> 'Figure':
         """Draw a map: hypotheses with 90% ellipses, smoothed track, sensors and ground truth.
@@ -172,23 +142,17 @@ class TrackingResult(DisplayedResult):
         Parameters
         ----------
         track_id : int, optional
-            Default: the first track.
 
         Returns
         -------
         matplotlib.figure.Figure
-
-        Raises
-        ------
-        UnknownTrackError
-            If there is no such track.
         """
         # Imported here, as in the other figures, because it loads matplotlib.
         from mag_tracking.report.figures import map_figure
 
         log, errors = self._track_log(track_id), self.errors(track_id)
-        truth = None if errors is None else interpolate_truth(self.truth[errors['name']],
-                                                              log.stamp_ns)
+        truth = None if errors is None else interpolate_truth(
+            self.truth[errors['name']], log.stamp_ns)
         return map_figure(log, self.network, truth, self._smoothed_path(log.id))
 
     def pass_figure(self, track_id: int | None = None, max_std: float = float('inf')) -> 'Figure':
@@ -197,18 +161,12 @@ class TrackingResult(DisplayedResult):
         Parameters
         ----------
         track_id : int, optional
-            Default: the first track.
         max_std : float, m, optional
             Poses with a larger standard deviation of the horizontal position are omitted.
 
         Returns
         -------
         matplotlib.figure.Figure
-
-        Raises
-        ------
-        UnknownTrackError
-            If there is no such track.
         """
         from mag_tracking.report.pass_picture import pass_figure
 
@@ -227,16 +185,10 @@ class TrackingResult(DisplayedResult):
         Parameters
         ----------
         track_id : int, optional
-            Default: the first track.
 
         Returns
         -------
         matplotlib.figure.Figure
-
-        Raises
-        ------
-        UnknownTrackError
-            If there is no such track.
         """
         from mag_tracking.report.figures import weights_figure
 
@@ -248,16 +200,10 @@ class TrackingResult(DisplayedResult):
         Parameters
         ----------
         track_id : int, optional
-            Default: the first track.
 
         Returns
         -------
         matplotlib.figure.Figure
-
-        Raises
-        ------
-        UnknownTrackError
-            If there is no such track.
         """
         from mag_tracking.report.figures import field_figure
 
@@ -315,24 +261,22 @@ def track(source: UserSource,
         If a setting has an unknown name, a wrong type, or a value out of range.
     """
     network = network_of(network)
-    pipeline, poses, history = Pipeline(network, settings_for(target, settings)), _Poses(), \
-        TrackHistory()
+    pipeline, found = Pipeline(network, settings_for(target, settings)), _Poses()
     opened = source_of(source, network, time_unit)
-    with shown_progress(opened) as progress:
-        report = run(opened, pipeline, [poses, history], progress)
-    truth = source.truth if isinstance(source, RecordedReadings) else \
-        opened.reader.truth_arrays() if isinstance(opened, RecordingSource) else {}
-    return TrackingResult(network, pipeline.settings, pose_array(poses.poses),
-                          smoothed_array(poses.smoothed), detection_array(poses.detections),
-                          history.logs, truth, report, tuple(history.disturbances.values()))
+    with progress_bar(opened, leave=False) as bar:
+        report = run(opened, pipeline, [found], bar.update)
+    return TrackingResult(network, pipeline.settings, pose_array(found.poses),
+                          smoothed_array(found.smoothed_poses), detection_array(found.detections),
+                          found.logs, opened.truth(), report, tuple(found.disturbances.values()))
 
 
-class _Poses(RecordReceiver):
-    """Collects detections and poses."""
+class _Poses(TrackHistory):
+    """Also stores detections and poses."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.poses: list[Track] = []
-        self.smoothed: list[SmoothedPose] = []
+        self.smoothed_poses: list[SmoothedPose] = []
         self.detections: list[Detection] = []
 
     def add_detection(self, detection: Detection) -> None:
@@ -341,8 +285,10 @@ class _Poses(RecordReceiver):
 
     def add_smoothed(self, pose: SmoothedPose) -> None:
         """Add a smoothed pose."""
-        self.smoothed.append(pose)
+        super().add_smoothed(pose)
+        self.smoothed_poses.append(pose)
 
     def add_track(self, track: Track) -> None:
         """Add a pose; omit its hypotheses, which are stored in the history of the track."""
+        super().add_track(track)
         self.poses.append(replace(track, hypotheses=()))

@@ -7,8 +7,7 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray
 from mag_tracking.network import SensorNetwork
-from mag_tracking.pipeline import Pipeline, Settings
-from mag_tracking.record_receiver import RecordReceiver, Step
+from mag_tracking.pipeline import Pipeline, RecordReceiver, Settings, Step
 from mag_tracking.recording.message_block import Progress
 from mag_tracking.recording.reader import Recording
 from mag_tracking.records import FieldFrame, Readings, SmoothedPose, Track

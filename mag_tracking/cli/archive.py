@@ -8,8 +8,14 @@ from pathlib import Path
 from tqdm import tqdm
 
 from mag_tracking.apps.archive import archive, recordings_of, size_of
-from mag_tracking.cli.options import Commands, add_command, add_recorded_network, recorded_network
-from mag_tracking.cli.tracking_options import add_settings, settings_of
+from mag_tracking.cli.options import (
+    Commands,
+    add_command,
+    add_recorded_network,
+    add_settings,
+    recorded_network,
+    settings_of,
+)
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.quantities import quantity

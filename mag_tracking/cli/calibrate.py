@@ -13,12 +13,13 @@ from mag_tracking.cli.options import (
     add_command,
     add_recorded_network,
     add_report,
+    add_settings,
     check_outputs,
     check_report,
     recorded_network,
+    settings_of,
     utc_timestamp,
 )
-from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network.file import write_network
 from mag_tracking.recording.reader import Recording

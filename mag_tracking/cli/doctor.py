@@ -13,15 +13,15 @@ from mag_tracking.cli.options import (
     add_command,
     add_recorded_network,
     add_report,
+    add_settings,
     check_report,
-    progress_bar,
     recorded_network,
+    settings_of,
 )
-from mag_tracking.cli.tracking_options import add_settings, settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.recording.reader import Recording
-from mag_tracking.run import RecordingSource
+from mag_tracking.run import RecordingSource, progress_bar
 from mag_tracking.stages.health.diagnosis import Finding, ranked
 from mag_tracking.stages.health.sensor_health import SensorHealth
 

@@ -2,7 +2,7 @@
 
 import argparse
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from mag_tracking.analysis.correlated_motion import contradicts_delays
 from mag_tracking.analysis.fitted_pass import FittedPass
 from mag_tracking.analysis.pass_result import MAX_NORMALISED_COST, Bearing, PassFit
 from mag_tracking.apps.fit import check_cpa_range, check_orders
-from mag_tracking.apps.pass_fitter import PassFitter
+from mag_tracking.apps.passes import PassFitter
 from mag_tracking.arrays import FloatArray
 from mag_tracking.cli.options import (
     Commands,
@@ -23,10 +23,9 @@ from mag_tracking.cli.options import (
     add_verbose,
     distinct_names,
     print_diagnoses,
-    progress_bar,
     recorded_network,
 )
-from mag_tracking.cli.vehicle_rows import HEADER, UNKNOWN, time_of, vehicle_row
+from mag_tracking.cli.tables import HEADER, time_of, vehicle_row
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.inference.detection_theory import energy_threshold
 from mag_tracking.inference.identification import Iron, hard_and_soft_iron
@@ -37,7 +36,7 @@ from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.results.fit_folder import FitFolder
-from mag_tracking.run import RecordingSource, RunReport, run
+from mag_tracking.run import RecordingSource, RunReport, progress_bar, run
 from mag_tracking.settings import read_parameter_file
 from mag_tracking.units import NS
 
@@ -100,7 +99,6 @@ class Fits:
     """Fits of the passes of all recordings, written and printed during the run."""
 
     upto = 'track'
-    """Last stage of the pipeline that the table needs."""
 
     def __init__(self, args: argparse.Namespace, network: SensorNetwork,
                  stopped: Callable[[], bool], stack: ExitStack) -> None:
@@ -118,9 +116,19 @@ class Fits:
         """Write and print a fitted pass; draw it for the command `fit`."""
         self.folder.add(fitted_pass)
         self.passes.append(fitted_pass)
-        _print_pass(fitted_pass, self._args.verbose)
-        if self._args.command == 'fit' and not self._args.no_figures:
-            _draw(fitted_pass, self._args.out)
+        fit, drawn = fitted_pass.chosen, fitted_pass.drawn
+        # The progress bar is moved down.
+        with tqdm.external_write_mode():
+            print(_row(fitted_pass))
+            if self._args.verbose:
+                _print_details(fitted_pass)
+            if fit is not None and contradicts_delays(fit.speed, fit.heading,
+                                                      fitted_pass.correlated):
+                print('    warning: the velocities of the fit and from the delay contradict each '
+                      'other; rely on neither. Check clock offsets, positions in the network '
+                      'file, and whether the target turned')
+        if self._args.command == 'fit' and not self._args.no_figures and drawn is not None:
+            _draw(fitted_pass, drawn, self._args.out)
 
     def finish(self, name: str, report: RunReport, out: Path | None) -> None:
         """Complete the content of `fits.json`, which is written at the end of all recordings."""
@@ -131,7 +139,13 @@ def _fit(args: argparse.Namespace) -> int:
     """Run `mag-tracking fit`."""
     network = recorded_network(args)
     settings = settings_for('vehicle', read_parameter_file(args.params) if args.params else {})
-    _check(args, network)
+    distinct_names(args.recordings)
+    check_orders('--orders', args.orders)
+    check_cpa_range('--cpa-range', args.cpa_range, network)
+    earth = network.earth_field
+    if args.same_vehicle and (earth is None or not earth.any()):
+        raise SettingsError('--same-vehicle: add earth_field to the network file; hard and soft '
+                            'iron cannot be separated without it')
     # All recordings are opened before a file is written.
     sources = [RecordingSource(Recording(path), network) for path in args.recordings]
     if any(source.recording.lies_in(args.out) for source in sources):
@@ -152,41 +166,25 @@ def _fit(args: argparse.Namespace) -> int:
             if signals:
                 break
         passes = fits.passes
-        iron = _iron(passes, network) if args.same_vehicle else None
+        iron = _iron(passes, earth) if args.same_vehicle and earth is not None else None
         fits.folder.summary = {'iron': iron, 'interrupted': bool(signals)}
-    # Imported here because it loads matplotlib.
-    from mag_tracking.apps.fit_report import write_report
+    _write_report(passes, network, warnings, args)
+    print(f'{"interrupted; partial results" if signals else "results"} in {args.out}')
+    return 130 if signals else 0
+
+
+def _write_report(passes: Sequence[FittedPass], network: SensorNetwork, warnings: Sequence[str],
+                  args: argparse.Namespace) -> None:
+    """Write the report of all passes, and draw their cost over the number of dipoles."""
+    # Imported here, as in `_draw`, because it loads matplotlib.
+    from mag_tracking.apps.fit_report import order_figure, write_report
+    from mag_tracking.report.style import save_figure
 
     write_report(passes, network, warnings, args.out)
     if not passes:
         print('no passes: nothing was detected')
     elif not args.no_figures:
-        _draw_orders(passes, args.out)
-    print(f'{"interrupted; partial results" if signals else "results"} in {args.out}')
-    return 130 if signals else 0
-
-
-def _check(args: argparse.Namespace, network: SensorNetwork) -> None:
-    """Check the options; raise SettingsError or OutputError if one is invalid."""
-    distinct_names(args.recordings)
-    check_orders('--orders', args.orders)
-    check_cpa_range('--cpa-range', args.cpa_range, network)
-    if args.same_vehicle and not (network.earth_field is not None and network.earth_field.any()):
-        raise SettingsError('--same-vehicle: add earth_field to the network file; hard and soft '
-                            'iron cannot be separated without it')
-
-
-def _print_pass(fitted_pass: FittedPass, verbose: bool) -> None:
-    """Print the row of a fitted pass above the progress bar, warnings and, on request, details."""
-    fit = fitted_pass.chosen
-    with tqdm.external_write_mode():
-        print(_row(fitted_pass))
-        if verbose:
-            _print_details(fitted_pass)
-        if fit is not None and contradicts_delays(fit.speed, fit.heading, fitted_pass.correlated):
-            print('    warning: the velocities of the fit and from the delay contradict each '
-                  'other; rely on neither. Check clock offsets, positions in the network file, and '
-                  'whether the target turned')
+        save_figure(order_figure(passes), args.out / 'orders.png')
 
 
 def _row(fitted_pass: FittedPass) -> str:
@@ -194,19 +192,23 @@ def _row(fitted_pass: FittedPass) -> str:
     label = f'pass {fitted_pass.number}' + f'.{fitted_pass.vehicle}' * (fitted_pass.n_vehicles > 1)
     fit = fitted_pass.reported
     if fit is None:
-        return vehicle_row(label, time_of(fitted_pass.fits[0].data.stamp_ns), '', '', UNKNOWN,
-                           UNKNOWN, fitted_pass.fits[-1].reason)
-    time, _, *closest = fit.closest_approach(
-        fit.data.network.positions[fit.data.sensors].mean(axis=0))
+        return vehicle_row(label, time_of(fitted_pass.fits[0].data.stamp_ns), '', '', '-', '-',
+                           fitted_pass.fits[-1].reason)
+    time, _, *closest = _closest_approach(fit)
     known = {*fit.trusted} if fit.reason else {'speed', 'direction', 'time', 'position'}
     return vehicle_row(
         label, time_of(fit.data.stamp_ns + (NS * time if 'time' in known else 0)),
         quantity(fit.n_dipoles, 'dipole'),
         f'{np.degrees(fit.heading[0]):.0f} deg' if 'direction' in known else '',
-        fit.speed if 'speed' in known else UNKNOWN,
-        (closest[0], closest[1]) if 'position' in known else UNKNOWN,
+        fit.speed if 'speed' in known else '-',
+        (closest[0], closest[1]) if 'position' in known else '-',
         fit.reason or ('ambiguous' if fit.ambiguous else 'unique')
         + (', poor fit' if fit.normalised_cost > MAX_NORMALISED_COST else ''))
+
+
+def _closest_approach(fit: PassFit) -> tuple[float, float, float, float]:
+    """Time [s] and distance [m] of the closest approach to the sensors, each with its std."""
+    return fit.closest_approach(fit.data.network.positions[fit.data.sensors].mean(axis=0))
 
 
 def _print_details(fitted_pass: FittedPass) -> None:
@@ -235,45 +237,37 @@ def _print_details(fitted_pass: FittedPass) -> None:
             print(f'        ambiguous: {np.exp(-0.5 * chi_square):.2f} times as likely at position '
                   f'({", ".join(f"{v:.2f}" for v in path[:3])}) m'
                   + (f' and length {abs(path[6]):.1f} m' if len(path) > 6 else ''))
-    _print_delay(fitted_pass)
+    c = fitted_pass.correlated
+    line = ' (assumed along the line of the sensors)' if np.isnan(c.heading_std) else ''
+    print(f'  no velocity from the delay between sensors: {c.reason}' if c.reason else
+          f'  velocity from the delay between sensors: {_with_std((c.speed, c.speed_std), 2)} m/s, '
+          f'heading {np.degrees(c.heading):.0f} deg{line}')
     if fitted_pass.chosen is not None:
-        chosen_cost = fitted_pass.chosen.normalised_cost
-        if chosen_cost > MAX_NORMALISED_COST:
-            print(f'  poor fit (cost {chosen_cost:.1f}): errors of speed and position may be '
-                  'several standard deviations')
-        centre = fitted_pass.chosen.data.network.positions[
-            fitted_pass.chosen.data.sensors].mean(axis=0)
-        time, std, distance, distance_std = fitted_pass.chosen.closest_approach(centre)
-        print(f'  closest to the centre of the sensors {time:+.2f} ({std:.2f}) s after the '
-              f'strongest field, at {distance:.2f} ({distance_std:.2f}) m')
-        dr, dv = fitted_pass.disagreement
-        if np.isfinite(dr):
-            print(f'  fits with a similar cost differ by up to {dr:.2f} m and {dv:.2f} m/s, '
-                  'which the standard deviations do not include')
+        _print_chosen(fitted_pass, fitted_pass.chosen)
+
+
+def _print_chosen(fitted_pass: FittedPass, chosen: PassFit) -> None:
+    """Print the quality and the closest approach of the chosen fit of a pass."""
+    if chosen.normalised_cost > MAX_NORMALISED_COST:
+        print(f'  poor fit (cost {chosen.normalised_cost:.1f}): errors of speed and position may '
+              'be several standard deviations')
+    time, std, distance, distance_std = _closest_approach(chosen)
+    print(f'  closest to the centre of the sensors {time:+.2f} ({std:.2f}) s after the '
+          f'strongest field, at {distance:.2f} ({distance_std:.2f}) m')
+    dr, dv = fitted_pass.disagreement
+    if np.isfinite(dr):
+        print(f'  fits with a similar cost differ by up to {dr:.2f} m and {dv:.2f} m/s, '
+              'which the standard deviations do not include')
 
 
 def _trusted_values(fit: PassFit) -> str:
     """Format speed, direction and time of a rejected fit, as far as they are reliable."""
-    speed, speed_std = fit.speed
-    heading, heading_std = np.degrees(fit.heading)
-    centre = fit.data.network.positions[fit.data.sensors].mean(axis=0)
-    time, time_std, _, _ = fit.closest_approach(centre)
-    values = {'speed': f'{speed:.2f}({speed_std:.2f}) m/s',
-              'direction': f'{heading:.1f}({heading_std:.1f}) deg',
+    time, time_std, _, _ = _closest_approach(fit)
+    values = {'speed': f'{_with_std(fit.speed, 2)} m/s',
+              'direction': f'{_with_std(np.degrees(fit.heading), 1)} deg',
               'time': f'closest to the centre of the sensors {time:+.2f}({time_std:.2f}) s after '
               'the strongest field'}
     return ', '.join(values[name] for name in fit.trusted)
-
-
-def _print_delay(fitted_pass: FittedPass) -> None:
-    """Print the velocity from the delays between sensors."""
-    c = fitted_pass.correlated
-    if c.reason:
-        print(f'  no velocity from the delay between sensors: {c.reason}')
-        return
-    line = ' (assumed along the line of the sensors)' if np.isnan(c.heading_std) else ''
-    print(f'  velocity from the delay between sensors: {c.speed:.2f}({c.speed_std:.2f}) m/s, '
-          f'heading {np.degrees(c.heading):.0f} deg{line}')
 
 
 def _formatted_estimates(fit: PassFit) -> str:
@@ -281,12 +275,16 @@ def _formatted_estimates(fit: PassFit) -> str:
     sd = np.sqrt(np.diagonal(fit.position_covariance))
     position = ' '.join(f'{v:6.2f}({s:.2f})' for v, s in zip(fit.position, sd, strict=True))
     moment, P = fit.moment
-    magnitude = np.linalg.norm(moment)
-    magnitude_std = np.sqrt(moment @ P @ moment) / magnitude
-    heading, heading_std = np.degrees(fit.heading)
-    return (f'{position} m  {fit.speed[0]:.2f}({fit.speed[1]:.2f}) m/s  {heading:.1f}'
-            f'({heading_std:.1f}) deg  {fit.length[0]:.1f}({fit.length[1]:.1f}) m  '
-            f'{magnitude:.0f}({magnitude_std:.0f}) A m^2')
+    magnitude = float(np.linalg.norm(moment))
+    return (f'{position} m  {_with_std(fit.speed, 2)} m/s  '
+            f'{_with_std(np.degrees(fit.heading), 1)} deg  {_with_std(fit.length, 1)} m  '
+            f'{_with_std((magnitude, float(np.sqrt(moment @ P @ moment)) / magnitude), 0)} A m^2')
+
+
+def _with_std(estimate: Iterable[float], digits: int) -> str:
+    """Format a value and its standard deviation."""
+    value, std = estimate
+    return f'{value:.{digits}f}({std:.{digits}f})'
 
 
 def _print_bearing(b: Bearing) -> None:
@@ -304,21 +302,18 @@ def _print_bearing(b: Bearing) -> None:
           f'speed/range {b.rate:.3f} ({b.rate_std:.3f}) 1/s')
 
 
-def _iron(passes: Sequence[FittedPass], network: SensorNetwork) -> dict[str, Any] | None:
+def _iron(passes: Sequence[FittedPass], earth_field: FloatArray) -> dict[str, Any] | None:
     """Estimate and print hard and soft iron; return them as a dict for JSON, or None on failure."""
-    simultaneous_passes = [p for p in passes if p.n_vehicles > 1]
-    if simultaneous_passes:
+    if n_together := sum(p.n_vehicles > 1 for p in passes):
         print('--same-vehicle: vehicles not used because they passed simultaneously with others: '
-              f'{len(simultaneous_passes)}')
+              f'{n_together}')
     fits = [p.chosen for p in passes if p.chosen is not None and p.n_vehicles == 1]
     try:
         if not fits:
             raise ValueError('no vehicle that passed alone has an estimate')
-        if network.earth_field is None:
-            raise ValueError('the network file has no earth_field')
         moments, covariances = zip(*(f.moment for f in fits), strict=True)
-        iron = hard_and_soft_iron(moments, [f.heading[0] for f in fits],
-                                  network.earth_field / MU0, covariances)
+        iron = hard_and_soft_iron(moments, [f.heading[0] for f in fits], earth_field / MU0,
+                                  covariances)
     except ValueError as error:
         print(f'hard and soft iron were not estimated: {error}')
         return None
@@ -347,11 +342,8 @@ def iron_warnings(iron: Iron, n_passes: int, soft_std: float) -> Iterator[str]:
         yield 'soft iron is negative, which is impossible; check the headings of the fits'
 
 
-def _draw(fitted_pass: FittedPass, out: Path) -> None:
+def _draw(fitted_pass: FittedPass, fit: PassFit, out: Path) -> None:
     """Draw the fit of a pass."""
-    fit = fitted_pass.drawn
-    if fit is None:
-        return
     # Imported here because it loads matplotlib.
     from mag_tracking.apps.fit_report import pass_figure
     from mag_tracking.report.style import save_figure
@@ -361,11 +353,3 @@ def _draw(fitted_pass: FittedPass, out: Path) -> None:
     save_figure(pass_figure(fit, title + (' (no estimate)' if fit.reason else '')),
                 out / f'{fitted_pass.recording}_'
                 f'{fitted_pass.label.replace(", ", "_").replace(" ", "_")}.png')
-
-
-def _draw_orders(passes: Sequence[FittedPass], out: Path) -> None:
-    """Draw the normalised cost over the number of dipoles for all passes."""
-    from mag_tracking.apps.fit_report import order_figure
-    from mag_tracking.report.style import save_figure
-
-    save_figure(order_figure(passes), out / 'orders.png')

@@ -1,44 +1,43 @@
-"""Options shared by several commands; see `tracking_options` for the options of the tracker."""
+"""Options shared by several commands, and what they select."""
 
 import argparse
 import dataclasses
 import datetime
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, TypeAlias
-
-from tqdm import tqdm
+from typing import TYPE_CHECKING, TypeAlias
 
 from mag_tracking.cli.commands import COMMANDS
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
+from mag_tracking.network.sensor_network import MAX_BOARD_EXTENT
 from mag_tracking.network.topics import checked_namespace
+from mag_tracking.settings import read_parameter_file
 from mag_tracking.stages.health.diagnosis import Diagnosis
 
 if TYPE_CHECKING:
     # Not every command loads the stages.
-    from mag_tracking.run import RecordingSource
+    from mag_tracking.pipeline import Settings
+    from mag_tracking.recording.field_table import TableOptions
 
 # Quoted because the class is not generic at run time.
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 """Subparsers of the main parser or of a command, to which each command is added."""
 
 FIGURE_SUFFIXES = ('.png', '.pdf', '.svg')
-"""File name extensions accepted for figures."""
 
 
 def add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace], int],
                 text: str = '') -> argparse.ArgumentParser:
     """Add the parser of a command or subcommand; `name` is a key in `COMMANDS`.
 
-    `run` takes the parsed arguments and returns the exit status. `text`, with the description and
-    examples, is printed after the options.
+    `run` returns the exit status. `text`, with examples, is printed after the options.
     """
     summary = COMMANDS[name].summary
-    parser = commands.add_parser(name.rpartition(' ')[2], help=summary, description=summary,
-                                 epilog=text,
-                                 formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = commands.add_parser(
+        name.rpartition(' ')[2], help=summary, description=summary, epilog=text,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.set_defaults(run_command=run, ros_arguments=[])
     return parser
 
@@ -66,10 +65,8 @@ def recorded_network(args: argparse.Namespace) -> SensorNetwork:
 
 
 def distinct_names(paths: Iterable[Path]) -> list[str]:
-    """Names without extension under which the results of the recordings are stored.
-
-    Raises OutputError if two names are equal, so that the results would overwrite each other.
-    """
+    """Names without extension under which the results of the recordings are stored; raises
+    OutputError if two are equal."""
     names = [path.resolve().stem for path in paths]
     duplicates = sorted({name for name in names if names.count(name) > 1})
     if duplicates:
@@ -95,9 +92,21 @@ def add_verbose(parser: argparse.ArgumentParser) -> None:
                         help='print the details of each vehicle')
 
 
+def add_page(parser: argparse._ActionsContainer, port: bool = True) -> None:
+    """Add --host and --port, or only --host."""
+    # Not every command loads the server.
+    from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK
+
+    if port:
+        parser.add_argument('--port', type=int, default=DEFAULT_PORT, metavar='PORT',
+                            help=f'port of the page (default: {DEFAULT_PORT}; 0 selects a free '
+                            'port)')
+    parser.add_argument('--host', default=LOOPBACK, metavar='ADDRESS', help='local address of '
+                        f'the page (default: {LOOPBACK})')
+
+
 def check_writable(path: Path | None) -> None:
-    """Check that an output file can be created; raises OutputError if its folder is missing, or if
-    it is a folder."""
+    """Raise OutputError if the folder of an output file is missing, or if it is a folder."""
     if path is not None and not path.absolute().parent.is_dir():
         raise OutputError(f'cannot write {path}: the folder {path.parent} does not exist')
     if path is not None and path.is_dir():
@@ -105,11 +114,8 @@ def check_writable(path: Path | None) -> None:
 
 
 def check_report(args: argparse.Namespace, *others: Path | None) -> None:
-    """Check that the report can be written without replacing another file of the command.
-
-    Raises OutputError if the folder is missing, the path is a folder, the name ends in neither
-    .html nor .htm, or the file is one of `others`.
-    """
+    """Raise OutputError if the report cannot be written, does not end in .html or .htm, or would
+    replace one of `others`."""
     path = args.report
     if path is None:
         return
@@ -122,11 +128,8 @@ def check_report(args: argparse.Namespace, *others: Path | None) -> None:
 
 
 def check_outputs(args: argparse.Namespace) -> None:
-    """Check that the files of --out and --figure can be written.
-
-    Raises OutputError if the folder of a file is missing or the file is a folder, and SettingsError
-    if the file type of the figure is not supported.
-    """
+    """Raise OutputError if the files of --out and --figure cannot be written, and SettingsError if
+    the file type of the figure is not supported."""
     for path in (args.out, args.figure):
         check_writable(path)
     if args.figure is not None and args.figure.suffix.lower() not in FIGURE_SUFFIXES:
@@ -134,13 +137,93 @@ def check_outputs(args: argparse.Namespace) -> None:
                             f'{", ".join(FIGURE_SUFFIXES)}; got {args.figure.name}')
 
 
-def progress_bar(source: 'RecordingSource') -> 'tqdm[NoReturn]':
-    """Progress bar of the bytes of a recording, shown only in a terminal."""
-    return tqdm(total=source.recording.size, unit='B', unit_scale=True, desc=source.name,
-                disable=None)
-
-
 def print_diagnoses(diagnoses: Iterable[Diagnosis]) -> None:
     """Print one line per diagnosis."""
     for diagnosis in diagnoses:
         print(f'  {"warning: " if diagnosis.serious else ""}{diagnosis}')
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Add --target and --params."""
+    from mag_tracking.pipeline import TARGET_DEFAULTS
+
+    parser.add_argument('--params', type=Path, metavar='FILE',
+                        help='YAML file with the settings to override')
+    parser.add_argument('--target', choices=list(TARGET_DEFAULTS),
+                        help='type of target: a vehicle, a magnet in a hand, or a magnet on a '
+                        'bench (default: magnet for a board of sensors, otherwise vehicle)')
+
+
+def settings_of(args: argparse.Namespace, network: SensorNetwork) -> 'Settings':
+    """Settings of --target and --params; raises SettingsError if the parameter file is invalid.
+
+    Without both, a board of sensors selects a magnet, and a line is printed.
+    """
+    from mag_tracking.pipeline import settings_for
+
+    changes = read_parameter_file(args.params) if args.params else {}
+    if args.target is not None:
+        return settings_for(args.target, changes)
+    if 'track.target' in changes or not network.is_board:
+        return settings_for(changes.get('track.target', 'vehicle'), changes)
+    print(f'{args.network}: {len(network)} sensors within {MAX_BOARD_EXTENT:g} m: the settings for '
+          'a magnet are used; --target vehicle selects those for vehicles')
+    return settings_for('magnet', changes)
+
+
+def add_table_options(parser: argparse.ArgumentParser, sensor: bool = True) -> None:
+    """Add the options that describe a table of readings, with or without --sensor."""
+    p = parser.add_argument_group('table of readings', 'properties that are found if not given')
+    p.add_argument('--columns', nargs='+', metavar='KEY=COLUMN',
+                   help='columns, by name or number (from 1): time=, and x= y= z= with sensor=, or '
+                   'for each sensor NAME.x= NAME.y= NAME.z=')
+    p.add_argument('--unit', default='', metavar='UNIT',
+                   help='unit of the field: T, mT, uT, nT, G or mG, counts per unit such as '
+                   '1090/G, or tesla per count')
+    p.add_argument('--time-unit', default='', metavar='UNIT',
+                   help='unit of times that are numbers: s, ms, us, ns, min, h, d, ticks per unit '
+                   'such as 32768/s, or seconds per tick')
+    if sensor:
+        p.add_argument('--sensor', default='', metavar='NAME',
+                       help='name of the only sensor (default: mag_1)')
+    p.add_argument('--sensors', nargs='+', default=[], metavar='TEXT=NAME',
+                   help='names of the sensors by the text in their column, or - to ignore it')
+    p.add_argument('--separator', default='', metavar='CHARACTER',
+                   help='comma, semicolon, tab, spaces, bar, or another character')
+    p.add_argument('--decimal', default='', metavar='MARK', help="decimal mark, . or ','")
+    p.add_argument('--header', type=int, metavar='LINE',
+                   help='number of the header line; 0 without a header')
+    p.add_argument('--encoding', default='', metavar='NAME', help='such as utf-16 or latin-1')
+    p.add_argument('--date-order', default='', metavar='ORDER',
+                   help='order of a date of three numbers: dmy, mdy or ymd')
+    p.add_argument('--rate', type=float, metavar='HZ',
+                   help='rate of the readings, for tables without times or with coarse times')
+    p.add_argument('--wrap', type=int, default=0, metavar='N',
+                   help='number at which the time returns to 0')
+    p.add_argument('--jumps', default='', metavar='split|sort',
+                   help='meaning of a time that runs backwards: the clock restarted (split into '
+                   'recordings), or the rows are out of order (sort)')
+
+
+def table_options(args: argparse.Namespace, sensor: str | None = None) -> 'TableOptions':
+    """Collect the options of `add_table_options`, with the name `sensor` of the only sensor if
+    --sensor is not one of them; raises SettingsError if --sensors is not valid."""
+    from mag_tracking.recording.field_table import TableOptions
+
+    sensors = dict(text.rpartition('=')[::2] for text in args.sensors)
+    if '' in sensors or not all(sensors.values()):
+        raise SettingsError('--sensors: expected TEXT=NAME such as A=mag_1')
+    return TableOptions(
+        args.columns or (), args.unit, args.time_unit,
+        args.sensor if sensor is None else sensor, sensors,
+        args.separator, args.decimal, args.header, args.encoding, args.date_order, args.rate,
+        args.wrap, args.jumps)
+
+
+def print_notes(table: Path, notes: Iterable[str]) -> None:
+    """Print what was found out about a table, with each warning on its own line."""
+    notes = list(notes)
+    print(f'{table}: {"; ".join(n for n in notes if not n.startswith("warning"))}')
+    for note in notes:
+        if note.startswith('warning'):
+            print(f'  {note}')

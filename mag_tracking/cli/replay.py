@@ -3,6 +3,7 @@
 import argparse
 import signal
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
@@ -16,22 +17,20 @@ from mag_tracking.analysis.track_log import TrackLog
 from mag_tracking.apps.replay import Run, replay, write_figures, write_trajectories
 from mag_tracking.apps.replay_report import notes_of, write_report
 from mag_tracking.apps.traffic import check_vehicles
-from mag_tracking.cli.events import Events
 from mag_tracking.cli.fit import ORDERS, Fits
-from mag_tracking.cli.live_page import add_page, show_recording
 from mag_tracking.cli.options import (
     Commands,
     add_command,
+    add_page,
     add_recorded_network,
+    add_settings,
     add_verbose,
     distinct_names,
     print_diagnoses,
-    progress_bar,
     recorded_network,
+    settings_of,
 )
-from mag_tracking.cli.passages import Passages
-from mag_tracking.cli.tracking_options import add_settings, settings_of
-from mag_tracking.cli.vehicle_rows import HEADER, time_of, vehicle_row
+from mag_tracking.cli.tables import HEADER, Events, Passages, time_of, vehicle_row
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.files import output_folder
 from mag_tracking.geometry import speed_of
@@ -42,7 +41,7 @@ from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.report.page import WARNING
 from mag_tracking.results.track_files import RERUN_FILE, check_rerun, write_rerun
-from mag_tracking.run import RecordingSource, Sink, output_error, run
+from mag_tracking.run import RecordingSource, Sink, output_error, progress_bar, run
 from mag_tracking.stages.track.doubts import MEANINGS
 
 _REPLAY_HELP = '''
@@ -162,8 +161,7 @@ def _replay(args: argparse.Namespace) -> int:
     settings = settings_of(args, network)
     _check(args, settings)
     if args.live:
-        return show_recording(args.recordings[0], network, settings, args.rate, args.host,
-                              args.port)
+        return _show(args, network, settings)
     names = distinct_names(args.recordings)
     sources = [RecordingSource(Recording(path), network) for path in args.recordings]
     folders = [args.out / name if args.out and len(names) > 1 else args.out for name in names]
@@ -185,6 +183,30 @@ def _replay(args: argparse.Namespace) -> int:
         elif signals:
             print('interrupted: the results cover only the part read so far')
     return 130 if signals else 0 if is_complete else 1
+
+
+def _show(args: argparse.Namespace, network: SensorNetwork, settings: Settings) -> int:
+    """Track a recording in real time on the live page until Ctrl-C; return the exit status."""
+    # Imported here because only --live needs them.
+    from mag_tracking.apps.view import view
+    from mag_tracking.web.live_scene import LiveScene
+    from mag_tracking.web.page_server import PageServer
+
+    if not 0.0 < args.rate < float('inf'):
+        raise SettingsError(f'--rate: expected a number above 0, got {args.rate:g}')
+    path = args.recordings[0]
+    recording, scene = Recording(path), LiveScene(path.name, network)
+    scene.subtitle = f'{quantity(len(network), "sensor")}, frame {network.frame}'
+    with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals, \
+            PageServer(scene, args.host, args.port) as server:
+        print(f'live page: {server.url}')
+        view(recording, network, settings, scene, args.rate,
+             lambda: bool(signals) or not server.is_serving)
+        if not signals:
+            print('end of the recording; the page remains available until Ctrl-C')
+        while not signals and server.is_serving:
+            time.sleep(0.1)
+        return 0 if server.is_serving else 1
 
 
 def _check(args: argparse.Namespace, settings: Settings) -> None:
@@ -249,23 +271,17 @@ def _replay_one(source: RecordingSource, network: SensorNetwork, settings: Setti
         with progress_bar(source) as bar:
             report = run(source, pipeline, sinks_of(pipeline), bar.update, stopped)
         print_diagnoses(report.diagnoses)
-    for failure in report.failures:
-        _print_incomplete(failure.error)
-    is_complete = not report.failures
+    errors = [failure.error for failure in report.failures]
     for table, sink in zip(tables, sinks, strict=True):
         if report.has_failed(sink):
             continue
         try:
             table.finish(source.stem, report, out)
         except (OutputError, OSError) as error:
-            _print_incomplete(output_error(error, table))
-            is_complete = False
-    return is_complete
-
-
-def _print_incomplete(error: OutputError) -> None:
-    """Print why results are incomplete."""
-    print(f'mag-tracking: incomplete results: {error}', file=sys.stderr)
+            errors.append(output_error(error, table))
+    for reason in errors:
+        print(f'mag-tracking: incomplete results: {reason}', file=sys.stderr)
+    return not errors
 
 
 def _write(result: Run, network: SensorNetwork, out: Path, stopped: Callable[[], bool],
@@ -277,7 +293,7 @@ def _write(result: Run, network: SensorNetwork, out: Path, stopped: Callable[[],
         write_rerun(out / RERUN_FILE, network, result.logs, result.smoothed)
     write_report(result, network, out)
     if not args.no_figures:
-        write_figures(result, network, out, stopped=stopped)
+        write_figures(result, network, out, stopped)
 
 
 def _print_summary(name: str, result: Run, network: SensorNetwork, verbose: bool) -> None:

@@ -4,9 +4,9 @@ import argparse
 import os
 import signal
 import sys
+import threading
 
-from mag_tracking.cli.live_page import WATCH_HELP, add_page, watch
-from mag_tracking.cli.options import Commands, add_command
+from mag_tracking.cli.options import Commands, add_command, add_page
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.quantities import quantity
@@ -14,6 +14,19 @@ from mag_tracking.quantities import quantity
 _GRAPH_HELP = '''
 A substitute for the command `ros2`, which ROS from PyPI lacks. Names are relative to the
 namespace set with --ros-args -r __ns:=/NAMESPACE.
+'''
+
+_WATCH_HELP = '''
+Shows the tracks of running nodes. Ctrl-C ends the page, not the nodes.
+
+Open the printed address in a browser. The page shows a map with tracks, 90% regions and
+hypotheses, the fields of the sensors, and the health of the system. The page is available on this
+machine only; --host 0.0.0.0 also serves it to other machines, which need the token in the address.
+
+examples:
+  mag-tracking ros watch
+  mag-tracking ros watch --ros-args -r __ns:=/robot1
+  mag-tracking ros watch --ros-args -r tracker_node/tracks:=/robot1/follower/tracks
 '''
 
 
@@ -32,7 +45,7 @@ def add(commands: Commands) -> None:
     p.add_argument('node', metavar='NODE', help='name of the node')
     p.add_argument('transition', nargs='?', metavar='TRANSITION', help='transition to trigger: '
                    'configure, activate, deactivate, cleanup or shutdown')
-    p = add_command(commands, 'ros watch', watch, WATCH_HELP)
+    p = add_command(commands, 'ros watch', _watch, _WATCH_HELP)
     add_page(p)
     p.add_argument('--until-eof', action='store_true', help=argparse.SUPPRESS)
 
@@ -87,11 +100,7 @@ def _param(args: argparse.Namespace) -> int:
 
 def _lifecycle(args: argparse.Namespace) -> int:
     """Run `mag-tracking ros lifecycle`."""
-    from mag_tracking.nodes.graph_tools import (
-        change_lifecycle_state,
-        lifecycle_state,
-        observer,
-    )
+    from mag_tracking.nodes.graph_tools import change_lifecycle_state, lifecycle_state, observer
 
     with observer(args.ros_arguments) as graph:
         if args.transition is not None:
@@ -99,3 +108,20 @@ def _lifecycle(args: argparse.Namespace) -> int:
         state, transitions = lifecycle_state(graph, args.node)
         print(f'{state}; available transitions: {", ".join(transitions)}')
     return 0
+
+
+def _watch(args: argparse.Namespace) -> int:
+    """Run `mag-tracking ros watch`."""
+    # Imported here because it needs ROS.
+    from mag_tracking.nodes import page_node
+
+    end_of_input = threading.Event()
+
+    def read() -> None:
+        # Stdin ends when the parent process has ended.
+        sys.stdin.read()
+        end_of_input.set()
+
+    if args.until_eof:
+        threading.Thread(target=read, daemon=True).start()
+    return page_node.watch(args.host, args.port, print, args.ros_arguments, end_of_input.is_set)

@@ -12,11 +12,13 @@ from mag_tracking.cli.options import (
     Commands,
     add_command,
     add_recorded_network,
+    add_table_options,
     check_outputs,
+    print_notes,
     recorded_network,
+    table_options,
     utc_timestamp,
 )
-from mag_tracking.cli.table_options import add_table_options, print_notes, table_options
 from mag_tracking.errors import SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork

@@ -13,7 +13,7 @@ from mag_tracking.errors import OutputError
 from mag_tracking.event_records import Disturbance
 from mag_tracking.files import new_text_file, output_folder, write_json
 from mag_tracking.network import SensorNetwork
-from mag_tracking.record_receiver import RecordReceiver
+from mag_tracking.pipeline import RecordReceiver
 from mag_tracking.recording import core
 from mag_tracking.recording.writer import check_no_other_recording
 from mag_tracking.records import Detection, FieldFrame, Hypotheses, SmoothedPose, Track

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from mag_tracking.apps.doctor import examine
-from mag_tracking.apps.events import find_events
 from mag_tracking.apps.replay import replay
-from mag_tracking.apps.traffic import count_traffic
+from mag_tracking.apps.traffic import events, traffic
 from mag_tracking.messages.schema import magnetic_field_dicts
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network.file import read_network
@@ -82,13 +81,11 @@ def spoilt(request, tmp_path_factory):
 def test_every_program_names_the_cause_first(spoilt, tmp_path):
     """No pose is unambiguous if its timestamps are wrong."""
     cause, path = spoilt
-    def source(**options):
-        return RecordingSource(Recording(path), NETWORK, **options)
-
-    doctor, damage = examine(source(by_message=True), NETWORK, SETTINGS)
+    doctor, damage = examine(RecordingSource(Recording(path), NETWORK, by_message=True), NETWORK,
+                             SETTINGS)
     results = [ranked(damage + doctor.findings()),
-               count_traffic(source(), NETWORK, SETTINGS).report.diagnoses,
-               find_events(source(), NETWORK, SETTINGS).report.diagnoses]
+               traffic(path, NETWORK).report.diagnoses,
+               events(path, NETWORK).report.diagnoses]
     for diagnoses in results:
         # Timestamps of zero are replaced by the log time.
         assert diagnoses[0].serious == (cause is not Cause.ZERO_STAMPS)

@@ -146,6 +146,6 @@ def test_a_broken_pipe_elsewhere_is_an_error(monkeypatch, capfd):
     def broken(path):
         raise BrokenPipeError(errno.EPIPE, 'the sensor')
 
-    monkeypatch.setattr('mag_tracking.cli.info.Recording', broken)
+    monkeypatch.setattr('mag_tracking.cli.recordings.Recording', broken)
     assert main(['info', str(vehicle_path(NAME))]) == 1
     assert 'the sensor' in capfd.readouterr().err

@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.apps.record import Selection
-from mag_tracking.cli import record, repair
+from mag_tracking.cli import nodes, recordings
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.messages.types import decode
 from mag_tracking.network.topics import absolute
@@ -33,8 +33,8 @@ def arguments_of(*arguments):
     """Parse a command line."""
     parser = argparse.ArgumentParser()
     commands = parser.add_subparsers()
-    record.add(commands)
-    repair.add(commands)
+    nodes.add(commands)
+    recordings.add(commands)
     return parser.parse_args([str(a) for a in arguments])
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mag_tracking.cli.tracking_options import settings_of
+from mag_tracking.cli.options import settings_of
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.file import read_network
 from mag_tracking.pipeline import settings_for

@@ -32,9 +32,9 @@ from support.shared_memory import orphaned_segments, segments_of
 
 pytestmark = pytest.mark.timeout(600)
 NS = 10**9
-COMMAND = ('import argparse, sys; from mag_tracking.cli import record; '
+COMMAND = ('import argparse, sys; from mag_tracking.cli import nodes; '
            'from mag_tracking.nodes import record_node; record_node.PROGRESS_INTERVAL_S = 0.2; '
-           'p = argparse.ArgumentParser(); record.add(p.add_subparsers()); '
+           'p = argparse.ArgumentParser(); nodes.add(p.add_subparsers()); '
            'a = p.parse_args(); sys.exit(a.run_command(a))')
 
 

@@ -1,9 +1,7 @@
 """Passes and fits of readings that are fed as by live sensors, without a prescan."""
 
-from mag_tracking.apps.pass_collector import PassCollector
-from mag_tracking.apps.pass_fitter import PassFitter
-from mag_tracking.pipeline import Pipeline, settings_for
-from mag_tracking.record_receiver import Step
+from mag_tracking.apps.passes import PassCollector, PassFitter
+from mag_tracking.pipeline import Pipeline, Step, settings_for
 from mag_tracking.records import Readings
 
 

@@ -1,19 +1,20 @@
-"""Table `passages` of `mag-tracking replay`: vehicles that cross a line, and traffic counts."""
+"""Tables `passages` and `events` of `mag-tracking replay`, and the rows of vehicles."""
 
 import argparse
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mag_tracking.apps.fleet import Fleet, earth_field_strength, pass_of
-from mag_tracking.apps.traffic import CountedVehicle, TrafficResult, TrafficSink
+from mag_tracking.apps.traffic import CountedVehicle, EventSink, TrafficResult, TrafficSink
 from mag_tracking.cli.options import check_writable
-from mag_tracking.cli.vehicle_rows import time_of
 from mag_tracking.errors import SettingsError
+from mag_tracking.event_records import PassEvent
 from mag_tracking.inference.identification import UNKNOWN, Identification
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline
@@ -24,17 +25,94 @@ from mag_tracking.results.traffic_tables import (
     passage_row,
     read_fleet,
     summary_rows,
+    write_events,
     write_fleet,
     write_traffic,
 )
 from mag_tracking.run import RunReport
+from mag_tracking.stages.events.stage import MAX_DURATION_S
+from mag_tracking.units import NS
+
+Estimate = tuple[float, float]
+"""Value and standard deviation; NaN if unknown."""
+
+
+def time_of(stamp_ns: float) -> str:
+    """Format the time of day of a timestamp (UTC)."""
+    time = datetime.fromtimestamp(stamp_ns / NS, tz=UTC)
+    return f'{time:%H:%M:%S}.{time.microsecond // 10000:02d}'
+
+
+def vehicle_row(label: str, time: str, kind: str, direction: str, speed: str | Estimate,
+                closest: str | Estimate, verdict: str) -> str:
+    """Format a row; `closest` is the distance from the centre of the sensors [m]."""
+    return (f'  {label:<9}  {time:<11}  {kind or "-":<9}  {direction or "-":<10}  '
+            f'{_text(speed):>14}  {_text(closest):>14}  {verdict or "-"}')
+
+
+def _text(estimate: str | Estimate) -> str:
+    """Format a value and its standard deviation, as far as they are known."""
+    if isinstance(estimate, str):
+        return estimate
+    value, std = estimate
+    return '-' if np.isnan(value) else f'{value:.2f}' if np.isnan(std) else \
+        f'{value:.2f} ± {std:.2f}'
+
+
+HEADER = vehicle_row('vehicle', 'time', 'kind', 'direction', 'speed [m/s]', 'closest [m]',
+                     'verdict')
+"""Header of the table."""
+
+
+class Events:
+    """Events of each recording, written to the folder of the recording.
+
+    Each table names the last stage that it needs, `upto`.
+    """
+
+    upto = 'calibrate'
+
+    def __init__(self, args: argparse.Namespace, network: SensorNetwork,
+                 stopped: Callable[[], bool], stack: ExitStack) -> None:
+        self._names = network.names
+
+    def sink(self, name: str, pipeline: Pipeline) -> EventSink:
+        """Return the sink of a recording."""
+        self._sink = EventSink(pipeline)
+        return self._sink
+
+    def finish(self, name: str, report: RunReport, out: Path | None) -> None:
+        """Print one line per event and the number of events of each sensor; write the tables."""
+        result = self._sink.result(report)
+        for event in result.events:
+            print(_event_line(event))
+        counts = result.counts()
+        print(', '.join(f'{name}: {quantity(counts.get(name, 0), "event")}'
+                        for name in self._names))
+        if out is not None:
+            write_events(out, result.events)
+
+
+def _event_line(event: PassEvent) -> str:
+    """Describe an event in one line."""
+    p = event.left_to_right
+    direction = f'left to right ({p:.0%})' if p > 0.9 else f'right to left ({1.0 - p:.0%})' \
+        if p < 0.1 else 'direction unknown'
+    duration = (event.release_ns - event.onset_ns) / NS
+    time = time_of(event.closest_ns)
+    closest = f'closest {time} ± {event.closest_std:.2f} s' if np.isfinite(event.closest_std) \
+        else f'peak at {time}, closest point unknown'
+    if duration > MAX_DURATION_S:
+        closest = f'from {time_of(event.onset_ns)} to {time_of(event.release_ns)}'
+    return (f'{event.sensor} {event.number}: {closest}, duration {duration:.2f} s, peak '
+            f'{1e9 * np.sqrt(np.nansum(event.peak**2)):.0f} nT on {event.axes}, {direction}'
+            + ('' if event.ended else ', not ended'))
 
 
 class Passages:
     """Passages of all recordings; the table is written after each recording."""
 
     upto = 'traffic'
-    """Last stage of the pipeline that the table needs."""
 
     def __init__(self, args: argparse.Namespace, network: SensorNetwork,
                  stopped: Callable[[], bool], stack: ExitStack) -> None:
@@ -57,8 +135,9 @@ class Passages:
                            for v in result.vehicles]
         _print(name, result, identifications)
         self._tables['passages'] += [
-            passage_row(name, v.passage, result.class_names, v.delays, _vehicle(identification))
-            for v, identification in zip(result.vehicles, identifications, strict=True)]
+            passage_row(name, v.passage, result.class_names, v.delays, {} if i is None else {
+                'vehicle': i.name, 'p_vehicle': i.probabilities.get(i.name, np.nan)})
+            for v, i in zip(result.vehicles, identifications, strict=True)]
         self._tables['intervals'] += [row for s in result.summaries
                                       for row in summary_rows(name, s)]
         if self._args.out is not None:
@@ -94,19 +173,12 @@ def _enrol(args: argparse.Namespace, network: SensorNetwork, passes: list[FleetP
     print(f'{args.fleet}: {args.enrol} is recognised at {at} (passes: {len(fleet[args.enrol])})')
 
 
-def _vehicle(identification: Identification | None) -> dict[str, Any]:
-    """Return the table columns of the identified vehicle; an empty dict without a fleet file."""
-    return {} if identification is None else {
-        'vehicle': identification.name,
-        'p_vehicle': identification.probabilities.get(identification.name, np.nan)}
-
-
 def _print(name: str, result: TrafficResult,
            identifications: Sequence[Identification | None]) -> None:
     """Print one line per vehicle, the counts, and warnings."""
     for vehicle, identification in zip(result.vehicles, identifications, strict=True):
         identity = '' if identification is None else f', vehicle {identification.name}'
-        print(f'{line_of(vehicle)}{identity}')
+        print(f'{_passage_line(vehicle)}{identity}')
     counts = Counter((v.passage.line, DIRECTIONS[v.passage.forward], v.passage.vehicle_class)
                      for v in result.vehicles)
     print(f'{name}: {quantity(len(result.vehicles), "vehicle")}')
@@ -122,7 +194,7 @@ def _print(name: str, result: TrafficResult,
         print(f'  {result.report.no_track_reason}')
 
 
-def line_of(vehicle: CountedVehicle) -> str:
+def _passage_line(vehicle: CountedVehicle) -> str:
     """Describe a passage in one line."""
     p = vehicle.passage
     error = '' if np.isnan(p.direction_error) else f' (error probability {p.direction_error:.3f})'
