@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from mag_tracking.analysis.placement import PlannedTarget, Sampling
     from mag_tracking.apps.events import EventsResult, events
     from mag_tracking.apps.fit import FitResult, fit
-    from mag_tracking.apps.plan import Plan
-    from mag_tracking.apps.plan_inputs import plan
+    from mag_tracking.apps.plan import Plan, plan
     from mag_tracking.apps.readings import RecordedReadings, read_recording, readings_from_arrays
     from mag_tracking.apps.track import TrackingResult, track
     from mag_tracking.apps.traffic import TrafficResult, traffic
@@ -54,8 +53,7 @@ _MODULES = {
     'analysis.placement': ('PlannedTarget', 'Sampling'),
     'apps.events': ('EventsResult', 'events'),
     'apps.fit': ('FitResult', 'fit'),
-    'apps.plan': ('Plan',),
-    'apps.plan_inputs': ('plan',),
+    'apps.plan': ('Plan', 'plan'),
     'apps.readings': ('RecordedReadings', 'read_recording', 'readings_from_arrays'),
     'apps.track': ('TrackingResult', 'track'),
     'apps.traffic': ('TrafficResult', 'traffic'),

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from mag_tracking.apps.plan import Plan
-from mag_tracking.apps.plan_inputs import PlanInputs, plan_inputs
+from mag_tracking.apps.plan import Plan, PlanInputs, plan_inputs
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.errors import SettingsError
 from mag_tracking.files import new_text_file, output_folder

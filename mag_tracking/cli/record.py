@@ -8,7 +8,7 @@ from mag_tracking.apps.record import Selection
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.file import read_network
-from mag_tracking.network.topics import TOPIC_NAME_PATTERN
+from mag_tracking.network.sensor_network import TOPIC_NAME_PATTERN
 
 _RECORD_HELP = '''
 Records the magnetic fields on the topics of the network, unchanged, until Ctrl-C. The

@@ -6,7 +6,7 @@ from rclpy.node import Node
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from mag_tracking.messages.types import MAGNETIC_FIELD
-from mag_tracking.network.topics import absolute
+from mag_tracking.network.sensor_network import absolute
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 
 MAX_NAMED = 4

@@ -19,7 +19,7 @@ from mag_tracking.messages.types import (
     decode,
 )
 from mag_tracking.network import SensorNetwork
-from mag_tracking.network.topics import absolute, namespaces_of
+from mag_tracking.network.sensor_network import absolute, namespaces_of
 from mag_tracking.recording.interruptible import Progress
 from mag_tracking.recording.message_block import MessageBlock
 from mag_tracking.recording.raw_message import RawMessage

@@ -7,7 +7,7 @@ import pytest
 
 from mag_tracking.analysis.network_geometry import GeometrySettings, calibrate_geometry
 from mag_tracking.analysis.network_readings import TrackedMagnet, rotation, tool_rotations
-from mag_tracking.apps.board_geometry import survey_geometry
+from mag_tracking.apps.calibrate import survey_geometry
 from mag_tracking.network import CalibrationRecord
 from mag_tracking.network.file import read_network, write_network
 from support.geometry_command import calibrated_readings, command, write_table
