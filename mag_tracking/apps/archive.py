@@ -30,18 +30,15 @@ METADATA = 'metadata.yaml'
 
 @dataclass
 class ArchiveRun:
-    """Results of an archive run."""
+    """Results of an archive run; the numbers are those of the recordings tracked in this run."""
 
     done: list[Path] = field(default_factory=list)
-    """Recordings tracked in this run."""
     tracked_earlier: list[Path] = field(default_factory=list)
-    """Recordings tracked by an earlier run."""
     failed: dict[Path, str] = field(default_factory=dict)
-    """Recordings that could not be tracked: {recording: reason}."""
+    """{recording: reason}."""
     tracks: int = 0
-    """Number of tracks in the recordings tracked in this run."""
     passes: int = 0
-    """Number of fitted passes, one per vehicle, in the recordings tracked in this run."""
+    """Number of fitted passes, one per vehicle."""
     lost_workers: int = 0
     """Number of lost workers, whose tasks were repeated."""
     interrupted: bool = False
@@ -57,8 +54,8 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
     selected: dict[Path, None] = {}
     for name in names:
         path = checked_path(name, RecordingError)
-        matches = [path] if path.exists() else [Path(p) for p in sorted(
-            glob.glob(str(path), recursive=True))]
+        matches = [path] if path.exists() else map(Path, sorted(
+            glob.glob(str(path), recursive=True)))
         recordings = [r for p in matches for r in _recordings_at(p, set())]
         if not recordings:
             raise RecordingError(f'{path}: no recording found; supported file types: '
@@ -104,23 +101,20 @@ def archive(recordings: Iterable[str | PathLike[str]],
             report: Callable[[str], object] | None = None) -> ArchiveRun:
     """Track recordings and write the results to a dataset.
 
+    `recordings` may be folders and glob patterns; `out` is laid out as in `results.archive_folder`.
     Recordings tracked by an earlier run are skipped unless they have changed. The tables contain
-    the same rows as a separate replay of each recording. Raises RecordingError if a name matches
-    nothing, OutputError if the dataset is in use or was created with another network, other
-    settings or another version of the tables, ClusterError if the scheduler does not respond or has
-    no workers.
+    the same rows as a separate replay of each recording.
 
-    Parameters
-    ----------
-    recordings : recordings, folders and glob patterns
-    out : folder of the dataset, laid out as in `results.archive_folder`
-    workers : number of processes on this machine
-    scheduler : address of a Dask scheduler, such as tcp://10.0.0.5:8786, used instead of `workers`;
-        its workers need this package, and the recordings and `out` under the same paths
-    progress : called with the size in bytes of each completed recording, including skipped ones
-    stopped : called several times per second; the run ends when it returns true, and the next run
-        continues it
-    report : called with a message for each recording that fails and each damaged file
+    The address of a Dask `scheduler`, such as tcp://10.0.0.5:8786, is used instead of `workers`
+    processes on this machine; its workers need this package, and the recordings and `out` under the
+    same paths. `progress` is called with the size in bytes of each completed recording, including
+    skipped ones, and `report` with a message for each recording that fails and each damaged file.
+    `stopped` is called several times per second; the run ends when it returns true, and the next
+    run continues it.
+
+    Raises RecordingError if a name matches nothing, OutputError if the dataset is in use or was
+    created with another network, other settings or another version of the tables, ClusterError if
+    the scheduler does not respond or has no workers.
     """
     import_pyarrow()
     network, paths, run = network_of(network), recordings_of(recordings), ArchiveRun()
@@ -189,17 +183,14 @@ class _Scheduler:
         """
         queued = list(reversed(recordings))
         while queued or self._cluster.n_running:
-            while queued and self._n_active_recordings() < 2 * self._cluster.n_workers + 1:
+            while queued and len({job.recording for _, job in self._cluster.keys()}) \
+                    < 2 * self._cluster.n_workers + 1:
                 self._start(queued.pop())
             if stopped():
                 self._run.interrupted = True
                 return
             for (kind, job), result in self._cluster.finished():
                 self._on_finished(kind, job, result)
-
-    def _n_active_recordings(self) -> int:
-        """Number of recordings with running tasks."""
-        return len({job.recording for _, job in self._cluster.keys()})
 
     def _start(self, path: Path) -> None:
         """Submit the first task of a recording, or report the recording as unreadable."""

@@ -36,36 +36,35 @@ CHUNK_FRAMES = 2000
 MIN_QUIET_S = 1.0
 """Minimum duration without a target that ends a segment [s]."""
 
+TRACKED_FILE = 'tracked.json'
+"""Name of the file with the result of a tracked segment."""
 Doubts = InputDoubts
 """{reason: {sensor: times at which its readings are doubtful}}."""
 NumberedPass = tuple[int, PassData, tuple[str, ...]]
 """Index of a pass in its recording (from 1), measurements of the pass, and notes for the user."""
 
 
+_FRAME_ARRAYS = tuple(f.name for f in dataclasses.fields(FieldFrame))
+_PASS_ARRAYS = ('t', 'sensor', 'field', 'covariance')
+
+
 @dataclasses.dataclass(frozen=True)
 class FrameChunk:
-    """Consecutive frames as arrays, and the passes that ended during these frames."""
+    """Attributes of n consecutive frames, stacked, and the passes that ended during these frames.
+
+    `doubts` are {index of a frame: doubtful times that apply from this frame on}.
+    """
 
     stamp_ns: IntArray
-    """(n,) ns, timestamps of the frames."""
     field: FloatArray
-    """(n, n_sensors, 3) T, sensor frame, background removed."""
     covariance: FloatArray
-    """(n, n_sensors, 3, 3) T², sensor frame."""
     n_samples: IntArray
-    """(n, n_sensors) number of averaged samples; 0 if the sensor is missing."""
     time_offset: FloatArray
-    """(n, n_sensors) s, mean time of the samples of a sensor relative to `stamp_ns`."""
     target_present: BoolArray
-    """(n,) whether a target is present."""
     statistic: FloatArray
-    """(n,) detection statistic."""
     degrees_of_freedom: IntArray
-    """(n,) degrees of freedom of the detection statistic."""
-    doubts: dict[int, Doubts] = dataclasses.field(default_factory=dict)
-    """{index of a frame: doubtful times that apply from this frame on}."""
-    passes: tuple[NumberedPass, ...] = ()
-    """Passes that ended within the chunk."""
+    doubts: dict[int, Doubts]
+    passes: tuple[NumberedPass, ...]
 
     def frames(self) -> Iterator[tuple[FieldFrame, Doubts | None]]:
         """Iterate over the frames, with the doubtful times of each sensor if they change, otherwise
@@ -75,11 +74,6 @@ class FrameChunk:
                 int(self.stamp_ns[k]), self.field[k], self.covariance[k], self.n_samples[k],
                 self.time_offset[k], bool(self.target_present[k]), float(self.statistic[k]),
                 int(self.degrees_of_freedom[k])), self.doubts.get(k)
-
-
-_FRAME_ARRAYS = ('stamp_ns', 'field', 'covariance', 'n_samples', 'time_offset', 'target_present',
-                 'statistic', 'degrees_of_freedom')
-_PASS_ARRAYS = ('t', 'sensor', 'field', 'covariance')
 
 
 @contextmanager
@@ -105,7 +99,7 @@ def read_segment(folder: Path, network: SensorNetwork) -> Iterator[FrameChunk]:
 
 
 def _read_chunk(path: Path, network: SensorNetwork) -> FrameChunk:
-    """Read a file written by `_write_chunk`."""
+    """Read a file of a segment."""
     with np.load(path) as arrays:
         text = json.loads(str(arrays['text']))
         doubts: dict[int, Doubts] = {
@@ -114,22 +108,11 @@ def _read_chunk(path: Path, network: SensorNetwork) -> FrameChunk:
                      for reason, by_sensor in by_reason.items()}
             for k, by_reason in text['doubts'].items()}
         passes = tuple(
-            (number, dataclasses.replace(PassData(network, stamp_ns, *(
-                arrays[f'pass_{number}_{name}'] for name in _PASS_ARRAYS)), doubt=doubt),
+            (number, PassData(network, stamp_ns, *(arrays[f'pass_{number}_{name}']
+                                                   for name in _PASS_ARRAYS), doubt=doubt),
              tuple(notes)) for number, stamp_ns, doubt, notes in text['passes'])
         return FrameChunk(**{name: arrays[name] for name in _FRAME_ARRAYS}, doubts=doubts,
                           passes=passes)
-
-
-def _write_chunk(path: Path, chunk: FrameChunk) -> None:
-    """Write a chunk as arrays and, for everything else, one JSON text; raises OSError."""
-    arrays = {name: getattr(chunk, name) for name in _FRAME_ARRAYS}
-    for number, data, _ in chunk.passes:
-        arrays |= {f'pass_{number}_{name}': getattr(data, name) for name in _PASS_ARRAYS}
-    text = json.dumps({'doubts': chunk.doubts, 'passes': [
-        (number, data.stamp_ns, data.doubt, notes) for number, data, notes in chunk.passes]})
-    with open(path, 'xb') as stream:
-        np.savez(stream, text=np.array(text), **arrays)
 
 
 class SegmentWriter:
@@ -199,40 +182,36 @@ class SegmentWriter:
         self._n_written = self._n_chunks = 0
 
     def _write(self) -> None:
-        """Write the buffered frames and passes to the next file; raises OutputError."""
-        frames = [frame for frame, _ in self._unwritten]
+        """Write the buffered frames and passes to the next file: arrays and, for everything else,
+        one JSON text; raises OutputError."""
+        arrays = {name: np.array([getattr(frame, name) for frame, _ in self._unwritten])
+                  for name in _FRAME_ARRAYS}
         doubts: dict[int, Doubts] = {}
         previous: Doubts | None = None
         for k, (_, current) in enumerate(self._unwritten):
             if current != previous:
                 doubts[k] = previous = current
-
-        arrays = {name: np.array([getattr(frame, name) for frame in frames])
-                  for name in _FRAME_ARRAYS}
-        chunk = FrameChunk(**arrays, doubts=doubts, passes=tuple(self._passes))
+        for number, data, _ in self._passes:
+            arrays |= {f'pass_{number}_{name}': getattr(data, name) for name in _PASS_ARRAYS}
+        text = json.dumps({'doubts': doubts, 'passes': [
+            (number, data.stamp_ns, data.doubt, notes) for number, data, notes in self._passes]})
         path = self._folder / f'segment-{self.n_segments}' / f'{self._n_chunks}.npz'
         try:
             path.parent.mkdir(exist_ok=True)
-            _write_chunk(path, chunk)
+            with open(path, 'xb') as stream:
+                np.savez(stream, text=np.array(text), **arrays)
         except OSError as error:
             raise OutputError(f'cannot write {path}: {error.strerror}') from error
-        self._n_written += len(frames)
+        self._n_written += len(self._unwritten)
         self._n_chunks += 1
         self._unwritten, self._passes = [], []
 
 
-TRACKED_FILE = 'tracked.json'
-"""Name of the file in the folder of a tracked segment."""
-
-
 class ClockComparisonHistory(ClockComparison):
-    """Clock comparison with the history of the passes added to it.
+    """Clock comparison with the passes added to it, each with the indices of its sensors.
 
-    Attributes
-    ----------
-    passes : passes, each with the indices of its sensors in the network
-    clocks_differed : whether a clock offset was ever significant, so that tracks depend on earlier
-        passes
+    `clocks_differed` is whether a clock offset was ever significant, so that tracks depend on
+    earlier passes.
     """
 
     def __init__(self, n_sensors: int) -> None:
@@ -248,32 +227,30 @@ class ClockComparisonHistory(ClockComparison):
 
 
 class SegmentResult(NamedTuple):
-    """Numbers of tracks and passes in a tracked segment, and its comparison of clocks."""
+    """Numbers of tracks and fitted vehicles in a segment, and its comparison of clocks.
+
+    The task `join` needs it; it is stored as JSON.
+    """
 
     n_tracks: int
-    """Number of tracks."""
     n_passes: int
-    """Number of fitted passes, one per vehicle."""
     clocks_differed: bool
-    """Whether a clock offset was ever significant within the segment."""
     clock_passes: list[tuple[RigidPass, IntArray]]
-    """Passes that compared the clocks, each with the indices of its sensors in the network."""
 
+    def write(self, folder: Path) -> None:
+        """Store the result in the folder of the segment."""
+        passes = [(dataclasses.asdict(found), rows) for found, rows in self.clock_passes]
+        replace_text(folder / TRACKED_FILE, json.dumps(
+            self._asdict() | {'clock_passes': passes}, default=np.ndarray.tolist))
 
-def write_result(folder: Path, result: SegmentResult) -> None:
-    """Store the result of a segment in its folder."""
-    passes = [(dataclasses.asdict(found), rows) for found, rows in result.clock_passes]
-    replace_text(folder / TRACKED_FILE, json.dumps(
-        result._asdict() | {'clock_passes': passes}, default=np.ndarray.tolist))
-
-
-def read_result(folder: Path) -> SegmentResult:
-    """Read the result of a segment; raises RecordingError if the file is damaged."""
-    with work_file_errors(folder / TRACKED_FILE):
-        values: dict[str, Any] = json.loads((folder / TRACKED_FILE).read_text())
-        passes = [(_rigid_pass(found), np.array(rows, dtype=np.int64))
-                  for found, rows in values.pop('clock_passes')]
-        return SegmentResult(**values, clock_passes=passes)
+    @classmethod
+    def read(cls, folder: Path) -> 'SegmentResult':
+        """Read the result of a segment; raises RecordingError if the file is damaged."""
+        with work_file_errors(folder / TRACKED_FILE):
+            values: dict[str, Any] = json.loads((folder / TRACKED_FILE).read_text())
+            passes = [(_rigid_pass(found), np.array(rows, dtype=np.int64))
+                      for found, rows in values.pop('clock_passes')]
+            return cls(**values, clock_passes=passes)
 
 
 def _rigid_pass(values: dict[str, Any]) -> RigidPass:
