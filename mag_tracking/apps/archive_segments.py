@@ -1,10 +1,9 @@
 """Segments of a recording in which a target is detected, stored as files for the tracker.
 
-The stages before the tracker process the recording once, from beginning to end, and keep their
-backgrounds across segments. The tracker is restarted for each segment, but finds the same tracks
-as in the whole recording. A segment therefore begins with all earlier frames that a new track may
-use. It ends only after an interval without a target that is longer than the time span of these
-frames.
+The stages before the tracker process the recording once, from beginning to end. The tracker is
+restarted for each segment, but finds the same tracks as in the whole recording: a segment begins
+with all earlier frames that a new track may use, and ends only after an interval without a target
+that is longer than the time span of these frames.
 """
 
 import dataclasses
@@ -67,8 +66,8 @@ class FrameChunk:
     passes: tuple[NumberedPass, ...]
 
     def frames(self) -> Iterator[tuple[FieldFrame, Doubts | None]]:
-        """Iterate over the frames, with the doubtful times of each sensor if they change, otherwise
-        None."""
+        """Iterate over the frames, each with the doubtful times, or None if they have not
+        changed."""
         for k in range(len(self.stamp_ns)):
             yield FieldFrame(
                 int(self.stamp_ns[k]), self.field[k], self.covariance[k], self.n_samples[k],
@@ -88,8 +87,7 @@ def work_file_errors(path: Path) -> Iterator[None]:
 
 
 def read_segment(folder: Path, network: SensorNetwork) -> Iterator[FrameChunk]:
-    """Read the segment that `SegmentWriter` wrote to a folder; raises RecordingError if it is
-    damaged."""
+    """Read the segment that `SegmentWriter` wrote to a folder; raises RecordingError."""
     with work_file_errors(folder):
         paths = sorted(folder.iterdir(), key=lambda path: int(path.stem))
     for path in paths:
@@ -138,10 +136,9 @@ class SegmentWriter:
     def add_frame(self, frame: FieldFrame, doubts: Doubts) -> None:
         """Add the next frame, with the doubtful times of each sensor as known then.
 
-        A chunk is written when it has `CHUNK_FRAMES` frames. A segment with at least
-        `MIN_SEGMENT_FRAMES` frames ends after an interval without a target that is longer than
-        `lookback_s` and `MIN_QUIET_S`. Any segment ends if the time jumps back while no target is
-        present.
+        A segment with at least `MIN_SEGMENT_FRAMES` frames ends after an interval without a target
+        that is longer than `lookback_s` and `MIN_QUIET_S`. Any segment ends if the time jumps back
+        while no target is present.
         """
         last, self._last_frame = self._last_frame, frame
         self.n_frames += 1
@@ -182,8 +179,7 @@ class SegmentWriter:
         self._n_written = self._n_chunks = 0
 
     def _write(self) -> None:
-        """Write the buffered frames and passes to the next file: arrays and, for everything else,
-        one JSON text; raises OutputError."""
+        """Write the buffered frames and passes to the next file: arrays, and one JSON text."""
         arrays = {name: np.array([getattr(frame, name) for frame, _ in self._unwritten])
                   for name in _FRAME_ARRAYS}
         doubts: dict[int, Doubts] = {}
@@ -208,11 +204,8 @@ class SegmentWriter:
 
 
 class ClockComparisonHistory(ClockComparison):
-    """Clock comparison with the passes added to it, each with the indices of its sensors.
-
-    `clocks_differed` is whether a clock offset was ever significant, so that tracks depend on
-    earlier passes.
-    """
+    """Clock comparison with the passes added to it, and whether a clock offset was ever
+    significant, so that tracks depend on earlier passes."""
 
     def __init__(self, n_sensors: int) -> None:
         super().__init__(n_sensors)
@@ -227,10 +220,8 @@ class ClockComparisonHistory(ClockComparison):
 
 
 class SegmentResult(NamedTuple):
-    """Numbers of tracks and fitted vehicles in a segment, and its comparison of clocks.
-
-    The task `join` needs it; it is stored as JSON.
-    """
+    """What the task `join` needs of a segment, and its passes that compared clocks; stored as
+    JSON."""
 
     n_tracks: int
     n_passes: int

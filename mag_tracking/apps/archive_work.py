@@ -1,7 +1,6 @@
 """Tasks of an archive: cut a recording into segments, track each segment, join the tables.
 
-The tasks `cut` and `track_segment` each write a folder, and do nothing if the folder exists. Every
-task can therefore be repeated.
+Each task may be repeated: `cut` and `track_segment` do nothing if their folder exists.
 """
 
 import copy
@@ -168,11 +167,8 @@ class _Segmenter:
             self._writer.add_pass(self._n_passes, data, notes)
 
     def _add_due_health(self, stamp_ns: int) -> None:
-        """Write the health rows if `HEALTH_INTERVAL_S` has passed since the previous ones.
-
-        The first interval begins with the first frame. If the time jumps back to before the current
-        interval, a new interval begins.
-        """
+        """Write the health rows `HEALTH_INTERVAL_S` after the previous ones, or after the first
+        frame or a time jump."""
         interval_ns = int(HEALTH_INTERVAL_S * NS)
         if self._next_health_ns is None or stamp_ns < self._next_health_ns - interval_ns:
             self._next_health_ns = stamp_ns + interval_ns
@@ -203,8 +199,7 @@ class _Segmenter:
 
 
 def track_segment(job: Job, k: int) -> None:
-    """Track segment `k`, fit its passes, and write its tables; raises RecordingError if it is
-    damaged."""
+    """Track segment `k` and write its tables; raises RecordingError if it is damaged."""
     if not job.segment_folder(k).exists():
         with _atomic_folder(job.segment_folder(k)) as folder:
             _SegmentTracker(folder, job, ClockComparisonHistory(len(job.network))).run(

@@ -229,10 +229,8 @@ class GeometrySurvey:
 
 
 def board_of(path: str | PathLike[str]) -> SensorNetwork:
-    """Network of uncalibrated sensors from a CSV table of positions x, y, z [m].
-
-    They are named `mag_0`, `mag_1`, ... and aligned with the axes.
-    """
+    """Network of sensors `mag_0`, `mag_1`, ..., aligned with the axes, from a CSV table of
+    positions x, y, z [m]."""
     positions = read_sensor_positions(path)
     names = tuple(f'mag_{j}' for j in range(len(positions)))
     try:
@@ -296,8 +294,8 @@ def _with_noise(network: SensorNetwork, noise_std: float) -> SensorNetwork:
 
 
 def _corrected(network: SensorNetwork, readings: FloatArray) -> FloatArray:
-    """Apply the offsets and corrections of a network to readings (K, n, 3), T, sensor frames, as
-    the stage Calibrate does; the background remains."""
+    """Apply the offsets and corrections of a network to readings (K, n, 3), as the stage
+    Calibrate."""
     field = np.array(readings, dtype=float)
     for j, (offset, C) in enumerate(zip(network.offset, network.correction, strict=True)):
         if offset is not None:

@@ -171,9 +171,8 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
                  progress: Callable[[int], object] | None = None) -> Plan:
     """Compute bounds, detection probabilities and the best position of an additional sensor.
 
-    `area` is that of the maps, `clearance` [m] the minimum distance of an additional sensor from a
-    lane, and `n_grid` the number of points along the longer side of the maps. `progress` is called
-    with 1 whenever one of the `n_parts` parts is completed.
+    `clearance` [m] is its minimum distance from a lane, and `n_grid` the number of points along the
+    longer side of the maps. `progress` is called with 1 for each of the `n_parts` parts.
     """
     report_part = progress or (lambda n: None)
     passes = _Passes(network, target, sampling, settings)
@@ -264,7 +263,8 @@ class _Passes:
                     self._filter_bound(points, heading), self.detection(points).mean(axis=1))
 
     def _filter_bound(self, points: FloatArray, heading: float) -> FloatArray:
-        """Position bound (n,) [m], at each point of a lane, of a filter that starts at the first.
+        """Position bound (n,) [m] at each point of a lane of a filter that starts at the first
+        point.
 
         The filter uses the motion model of the tracker and estimates the backgrounds. The bound is
         the median over the directions of the moment.
@@ -300,11 +300,8 @@ class _Passes:
 
     def added_sensor_bounds(self, near_lanes: Sequence[tuple[float, FloatArray]],
                             candidates: FloatArray) -> tuple[float, FloatArray]:
-        """Median position bound [m] without and with an additional sensor at each candidate.
-
-        `near_lanes` are headings and points (n, 2). Without candidates, the results are NaN and an
-        empty array.
-        """
+        """Median position bound [m] on lanes (heading, points) without and with an additional
+        sensor at each candidate; NaN and an empty array without candidates."""
         n = len(candidates)
         if not n:
             return float('nan'), np.zeros(0)
@@ -323,8 +320,8 @@ class _Passes:
 
     def closest_point(self, lane: Lane, distance_scale: float
                       ) -> tuple[Observability, dict[str, FloatArray]]:
-        """Compute `Plan.observability`, with positions in units of `distance_scale` [m], and
-        `Plan.bounds_at_closest`."""
+        """Compute `Plan.observability`, in units of `distance_scale` [m], and
+        `bounds_at_closest`."""
         J = self.information(lane.points[np.argmin(np.abs(lane.along))][None], lane.heading)[0]
         scale = np.repeat([max(distance_scale, 1e-3), self.target.speed, self.target.moment], 3)
         return (observability(J[3], STATES, scale),
@@ -332,8 +329,8 @@ class _Passes:
                  'without prior': np.median(bounds_of(J, np.zeros((9, 9))), axis=0)})
 
     def miss_curve(self, lane: Lane, area: Area) -> FloatArray:
-        """Compute `Plan.miss_curve`: a pass is missed unless `detect.onset_frames` consecutive
-        frames detect the target."""
+        """Compute `Plan.miss_curve`: `detect.onset_frames` consecutive frames must detect the
+        target."""
         half_length = 0.5 * max(area[2] - area[0], area[3] - area[1])
         n = int(np.clip(4.0 * half_length / (self.target.speed * self.sampling.period), 1,
                         MAX_FRAMES))

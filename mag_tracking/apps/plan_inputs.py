@@ -45,10 +45,8 @@ def plan_inputs(network: SensorNetwork, settings: Settings, target: str | None,
                 heading: Sequence[float] | None, offset: Sequence[float] | None,
                 noise_std: float | None, rate: float, field_error: float | None,
                 area: Sequence[float] | None, clearance: float | None, grid: int) -> PlanInputs:
-    """Check and complete the inputs of a plan, which are described in `plan`.
-
-    Raises SettingsError if one is out of range; the message begins with its name.
-    """
+    """Check and complete the inputs of `plan`; raises SettingsError that begins with the name of
+    the invalid one."""
     planned_target = _target(settings.track.vehicle, target, moment, height, speed)
     lanes = _lanes(settings.track.vehicle, _to_floats(heading), _to_floats(offset))
     _in_range('grid', grid, 5, 200)

@@ -116,10 +116,8 @@ def _geometry(args: argparse.Namespace) -> int:
 
 
 def _checked_box(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[float]] | None:
-    """Check the options; return the corners of the box, or None without --unknown-poses.
-
-    Raises SettingsError or OutputError if an option is invalid.
-    """
+    """Return the corners of the box, or None without --unknown-poses; raises SettingsError,
+    OutputError for any invalid option."""
     corners = args.low, args.high
     if args.unknown_poses and None in corners:
         raise SettingsError('--unknown-poses: give the box that contains the magnet with --low and '

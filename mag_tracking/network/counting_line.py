@@ -22,11 +22,8 @@ MAX_EXTRAPOLATION_S = 1.0
 
 @dataclass(frozen=True)
 class CountingLine:
-    """A line segment on the ground at which vehicles are counted; world frame.
-
-    It has a midpoint (2,) [m], a unit vector (2,) of the forward direction, perpendicular to the
-    line, and half of its length [m].
-    """
+    """A line on the ground at which vehicles are counted: midpoint (2,) [m], unit vector (2,) of
+    the forward direction across the line, and half of its length [m]; world frame."""
 
     name: str
     point: FloatArray
@@ -45,11 +42,8 @@ class CountingLine:
 
 def counting_lines(names: Sequence[str], headings_deg: Sequence[float], offsets: Sequence[float],
                    half_widths: Sequence[float], centre: FloatArray) -> list[CountingLine]:
-    """Create counting lines from lists of their parameters.
-
-    Headings are forward directions, anticlockwise from x; offsets in m are distances from the
-    centre of the network (world frame) in the forward direction.
-    """
+    """Create counting lines from their forward directions, anticlockwise from x, and their
+    distances [m] from the centre of the network in this direction."""
     out = []
     for name, heading, offset, half_width in zip(names, np.deg2rad(headings_deg), offsets,
                                                  half_widths, strict=True):

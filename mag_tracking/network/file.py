@@ -1,8 +1,7 @@
 """Network file (`network.yaml`): geometry and calibration of a sensor network.
 
-The Earth's field at a site is that of the World Magnetic Model (WMM). The model is evaluated by
-pygeomag, which contains the coefficients published by NOAA and the British Geological Survey. T10
-section 6.3.1 uses the declination of the model.
+The Earth's field at a site is that of the World Magnetic Model, evaluated by pygeomag with the
+coefficients of NOAA and the British Geological Survey; T10 section 6.3.1 uses its declination.
 """
 
 import datetime
@@ -249,12 +248,9 @@ def _parse_earth_field(content: dict[str, Any]) -> FloatArray | None:
 
 @dataclass(frozen=True)
 class Site:
-    """Place and date of a network, and orientation of its frame.
-
-    Geodetic latitude [deg], longitude [deg, east positive], height above the ellipsoid [m], decimal
-    year, and bearing of the x axis [deg, clockwise from true north]: 90 for ENU, or the bearing of
-    a road that is parallel to x.
-    """
+    """Geodetic latitude [deg], longitude [deg, east positive], height above the ellipsoid [m],
+    decimal year, and bearing of the x axis [deg, clockwise from true north]: 90 for ENU, or that of
+    a road parallel to x."""
 
     latitude: float
     longitude: float
@@ -270,11 +266,8 @@ def decimal_year(day: datetime.date) -> float:
 
 
 def earth_field(site: Site) -> FloatArray:
-    """Magnetic flux density (3,) of the Earth at a site, T, world frame (z up).
-
-    Raises ValueError if the model does not cover the place or the year, and ModuleNotFoundError
-    without pygeomag.
-    """
+    """Magnetic flux density (3,) of the Earth at a site, T, world frame (z up); raises ValueError
+    outside the model, and ModuleNotFoundError without pygeomag."""
     # Optional dependency, required only for networks that define a site instead of a field.
     from pygeomag import GeoMag
 
