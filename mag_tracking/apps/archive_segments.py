@@ -34,15 +34,12 @@ CHUNK_FRAMES = 2000
 """Number of frames in memory at which a chunk is written to the file."""
 MIN_QUIET_S = 1.0
 """Minimum duration without a target that ends a segment [s]."""
-
 TRACKED_FILE = 'tracked.json'
 """Name of the file with the result of a tracked segment."""
 Doubts = InputDoubts
 """{reason: {sensor: times at which its readings are doubtful}}."""
 NumberedPass = tuple[int, PassData, tuple[str, ...]]
 """Index of a pass in its recording (from 1), measurements of the pass, and notes for the user."""
-
-
 _FRAME_ARRAYS = tuple(f.name for f in dataclasses.fields(FieldFrame))
 _PASS_ARRAYS = ('t', 'sensor', 'field', 'covariance')
 
@@ -76,6 +73,15 @@ class FrameChunk:
 
 
 @contextmanager
+def output_errors(path: Path) -> Iterator[None]:
+    """Convert an OSError to an OutputError that names `path`."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f'cannot write {path}: {error.strerror}') from error
+
+
+@contextmanager
 def work_file_errors(path: Path) -> Iterator[None]:
     """Convert the errors of reading a file of intermediate results to a RecordingError."""
     try:
@@ -91,26 +97,20 @@ def read_segment(folder: Path, network: SensorNetwork) -> Iterator[FrameChunk]:
     with work_file_errors(folder):
         paths = sorted(folder.iterdir(), key=lambda path: int(path.stem))
     for path in paths:
-        with work_file_errors(path):
-            chunk = _read_chunk(path, network)
+        with work_file_errors(path), np.load(path) as arrays:
+            text = json.loads(str(arrays['text']))
+            doubts: dict[int, Doubts] = {
+                int(k): {reason: {sensor: tuple((begin, end) for begin, end in times)
+                                  for sensor, times in by_sensor.items()}
+                         for reason, by_sensor in by_reason.items()}
+                for k, by_reason in text['doubts'].items()}
+            passes = tuple(
+                (number, PassData(network, stamp_ns, *(arrays[f'pass_{number}_{name}']
+                                                       for name in _PASS_ARRAYS), doubt=doubt),
+                 tuple(notes)) for number, stamp_ns, doubt, notes in text['passes'])
+            chunk = FrameChunk(**{name: arrays[name] for name in _FRAME_ARRAYS}, doubts=doubts,
+                               passes=passes)
         yield chunk
-
-
-def _read_chunk(path: Path, network: SensorNetwork) -> FrameChunk:
-    """Read a file of a segment."""
-    with np.load(path) as arrays:
-        text = json.loads(str(arrays['text']))
-        doubts: dict[int, Doubts] = {
-            int(k): {reason: {sensor: tuple((begin, end) for begin, end in times)
-                              for sensor, times in by_sensor.items()}
-                     for reason, by_sensor in by_reason.items()}
-            for k, by_reason in text['doubts'].items()}
-        passes = tuple(
-            (number, PassData(network, stamp_ns, *(arrays[f'pass_{number}_{name}']
-                                                   for name in _PASS_ARRAYS), doubt=doubt),
-             tuple(notes)) for number, stamp_ns, doubt, notes in text['passes'])
-        return FrameChunk(**{name: arrays[name] for name in _FRAME_ARRAYS}, doubts=doubts,
-                          passes=passes)
 
 
 class SegmentWriter:
@@ -192,12 +192,10 @@ class SegmentWriter:
         text = json.dumps({'doubts': doubts, 'passes': [
             (number, data.stamp_ns, data.doubt, notes) for number, data, notes in self._passes]})
         path = self._folder / f'segment-{self.n_segments}' / f'{self._n_chunks}.npz'
-        try:
+        with output_errors(path):
             path.parent.mkdir(exist_ok=True)
             with open(path, 'xb') as stream:
                 np.savez(stream, text=np.array(text), **arrays)
-        except OSError as error:
-            raise OutputError(f'cannot write {path}: {error.strerror}') from error
         self._n_written += len(self._unwritten)
         self._n_chunks += 1
         self._unwritten, self._passes = [], []
@@ -239,15 +237,11 @@ class SegmentResult(NamedTuple):
         """Read the result of a segment; raises RecordingError if the file is damaged."""
         with work_file_errors(folder / TRACKED_FILE):
             values: dict[str, Any] = json.loads((folder / TRACKED_FILE).read_text())
-            passes = [(_rigid_pass(found), np.array(rows, dtype=np.int64))
-                      for found, rows in values.pop('clock_passes')]
+            passes = []
+            for found, rows in values.pop('clock_passes'):
+                arrays = {name: np.array(value, dtype=np.float64) for name, value in found.items()
+                          if isinstance(value, list)}
+                # The shape of an empty array is not stored.
+                arrays['straight_paths'] = arrays['straight_paths'].reshape(-1, 6)
+                passes.append((RigidPass(**{**found, **arrays}), np.array(rows, dtype=np.int64)))
             return cls(**values, clock_passes=passes)
-
-
-def _rigid_pass(values: dict[str, Any]) -> RigidPass:
-    """Create a pass from its JSON values."""
-    arrays = {name: np.array(value, dtype=np.float64) for name, value in values.items()
-              if isinstance(value, list)}
-    # The shape of an empty array is not stored.
-    arrays['straight_paths'] = arrays['straight_paths'].reshape(-1, 6)
-    return RigidPass(**{**values, **arrays})

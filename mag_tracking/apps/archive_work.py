@@ -22,6 +22,7 @@ from mag_tracking.apps.archive_segments import (
     ClockComparisonHistory,
     SegmentResult,
     SegmentWriter,
+    output_errors,
     read_segment,
     work_file_errors,
 )
@@ -29,7 +30,6 @@ from mag_tracking.apps.pass_collector import PassCollector
 from mag_tracking.apps.pass_fitter import fitted_vehicles
 from mag_tracking.apps.pass_tracks import PassTracks, ground_prior
 from mag_tracking.apps.replay import TrackHistory
-from mag_tracking.errors import OutputError
 from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings
@@ -100,12 +100,12 @@ def _atomic_folder(final: Path) -> Iterator[Path]:
     The first result is kept; all results are equal.
     """
     temporary = final.with_name(f'.{secrets.token_hex(8)}.{final.name}')
-    with _output_errors(final):
+    with output_errors(final):
         temporary.mkdir()
     try:
         yield temporary
         if not final.exists():
-            with _output_errors(final):
+            with output_errors(final):
                 try:
                     temporary.rename(final)
                 except OSError:
@@ -113,15 +113,6 @@ def _atomic_folder(final: Path) -> Iterator[Path]:
                         raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-
-
-@contextmanager
-def _output_errors(path: Path) -> Iterator[None]:
-    """Convert an OSError to an OutputError that names `path`."""
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f'cannot write {path}: {error.strerror}') from error
 
 
 class _Segmenter:
@@ -183,10 +174,9 @@ class _Segmenter:
             counts = calibrate.counts_of(name)
             previous, total = self._previous_counts[name], (counts['accepted'], counts['rejected'])
             self._previous_counts[name] = total
-            covariance = background.covariance
+            is_known, covariance = background.ready and total[0] > 0, background.covariance
             vectors = {
-                'background': calibrate.background(name)
-                if background.ready and counts['accepted'] > 0 else unknown,
+                'background': calibrate.background(name) if is_known else unknown,
                 'drift': background.drift,
                 'noise': unknown if covariance is None else np.sqrt(np.diagonal(covariance))}
             self._health.add({
@@ -265,9 +255,9 @@ class _SegmentTracker(RecordReceiver):
         del self._history.logs[log.id]
         smoothed, summary = self._history.smoothed.pop(log.id, None), log.summary()
         self._n_tracks += 1
-        columns = common_columns(self._job.recording, log.stamp_ns[0]) | {
-            'track_id': log.id} | summary | dict(
-                zip(names_of(MOMENT), summary['moment'], strict=True)) | {
+        columns = {
+            **common_columns(self._job.recording, log.stamp_ns[0]), 'track_id': log.id, **summary,
+            **dict(zip(names_of(MOMENT), summary['moment'], strict=True)),
             'doubts': ' '.join(summary['doubts']),
             'arrival_weight': summary['arrival_weights'][summary['arrival']]}
         if smoothed is not None:

@@ -201,8 +201,7 @@ def _local_client(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
     # the thread of the event loop.
     resource_tracker.ensure_running()
     # Dask would never restart a worker that is still starting 15 s after an earlier loss.
-    stack.enter_context(dask.config.set(
-        {'distributed.deploy.lost-worker-timeout': '365 days'}))
+    stack.enter_context(dask.config.set({'distributed.deploy.lost-worker-timeout': '365 days'}))
     try:
         cluster = stack.enter_context(distributed.LocalCluster(
             loop=_event_loop(), n_workers=workers, threads_per_worker=1, processes=True,

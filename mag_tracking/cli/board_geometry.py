@@ -69,8 +69,7 @@ def add(commands: Commands) -> None:
                 'in the order of the table')
     p.add_argument('--moment', required=True, type=float, metavar='A_M2',
                    help='magnitude of the magnet\'s moment [A m^2]')
-    p.add_argument('--out', required=True, type=Path, metavar='FILE',
-                   help='network file to write')
+    p.add_argument('--out', required=True, type=Path, metavar='FILE', help='network file to write')
     p.add_argument('--noise-std', type=float, metavar='TESLA', help='noise standard deviation '
                    'of one reading, for sensors without noise_std in the network file '
                    f'(default: {ASSUMED_NOISE:g}, not written to the output)')
@@ -171,30 +170,26 @@ def _print(survey: GeometrySurvey, has_unknown_poses: bool) -> None:
         print(f'moment {moment:.4f} ({std:.4f}) A m^2' if std
               else f'moment {moment:g} A m^2 (given)')
         if not has_unknown_poses:
-            offset, tilt = (' '.join(f'{scale * v:.2f} ({scale * s:.2f})'
-                                     for v, s in zip(*values, strict=True))
-                            for scale, values in ((1e3, g.tool_offset),
-                                                  (180.0 / np.pi, g.tool_tilt)))
+            offset, tilt = (
+                ' '.join(f'{scale * v:.2f} ({scale * s:.2f})' for v, s in zip(*values, strict=True))
+                for scale, values in ((1e3, g.tool_offset), (180.0 / np.pi, g.tool_tilt)))
             print(f'magnet relative to the tracked point, tool frame: {offset} mm; tilt {tilt} deg')
-    n_unused = survey.n_poses - len(survey.rows)
     print(f'{len(survey.rows)} of {survey.n_poses} poses used, normalised cost '
           f'{g.normalised_cost:.2f} (1 if consistent with noise and field error)')
-    if n_unused:
+    if n_unused := survey.n_poses - len(survey.rows):
         print('  warning: poses not used (no readings'
               f'{" or outside the box" * has_unknown_poses}): {n_unused}')
     if g.suspect_sensors:
         print('  warning: sensors inconsistent with other sensors or their nominal geometry '
               f'(check mounting, axes, unit, noise): {", ".join(g.suspect_sensors)}')
-    n_assumed = sum(std is None for std in survey.network.noise_std)
-    if n_assumed:
+    if n_assumed := sum(std is None for std in survey.network.noise_std):
         print(f'  note: noise of {quantity(n_assumed, "sensor")} assumed to be '
               f'{ASSUMED_NOISE:g} T (set --noise-std, or noise_std in a network file)')
     for j, name in enumerate(survey.network.names):
         if np.isnan(g.bias[j]).all():
             print(f'  warning: {name} has no readings; its nominal geometry is kept')
     for name, axes in survey.silent_axes:
-        print(f'  warning: {name} never reported {axes}: the background of these axes '
-              'is unknown')
+        print(f'  warning: {name} never reported {axes}: the background of these axes is unknown')
     if survey.suspect_rows:
         print('  warning: rows with inconsistent poses (the header is row 1): '
               f'{", ".join(map(str, survey.suspect_rows))}')

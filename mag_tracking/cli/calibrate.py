@@ -67,8 +67,7 @@ examples:
 
 def add(commands: Commands) -> None:
     """Register the commands."""
-    p = _add_command(commands, 'calibrate network', _network, _NETWORK_HELP,
-                     'or rosbag2 folder')
+    p = _add_command(commands, 'calibrate network', _network, _NETWORK_HELP, 'or rosbag2 folder')
     add_settings(p)
     p.add_argument('--no-passes', action='store_true',
                    help='do not estimate headings from passing targets')
@@ -90,10 +89,8 @@ def _add_command(commands: Commands, name: str, run: Callable[[argparse.Namespac
     p.add_argument('recording', type=Path, metavar='RECORDING',
                    help=f'.mcap, .db3 or .bag file, {kinds}')
     add_recorded_network(p)
-    p.add_argument('--out', required=True, type=Path, metavar='FILE',
-                   help='network file to write')
-    p.add_argument('--figure', type=Path, metavar='FILE',
-                   help='draw the calibration (.png, .pdf)')
+    p.add_argument('--out', required=True, type=Path, metavar='FILE', help='network file to write')
+    p.add_argument('--figure', type=Path, metavar='FILE', help='draw the calibration (.png, .pdf)')
     return p
 
 
