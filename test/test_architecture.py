@@ -18,7 +18,7 @@ MAX_FILE_LINES, MAX_FUNCTION_LINES = 350, 40
 BUDGETS = {
     'cli': 3100, 'nodes': 4300, 'apps': 5800, 'results': 1550, 'drivers': 5400, 'recording': 4850,
     'web': 650, 'stages': 12200, 'analysis': 4050, 'messages': 1750, 'simulation': 250,
-    'physics': 2450, 'inference': 3100, 'calibration': 4700, 'network': 850, 'report': 2300,
+    'physics': 2450, 'inference': 3100, 'calibration': 4700, 'network': 750, 'report': 2300,
     'modules': 2900}
 """Maximum lines of each package, and of the modules outside packages, in Python and C++ with
 docstrings. A change may lower a budget; one that raises it says why."""

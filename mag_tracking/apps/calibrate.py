@@ -1,6 +1,6 @@
 """Calibration of a network from a recording, by tumbling, or with a magnet above a board."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -22,12 +22,12 @@ from mag_tracking.network import CalibrationRecord, SensorNetwork
 from mag_tracking.pipeline import Pipeline, Settings
 from mag_tracking.quantities import quantity
 from mag_tracking.record_receiver import RecordReceiver
-from mag_tracking.recording.interruptible import Progress, ReadingStopped, until_stopped
+from mag_tracking.recording.interruptible import ReadingStopped, until_stopped
 from mag_tracking.recording.pose_table import read_pose_table, read_readings, read_sensor_positions
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
-from mag_tracking.records import AccelerationSample, Readings, Track
-from mag_tracking.run import RecordingSource, run
+from mag_tracking.records import AccelerationSample, Track
+from mag_tracking.run import RecordingSource, Source, run
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.stage import rejected
 from mag_tracking.stages.survey.stage import NetworkSurvey, Survey, with_measured_noise
@@ -140,8 +140,7 @@ class _PassTracks(RecordReceiver):
         return [track for n, track in self._poses.values() if n >= MIN_POSES]
 
 
-def tumble(source: Recording | Sequence[Readings], network: SensorNetwork,
-           sensors: Collection[str], date: str,
+def tumble(source: Source, network: SensorNetwork, sensors: Collection[str], date: str,
            field_magnitude: float | None = None, progress: Callable[[int], object] | None = None,
            stopped: Callable[[], bool] | None = None,
            ) -> tuple[SensorNetwork, dict[str, EllipsoidFit], dict[str, FloatArray]]:
@@ -154,7 +153,7 @@ def tumble(source: Recording | Sequence[Readings], network: SensorNetwork,
     rows = {name: network.index(name) for name in tuple(sensors) or network.names}
     collected: dict[str, list[FloatArray]] = {name: [np.empty((0, 3))] for name in rows}
     with suppress(ReadingStopped):
-        for batch in until_stopped(_batches(source, network), progress, stopped):
+        for batch, _ in until_stopped(source.batches, progress, stopped):
             row = batch.rows(rows)
             row[np.isinf(batch.field).any(axis=1)] = -1
             for name, j in rows.items():
@@ -174,18 +173,6 @@ def tumble(source: Recording | Sequence[Readings], network: SensorNetwork,
             network, j, date, f'{"nominal orientation" if record is None else record.by}; tumbled '
             f'with a residual of {100 * fit.residual:.1f} % of the field')
     return _with_columns(network, columns), fits, readings
-
-
-def _batches(source: Recording | Sequence[Readings], network: SensorNetwork
-             ) -> Callable[[Progress | None], Iterator[Readings]]:
-    """Return a function that iterates over the readings of the network."""
-    if isinstance(source, Recording):
-        return SampleReader(source, network).readings
-    names = dict.fromkeys(name for batch in source for name in batch.names)
-    if not set(names) & set(network.names):
-        raise RecordingError(f'the table has the sensors {", ".join(names)}, and the network '
-                             f'{", ".join(network.names)}')
-    return lambda progress: iter(source)
 
 
 def _calibration_record(network: SensorNetwork, j: int, date: str, by: str

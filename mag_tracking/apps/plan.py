@@ -176,8 +176,7 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     """
     report_part = progress or (lambda n: None)
     passes = _Passes(network, target, sampling, settings)
-    x, y = _grid(area, n_grid)
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    x, y, points = _grid(area, n_grid)
     bounds = []
     for heading in _directions(lanes):
         bounds.append(passes.bounds(points, heading)[..., 0])
@@ -189,20 +188,17 @@ def compute_plan(network: SensorNetwork, target: PlannedTarget, sampling: Sampli
     # The effect of the additional sensor is evaluated where the lanes are near the network.
     half_length = 0.5 * max(np.ptp(network.positions[:, :2], axis=0).max(), 8.0 * target.height)
     near = [(lane.heading, lane.points[np.abs(lane.along) <= half_length][::4]) for lane in planned]
-    coarse_x, coarse_y = _grid(area, max(11, n_grid // 2))
-    sites = np.stack(np.meshgrid(coarse_x, coarse_y), axis=-1).reshape(-1, 2)
+    coarse_x, coarse_y, sites = _grid(area, max(11, n_grid // 2))
     is_allowed = np.all([_lane_distances(lane, sites) >= clearance for lane in planned], axis=0)
     median_bound = np.full(len(sites), np.nan)
     without, median_bound[is_allowed] = passes.added_sensor_bounds(near, sites[is_allowed])
     report_part(1)
-    best_index = int(np.nanargmin(median_bound)) if is_allowed.any() else 0
-    shape = len(coarse_y), len(coarse_x)
+    best_x, best_y = sites[np.nanargmin(median_bound) if is_allowed.any() else 0].tolist()
     return Plan(
         network, target, sampling, x, y,
         np.median(np.concatenate(bounds, axis=1), axis=1).reshape(len(y), len(x)),
         probability.mean(axis=1).reshape(len(y), len(x)), planned,
-        median_bound.reshape(shape), without,
-        (float(coarse_x[best_index % shape[1]]), float(coarse_y[best_index // shape[1]])),
+        median_bound.reshape(len(coarse_y), len(coarse_x)), without, (best_x, best_y),
         *passes.closest_point(planned[0], half_length), passes.miss_curve(planned[0], area))
 
 
@@ -214,12 +210,14 @@ def _lane_distances(lane: Lane, points: FloatArray) -> FloatArray:
     return distance
 
 
-def _grid(area: Area, n: int) -> tuple[FloatArray, FloatArray]:
-    """Coordinates (x, y) of a map with square cells and `n` points along the longer side."""
+def _grid(area: Area, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Coordinates (nx,), (ny,) and points (ny nx, 2) of a map with square cells and `n` points
+    along the longer side."""
     x0, y0, x1, y1 = area
     cell = max(x1 - x0, y1 - y0) / (n - 1)
-    return (np.linspace(x0, x1, max(2, int(round((x1 - x0) / cell)) + 1), dtype=float),
-            np.linspace(y0, y1, max(2, int(round((y1 - y0) / cell)) + 1), dtype=float))
+    x, y = (np.linspace(low, high, max(2, int(round((high - low) / cell)) + 1), dtype=float)
+            for low, high in ((x0, x1), (y0, y1)))
+    return x, y, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 class _Passes:

@@ -23,13 +23,14 @@ from mag_tracking.cli.options import (
 )
 from mag_tracking.cli.table_options import add_table_options, print_notes, table_options
 from mag_tracking.cli.tracking_options import add_settings, settings_of
-from mag_tracking.errors import SettingsError
+from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import write_network
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.records import Readings
+from mag_tracking.run import ArraySource, RecordingSource
 
 _NETWORK_HELP = '''
 Estimates the tilt (from the accelerometer), the heading (from the Earth's field), the clock offset
@@ -180,15 +181,14 @@ def _tumble(args: argparse.Namespace) -> int:
     network = recorded_network(args)
     source = _source(args, network)
     check_outputs(args)
-    with recorded_signals(signal.SIGINT) as signals, \
-            _bar(args, getattr(source, 'size', None)) as bar:
+    size = source.recording.size if isinstance(source, RecordingSource) else None
+    with recorded_signals(signal.SIGINT) as signals, _bar(args, size) as bar:
         calibrated, fits, readings = tumble(source, network, args.sensor, utc_timestamp(),
                                             magnitude, bar.update, lambda: bool(signals))
     for name, fit in fits.items():
         _print_fit(name, fit)
-    if isinstance(source, Recording):
-        for cause, n in source.losses.items():
-            print(f'  warning: {cause}: {n}')
+    for cause, n in source.lost.items():
+        print(f'  warning: {cause}: {n}')
     converged_names = [name for name, fit in fits.items() if fit.converged]
     if signals or not converged_names:
         print('interrupted: nothing was written' if signals else 'nothing was written')
@@ -205,18 +205,22 @@ def _tumble(args: argparse.Namespace) -> int:
     return 0
 
 
-def _source(args: argparse.Namespace, network: SensorNetwork) -> Recording | list[Readings]:
+def _source(args: argparse.Namespace, network: SensorNetwork) -> RecordingSource | ArraySource:
     """Open the recording, or read the table of readings."""
     from mag_tracking.recording.field_table import SUFFIXES, read_field_table
 
     if args.recording.suffix.lower() not in SUFFIXES:
-        return Recording(args.recording)
+        return RecordingSource(Recording(args.recording), network)
     # The name of the only sensor of a table that does not name it.
     candidates = args.sensor or network.names
     table = read_field_table(args.recording, table_options(
         args, candidates[0] if len(candidates) == 1 else ''), with_times=False)
     print_notes(args.recording, table.notes)
-    return table.sessions
+    readings = Readings.joined(table.sessions)
+    if not set(readings.names) & set(network.names):
+        raise RecordingError(f'the table has the sensors {", ".join(readings.names)}, and the '
+                             f'network {", ".join(network.names)}')
+    return ArraySource(readings)
 
 
 def _print_fit(name: str, fit: EllipsoidFit) -> None:
