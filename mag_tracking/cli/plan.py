@@ -50,23 +50,23 @@ def add(commands: Commands) -> None:
     p.add_argument('--target', metavar='KIND', help='small, car or truck: a vehicle with the '
                    'moment and height given in the settings (default: car); magnet requires '
                    '--moment and --height')
-    for name, metavar, text, keywords in (
-            ('moment', 'A_M2', 'magnitude of the moment [A m^2]; requires --height', {}),
-            ('height', 'M', 'height of the magnetic centre, z in the frame of the network [m]', {}),
-            ('speed', 'M_S', 'speed [m/s] (default: 10)', {'default': 10.0}),
-            ('heading', 'DEG', 'heading of each lane, measured anticlockwise from x [deg] '
-             '(default: the arrival directions of the settings)', {'nargs': '+'}),
-            ('offset', 'M', 'lateral offset of each lane, to the left of the centre of the sensors '
-             '[m] (default: 0)', {'nargs': '+'}),
-            ('noise-std', 'TESLA', 'noise standard deviation of one sample [T] (default: noise_std '
-             'of the network file, or 1.2e-8)', {}),
-            ('rate', 'HZ', 'sample rate of each sensor (default: 100)', {'default': 100.0}),
-            ('field-error', 'FRACTION', 'relative error of the field (default: track.field_error)',
-             {}),
-            ('area', ('X0', 'Y0', 'X1', 'Y1'), 'area of the maps [m] (default: where at least half '
-             'of the targets are detected)', {'nargs': 4}),
-            ('clearance', 'M', 'minimum distance of an additional sensor from a lane [m] (default: '
-             '2 for vehicles, 0 with --moment)', {})):
+    options: list[tuple[str, Any, str, dict[str, Any]]] = [
+        ('moment', 'A_M2', 'magnitude of the moment [A m^2]; requires --height', {}),
+        ('height', 'M', 'height of the magnetic centre, z in the frame of the network [m]', {}),
+        ('speed', 'M_S', 'speed [m/s] (default: 10)', {'default': 10.0}),
+        ('heading', 'DEG', 'heading of each lane, measured anticlockwise from x [deg] (default: '
+         'the arrival directions of the settings)', {'nargs': '+'}),
+        ('offset', 'M', 'lateral offset of each lane, to the left of the centre of the sensors [m] '
+         '(default: 0)', {'nargs': '+'}),
+        ('noise-std', 'TESLA', 'noise standard deviation of one sample [T] (default: noise_std of '
+         'the network file, or 1.2e-8)', {}),
+        ('rate', 'HZ', 'sample rate of each sensor (default: 100)', {'default': 100.0}),
+        ('field-error', 'FRACTION', 'relative error of the field (default: track.field_error)', {}),
+        ('area', ('X0', 'Y0', 'X1', 'Y1'), 'area of the maps [m] (default: where at least half of '
+         'the targets are detected)', {'nargs': 4}),
+        ('clearance', 'M', 'minimum distance of an additional sensor from a lane [m] (default: 2 '
+         'for vehicles, 0 with --moment)', {})]
+    for name, metavar, text, keywords in options:
         p.add_argument(f'--{name}', type=float, metavar=metavar, help=text, **keywords)
     p.add_argument('--grid', type=int, default=41, metavar='N',
                    help='number of points along the longer side of the maps (default: 41)')
