@@ -218,8 +218,7 @@ class ClockComparisonHistory(ClockComparison):
 
 
 class SegmentResult(NamedTuple):
-    """What the task `join` needs of a segment, and its passes that compared clocks; stored as
-    JSON."""
+    """Counts of a segment and its passes that compared clocks, for the task `join`; JSON."""
 
     n_tracks: int
     n_passes: int
