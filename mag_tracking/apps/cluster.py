@@ -64,7 +64,6 @@ class Cluster(Generic[_Key]):
                 'archives need pyarrow and Dask: pip install "mag_tracking[archive]"') from error
         # Dask logs many lines for each lost worker.
         logging.getLogger('distributed').setLevel(logging.CRITICAL)
-        self._stack = ExitStack()
         self._running: dict[Future[Any], _Task] = {}
         # Dask reports all tasks of a lost worker as failed, including queued ones. Each such task
         # is therefore repeated while no other task is running.
@@ -72,13 +71,11 @@ class Cluster(Generic[_Key]):
         self._workers: set[str] = set()
         self.n_lost = 0
         self._last_worker_time = time.monotonic()
-        try:
-            self._client = self._stack.enter_context(
-                _local_client(distributed, self._stack, workers) if scheduler is None
+        with ExitStack() as stack:
+            self._client = stack.enter_context(
+                _local_client(distributed, stack, workers) if scheduler is None
                 else _remote_client(distributed, scheduler))
-        except BaseException:
-            self._stack.close()
-            raise
+            self._stack = stack.pop_all()
         self._count_lost()
 
     def __enter__(self) -> 'Cluster[_Key]':
