@@ -105,8 +105,8 @@ def read_segment(folder: Path, network: SensorNetwork) -> Iterator[FrameChunk]:
                          for reason, by_sensor in by_reason.items()}
                 for k, by_reason in text['doubts'].items()}
             passes = tuple(
-                (number, PassData(network, stamp_ns, *(arrays[f'pass_{number}_{name}']
-                                                       for name in _PASS_ARRAYS), doubt=doubt),
+                (number, PassData(network, stamp_ns, doubt=doubt, **{
+                    name: arrays[f'pass_{number}_{name}'] for name in _PASS_ARRAYS}),
                  tuple(notes)) for number, stamp_ns, doubt, notes in text['passes'])
             chunk = FrameChunk(**{name: arrays[name] for name in _FRAME_ARRAYS}, doubts=doubts,
                                passes=passes)
@@ -180,8 +180,9 @@ class SegmentWriter:
 
     def _write(self) -> None:
         """Write the buffered frames and passes to the next file: arrays, and one JSON text."""
-        arrays = {name: np.array([getattr(frame, name) for frame, _ in self._unwritten])
-                  for name in _FRAME_ARRAYS}
+        arrays: dict[str, Any] = {
+            name: np.array([getattr(frame, name) for frame, _ in self._unwritten])
+            for name in _FRAME_ARRAYS}
         doubts: dict[int, Doubts] = {}
         previous: Doubts | None = None
         for k, (_, current) in enumerate(self._unwritten):

@@ -15,7 +15,7 @@ from mag_tracking.analysis.network_geometry import (
     calibrate_geometry,
 )
 from mag_tracking.analysis.pass_mounting import MountingEvidence, fuse_mounting, with_pass_mounting
-from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit, fit_ellipsoid
 from mag_tracking.errors import NetworkError, RecordingError
 from mag_tracking.network import CalibrationRecord, SensorNetwork
@@ -187,7 +187,7 @@ def _with_columns(network: SensorNetwork, columns: dict[str, list[Any]],
                   **arrays: FloatArray) -> SensorNetwork:
     """Replace attributes of a network that have one value per sensor."""
     changes: dict[str, Any] = {name: tuple(column) for name, column in columns.items()}
-    return replace(network, **changes, **arrays)
+    return replace(network, **(changes | arrays))
 
 
 @dataclass(frozen=True)
@@ -265,8 +265,9 @@ def survey_geometry(table: str | PathLike[str], network: SensorNetwork, moment: 
     except ValueError as error:
         raise RecordingError(f'{table}: {error}') from error
     method = f'magnet, {len(geometry.rows)} {"unknown" if box is not None else "tracked"} poses'
+    is_silent: BoolArray = np.all(is_missing, axis=0)
     silent_axes = tuple((name, ' and '.join(np.array(list('xyz'))[silent]))
-                        for name, silent in zip(network.names, is_missing.all(axis=0), strict=True)
+                        for name, silent in zip(network.names, is_silent, strict=True)
                         if silent.any() and not silent.all())
     return GeometrySurvey(
         nominal, _calibrated_network(network, geometry, date, method), geometry,

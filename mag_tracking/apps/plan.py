@@ -332,7 +332,7 @@ class _Passes:
         half_length = 0.5 * max(area[2] - area[0], area[3] - area[1])
         n = int(np.clip(4.0 * half_length / (self.target.speed * self.sampling.period), 1,
                         MAX_FRAMES))
-        along = np.linspace(-2.0 * half_length, 2.0 * half_length, n)
+        along = np.linspace(-2.0 * half_length, 2.0 * half_length, n, dtype=np.float64)
         return np.array([(offset, float(np.mean(missed_detection_probability(
             self.detection(self.points(lane.heading, offset, along)),
             self.settings.detect.onset_frames))))
