@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from mag_tracking.analysis.fitted_pass import FittedPass
     from mag_tracking.analysis.placement import PlannedTarget, Sampling
     from mag_tracking.apps.fit import FitResult, fit
-    from mag_tracking.apps.plan import Plan
-    from mag_tracking.apps.plan_inputs import plan
+    from mag_tracking.apps.plan import Plan, plan
     from mag_tracking.apps.readings import RecordedReadings, read_recording, readings_from_arrays
     from mag_tracking.apps.track import TrackingResult, track
     from mag_tracking.apps.traffic import EventsResult, TrafficResult, events, traffic
@@ -51,8 +50,7 @@ _MODULES = {
     'analysis.fitted_pass': ('FittedPass',),
     'analysis.placement': ('PlannedTarget', 'Sampling'),
     'apps.fit': ('FitResult', 'fit'),
-    'apps.plan': ('Plan',),
-    'apps.plan_inputs': ('plan',),
+    'apps.plan': ('Plan', 'plan'),
     'apps.readings': ('RecordedReadings', 'read_recording', 'readings_from_arrays'),
     'apps.track': ('TrackingResult', 'track'),
     'apps.traffic': ('EventsResult', 'TrafficResult', 'events', 'traffic'),

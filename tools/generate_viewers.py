@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import yaml
 
 from mag_tracking.network.file import read_network
-from mag_tracking.network.topics import absolute
+from mag_tracking.network.sensor_network import absolute
 from mag_tracking.report.style import AXIS_COLOURS, BLUE, ORANGE, VERMILLION
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -30,18 +30,15 @@ METADATA = 'metadata.yaml'
 
 @dataclass
 class ArchiveRun:
-    """Results of an archive run."""
+    """Results of an archive run; the numbers are those of the recordings tracked in this run."""
 
     done: list[Path] = field(default_factory=list)
-    """Recordings tracked in this run."""
     tracked_earlier: list[Path] = field(default_factory=list)
-    """Recordings tracked by an earlier run."""
     failed: dict[Path, str] = field(default_factory=dict)
-    """Recordings that could not be tracked: {recording: reason}."""
+    """{recording: reason}."""
     tracks: int = 0
-    """Number of tracks in the recordings tracked in this run."""
     passes: int = 0
-    """Number of fitted passes, one per vehicle, in the recordings tracked in this run."""
+    """Number of fitted passes, one per vehicle."""
     lost_workers: int = 0
     """Number of lost workers, whose tasks were repeated."""
     interrupted: bool = False
@@ -57,8 +54,8 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
     selected: dict[Path, None] = {}
     for name in names:
         path = checked_path(name, RecordingError)
-        matches = [path] if path.exists() else [Path(p) for p in sorted(
-            glob.glob(str(path), recursive=True))]
+        matches = [path] if path.exists() else map(Path, sorted(
+            glob.glob(str(path), recursive=True)))
         recordings = [r for p in matches for r in _recordings_at(p, set())]
         if not recordings:
             raise RecordingError(f'{path}: no recording found; supported file types: '
@@ -69,10 +66,8 @@ def recordings_of(names: Iterable[str | PathLike[str]]) -> list[Path]:
 
 
 def _recordings_at(path: Path, visited: set[Path]) -> list[Path]:
-    """Recordings at or below a path, except in folders that are in `visited`, which is extended.
-
-    An unreadable folder is returned like a recording, so that it is reported as failed.
-    """
+    """Recordings at or below a path that are not in folders of `visited`, which is extended; an
+    unreadable folder is returned, so that it is reported as failed."""
     path = path.resolve()
     if not path.is_dir():
         return [path] if path.is_file() and path.suffix.lower() in SUFFIXES else []
@@ -102,62 +97,39 @@ def archive(recordings: Iterable[str | PathLike[str]],
             progress: Callable[[int], object] | None = None,
             stopped: Callable[[], bool] | None = None,
             report: Callable[[str], object] | None = None) -> ArchiveRun:
-    """Track recordings and write the results to a dataset.
+    """Track recordings, also in folders and by glob patterns, and write the results to a dataset.
 
     Recordings tracked by an earlier run are skipped unless they have changed. The tables contain
-    the same rows as a separate replay of each recording. Raises RecordingError if a name matches
-    nothing, OutputError if the dataset is in use or was created with another network, other
-    settings or another version of the tables, ClusterError if the scheduler does not respond or has
-    no workers.
+    the same rows as a separate replay of each recording. The address of a Dask `scheduler`, such as
+    tcp://10.0.0.5:8786, replaces the `workers` processes on this machine; its workers need this
+    package, and the recordings and `out` under the same paths. `progress` is called with the size
+    in bytes of each completed or skipped recording, and `report` with a message for each recording
+    that fails and each damaged file. `stopped` is called several times per second; the run ends
+    when it returns true, and the next run continues it.
 
-    Parameters
-    ----------
-    recordings : recordings, folders and glob patterns
-    out : folder of the dataset, laid out as in `results.archive_folder`
-    workers : number of processes on this machine
-    scheduler : address of a Dask scheduler, such as tcp://10.0.0.5:8786, used instead of `workers`;
-        its workers need this package, and the recordings and `out` under the same paths
-    progress : called with the size in bytes of each completed recording, including skipped ones
-    stopped : called several times per second; the run ends when it returns true, and the next run
-        continues it
-    report : called with a message for each recording that fails and each damaged file
+    Raises RecordingError if a name matches nothing, OutputError if the dataset is in use or was
+    created with another network, other settings or another version of the tables, ClusterError if
+    the scheduler does not respond or has no workers.
     """
     import_pyarrow()
-    network, paths, run = network_of(network), recordings_of(recordings), ArchiveRun()
+    network, paths = network_of(network), recordings_of(recordings)
     folder = checked_path(out, OutputError).resolve()
     progress, report = progress or (lambda _: None), report or (lambda _: None)
     with ArchiveFolder(folder, _configuration(network, settings)) as dataset:
-        remaining = _remaining([path for path in paths if folder not in path.parents], dataset, run,
-                               progress, report)
+        tasks = _Scheduler(dataset, network, settings, progress, report)
+        remaining = [path for path in paths
+                     if folder not in path.parents and not tasks.is_done(path)]
+        run = tasks.result
         try:
             if remaining:
                 with _Cluster(workers, scheduler) as cluster:
-                    _Scheduler(dataset, cluster, network, settings, run, progress, report).run(
-                        remaining, stopped or (lambda: False))
+                    tasks.run(remaining, cluster, stopped or (lambda: False))
                     run.lost_workers = cluster.n_lost
         finally:
             dataset.write_recordings([*dataset.summaries(report), *(
                 common_columns(path, None) | {'error': reason}
                 for path, reason in run.failed.items())])
     return run
-
-
-def _remaining(paths: Iterable[Path], dataset: ArchiveFolder, run: ArchiveRun,
-               progress: Callable[[int], object], report: Callable[[str], object]) -> list[Path]:
-    """Return the recordings that are not yet tracked, and add the others to `run`."""
-    remaining = []
-    for path in paths:
-        try:
-            summary = dataset.done(path)
-        except OutputError as error:
-            report(f'{error}; {path.name} is tracked again')
-            summary = None
-        if summary is None:
-            remaining.append(path)
-        else:
-            run.tracked_earlier.append(path)
-            progress(summary['size'])
-    return remaining
 
 
 def _configuration(network: SensorNetwork, settings: Settings) -> dict[str, Any]:
@@ -169,76 +141,86 @@ def _configuration(network: SensorNetwork, settings: Settings) -> dict[str, Any]
             'settings': dataclasses.asdict(settings)}
 
 
+@dataclass
 class _Scheduler:
     """Submits the tasks of all recordings to a cluster, each task after its dependencies."""
 
-    def __init__(self, dataset: ArchiveFolder, cluster: _Cluster, network: SensorNetwork,
-                 settings: Settings, run: ArchiveRun, progress: Callable[[int], object],
-                 report: Callable[[str], object]) -> None:
-        self._dataset, self._cluster, self._run = dataset, cluster, run
-        self._network, self._settings = network, settings
-        self._progress, self._report = progress, report
-        self._unfinished_segments: Counter[Path] = Counter()
-        self._states: dict[Path, list[list[Any]]] = {}
+    dataset: ArchiveFolder
+    network: SensorNetwork
+    settings: Settings
+    progress: Callable[[int], object]
+    report: Callable[[str], object]
+    result: ArchiveRun = field(default_factory=ArchiveRun)
+    n_unfinished: Counter[Path] = field(default_factory=Counter)
+    """Number of segments that are not tracked yet."""
+    states: dict[Path, list[list[Any]]] = field(default_factory=dict)
 
-    def run(self, recordings: Sequence[Path], stopped: Callable[[], bool]) -> None:
-        """Track recordings until all are processed or `stopped()` returns true.
+    def is_done(self, path: Path) -> bool:
+        """Whether an earlier run has tracked a recording, which is then added to the result."""
+        try:
+            summary = self.dataset.done(path)
+        except OutputError as error:
+            self.report(f'{error}; {path.name} is tracked again')
+            return False
+        if summary is None:
+            return False
+        self.result.tracked_earlier.append(path)
+        self.progress(summary['size'])
+        return True
 
-        At most two recordings per worker, plus one, are processed at a time, which limits the size
-        of the intermediate files.
-        """
+    def run(self, recordings: Sequence[Path], cluster: _Cluster,
+            stopped: Callable[[], bool]) -> None:
+        """Track recordings until all are processed or `stopped()` returns true; at most two per
+        worker, plus one, at a time, which limits the size of the intermediate files."""
         queued = list(reversed(recordings))
-        while queued or self._cluster.n_running:
-            while queued and self._n_active_recordings() < 2 * self._cluster.n_workers + 1:
-                self._start(queued.pop())
+        while queued or cluster.n_running:
+            while queued and len({job.recording for _, job in cluster.keys()}) \
+                    < 2 * cluster.n_workers + 1:
+                self._start(queued.pop(), cluster)
             if stopped():
-                self._run.interrupted = True
+                self.result.interrupted = True
                 return
-            for (kind, job), result in self._cluster.finished():
-                self._on_finished(kind, job, result)
+            for (kind, job), result in cluster.finished():
+                self._on_finished(kind, job, result, cluster)
 
-    def _n_active_recordings(self) -> int:
-        """Number of recordings with running tasks."""
-        return len({job.recording for _, job in self._cluster.keys()})
-
-    def _start(self, path: Path) -> None:
+    def _start(self, path: Path, cluster: _Cluster) -> None:
         """Submit the first task of a recording, or report the recording as unreadable."""
         try:
-            self._states[path] = recording_state(path)
+            state = self.states[path] = recording_state(path)
         except OSError as error:
             self._fail(path, f'cannot read the recording: {error.strerror}')
             return
-        job = Job(path, self._dataset.begin(path, self._states[path]), self._dataset.path,
-                  self._network, self._settings)
-        self._cluster.submit(('cut', job), 0, cut, job)
+        job = Job(path, self.dataset.begin(path, state), self.dataset.path, self.network,
+                  self.settings)
+        cluster.submit(('cut', job), 0, cut, job)
 
-    def _on_finished(self, kind: str, job: Job, result: Any) -> None:
+    def _on_finished(self, kind: str, job: Job, result: Any, cluster: _Cluster) -> None:
         """Record a result and submit the tasks that need it; raises OutputError, ClusterError."""
         path = job.recording
         if isinstance(result, OutputError | ClusterError):
             raise result
-        if path in self._run.failed:
+        if path in self.result.failed:
             return
         if isinstance(result, BaseException):
             self._fail(path, str(result) if isinstance(result, MagTrackingError)
                        else f'{type(result).__name__}: {result}')
         elif kind == 'join':
-            self._dataset.complete(path, job.work_folder, self._states[path], result)
-            self._run.done.append(path)
-            self._run.tracks += result['tracks']
-            self._run.passes += result['passes']
-            self._progress(result['size'])
+            self.dataset.complete(path, job.work_folder, self.states[path], result)
+            self.result.done.append(path)
+            self.result.tracks += result['tracks']
+            self.result.passes += result['passes']
+            self.progress(result['size'])
         else:
             if kind == 'cut':
-                self._unfinished_segments[path] = result['segments']
+                self.n_unfinished[path] = result['segments']
                 for k in range(result['segments']):
-                    self._cluster.submit(('track', job), 1, track_segment, job, k)
+                    cluster.submit(('track', job), 1, track_segment, job, k)
             else:
-                self._unfinished_segments[path] -= 1
-            if not self._unfinished_segments[path]:
-                self._cluster.submit(('join', job), 2, join, job)
+                self.n_unfinished[path] -= 1
+            if not self.n_unfinished[path]:
+                cluster.submit(('join', job), 2, join, job)
 
     def _fail(self, path: Path, reason: str) -> None:
         """Record and report the failure of a recording; other recordings are still tracked."""
-        self._run.failed[path] = reason
-        self._report(f'{path.name}: {reason}')
+        self.result.failed[path] = reason
+        self.report(f'{path.name}: {reason}')

@@ -1,10 +1,9 @@
 """Segments of a recording in which a target is detected, stored as files for the tracker.
 
-The stages before the tracker process the recording once, from beginning to end, and keep their
-backgrounds across segments. The tracker is restarted for each segment, but finds the same tracks
-as in the whole recording. A segment therefore begins with all earlier frames that a new track may
-use. It ends only after an interval without a target that is longer than the time span of these
-frames.
+The stages before the tracker process the recording once, from beginning to end. The tracker is
+restarted for each segment, but finds the same tracks as in the whole recording: a segment begins
+with all earlier frames that a new track may use, and ends only after an interval without a target
+that is longer than the time span of these frames.
 """
 
 import dataclasses
@@ -13,6 +12,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
@@ -21,8 +21,11 @@ from mag_tracking.analysis.pass_data import PassData
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.calibration.doubtful_times import InputDoubts
 from mag_tracking.errors import OutputError, RecordingError
+from mag_tracking.files import replace_text
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track.cross_check import ClockComparison
+from mag_tracking.stages.track.pass_samples import RigidPass
 from mag_tracking.units import NS
 
 MIN_SEGMENT_FRAMES = 300
@@ -31,41 +34,37 @@ CHUNK_FRAMES = 2000
 """Number of frames in memory at which a chunk is written to the file."""
 MIN_QUIET_S = 1.0
 """Minimum duration without a target that ends a segment [s]."""
-
+TRACKED_FILE = 'tracked.json'
+"""Name of the file with the result of a tracked segment."""
 Doubts = InputDoubts
 """{reason: {sensor: times at which its readings are doubtful}}."""
 NumberedPass = tuple[int, PassData, tuple[str, ...]]
 """Index of a pass in its recording (from 1), measurements of the pass, and notes for the user."""
+_FRAME_ARRAYS = tuple(f.name for f in dataclasses.fields(FieldFrame))
+_PASS_ARRAYS = ('t', 'sensor', 'field', 'covariance')
 
 
 @dataclasses.dataclass(frozen=True)
 class FrameChunk:
-    """Consecutive frames as arrays, and the passes that ended during these frames."""
+    """Attributes of n consecutive frames, stacked, and the passes that ended during these frames.
+
+    `doubts` are {index of a frame: doubtful times that apply from this frame on}.
+    """
 
     stamp_ns: IntArray
-    """(n,) ns, timestamps of the frames."""
     field: FloatArray
-    """(n, n_sensors, 3) T, sensor frame, background removed."""
     covariance: FloatArray
-    """(n, n_sensors, 3, 3) T², sensor frame."""
     n_samples: IntArray
-    """(n, n_sensors) number of averaged samples; 0 if the sensor is missing."""
     time_offset: FloatArray
-    """(n, n_sensors) s, mean time of the samples of a sensor relative to `stamp_ns`."""
     target_present: BoolArray
-    """(n,) whether a target is present."""
     statistic: FloatArray
-    """(n,) detection statistic."""
     degrees_of_freedom: IntArray
-    """(n,) degrees of freedom of the detection statistic."""
-    doubts: dict[int, Doubts] = dataclasses.field(default_factory=dict)
-    """{index of a frame: doubtful times that apply from this frame on}."""
-    passes: tuple[NumberedPass, ...] = ()
-    """Passes that ended within the chunk."""
+    doubts: dict[int, Doubts]
+    passes: tuple[NumberedPass, ...]
 
     def frames(self) -> Iterator[tuple[FieldFrame, Doubts | None]]:
-        """Iterate over the frames, with the doubtful times of each sensor if they change, otherwise
-        None."""
+        """Iterate over the frames, each with the doubtful times, or None if they have not
+        changed."""
         for k in range(len(self.stamp_ns)):
             yield FieldFrame(
                 int(self.stamp_ns[k]), self.field[k], self.covariance[k], self.n_samples[k],
@@ -73,9 +72,13 @@ class FrameChunk:
                 int(self.degrees_of_freedom[k])), self.doubts.get(k)
 
 
-_FRAME_ARRAYS = ('stamp_ns', 'field', 'covariance', 'n_samples', 'time_offset', 'target_present',
-                 'statistic', 'degrees_of_freedom')
-_PASS_ARRAYS = ('t', 'sensor', 'field', 'covariance')
+@contextmanager
+def output_errors(path: Path) -> Iterator[None]:
+    """Convert an OSError to an OutputError that names `path`."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f'cannot write {path}: {error.strerror}') from error
 
 
 @contextmanager
@@ -90,42 +93,24 @@ def work_file_errors(path: Path) -> Iterator[None]:
 
 
 def read_segment(folder: Path, network: SensorNetwork) -> Iterator[FrameChunk]:
-    """Read the segment that `SegmentWriter` wrote to a folder; raises RecordingError if it is
-    damaged."""
+    """Read the segment that `SegmentWriter` wrote to a folder; raises RecordingError."""
     with work_file_errors(folder):
         paths = sorted(folder.iterdir(), key=lambda path: int(path.stem))
     for path in paths:
-        with work_file_errors(path):
-            chunk = _read_chunk(path, network)
+        with work_file_errors(path), np.load(path) as arrays:
+            text = json.loads(str(arrays['text']))
+            doubts: dict[int, Doubts] = {
+                int(k): {reason: {sensor: tuple((begin, end) for begin, end in times)
+                                  for sensor, times in by_sensor.items()}
+                         for reason, by_sensor in by_reason.items()}
+                for k, by_reason in text['doubts'].items()}
+            passes = tuple(
+                (number, PassData(network, stamp_ns, doubt=doubt, **{
+                    name: arrays[f'pass_{number}_{name}'] for name in _PASS_ARRAYS}),
+                 tuple(notes)) for number, stamp_ns, doubt, notes in text['passes'])
+            chunk = FrameChunk(**{name: arrays[name] for name in _FRAME_ARRAYS}, doubts=doubts,
+                               passes=passes)
         yield chunk
-
-
-def _read_chunk(path: Path, network: SensorNetwork) -> FrameChunk:
-    """Read a file written by `_write_chunk`."""
-    with np.load(path) as arrays:
-        text = json.loads(str(arrays['text']))
-        doubts: dict[int, Doubts] = {
-            int(k): {reason: {sensor: tuple((begin, end) for begin, end in times)
-                              for sensor, times in by_sensor.items()}
-                     for reason, by_sensor in by_reason.items()}
-            for k, by_reason in text['doubts'].items()}
-        passes = tuple(
-            (number, dataclasses.replace(PassData(network, stamp_ns, *(
-                arrays[f'pass_{number}_{name}'] for name in _PASS_ARRAYS)), doubt=doubt),
-             tuple(notes)) for number, stamp_ns, doubt, notes in text['passes'])
-        return FrameChunk(**{name: arrays[name] for name in _FRAME_ARRAYS}, doubts=doubts,
-                          passes=passes)
-
-
-def _write_chunk(path: Path, chunk: FrameChunk) -> None:
-    """Write a chunk as arrays and, for everything else, one JSON text; raises OSError."""
-    arrays = {name: getattr(chunk, name) for name in _FRAME_ARRAYS}
-    for number, data, _ in chunk.passes:
-        arrays |= {f'pass_{number}_{name}': getattr(data, name) for name in _PASS_ARRAYS}
-    text = json.dumps({'doubts': chunk.doubts, 'passes': [
-        (number, data.stamp_ns, data.doubt, notes) for number, data, notes in chunk.passes]})
-    with open(path, 'xb') as stream:
-        np.savez(stream, text=np.array(text), **arrays)
 
 
 class SegmentWriter:
@@ -151,10 +136,9 @@ class SegmentWriter:
     def add_frame(self, frame: FieldFrame, doubts: Doubts) -> None:
         """Add the next frame, with the doubtful times of each sensor as known then.
 
-        A chunk is written when it has `CHUNK_FRAMES` frames. A segment with at least
-        `MIN_SEGMENT_FRAMES` frames ends after an interval without a target that is longer than
-        `lookback_s` and `MIN_QUIET_S`. Any segment ends if the time jumps back while no target is
-        present.
+        A segment with at least `MIN_SEGMENT_FRAMES` frames ends after an interval without a target
+        that is longer than `lookback_s` and `MIN_QUIET_S`. Any segment ends if the time jumps back
+        while no target is present.
         """
         last, self._last_frame = self._last_frame, frame
         self.n_frames += 1
@@ -195,23 +179,69 @@ class SegmentWriter:
         self._n_written = self._n_chunks = 0
 
     def _write(self) -> None:
-        """Write the buffered frames and passes to the next file; raises OutputError."""
-        frames = [frame for frame, _ in self._unwritten]
+        """Write the buffered frames and passes to the next file: arrays, and one JSON text."""
+        arrays: dict[str, Any] = {
+            name: np.array([getattr(frame, name) for frame, _ in self._unwritten])
+            for name in _FRAME_ARRAYS}
         doubts: dict[int, Doubts] = {}
         previous: Doubts | None = None
         for k, (_, current) in enumerate(self._unwritten):
             if current != previous:
                 doubts[k] = previous = current
-
-        arrays = {name: np.array([getattr(frame, name) for frame in frames])
-                  for name in _FRAME_ARRAYS}
-        chunk = FrameChunk(**arrays, doubts=doubts, passes=tuple(self._passes))
+        for number, data, _ in self._passes:
+            arrays |= {f'pass_{number}_{name}': getattr(data, name) for name in _PASS_ARRAYS}
+        text = json.dumps({'doubts': doubts, 'passes': [
+            (number, data.stamp_ns, data.doubt, notes) for number, data, notes in self._passes]})
         path = self._folder / f'segment-{self.n_segments}' / f'{self._n_chunks}.npz'
-        try:
+        with output_errors(path):
             path.parent.mkdir(exist_ok=True)
-            _write_chunk(path, chunk)
-        except OSError as error:
-            raise OutputError(f'cannot write {path}: {error.strerror}') from error
-        self._n_written += len(frames)
+            with open(path, 'xb') as stream:
+                np.savez(stream, text=np.array(text), **arrays)
+        self._n_written += len(self._unwritten)
         self._n_chunks += 1
         self._unwritten, self._passes = [], []
+
+
+class ClockComparisonHistory(ClockComparison):
+    """Clock comparison with the passes added to it, and whether a clock offset was ever
+    significant, so that tracks depend on earlier passes."""
+
+    def __init__(self, n_sensors: int) -> None:
+        super().__init__(n_sensors)
+        self.passes: list[tuple[RigidPass, IntArray]] = []
+        self.clocks_differed = False
+
+    def add(self, found: RigidPass, rows: IntArray) -> None:
+        """Add a pass; `rows` are the indices of its sensors in the network."""
+        super().add(found, rows)
+        self.passes.append((found, rows))
+        self.clocks_differed |= self.largest_offset is not None
+
+
+class SegmentResult(NamedTuple):
+    """Counts of a segment and its passes that compared clocks, for the task `join`; JSON."""
+
+    n_tracks: int
+    n_passes: int
+    clocks_differed: bool
+    clock_passes: list[tuple[RigidPass, IntArray]]
+
+    def write(self, folder: Path) -> None:
+        """Store the result in the folder of the segment."""
+        passes = [(dataclasses.asdict(found), rows) for found, rows in self.clock_passes]
+        replace_text(folder / TRACKED_FILE, json.dumps(
+            self._asdict() | {'clock_passes': passes}, default=np.ndarray.tolist))
+
+    @classmethod
+    def read(cls, folder: Path) -> 'SegmentResult':
+        """Read the result of a segment; raises RecordingError if the file is damaged."""
+        with work_file_errors(folder / TRACKED_FILE):
+            values: dict[str, Any] = json.loads((folder / TRACKED_FILE).read_text())
+            passes = []
+            for found, rows in values.pop('clock_passes'):
+                arrays = {name: np.array(value, dtype=np.float64) for name, value in found.items()
+                          if isinstance(value, list)}
+                # The shape of an empty array is not stored.
+                arrays['straight_paths'] = arrays['straight_paths'].reshape(-1, 6)
+                passes.append((RigidPass(**{**found, **arrays}), np.array(rows, dtype=np.int64)))
+            return cls(**values, clock_passes=passes)

@@ -9,8 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from mag_tracking.apps.board_geometry import GeometrySurvey
-from mag_tracking.apps.calibrate import Calibration
+from mag_tracking.apps.calibrate import Calibration, GeometrySurvey
 from mag_tracking.arrays import BoolArray, FloatArray
 from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit
 from mag_tracking.geometry import yaw_between

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,6 @@ from mag_tracking.analysis.signature_classifier import (
     evaluate,
     evaluate_splits,
     feature_table,
-    train,
 )
 from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import LabelsError
@@ -33,22 +31,19 @@ from mag_tracking.run import RecordingSource, run
 
 @dataclass(frozen=True)
 class Examples:
-    """Feature vectors of signatures, with labels and origins."""
+    """Features (n, n_features) of signatures, their origins, and the axes and unit of all of them.
+
+    Labels are empty if unlabelled; signatures of the same target have equal `groups`. There is one
+    message in `unusable` per signature for which no features could be computed.
+    """
 
     x: FloatArray
-    """(n, n_features) feature vectors."""
     labels: tuple[str, ...]
-    """(n,) classes; empty strings if unlabelled."""
     sources: tuple[str, ...]
-    """(n,) origins of the signatures, for messages."""
     groups: tuple[str, ...]
-    """(n,) identifiers of targets; equal for signatures of the same target."""
     axes: tuple[str, ...]
-    """Axes that every signature has, such as ('x', 'y')."""
     unit: str
-    """Unit of all signatures; empty if unknown."""
     unusable: tuple[str, ...]
-    """One message per signature for which no features could be computed."""
 
 
 def examples_of(signatures: list[Signature]) -> Examples:
@@ -79,43 +74,6 @@ def labelled_signatures(path: str | PathLike[str], labels: str | PathLike[str] |
     return list(_interval_signatures(Path(path), labels, network))
 
 
-def _interval_signatures(path: Path, labels: str | PathLike[str], network: SensorNetwork
-                         ) -> Iterator[Signature]:
-    """Extract one signature per labelled interval and sensor; raises LabelsError."""
-    readings = _calibrated_readings(path, network)
-    if not len(readings):
-        raise LabelsError(f'{path}: no sensor has calibrated readings')
-    names = np.array(readings.names)[readings.sensor]
-    for interval in read_intervals(labels, int(readings.stamp_ns.min())):
-        if interval.sensor and interval.sensor not in network.names:
-            raise LabelsError(f'{labels}: row {interval.row}: the network has no sensor '
-                              f'{interval.sensor!r}; its sensors are {", ".join(network.names)}')
-        signatures = list(_signatures(path, readings, names, interval))
-        if not signatures:
-            raise LabelsError(f'{labels}: row {interval.row}: the interval contains no readings')
-        yield from signatures
-
-
-def _signatures(path: Path, readings: Readings, names: Any,
-                interval: LabelledInterval) -> Iterator[Signature]:
-    """Extract the signatures of one interval, one per sensor with readings in the interval."""
-    is_inside = (interval.begin_ns <= readings.stamp_ns) & (readings.stamp_ns <= interval.end_ns)
-    for name in readings.names:
-        selected = is_inside & (names == name)
-        if interval.sensor not in ('', name) or not selected.any():
-            continue
-        field = readings.field[selected]
-        has_axis = ~np.isnan(field).all(axis=0)
-        field = field[:, has_axis]
-        is_complete = ~np.isnan(field).any(axis=1)
-        if has_axis.any() and is_complete.any():
-            yield Signature((readings.stamp_ns[selected][is_complete] - interval.begin_ns) / 1e9,
-                            field[is_complete], interval.label,
-                            f'{path.name}: {name}, row {interval.row}',
-                            tuple(np.array(list('xyz'))[has_axis].tolist()), 'T',
-                            f'row {interval.row}')
-
-
 class _CalibratedReadings(RecordReceiver):
     """Collects calibrated readings."""
 
@@ -127,17 +85,41 @@ class _CalibratedReadings(RecordReceiver):
         self.batches.append(readings)
 
 
-def _calibrated_readings(path: Path, network: SensorNetwork) -> Readings:
-    """Read a recording and return its calibrated readings."""
+def _interval_signatures(path: Path, labels: str | PathLike[str], network: SensorNetwork
+                         ) -> Iterator[Signature]:
+    """Extract one signature per labelled interval and sensor; raises LabelsError."""
     sink = _CalibratedReadings()
     run(RecordingSource(Recording(path), network),
         Pipeline(network, settings_for('vehicle'), 'calibrate'), [sink])
-    return Readings.joined(sink.batches)
+    readings = Readings.joined(sink.batches)
+    if not len(readings):
+        raise LabelsError(f'{path}: no sensor has calibrated readings')
+    for interval in read_intervals(labels, int(readings.stamp_ns.min())):
+        if interval.sensor and interval.sensor not in network.names:
+            raise LabelsError(f'{labels}: row {interval.row}: the network has no sensor '
+                              f'{interval.sensor!r}; its sensors are {", ".join(network.names)}')
+        signatures = list(_signatures(path, readings, interval))
+        if not signatures:
+            raise LabelsError(f'{labels}: row {interval.row}: the interval contains no readings')
+        yield from signatures
 
 
-def train_classes(examples: Examples) -> SignatureModel:
-    """Train a classifier; raises LabelsError if there are too few examples or classes."""
-    return train(examples.x, examples.labels, examples.groups, examples.axes, examples.unit)
+def _signatures(path: Path, readings: Readings, interval: LabelledInterval) -> Iterator[Signature]:
+    """Extract the signatures of one interval, one per sensor with readings in the interval."""
+    is_inside = (interval.begin_ns <= readings.stamp_ns) & (readings.stamp_ns <= interval.end_ns)
+    for j, name in enumerate(readings.names):
+        selected = is_inside & (readings.sensor == j)
+        if interval.sensor not in ('', name) or not selected.any():
+            continue
+        field = readings.field[selected]
+        has_axis = ~np.isnan(field).all(axis=0)
+        is_complete = ~np.isnan(field[:, has_axis]).any(axis=1)
+        if has_axis.any() and is_complete.any():
+            yield Signature((readings.stamp_ns[selected][is_complete] - interval.begin_ns) / 1e9,
+                            field[:, has_axis][is_complete], interval.label,
+                            f'{path.name}: {name}, row {interval.row}',
+                            tuple(np.array(list('xyz'))[has_axis].tolist()), 'T',
+                            f'row {interval.row}')
 
 
 def evaluate_classes(examples: Examples, model: SignatureModel | None = None, n_splits: int = 20,

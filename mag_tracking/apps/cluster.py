@@ -20,16 +20,13 @@ if TYPE_CHECKING:
     from distributed import Client, Future
     from tornado.ioloop import IOLoop
 
+# Maximum times [s] to wait for a response of a scheduler; for its first worker, which on a busy
+# computer needs more than 15 s to start; for a thread to start; and for workers after all of them
+# were lost, because a busy computer may need more than a minute to start one again.
 CONNECT_TIMEOUT_S = 15.0
-"""Maximum time to wait for a response of a scheduler [s]."""
 FIRST_WORKER_TIMEOUT_S = 60.0
-"""Maximum time to wait for the first worker of a scheduler [s]. On a busy computer, a worker needs
-more than 15 s to start."""
 THREAD_START_TIMEOUT_S = 60.0
-"""Maximum time for a thread to start [s]."""
 NO_WORKERS_TIMEOUT_S = 180.0
-"""Maximum time without workers after all of them were lost [s]. A busy computer may need more than
-a minute to start a worker again."""
 LOCAL_ADDRESS = '127.0.0.1'
 """Address on which the processes on this machine listen."""
 TLS_VARIABLES = ', '.join(f'DASK_DISTRIBUTED__COMM__TLS__{name}'
@@ -39,12 +36,6 @@ POLL_S = 0.3
 """Maximum time to wait for a task before returning to the caller [s]."""
 
 _Key = TypeVar('_Key')
-# Before Python 3.11, these are different classes.
-_TIMEOUT_ERRORS = (TimeoutError, asyncio.TimeoutError)
-
-
-class LostWorkersError(MagTrackingError):
-    """A task failed because its worker was lost several times."""
 
 
 class _Task(NamedTuple):
@@ -58,12 +49,11 @@ class _Task(NamedTuple):
 
 
 class Cluster(Generic[_Key]):
-    """Runs tasks on workers; a context manager that cancels unfinished tasks on exit.
+    """Runs tasks on `workers` processes of this machine, or on the Dask scheduler at an address.
 
-    `workers` processes on this machine, or the Dask scheduler at the address `scheduler`;
-    certificates for tls:// are those of the configuration of Dask (`TLS_VARIABLES`). `n_lost`
-    counts lost workers. Raises ClusterError if the workers do not start, or the scheduler does not
-    respond or has none.
+    On exit, unfinished tasks are cancelled. Certificates for tls:// are those of the configuration
+    of Dask (`TLS_VARIABLES`). `n_lost` counts lost workers. Raises ClusterError if the workers do
+    not start, or the scheduler does not respond or has none.
     """
 
     def __init__(self, workers: int, scheduler: str | None) -> None:
@@ -74,7 +64,6 @@ class Cluster(Generic[_Key]):
                 'archives need pyarrow and Dask: pip install "mag_tracking[archive]"') from error
         # Dask logs many lines for each lost worker.
         logging.getLogger('distributed').setLevel(logging.CRITICAL)
-        self._stack = ExitStack()
         self._running: dict[Future[Any], _Task] = {}
         # Dask reports all tasks of a lost worker as failed, including queued ones. Each such task
         # is therefore repeated while no other task is running.
@@ -82,13 +71,11 @@ class Cluster(Generic[_Key]):
         self._workers: set[str] = set()
         self.n_lost = 0
         self._last_worker_time = time.monotonic()
-        try:
-            self._client = self._stack.enter_context(
-                _local_client(distributed, self._stack, workers) if scheduler is None
+        with ExitStack() as stack:
+            self._client = stack.enter_context(
+                _local_client(distributed, stack, workers) if scheduler is None
                 else _remote_client(distributed, scheduler))
-        except BaseException:
-            self._stack.close()
-            raise
+            self._stack = stack.pop_all()
         self._count_lost()
 
     def __enter__(self) -> 'Cluster[_Key]':
@@ -113,50 +100,41 @@ class Cluster(Generic[_Key]):
         return [task.key for task in self._running.values()]
 
     def submit(self, key: _Key, priority: int, task: Callable[..., Any], *arguments: Any) -> None:
-        """Submit the call `task(*arguments)`, picklable, to the workers.
-
-        `finished` yields `key` with the result. Tasks with a higher priority are started first.
-        """
+        """Submit the call `task(*arguments)`, picklable; a higher `priority` is started first."""
         self._run(_Task(key, priority, task, arguments, False))
 
     def _run(self, task: _Task) -> None:
         """Submit a task to the scheduler."""
-        future = self._client.submit(task.call, *task.arguments, pure=False,
-                                     priority=task.priority)
-        self._running[future] = task
+        self._running[self._client.submit(task.call, *task.arguments, pure=False,
+                                          priority=task.priority)] = task
 
     def finished(self) -> Iterator[tuple[_Key, Any]]:
-        """Wait up to `POLL_S` for tasks; yield the key and result, or exception, of each that
-        finished.
+        """Wait up to `POLL_S` for tasks; yield the key and the result or exception of each finished
+        one.
 
         Raises ClusterError if the scheduler is lost, or there have been no workers for too long.
         """
-        from distributed import wait
+        from distributed import KilledWorker, wait
 
         if not self._running and self._suspects:
             self._run(self._suspects.popleft()._replace(runs_alone=True))
-        with suppress(*_TIMEOUT_ERRORS), self._scheduler_errors():
+        with suppress(TimeoutError), self._scheduler_errors():
             wait(list(self._running), timeout=POLL_S, return_when='FIRST_COMPLETED')
         self._count_lost()
         for future in [f for f in self._running if f.done()]:
-            task, result = self._running.pop(future), self._result_of(future)
-            if isinstance(result, LostWorkersError) and not task.runs_alone:
-                self._suspects.append(task)
+            task = self._running.pop(future)
+            if future.status == 'finished':
+                yield task.key, future.result()
+                continue
+            error = future.exception() if future.status == 'error' else None
+            if not isinstance(error, KilledWorker):
+                yield task.key, error or ClusterError(
+                    'the scheduler has stopped or has cancelled a task; run the command again')
+            elif task.runs_alone:
+                yield task.key, MagTrackingError(
+                    'the worker of a task was lost several times (killed or out of memory)')
             else:
-                yield task.key, result
-
-    def _result_of(self, future: 'Future[Any]') -> Any:
-        """Return the result of a finished task, or its exception."""
-        from distributed import KilledWorker
-
-        if future.status == 'finished':
-            return future.result()
-        error = future.exception() if future.status == 'error' else None
-        if isinstance(error, KilledWorker):
-            return LostWorkersError('the worker of a task was lost several times (killed or out of '
-                                    'memory)')
-        return error or ClusterError('the scheduler has stopped or has cancelled a task; run the '
-                                     'command again')
+                self._suspects.append(task)
 
     def _count_lost(self) -> None:
         """Count lost workers; raises ClusterError if there have been no workers for too long."""
@@ -175,7 +153,7 @@ class Cluster(Generic[_Key]):
         """Convert connection errors to ClusterError."""
         try:
             yield
-        except _TIMEOUT_ERRORS:
+        except TimeoutError:
             raise
         except (OSError, CancelledError, asyncio.CancelledError) as error:
             raise ClusterError(f'lost the connection to the scheduler ({error}); run the command '
@@ -220,8 +198,7 @@ def _local_client(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
     # the thread of the event loop.
     resource_tracker.ensure_running()
     # Dask would never restart a worker that is still starting 15 s after an earlier loss.
-    stack.enter_context(dask.config.set(
-        {'distributed.deploy.lost-worker-timeout': '365 days'}))
+    stack.enter_context(dask.config.set({'distributed.deploy.lost-worker-timeout': '365 days'}))
     try:
         cluster = stack.enter_context(distributed.LocalCluster(
             loop=_event_loop(), n_workers=workers, threads_per_worker=1, processes=True,
@@ -232,7 +209,7 @@ def _local_client(distributed: Any, stack: ExitStack, workers: int) -> 'Client':
             silence_logs=logging.CRITICAL,
             # Each worker uses one core.
             env={'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1'}))
-    except (OSError, RuntimeError, *_TIMEOUT_ERRORS) as error:
+    except (OSError, RuntimeError) as error:
         raise ClusterError('the worker processes did not start: one of them was killed or out of '
                            f'memory, or cannot listen on {LOCAL_ADDRESS} '
                            f'({error.__cause__ or error}); run the command again, if needed with '
@@ -264,7 +241,7 @@ def _remote_client(distributed: Any, address: str) -> 'Client':
         raise ClusterError(f'{address}: no response from a Dask scheduler ({error})') from error
     try:
         client.wait_for_workers(1, timeout=FIRST_WORKER_TIMEOUT_S)
-    except _TIMEOUT_ERRORS as error:
+    except TimeoutError as error:
         client.close()
         raise ClusterError(f'{address}: the scheduler has no workers') from error
     return client

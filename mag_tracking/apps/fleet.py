@@ -19,8 +19,8 @@ from mag_tracking.results.traffic_tables import FleetPass
 
 
 def earth_field_strength(network: SensorNetwork) -> FloatArray:
-    """Magnetic field strength of the Earth at a network, (3,), A/m, world frame; raises
-    NetworkError if it is unknown."""
+    """Magnetic field strength (3,) of the Earth [A/m], world frame; raises NetworkError if
+    unknown."""
     if network.earth_field is None or not network.earth_field.any():
         raise NetworkError('hard and soft iron cannot be separated without the field of the Earth: '
                            'add earth_field to the network file')
@@ -28,10 +28,8 @@ def earth_field_strength(network: SensorNetwork) -> FloatArray:
 
 
 def pass_of(recording: str, passages: Sequence[VehiclePassage]) -> FleetPass:
-    """Convert the only passage in a recording to a pass for the enrolment of a vehicle.
-
-    Raises LabelsError if there is not exactly one passage, or it is ambiguous.
-    """
+    """Convert the only passage in a recording to a pass for the enrolment of a vehicle; raises
+    LabelsError if there is not exactly one passage, or it is ambiguous."""
     if len(passages) != 1:
         raise LabelsError(f'{recording}: expected exactly one vehicle to enrol, but '
                           f'{len(passages)} crossed a line')
@@ -43,11 +41,8 @@ def pass_of(recording: str, passages: Sequence[VehiclePassage]) -> FleetPass:
 
 
 class Fleet:
-    """Enrolled vehicles of one site, from the passes of each.
-
-    Raises LabelsError if a vehicle cannot be enrolled, NetworkError if the Earth's field is
-    unknown.
-    """
+    """Enrolled vehicles of one site, from the passes of each; raises LabelsError if a vehicle
+    cannot be enrolled, NetworkError if the Earth's field is unknown."""
 
     def __init__(self, passes: dict[str, list[FleetPass]], network: SensorNetwork) -> None:
         self._field_strength = earth_field_strength(network)

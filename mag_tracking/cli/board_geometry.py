@@ -11,15 +11,13 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps.board_geometry import (
+from mag_tracking.apps.calibrate import (
     ASSUMED_NOISE,
     GeometrySurvey,
     board_of,
     survey_geometry,
 )
-from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.network_fit import GeometrySettings
-from mag_tracking.calibration.network_geometry import NetworkGeometry
 from mag_tracking.cli.options import (
     Commands,
     add_command,
@@ -71,8 +69,7 @@ def add(commands: Commands) -> None:
                 'in the order of the table')
     p.add_argument('--moment', required=True, type=float, metavar='A_M2',
                    help='magnitude of the magnet\'s moment [A m^2]')
-    p.add_argument('--out', required=True, type=Path, metavar='FILE',
-                   help='network file to write')
+    p.add_argument('--out', required=True, type=Path, metavar='FILE', help='network file to write')
     p.add_argument('--noise-std', type=float, metavar='TESLA', help='noise standard deviation '
                    'of one reading, for sensors without noise_std in the network file '
                    f'(default: {ASSUMED_NOISE:g}, not written to the output)')
@@ -118,10 +115,8 @@ def _geometry(args: argparse.Namespace) -> int:
 
 
 def _checked_box(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[float]] | None:
-    """Check the options; return the corners of the box, or None without --unknown-poses.
-
-    Raises SettingsError or OutputError if an option is invalid.
-    """
+    """Return the corners of the box, or None without --unknown-poses; raises SettingsError,
+    OutputError for any invalid option."""
     corners = args.low, args.high
     if args.unknown_poses and None in corners:
         raise SettingsError('--unknown-poses: give the box that contains the magnet with --low and '
@@ -146,22 +141,21 @@ def _checked_box(args: argparse.Namespace) -> tuple[Sequence[float], Sequence[fl
 def _elapsed_time(task: str) -> Iterator[None]:
     """Print the task and, on a terminal, the elapsed time while the context is open."""
     stop = threading.Event()
-    bar = tqdm(desc=task, bar_format='{desc}: {elapsed}', disable=None)
-    if bar.disable:
-        print(task, flush=True)
+    with tqdm(desc=task, bar_format='{desc}: {elapsed}', disable=None) as bar:
+        if bar.disable:
+            print(task, flush=True)
 
-    def tick() -> None:
-        while not stop.wait(0.5):
-            bar.refresh()
+        def tick() -> None:
+            while not stop.wait(0.5):
+                bar.refresh()
 
-    ticker = threading.Thread(target=tick, daemon=True)
-    ticker.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        ticker.join()
-        bar.close()
+        ticker = threading.Thread(target=tick, daemon=True)
+        ticker.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            ticker.join()
 
 
 def _print(survey: GeometrySurvey, has_unknown_poses: bool) -> None:
@@ -172,45 +166,33 @@ def _print(survey: GeometrySurvey, has_unknown_poses: bool) -> None:
               'bias [uT]                    residual')
         for j, name in enumerate(survey.network.names):
             print(f'{name:11s} {_row(survey, j)}')
-        _print_magnet(g, has_unknown_poses)
-    n_unused = survey.n_poses - len(survey.rows)
+        moment, std = g.moment
+        print(f'moment {moment:.4f} ({std:.4f}) A m^2' if std
+              else f'moment {moment:g} A m^2 (given)')
+        if not has_unknown_poses:
+            offset, tilt = (
+                ' '.join(f'{scale * v:.2f} ({scale * s:.2f})' for v, s in zip(*values, strict=True))
+                for scale, values in ((1e3, g.tool_offset), (180.0 / np.pi, g.tool_tilt)))
+            print(f'magnet relative to the tracked point, tool frame: {offset} mm; tilt {tilt} deg')
     print(f'{len(survey.rows)} of {survey.n_poses} poses used, normalised cost '
           f'{g.normalised_cost:.2f} (1 if consistent with noise and field error)')
-    if n_unused:
+    if n_unused := survey.n_poses - len(survey.rows):
         print('  warning: poses not used (no readings'
               f'{" or outside the box" * has_unknown_poses}): {n_unused}')
     if g.suspect_sensors:
         print('  warning: sensors inconsistent with other sensors or their nominal geometry '
               f'(check mounting, axes, unit, noise): {", ".join(g.suspect_sensors)}')
-    n_assumed = sum(std is None for std in survey.network.noise_std)
-    if n_assumed:
+    if n_assumed := sum(std is None for std in survey.network.noise_std):
         print(f'  note: noise of {quantity(n_assumed, "sensor")} assumed to be '
               f'{ASSUMED_NOISE:g} T (set --noise-std, or noise_std in a network file)')
     for j, name in enumerate(survey.network.names):
         if np.isnan(g.bias[j]).all():
             print(f'  warning: {name} has no readings; its nominal geometry is kept')
     for name, axes in survey.silent_axes:
-        print(f'  warning: {name} never reported {axes}: the background of these axes '
-              'is unknown')
+        print(f'  warning: {name} never reported {axes}: the background of these axes is unknown')
     if survey.suspect_rows:
         print('  warning: rows with inconsistent poses (the header is row 1): '
               f'{", ".join(map(str, survey.suspect_rows))}')
-
-
-def _print_magnet(g: NetworkGeometry, has_unknown_poses: bool) -> None:
-    """Print the moment and, for known poses, the offset and tilt of the magnet in the tool."""
-    def formatted(values: FloatArray, std: FloatArray, scale: float, digits: int) -> str:
-        return ' '.join(f'{scale * v:.{digits}f} ({scale * s:.{digits}f})'
-                        for v, s in zip(values, std, strict=True))
-
-    moment, std = g.moment
-    print(f'moment {moment:.4f} ({std:.4f}) A m^2' if std else f'moment {moment:g} A m^2 (given)')
-    if not has_unknown_poses:
-        offset, offset_std = g.tool_offset
-        tilt, tilt_std = g.tool_tilt
-        print(f'magnet relative to the tracked point, tool frame: '
-              f'{formatted(offset, offset_std, 1e3, 2)} mm; tilt '
-              f'{formatted(tilt, tilt_std, 180.0 / np.pi, 2)} deg')
 
 
 def _row(survey: GeometrySurvey, j: int) -> str:

@@ -1,30 +1,41 @@
-"""Command `mag-tracking calibrate network`."""
+"""Commands `mag-tracking calibrate network` and `calibrate tumble`."""
 
 import argparse
 import signal
+from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps.calibrate import Calibration, calibrate
+from mag_tracking.apps.calibrate import Calibration, calibrate, tumble
+from mag_tracking.calibration.ellipsoid_fit import EllipsoidFit
 from mag_tracking.cli.options import (
     Commands,
     add_command,
     add_recorded_network,
     add_report,
     add_settings,
+    add_table_options,
     check_outputs,
     check_report,
+    print_notes,
     recorded_network,
     settings_of,
+    table_options,
     utc_timestamp,
 )
+from mag_tracking.errors import RecordingError, SettingsError
 from mag_tracking.interrupts import recorded_signals
+from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import write_network
+from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
+from mag_tracking.records import Readings
+from mag_tracking.run import ArraySource, RecordingSource
 
-_CALIBRATE_HELP = '''
+_NETWORK_HELP = '''
 Estimates the tilt (from the accelerometer), the heading (from the Earth's field), the clock offset
 (from two or more knocks, at uneven intervals, that shake all sensors) and the noise of each sensor.
 Keep targets away during the first seconds of the recording. Checks that all sensors measure the
@@ -42,24 +53,57 @@ example:
   mag-tracking calibrate network first_day.mcap --network site.yaml --out calibrated.yaml
 '''
 
+_TUMBLE_HELP = '''
+Calibrates sensors that can be held in the hand. Rotate each sensor slowly through all orientations,
+far from iron, while `mag-tracking record` runs, or write the readings to a table, with or without
+times. The readings lie on an ellipsoid; the correction to
+a sphere (hard iron, soft iron, scale factors, skewness) is written to the network file and applied
+to all later readings. Run this calibration before others, because background and noise in the
+network file refer to uncorrected readings and are removed. The calibration of a sensor is rejected
+if its rotation did not cover enough directions.
+
+examples:
+  mag-tracking calibrate tumble hand.mcap --network site.yaml --sensor mag_3 --out tumbled.yaml
+  mag-tracking calibrate tumble hand.csv --unit uT --network site.yaml \\
+      --sensor mag_3 --out tumbled.yaml
+'''
+
 
 def add(commands: Commands) -> None:
-    """Register the command."""
-    p = add_command(commands, 'calibrate network', _calibrate, _CALIBRATE_HELP)
-    p.add_argument('recording', type=Path, metavar='RECORDING',
-                   help='.mcap, .db3 or .bag file, or rosbag2 folder')
-    add_recorded_network(p)
-    p.add_argument('--out', required=True, type=Path, metavar='FILE',
-                   help='network file to write')
+    """Register the commands."""
+    p = _add_command(commands, 'calibrate network', _network, _NETWORK_HELP, 'or rosbag2 folder')
     add_settings(p)
     p.add_argument('--no-passes', action='store_true',
                    help='do not estimate headings from passing targets')
-    p.add_argument('--figure', type=Path, metavar='FILE',
-                   help='draw the calibration (.png, .pdf)')
     add_report(p)
+    p = _add_command(commands, 'calibrate tumble', _tumble, _TUMBLE_HELP,
+                     'rosbag2 folder, or table of readings')
+    p.add_argument('--sensor', nargs='+', default=[], metavar='NAME',
+                   help='sensors that were rotated (default: all)')
+    p.add_argument('--field-magnitude', type=float, metavar='TESLA',
+                   help='magnitude of the ambient field (if it is not given, the mean gain is not '
+                   'calibrated)')
+    add_table_options(p, sensor=False)
 
 
-def _calibrate(args: argparse.Namespace) -> int:
+def _add_command(commands: Commands, name: str, run: Callable[[argparse.Namespace], int],
+                 text: str, kinds: str) -> argparse.ArgumentParser:
+    """Register a command with its recording, network and outputs."""
+    p = add_command(commands, name, run, text)
+    p.add_argument('recording', type=Path, metavar='RECORDING',
+                   help=f'.mcap, .db3 or .bag file, {kinds}')
+    add_recorded_network(p)
+    p.add_argument('--out', required=True, type=Path, metavar='FILE', help='network file to write')
+    p.add_argument('--figure', type=Path, metavar='FILE', help='draw the calibration (.png, .pdf)')
+    return p
+
+
+def _bar(args: argparse.Namespace, size: int | None) -> 'tqdm[NoReturn]':
+    """Progress bar of the bytes of the recording, shown only in a terminal."""
+    return tqdm(total=size, unit='B', unit_scale=True, desc=args.recording.name, disable=None)
+
+
+def _network(args: argparse.Namespace) -> int:
     """Run `mag-tracking calibrate network`."""
     network = recorded_network(args)
     settings = settings_of(args, network)
@@ -67,11 +111,9 @@ def _calibrate(args: argparse.Namespace) -> int:
     check_outputs(args)
     check_report(args, args.recording, args.network, args.out, args.figure)
     n_reads = 1 if args.no_passes else 2
-    with recorded_signals(signal.SIGINT) as signals:
-        with tqdm(total=n_reads * recording.size, unit='B', unit_scale=True,
-                  desc=args.recording.name, disable=None) as bar:
-            result = calibrate(recording, network, settings, utc_timestamp(), not args.no_passes,
-                               bar.update, lambda: bool(signals))
+    with recorded_signals(signal.SIGINT) as signals, _bar(args, n_reads * recording.size) as bar:
+        result = calibrate(recording, network, settings, utc_timestamp(), not args.no_passes,
+                           bar.update, lambda: bool(signals))
     _print(result, recording)
     if signals:
         print('interrupted: nothing was written')
@@ -105,8 +147,7 @@ def _print(result: Calibration, recording: Recording) -> None:
         scatter = result.evidence.scatter[~np.isnan(result.evidence.scatter)]
         print(f'passes used: {result.evidence.n_tracks}'
               + (f'; largest scatter between passes: {np.sqrt(scatter.max()):.1f} standard '
-                 'deviations'
-                 if len(scatter) else ''))
+                 'deviations' if len(scatter) else ''))
     for warning in survey.warnings():
         print(f'  warning: {warning}')
     for name in result.without_background:
@@ -133,3 +174,68 @@ def _row(result: Calibration, j: int) -> str:
     noise_column = ' '.join(f'{1e9 * v:5.1f}' for v in noise) if noise is not None else ' ' * 17
     return (f'{tilt:6.1f}  {heading:+8.1f} {sd:>6s}  {clock:16s}  {noise_column}  '
             f'{"nominal orientation" if calibrated is None else calibrated.by}')
+
+
+def _tumble(args: argparse.Namespace) -> int:
+    """Run `mag-tracking calibrate tumble`."""
+    magnitude = args.field_magnitude
+    if magnitude is not None and not 1e-6 <= magnitude <= 1e-3:
+        raise SettingsError(f'--field-magnitude: expected 1e-6 to 1e-3 T, got {magnitude:g}')
+    network = recorded_network(args)
+    source = _source(args, network)
+    check_outputs(args)
+    size = source.recording.size if isinstance(source, RecordingSource) else None
+    with recorded_signals(signal.SIGINT) as signals, _bar(args, size) as bar:
+        calibrated, fits, readings = tumble(source, network, args.sensor, utc_timestamp(),
+                                            magnitude, bar.update, lambda: bool(signals))
+    for name, fit in fits.items():
+        _print_fit(name, fit)
+    for cause, n in source.lost.items():
+        print(f'  warning: {cause}: {n}')
+    converged_names = [name for name, fit in fits.items() if fit.converged]
+    if signals or not converged_names:
+        print('interrupted: nothing was written' if signals else 'nothing was written')
+        return 130 if signals else 1
+    write_network(args.out, calibrated, f'{", ".join(converged_names)} tumbled in '
+                  f'{args.recording.name}; based on {args.network.name}.')
+    if args.figure is not None:
+        from mag_tracking.apps.calibrate_report import tumble_figure
+        from mag_tracking.report.style import save_figure
+
+        save_figure(tumble_figure({name: fits[name] for name in converged_names}, readings),
+                    args.figure)
+    print(f'network written to {args.out}')
+    return 0
+
+
+def _source(args: argparse.Namespace, network: SensorNetwork) -> RecordingSource | ArraySource:
+    """Open the recording, or read the table of readings."""
+    from mag_tracking.recording.field_table import SUFFIXES, read_field_table
+
+    if args.recording.suffix.lower() not in SUFFIXES:
+        return RecordingSource(Recording(args.recording), network)
+    # The name of the only sensor of a table that does not name it.
+    candidates = args.sensor or network.names
+    table = read_field_table(args.recording, table_options(
+        args, candidates[0] if len(candidates) == 1 else ''), with_times=False)
+    print_notes(args.recording, table.notes)
+    readings = Readings.joined(table.sessions)
+    if not set(readings.names) & set(network.names):
+        raise RecordingError(f'the table has the sensors {", ".join(readings.names)}, and the '
+                             f'network {", ".join(network.names)}')
+    return ArraySource(readings)
+
+
+def _print_fit(name: str, fit: EllipsoidFit) -> None:
+    """Print the ellipsoid fit of one sensor, or the reason for its rejection."""
+    if not fit.converged:
+        print(f'{name}: calibration rejected: {fit.reason}')
+    else:
+        offset = ' '.join(f'{1e6 * v:.3f} ({1e6 * s:.3f})' for v, s in
+                          zip(fit.offset, fit.offset_std, strict=True))
+        print(f'{name}: scatter of the field magnitude {100 * fit.residual:.2f}% (uncorrected '
+              f'{100 * fit.residual_before:.1f}%); offset {offset} uT; coverage '
+              f'{fit.coverage:.2f}; {quantity(fit.n_readings, "reading")}, '
+              f'{quantity(fit.n_outliers, "outlier")}')
+    for warning in fit.warnings:
+        print(f'  warning: {name}: {warning}')

@@ -2,23 +2,22 @@
 
 import argparse
 from collections import Counter
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.analysis.signature_classifier import Evaluation
+from mag_tracking.analysis.signature_classifier import train
 from mag_tracking.apps.classes import (
     Examples,
     check_axes,
     evaluate_classes,
     examples_of,
     labelled_signatures,
-    train_classes,
 )
-from mag_tracking.cli.options import Commands, add_command, check_writable
+from mag_tracking.arrays import FloatArray
+from mag_tracking.cli.options import Commands, add_command, add_network, check_writable
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.network.file import read_network
 from mag_tracking.quantities import quantity
@@ -51,27 +50,21 @@ examples:
 def add(commands: Commands) -> None:
     """Register the commands."""
     for name, run in (('train', _train), ('evaluate', _evaluate), ('predict', _predict)):
-        _add_action(commands, name, run)
-
-
-def _add_action(commands: Commands, name: str, run: Callable[[argparse.Namespace], int]) -> None:
-    """Register `classes train`, `evaluate` or `predict`."""
-    p = add_command(commands, f'classes {name}', run, _CLASSES_HELP)
-    p.add_argument('labelled', type=Path, metavar='LABELLED',
-                   help='table of signatures (.csv) or recording')
-    p.add_argument('--labels', type=Path, metavar='FILE',
-                   help='table of the labelled intervals of a recording (.csv)')
-    p.add_argument('--network', type=Path, metavar='FILE',
-                   help='network file, required for a recording')
-    if name == 'train':
-        p.add_argument('--out', type=Path, required=True, metavar='FILE',
-                       help='model file to write (.json)')
-    else:
-        p.add_argument('--model', type=Path, required=name == 'predict', metavar='FILE',
-                       help='model file written by `classes train`')
-    if name == 'evaluate':
-        p.add_argument('--splits', type=int, default=20, metavar='N',
-                       help='number of 70/30 splits, if --model is not given (default: 20)')
+        p = add_command(commands, f'classes {name}', run, _CLASSES_HELP)
+        p.add_argument('labelled', type=Path, metavar='LABELLED',
+                       help='table of signatures (.csv) or recording')
+        p.add_argument('--labels', type=Path, metavar='FILE',
+                       help='table of the labelled intervals of a recording (.csv)')
+        add_network(p, required=False, text='network file, required for a recording')
+        if name == 'train':
+            p.add_argument('--out', type=Path, required=True, metavar='FILE',
+                           help='model file to write (.json)')
+        else:
+            p.add_argument('--model', type=Path, required=name == 'predict', metavar='FILE',
+                           help='model file written by `classes train`')
+        if name == 'evaluate':
+            p.add_argument('--splits', type=int, default=20, metavar='N',
+                           help='number of 70/30 splits, if --model is not given (default: 20)')
 
 
 def _examples(args: argparse.Namespace) -> Examples:
@@ -90,7 +83,8 @@ def _train(args: argparse.Namespace) -> int:
     if any(path is not None and path.resolve() == args.out.resolve()
            for path in (args.labelled, args.labels, args.network)):
         raise OutputError(f'--out: {args.out} is an input of this command; choose another file')
-    model = train_classes(_examples(args))
+    examples = _examples(args)
+    model = train(examples.x, examples.labels, examples.groups, examples.axes, examples.unit)
     write_model(args.out, model)
     print(f'{args.out}: {model.method}; '
           + ', '.join(f'{n} of {name}' for name, n in sorted(model.examples.items())))
@@ -107,12 +101,6 @@ def _evaluate(args: argparse.Namespace) -> int:
                                   partial(tqdm, desc='splits', disable=None, leave=False))
     test_method = f'{quantity(args.splits, "split")} of 70/30' if model is None else f'{args.model}'
     print(f'{quantity(len(examples.labels), "signature")}, {test_method}; {evaluation.n} tested')
-    _print_evaluation(evaluation)
-    return 0
-
-
-def _print_evaluation(evaluation: Evaluation) -> None:
-    """Print the accuracy, recall and calibration error of an evaluation."""
     print(f'  largest class: {evaluation.majority:.1%} (accuracy of a constant prediction)')
     for name, values in (('accuracy', evaluation.accuracy),
                          ('balanced accuracy', evaluation.balanced_accuracy),
@@ -122,9 +110,10 @@ def _print_evaluation(evaluation: Evaluation) -> None:
         print(f'  recall of {name}: {_mean_fraction(evaluation.recall[:, k])}')
     print('  expected calibration error of the probabilities: '
           f'{evaluation.expected_calibration_error:.3f}')
+    return 0
 
 
-def _mean_fraction(values: 'np.ndarray[tuple[int, ...], np.dtype[np.float64]]') -> str:
+def _mean_fraction(values: FloatArray) -> str:
     """Format the mean of fractions in percent, and their standard deviation; skip NaN values."""
     finite = values[np.isfinite(values)]
     if not len(finite):

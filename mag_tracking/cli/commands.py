@@ -33,7 +33,7 @@ COMMANDS = {
     'listen': Command('listen', 'Print the readings of the devices in a drivers file.'),
     'calibrate network': Command('calibrate', 'Calibrate sensor orientations, clocks and noise.'),
     'calibrate tumble': Command(
-        'tumble', 'Calibrate hard and soft iron by rotating the sensors.'),
+        'calibrate', 'Calibrate hard and soft iron by rotating the sensors.'),
     'calibrate board': Command(
         'board_geometry', 'Calibrate the geometry of a board with a magnet.'),
     'doctor': Command('doctor', 'Diagnose sensor faults.'),

@@ -20,7 +20,7 @@ from mag_tracking.cli.options import (
 )
 from mag_tracking.errors import SettingsError
 from mag_tracking.network.file import read_network
-from mag_tracking.network.topics import TOPIC_NAME_PATTERN
+from mag_tracking.network.sensor_network import TOPIC_NAME_PATTERN
 from mag_tracking.recording.reader import Recording
 from mag_tracking.web.page_server import DEFAULT_PORT, LOOPBACK, check_port
 

@@ -11,8 +11,7 @@ from mag_tracking.cli.commands import COMMANDS
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
-from mag_tracking.network.sensor_network import MAX_BOARD_EXTENT
-from mag_tracking.network.topics import checked_namespace
+from mag_tracking.network.sensor_network import MAX_BOARD_EXTENT, checked_namespace
 from mag_tracking.settings import read_parameter_file
 from mag_tracking.stages.health.diagnosis import Diagnosis
 

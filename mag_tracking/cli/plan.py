@@ -2,17 +2,18 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
-from mag_tracking.apps.plan import Plan
-from mag_tracking.apps.plan_inputs import PlanInputs, plan_inputs
+from mag_tracking.apps.plan import Plan, compute_plan, n_parts
+from mag_tracking.apps.plan_inputs import plan_inputs
 from mag_tracking.cli.options import Commands, add_command, add_network
 from mag_tracking.errors import SettingsError
 from mag_tracking.files import output_folder, write_json
-from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
-from mag_tracking.pipeline import Settings, settings_for
+from mag_tracking.pipeline import settings_for
 from mag_tracking.settings import read_parameter_file
 
 _PLAN_HELP = '''
@@ -47,46 +48,28 @@ def add(commands: Commands) -> None:
     p.add_argument('--target', metavar='KIND', help='small, car or truck: a vehicle with the '
                    'moment and height given in the settings (default: car); magnet requires '
                    '--moment and --height')
-    p.add_argument('--moment', type=float, metavar='A_M2',
-                   help='magnitude of the moment [A m^2]; requires --height')
-    p.add_argument('--height', type=float, metavar='M', help='height of the '
-                   'magnetic centre, z in the frame of the network [m]')
-    p.add_argument('--speed', type=float, default=10.0, metavar='M_S',
-                   help='speed [m/s] (default: 10)')
-    p.add_argument('--heading', type=float, nargs='+', metavar='DEG',
-                   help='heading of each lane, measured anticlockwise from x [deg] (default: the '
-                   'arrival directions of the settings)')
-    p.add_argument('--offset', type=float, nargs='+', metavar='M', help='lateral offset of each '
-                   'lane, to the left of the centre of the sensors [m] (default: 0)')
-    p.add_argument('--noise-std', type=float, metavar='TESLA', help='noise standard '
-                   'deviation of one sample [T] (default: noise_std of the network file, or '
-                   '1.2e-8)')
-    p.add_argument('--rate', type=float, default=100.0, metavar='HZ',
-                   help='sample rate of each sensor (default: 100)')
-    p.add_argument('--field-error', type=float, metavar='FRACTION',
-                   help='relative error of the field (default: track.field_error)')
-    p.add_argument('--area', type=float, nargs=4, metavar=('X0', 'Y0', 'X1', 'Y1'),
-                   help='area of the maps [m] (default: where at least half of the targets are '
-                   'detected)')
-    p.add_argument('--clearance', type=float, metavar='M', help='minimum distance of an additional '
-                   'sensor from a lane [m] (default: 2 for vehicles, 0 with --moment)')
+    options: list[tuple[str, Any, str, dict[str, Any]]] = [
+        ('moment', 'A_M2', 'magnitude of the moment [A m^2]; requires --height', {}),
+        ('height', 'M', 'height of the magnetic centre, z in the frame of the network [m]', {}),
+        ('speed', 'M_S', 'speed [m/s] (default: 10)', {'default': 10.0}),
+        ('heading', 'DEG', 'heading of each lane, measured anticlockwise from x [deg] (default: '
+         'the arrival directions of the settings)', {'nargs': '+'}),
+        ('offset', 'M', 'lateral offset of each lane, to the left of the centre of the sensors [m] '
+         '(default: 0)', {'nargs': '+'}),
+        ('noise-std', 'TESLA', 'noise standard deviation of one sample [T] (default: noise_std of '
+         'the network file, or 1.2e-8)', {}),
+        ('rate', 'HZ', 'sample rate of each sensor (default: 100)', {'default': 100.0}),
+        ('field-error', 'FRACTION', 'relative error of the field (default: track.field_error)', {}),
+        ('area', ('X0', 'Y0', 'X1', 'Y1'), 'area of the maps [m] (default: where at least half of '
+         'the targets are detected)', {'nargs': 4}),
+        ('clearance', 'M', 'minimum distance of an additional sensor from a lane [m] (default: 2 '
+         'for vehicles, 0 with --moment)', {})]
+    for name, metavar, text, keywords in options:
+        p.add_argument(f'--{name}', type=float, metavar=metavar, help=text, **keywords)
     p.add_argument('--grid', type=int, default=41, metavar='N',
                    help='number of points along the longer side of the maps (default: 41)')
     p.add_argument('--params', type=Path, metavar='FILE',
                    help='YAML file with the settings to override')
-
-
-def _inputs(args: argparse.Namespace, network: SensorNetwork, settings: Settings) -> PlanInputs:
-    """Return the inputs of the plan; raise SettingsError that names the invalid option."""
-    try:
-        return plan_inputs(
-            network, settings, args.target, moment=args.moment, height=args.height,
-            speed=args.speed, heading=args.heading, offset=args.offset, noise_std=args.noise_std,
-            rate=args.rate, field_error=args.field_error, area=args.area,
-            clearance=args.clearance, grid=args.grid)
-    except SettingsError as error:
-        name, _, message = str(error).partition(':')
-        raise SettingsError(f'--{name.replace("_", "-")}:{message}') from error
 
 
 def _plan(args: argparse.Namespace) -> int:
@@ -94,10 +77,17 @@ def _plan(args: argparse.Namespace) -> int:
     network = read_network(args.network)
     kind = 'magnet' if args.target == 'magnet' else 'vehicle'
     settings = settings_for(kind, read_parameter_file(args.params) if args.params else {})
-    inputs = _inputs(args, network, settings)
+    try:
+        inputs = plan_inputs(
+            network, settings, args.target, args.moment, args.height, args.speed, args.heading,
+            args.offset, args.noise_std, args.rate, args.field_error, args.area, args.clearance,
+            args.grid)
+    except SettingsError as error:
+        name, _, message = str(error).partition(':')
+        raise SettingsError(f'--{name.replace("_", "-")}:{message}') from error
     output_folder(args.out)
-    with tqdm(total=inputs.n_parts, desc='plan', disable=None) as bar:
-        result = inputs.run(network, settings, bar.update)
+    with tqdm(total=n_parts(inputs.lanes), desc='plan', disable=None) as bar:
+        result = compute_plan(*inputs, bar.update)
     # Imported here because it loads matplotlib.
     from mag_tracking.apps.plan_report import summary_lines, write_report
 
@@ -112,18 +102,16 @@ def _plan(args: argparse.Namespace) -> int:
 
 def _write(p: Plan, out: Path) -> None:
     """Write the figures and `plan.json`."""
+    def values(source: object, names: str) -> dict[str, Any]:
+        attributes = ((name, getattr(source, name)) for name in names.split())
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in attributes}
+
     content = {
-        'x': p.x.tolist(), 'y': p.y.tolist(), 'position_std': p.position_std.tolist(),
-        'detection': p.detection.tolist(),
-        'std_with_added_sensor': p.std_with_added_sensor.tolist(),
-        'std_without_added_sensor': p.std_without_added_sensor,
-        'best_position': list(p.best_position),
+        **values(p, 'x y position_std detection std_with_added_sensor std_without_added_sensor '
+                 'best_position'),
         'bounds_at_closest': {k: v.tolist() for k, v in p.bounds_at_closest.items()},
-        'unobservable': list(p.observability.unobservable),
-        'miss_curve': p.miss_curve.tolist(),
-        'lanes': [{'name': lane.name, 'along': lane.along.tolist(),
-                   'filter_std': lane.filter_std.tolist(), 'pass_std': lane.pass_std.tolist(),
-                   'detection': lane.detection.tolist()} for lane in p.lanes]}
+        'unobservable': p.observability.unobservable, 'miss_curve': p.miss_curve.tolist(),
+        'lanes': [values(lane, 'name along filter_std pass_std detection') for lane in p.lanes]}
     write_json(out / 'plan.json', content)
     # Imported here because it loads matplotlib.
     from mag_tracking.apps import plan_report

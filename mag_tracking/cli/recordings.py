@@ -20,7 +20,7 @@ from mag_tracking.errors import SettingsError
 from mag_tracking.messages.types import MAGNETIC_FIELD
 from mag_tracking.network import SensorNetwork
 from mag_tracking.network.file import read_network
-from mag_tracking.network.topics import absolute, namespaces_of
+from mag_tracking.network.sensor_network import absolute, namespaces_of
 from mag_tracking.quantities import quantity
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.repair import repair

@@ -22,16 +22,13 @@ MAX_EXTRAPOLATION_S = 1.0
 
 @dataclass(frozen=True)
 class CountingLine:
-    """A line segment on the ground at which vehicles are counted."""
+    """A line on the ground at which vehicles are counted: midpoint (2,) [m], unit vector (2,) of
+    the forward direction across the line, and half of its length [m]; world frame."""
 
     name: str
-    """Name of the line."""
     point: FloatArray
-    """Midpoint of the line, (2,) m, world frame."""
     direction: FloatArray
-    """Unit vector of the forward direction, perpendicular to the line, (2,), world frame."""
     half_width: float
-    """Half of the length of the line, m."""
 
     def forward_distance(self, position: FloatArray) -> float:
         """Signed distance [m] of a world position (2,) or (3,); positive beyond the line."""
@@ -45,11 +42,8 @@ class CountingLine:
 
 def counting_lines(names: Sequence[str], headings_deg: Sequence[float], offsets: Sequence[float],
                    half_widths: Sequence[float], centre: FloatArray) -> list[CountingLine]:
-    """Create counting lines from lists of their parameters.
-
-    Headings are forward directions, anticlockwise from x; offsets in m are distances from the
-    centre of the network (world frame) in the forward direction.
-    """
+    """Create counting lines from their forward directions, anticlockwise from x, and their
+    distances [m] from the centre of the network in this direction."""
     out = []
     for name, heading, offset, half_width in zip(names, np.deg2rad(headings_deg), offsets,
                                                  half_widths, strict=True):
@@ -59,12 +53,10 @@ def counting_lines(names: Sequence[str], headings_deg: Sequence[float], offsets:
 
 
 class Crossing(NamedTuple):
-    """A crossing of a line by a track."""
+    """A crossing of a line by a track, at a position (3,) m, world frame."""
 
     stamp_ns: int
-    """Time of the crossing, ns since 1970."""
     position: FloatArray
-    """Position on the line, (3,) m, world frame."""
     forward: bool
     """Whether the track moved in the forward direction of the line."""
     pose: Pose
@@ -110,10 +102,10 @@ class CrossingDetector:
             return None
         crossing = self._interpolate() if self._is_beyond(self._first_pose) != self._is_beyond(
             self._last_pose) else self._extrapolate(self._first_pose, self._last_pose)
-        if crossing is None:
+        if crossing is None or abs(
+                self.line.lateral_offset(crossing.position)) > self.line.half_width:
             return None
-        lateral_offset = self.line.lateral_offset(crossing.position)
-        return None if abs(lateral_offset) > self.line.half_width else crossing
+        return crossing
 
     def _interpolate(self) -> Crossing:
         """Interpolate the crossing between the poses before and after the line."""

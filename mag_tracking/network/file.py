@@ -1,9 +1,14 @@
-"""Network file (`network.yaml`): geometry and calibration of a sensor network."""
+"""Network file (`network.yaml`): geometry and calibration of a sensor network.
+
+The Earth's field at a site is that of the World Magnetic Model, evaluated by pygeomag with the
+coefficients of NOAA and the British Geological Survey; T10 section 6.3.1 uses its declination.
+"""
 
 import datetime
 import json
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
@@ -15,8 +20,7 @@ from mag_tracking.errors import NetworkError
 from mag_tracking.files import is_utf8_encodable, read_yaml, replace_text, short_repr
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
 from mag_tracking.network import CalibrationRecord, SensorNetwork
-from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
-from mag_tracking.network.topics import TOPIC_NAME_PATTERN
+from mag_tracking.network.sensor_network import TOPIC_NAME_PATTERN
 
 _SENSOR_NAME_PATTERN = re.compile(r'[A-Za-z0-9_.-]+')
 _KEYS_OF_0_1_0 = {'stated': 'nominal', 'stated_std_deg': 'nominal_std_deg'}
@@ -26,14 +30,48 @@ _SITE_KEYS = ('latitude', 'longitude', 'height', 'date', 'x_azimuth_deg')
 _SENSOR_KEYS = {'position', 'orientation', 'orientation_std_deg', 'clock_offset', 'noise_std',
                 'background', 'offset', 'correction', 'topic', 'imu_topic', 'calibrated'}
 
-_MAX_COORDINATE = 1e8
-"""Maximum absolute coordinate of a position [m]; covers all frames on Earth."""
+COEFFICIENTS = 'wmm/WMM_2025.COF'
+"""Coefficient file of WMM2025, relative to the pygeomag package."""
+FIRST_YEAR, LAST_YEAR = 2025.0, 2030.0
+"""Period of validity of WMM2025, decimal years."""
 
-_MIN_NOISE_STD = 1e-15
-"""Minimum standard deviation of the noise [T]."""
 
-_MAX_CLOCK_OFFSET = 3600.0
-"""Maximum clock offset that is corrected [s]. A clock with a larger offset must be set."""
+def _is_regular(matrix: FloatArray) -> bool:
+    """Whether a matrix (9,), in row-major order, is far from singular."""
+    singular_values = np.linalg.svd(matrix.reshape(3, 3), compute_uv=False)
+    return bool(singular_values[-1] > 0.02 * singular_values[0])
+
+
+_FIELD = ((3,), lambda B: np.abs(B).max() <= 0.1,
+          ': {} T exceeds 0.1 T; is the value in microtesla or gauss?')
+_NUMBERS: dict[str, tuple[tuple[int, ...], Callable[[FloatArray], Any], str]] = {
+    'position': ((3,), lambda r: np.abs(r).max() <= 1e8,
+                 ': {} m is too far from the origin for any place on Earth; positions are in '
+                 'metres'),
+    'noise_std': ((1, 3), lambda std: ((std >= 1e-15) & (std < 1e-3)).all(),
+                  ' must be at least a femtotesla and below a millitesla, got {} T'),
+    'background': _FIELD, 'offset': _FIELD,
+    'correction': ((9,), _is_regular, ': {} is singular or almost singular'),
+    'orientation_std_deg': ((1, 3), lambda std: ((std > 0.0) & (std <= 180.0)).all(),
+                            ' must be above 0 and at most 180 degrees, got {}'),
+    'clock_offset': ((1,), lambda offset: abs(offset[0]) <= 3600.0,
+                     ": {0[0]} s exceeds 3600 s; set the sensor's clock"),
+    'earth_field': ((3,), lambda B: np.linalg.norm(B) <= 1e-3,
+                    ': {} T exceeds a millitesla; is the value in microtesla or gauss?')}
+"""How many numbers a key has, which are valid, and the error otherwise. One number may stand for
+three equal ones."""
+
+
+def _numbers(prefix: str, key: str, value: object) -> FloatArray:
+    """Convert the value of a key in `_NUMBERS` to an array."""
+    lengths, are_valid, error = _NUMBERS[key]
+    is_single = lengths == (1,) or 1 in lengths and not isinstance(value, list)
+    numbers = _parse_vector(f'{prefix}{key}', [value] if is_single else value, lengths)
+    if 3 in lengths:
+        numbers = numbers * np.ones(3)
+    if not are_valid(numbers):
+        raise NetworkError(f'{prefix}{key}{error.format(numbers.tolist())}')
+    return numbers
 
 
 def _parse_vector(label: str, value: object, lengths: tuple[int, ...]) -> FloatArray:
@@ -67,90 +105,35 @@ def _parse_sensor(name: str, entry: Any) -> dict[str, Any]:
     _check_keys(label, entry, _SENSOR_KEYS)
     if 'position' not in entry:
         raise NetworkError(f'{label}: position is missing')
-    position = _parse_vector(f'{label}: position', entry['position'], (3,))
-    if np.abs(position).max() > _MAX_COORDINATE:
-        raise NetworkError(f'{label}: position: {position.tolist()} m is too far from the '
-                           'origin for any place on Earth; positions are in metres')
-    quaternion = _parse_vector(f'{label}: orientation',
-                               entry.get('orientation', [0, 0, 0, 1]), (4,))
-    R_ws = _parse_rotation(f'{label}: orientation', quaternion)
-    topic = _check_topic(label, 'topic', entry.get('topic', f'{name}/imu/mag'))
+    entry = {'orientation': [0, 0, 0, 1], 'clock_offset': 0.0, 'topic': f'{name}/imu/mag', **entry}
+
+    def numbers(key: str) -> FloatArray:
+        return _numbers(f'{label}: ', key, entry[key])
+
+    def optional(key: str) -> FloatArray | None:
+        return None if entry.get(key) is None else numbers(key)
+
+    position = numbers('position')
+    _, R_ws = _parse_rotation(f'{label}: orientation', entry['orientation'])
+    topic = _check_topic(label, 'topic', entry['topic'])
     # REP-145: the accelerometer topic data_raw and the magnetometer topic mag share a namespace.
-    default_imu_topic = topic.removesuffix('/mag') + '/data_raw' if topic.endswith('/mag') else None
-    imu_topic = entry.get('imu_topic', default_imu_topic)
-    return {'positions': position, 'R_ws': R_ws, 'topics': topic,
-            'imu_topics': None if imu_topic is None else _check_topic(label, 'imu_topic',
-                                                                      imu_topic),
-            'noise_std': _parse_noise(label, entry.get('noise_std')),
-            'background': _parse_field(label, 'background', entry.get('background')),
-            'offset': _parse_field(label, 'offset', entry.get('offset')),
-            'correction': _parse_correction(label, entry.get('correction')),
-            'orientation_std': _parse_orientation_std(label, entry.get('orientation_std_deg')),
-            'clock_offset': _parse_clock_offset(label, entry.get('clock_offset', 0.0)),
-            'calibrated': _parse_calibration(label, entry.get('calibrated'))}
-
-
-def _parse_noise(label: str, noise: object) -> FloatArray | None:
-    """Parse the noise standard deviation (3,) [T], one or three numbers; None if missing."""
-    if noise is None:
-        return None
-    numbers = noise if isinstance(noise, list) else [noise]
-    std = _parse_vector(f'{label}: noise_std', numbers, (1, 3)) * np.ones(3)
-    if not ((std >= _MIN_NOISE_STD) & (std < 1e-3)).all():
-        raise NetworkError(f'{label}: noise_std must be at least a femtotesla and below a '
-                           f'millitesla, got {std.tolist()} T')
-    return std
-
-
-def _parse_field(label: str, key: str, value: object) -> FloatArray | None:
-    """Parse a field (3,) [T], three numbers of at most 0.1 T; None if missing."""
-    if value is None:
-        return None
-    B = _parse_vector(f'{label}: {key}', value, (3,))
-    if np.abs(B).max() > 0.1:
-        raise NetworkError(f'{label}: {key}: {B.tolist()} T exceeds 0.1 T; is the value in '
-                           'microtesla or gauss?')
-    return B
-
-
-def _parse_correction(label: str, value: object) -> FloatArray | None:
-    """Parse the correction matrix (3, 3), nine numbers; None if missing."""
-    if value is None:
-        return None
-    matrix = _parse_vector(f'{label}: correction', value, (9,)).reshape(3, 3)
-    singular_values = np.linalg.svd(matrix, compute_uv=False)
-    if not singular_values[-1] > 0.02 * singular_values[0]:
-        raise NetworkError(f'{label}: correction: {matrix.ravel().tolist()} is singular or almost '
-                           'singular')
-    return matrix
-
-
-def _parse_orientation_std(label: str, value: object) -> FloatArray | None:
-    """Convert one or three orientation standard deviations [deg] to (3,) [rad]; None if missing."""
-    if value is None:
-        return None
-    numbers = value if isinstance(value, list) else [value]
-    std = _parse_vector(f'{label}: orientation_std_deg', numbers, (1, 3)) * np.ones(3)
-    if not ((std > 0.0) & (std <= 180.0)).all():
-        raise NetworkError(f'{label}: orientation_std_deg must be above 0 and at most 180 degrees, '
-                           f'got {std.tolist()}')
-    return np.deg2rad(std)
-
-
-def _parse_clock_offset(label: str, value: object) -> float:
-    """Parse the clock offset [s]."""
-    offset = _parse_vector(f'{label}: clock_offset', [value], (1,))[0]
-    if abs(offset) > _MAX_CLOCK_OFFSET:
-        raise NetworkError(f'{label}: clock_offset: {offset} s exceeds {_MAX_CLOCK_OFFSET:g} s; '
-                           "set the sensor's clock")
-    return float(offset)
+    imu_topic = entry.get('imu_topic', topic.removesuffix('/mag') + '/data_raw'
+                          if topic.endswith('/mag') else None)
+    if imu_topic is not None:
+        _check_topic(label, 'imu_topic', imu_topic)
+    fields = {key: optional(key) for key in ('noise_std', 'background', 'offset')}
+    correction, std_deg = optional('correction'), optional('orientation_std_deg')
+    return {'positions': position, 'R_ws': R_ws, 'topics': topic, 'imu_topics': imu_topic, **fields,
+            'correction': None if correction is None else correction.reshape(3, 3),
+            'orientation_std': None if std_deg is None else np.deg2rad(std_deg),
+            'clock_offset': float(numbers('clock_offset')[0]),
+            'calibrated': _parse_calibration(f'{label}: calibrated', entry.get('calibrated'))}
 
 
 def _parse_calibration(label: str, value: Any) -> CalibrationRecord | None:
     """Parse the calibration record of a sensor; None if missing."""
     if value is None:
         return None
-    label = f'{label}: calibrated'
     if isinstance(value, dict):
         # Version 0.1.0 wrote `stated` instead of `nominal`.
         value = {key if (new := _KEYS_OF_0_1_0.get(key, key)) in value else new: v
@@ -160,23 +143,23 @@ def _parse_calibration(label: str, value: Any) -> CalibrationRecord | None:
         if not isinstance(value.get(key), str) or not is_utf8_encodable(value[key]):
             raise NetworkError(f"{label}: {key} must be a string ('...'), "
                                f'got {short_repr(value.get(key))}')
-    std, orientation = value.get('clock_offset_std'), value.get('nominal')
+    std, nominal, nominal_std = map(value.get, ('clock_offset_std', 'nominal', 'nominal_std_deg'))
     std = float('nan') if std is None else float(_parse_vector(label, [std], (1,))[0])
     if std < 0.0:
         raise NetworkError(f'{label}: clock_offset_std: {std} s is negative')
-    if orientation is not None:
-        orientation = _parse_vector(f'{label}: nominal', orientation, (4,))
-        _parse_rotation(f'{label}: nominal', orientation)
-        orientation = tuple(orientation.tolist())
-    nominal_std = _parse_orientation_std(label, value.get('nominal_std_deg'))
-    return CalibrationRecord(value['date'], value['by'], std, orientation,
-                             None if nominal_std is None else tuple(nominal_std.tolist()))
+    if nominal is not None:
+        nominal = tuple(_parse_rotation(f'{label}: nominal', nominal)[0].tolist())
+    if nominal_std is not None:
+        nominal_std = tuple(np.deg2rad(
+            _numbers(f'{label}: ', 'orientation_std_deg', nominal_std)).tolist())
+    return CalibrationRecord(value['date'], value['by'], std, nominal, nominal_std)
 
 
-def _parse_rotation(label: str, q: FloatArray) -> FloatArray:
-    """Convert a quaternion to a rotation matrix (3, 3); raises NetworkError if it is invalid."""
+def _parse_rotation(label: str, value: object) -> tuple[FloatArray, FloatArray]:
+    """Parse a quaternion (4,) xyzw; return it and its rotation matrix (3, 3)."""
+    quaternion = _parse_vector(label, value, (4,))
     try:
-        return rotation_from_quaternion(q)
+        return quaternion, rotation_from_quaternion(quaternion)
     except ValueError as error:
         raise NetworkError(f'{label}: {error}') from error
 
@@ -241,13 +224,8 @@ def _parse_earth_field(content: dict[str, Any]) -> FloatArray | None:
     if earth is not None and site is not None:
         raise NetworkError('earth_field and site both define the field of the Earth: remove one '
                            'of them')
-    if earth is not None:
-        earth = _parse_vector('earth_field', earth, (3,))
-        if np.linalg.norm(earth) > 1e-3:
-            raise NetworkError(f'earth_field: {earth.tolist()} T exceeds a millitesla; is the '
-                               'value in microtesla or gauss?')
     if site is None:
-        return earth
+        return None if earth is None else _numbers('', 'earth_field', earth)
     _check_keys('site', site, _SITE_KEYS)
     missing = [key for key in _SITE_KEYS if key not in site]
     if missing:
@@ -267,9 +245,45 @@ def _parse_earth_field(content: dict[str, Any]) -> FloatArray | None:
                            'pygeomag, or set earth_field instead') from error
 
 
-def _yaml_floats(values: Iterable[float]) -> str:
-    """Format floats as a YAML flow sequence."""
-    return '[' + ', '.join(_yaml_float(v) for v in values) + ']'
+@dataclass(frozen=True)
+class Site:
+    """Geodetic latitude [deg], longitude [deg, east positive], height above the ellipsoid [m],
+    decimal year, and bearing of the x axis [deg, clockwise from true north]: 90 for ENU, or that of
+    a road parallel to x."""
+
+    latitude: float
+    longitude: float
+    height: float
+    year: float
+    x_azimuth: float
+
+
+def decimal_year(day: datetime.date) -> float:
+    """Convert a date to a decimal year."""
+    first = datetime.date(day.year, 1, 1)
+    return day.year + (day - first).days / (datetime.date(day.year + 1, 1, 1) - first).days
+
+
+def earth_field(site: Site) -> FloatArray:
+    """Magnetic flux density (3,) of the Earth at a site, T, world frame (z up); raises ValueError
+    outside the model, and ModuleNotFoundError without pygeomag."""
+    # Optional dependency, required only for networks that define a site instead of a field.
+    from pygeomag import GeoMag
+
+    for name, value, low, high, unit in (
+            ('latitude', site.latitude, -90.0, 90.0, 'deg'),
+            ('longitude', site.longitude, -180.0, 360.0, 'deg'),
+            ('height', site.height, -1000.0, 850e3, 'm'),
+            ('year', site.year, FIRST_YEAR, LAST_YEAR, '(WMM2025)'),
+            ('x_azimuth', site.x_azimuth, -360.0, 360.0, 'deg')):
+        if not low <= value <= high:
+            raise ValueError(f'{name}: {value:g} is outside {low:g} .. {high:g} {unit}')
+    field = GeoMag(coefficients_file=COEFFICIENTS).calculate(
+        glat=site.latitude, glon=site.longitude, alt=site.height * 1e-3, time=site.year)
+    north, east, down = np.array([field.x, field.y, field.z]) * 1e-9
+    azimuth = np.deg2rad(site.x_azimuth)
+    return np.array([north * np.cos(azimuth) + east * np.sin(azimuth),
+                     north * np.sin(azimuth) - east * np.cos(azimuth), -down])
 
 
 def _yaml_float(value: float) -> str:
@@ -278,32 +292,30 @@ def _yaml_float(value: float) -> str:
     return text.replace('e', '.0e') if 'e' in text and '.' not in text else text
 
 
+def _number_lines(indent: str, values: dict[str, Any]) -> list[str]:
+    """Format the numbers and arrays that are not None as lines of YAML."""
+    return [f'{indent}{key}: ' + (f'[{", ".join(map(_yaml_float, np.ravel(value)))}]'
+                                  if np.ndim(value) else _yaml_float(value))
+            for key, value in values.items() if value is not None]
+
+
 def _sensor_lines(network: SensorNetwork, i: int) -> list[str]:
     """Format the entry of sensor `i` as lines of YAML."""
-    lines = [f'  {_yaml_string(network.names[i])}:',
-             f'    position: {_yaml_floats(network.positions[i])}',
-             f'    orientation: {_yaml_floats(quaternion_from_rotation(network.R_ws[i]))}']
-    std = network.orientation_std[i]
-    if std is not None:
-        lines.append(f'    orientation_std_deg: {_yaml_floats(np.rad2deg(std))}')
-    if network.clock_offset[i]:
-        lines.append(f'    clock_offset: {_yaml_float(network.clock_offset[i])}')
-    for key in ('noise_std', 'background', 'offset', 'correction'):
-        value = getattr(network, key)[i]
-        if value is not None:
-            lines.append(f'    {key}: {_yaml_floats(np.ravel(value))}')
-    lines.append(f'    topic: {network.topics[i]}')
-    lines.append(f'    imu_topic: {network.imu_topics[i] or "null"}')
-    record = network.calibrated[i]
+    std, record = network.orientation_std[i], network.calibrated[i]
+    lines = [f'  {_yaml_string(network.names[i])}:', *_number_lines('    ', {
+        'position': network.positions[i], 'orientation': quaternion_from_rotation(network.R_ws[i]),
+        'orientation_std_deg': None if std is None else np.rad2deg(std),
+        'clock_offset': network.clock_offset[i] or None,
+        **{key: getattr(network, key)[i]
+           for key in ('noise_std', 'background', 'offset', 'correction')}}),
+        f'    topic: {network.topics[i]}', f'    imu_topic: {network.imu_topics[i] or "null"}']
     if record is not None:
         lines += ['    calibrated:', f'      date: {json.dumps(record.date)}',
-                  f'      by: {json.dumps(record.by)}']
-        if not np.isnan(record.clock_offset_std):
-            lines.append(f'      clock_offset_std: {_yaml_float(record.clock_offset_std)}')
-        if record.nominal is not None:
-            lines.append(f'      nominal: {_yaml_floats(record.nominal)}')
-        if record.nominal_std is not None:
-            lines.append(f'      nominal_std_deg: {_yaml_floats(np.rad2deg(record.nominal_std))}')
+                  f'      by: {json.dumps(record.by)}', *_number_lines('      ', {
+                      'clock_offset_std': None if np.isnan(record.clock_offset_std)
+                      else record.clock_offset_std, 'nominal': record.nominal,
+                      'nominal_std_deg': None if record.nominal_std is None
+                      else np.rad2deg(record.nominal_std)})]
     return lines
 
 
@@ -314,11 +326,8 @@ def _yaml_string(text: str) -> str:
 
 def write_network(path: str | PathLike[str], network: SensorNetwork, comment: str = '') -> None:
     """Write a network file atomically, with a comment at its beginning; raises OutputError."""
-    lines = [f'# {line}' for line in comment.splitlines()] \
-        + [f'frame: {_yaml_string(network.frame)}']
-    if network.earth_field is not None:
-        lines.append(f'earth_field: {_yaml_floats(network.earth_field)}')
-    lines.append('sensors:')
-    for i in range(len(network)):
-        lines += _sensor_lines(network, i)
+    lines = [*(f'# {line}' for line in comment.splitlines()),
+             f'frame: {_yaml_string(network.frame)}',
+             *_number_lines('', {'earth_field': network.earth_field}), 'sensors:',
+             *(line for i in range(len(network)) for line in _sensor_lines(network, i))]
     replace_text(path, '\n'.join(lines) + '\n')

@@ -1,7 +1,8 @@
-"""The sensor network: position, orientation and calibration of each sensor."""
+"""The sensor network: position, orientation, calibration and topic of each sensor."""
 
+import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -10,9 +11,11 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.errors import NetworkError
 from mag_tracking.geometry import quaternion_from_rotation, rotation_from_quaternion
-from mag_tracking.network.topics import absolute
 from mag_tracking.units import NS
 
+TOPIC_NAME_PATTERN = re.compile(r'/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
+"""Pattern of a valid relative or absolute topic name."""
+_NAMESPACE_PATTERN = re.compile(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+')
 MAX_COMPACT_EXTENT = 2.0
 """Maximum horizontal extent of a compact network [m], half of the length of a car."""
 MAX_SENSORS = 1000
@@ -24,6 +27,33 @@ MIN_BOARD_SENSORS, MAX_BOARD_EXTENT = 3, 1.0
 """Minimum number of sensors of a board, and its maximum extent [m]. A board tracks a magnet."""
 MIN_DELAY_BASELINE = 0.1
 """Minimum horizontal distance between two sensors for the estimation of a delay [m]."""
+_OPTIONAL = ('noise_std', 'background', 'orientation_std', 'offset', 'correction', 'imu_topics',
+             'calibrated')
+"""Attributes of a network that a sensor may lack."""
+
+
+def absolute(topic: str, namespace: str = '/') -> str:
+    """Resolve a topic name in a namespace; an absolute name is returned unchanged."""
+    return topic if topic.startswith('/') else f'{namespace.rstrip("/")}/{topic}'
+
+
+def namespaces_of(topics: Iterable[str], recorded: Collection[str]) -> list[str]:
+    """Namespaces, in alphabetical order, in which at least one relative topic was recorded.
+
+    Absolute `topics` are ignored. If the root namespace '/' is among them, it is the only one.
+    """
+    namespaces = {name.removesuffix(f'/{topic}') or '/'
+                  for topic in topics if not topic.startswith('/')
+                  for name in recorded if name.endswith(f'/{topic}')}
+    return ['/'] if '/' in namespaces else sorted(namespaces)
+
+
+def checked_namespace(namespace: str) -> str:
+    """Return a valid absolute namespace unchanged; raises NetworkError for any other."""
+    if not _NAMESPACE_PATTERN.fullmatch(namespace):
+        raise NetworkError(f'{namespace!r} is not a valid namespace: it must begin with / and '
+                           'contain only letters, digits and _; no part may begin with a digit')
+    return namespace
 
 
 def _duplicates(values: Sequence[str]) -> list[str]:
@@ -33,18 +63,16 @@ def _duplicates(values: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class CalibrationRecord:
-    """Record of a sensor calibration: date, method, and the orientation entered by hand."""
+    """Record of a sensor calibration: date (ISO 8601), method, and orientation entered by hand."""
 
     date: str
-    """Date in ISO 8601 format."""
     by: str
     """Source of the orientation, such as the name of the method."""
     clock_offset_std: float
     """Standard deviation of the clock offset, s. NaN if the offset was not measured."""
     nominal: tuple[float, ...] | None = None
     """Orientation entered by hand, (4,) quaternion xyzw, sensor to world frame. None if unknown.
-    Each survey uses this orientation as its prior, because the result of a previous survey is not
-    independent evidence."""
+    Each survey uses it as its prior: the result of a previous survey is no independent evidence."""
     nominal_std: tuple[float, ...] | None = None
     """Standard deviation of `nominal` about the world axes, (3,) rad. None if unknown."""
 
@@ -98,12 +126,10 @@ class SensorNetwork:
         if n > MAX_SENSORS:
             raise NetworkError(f'the network has {n} sensors; the maximum is {MAX_SENSORS}: divide '
                                'it into several networks')
-        duplicates = _duplicates(self.names)
-        if duplicates:
+        if duplicates := _duplicates(self.names):
             raise NetworkError(f'duplicate sensor name {duplicates[0]}; names must be unique')
-        duplicate_topics = _duplicates([absolute(t) for t in self.topics])
-        if duplicate_topics:
-            raise NetworkError(f'topic {duplicate_topics[0]} is assigned to more than one sensor')
+        if duplicates := _duplicates([absolute(t) for t in self.topics]):
+            raise NetworkError(f'topic {duplicates[0]} is assigned to more than one sensor')
         if self.positions.shape != (n, 3) or self.R_ws.shape != (n, 3, 3):
             raise NetworkError(f'{n} sensors require positions of shape ({n}, 3) and orientations '
                                f'of shape ({n}, 3, 3)')
@@ -113,8 +139,7 @@ class SensorNetwork:
             other = names_by_position.setdefault(position, name)
             if other != name:
                 raise NetworkError(f'sensors {other} and {name} are both at {list(position)} m')
-        for name in ('noise_std', 'background', 'orientation_std', 'offset', 'correction',
-                     'imu_topics', 'calibrated'):
+        for name in _OPTIONAL:
             if not getattr(self, name):
                 object.__setattr__(self, name, (None,) * n)
         if self.clock_offset is None:
@@ -147,14 +172,12 @@ class SensorNetwork:
     @property
     def clock_offset_ns(self) -> IntArray:
         """`clock_offset` rounded to nanoseconds, (n,) ns."""
-        offset: IntArray = np.rint(np.multiply(self.clock_offset, NS)).astype(np.int64)
-        return offset
+        return np.asarray(np.rint(np.multiply(self.clock_offset, NS)), dtype=np.int64)
 
     @property
     def centre(self) -> FloatArray:
         """Mean of the sensor positions, (3,) m, world frame."""
-        centre: FloatArray = self.positions.mean(axis=0)
-        return centre
+        return np.asarray(self.positions.mean(axis=0))
 
     @property
     def is_compact(self) -> bool:
@@ -183,10 +206,8 @@ class SensorNetwork:
         -------
         SensorNetwork
         """
-        per_sensor: dict[str, Any] = {
-            name: tuple(getattr(self, name)[j] for j in rows)
-            for name in ('names', 'topics', 'noise_std', 'background', 'orientation_std', 'offset',
-                         'correction', 'imu_topics', 'calibrated')}
+        per_sensor: dict[str, Any] = {name: tuple(getattr(self, name)[j] for j in rows)
+                                      for name in ('names', 'topics', *_OPTIONAL)}
         return replace(self, positions=self.positions[rows], R_ws=self.R_ws[rows],
                        clock_offset=self.clock_offset[rows], **per_sensor)
 

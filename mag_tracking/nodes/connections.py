@@ -9,7 +9,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from mag_tracking.messages.types import MAGNETIC_FIELD
-from mag_tracking.network.topics import absolute
+from mag_tracking.network.sensor_network import absolute
 from mag_tracking.nodes.diagnostics import ERROR, OK, WARN, status_of
 from mag_tracking.quantities import quantity
 from mag_tracking.stages.health.diagnosis import Cause, Finding

@@ -12,8 +12,7 @@ from mag_tracking_msgs.msg import FieldReadings
 from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 
-from mag_tracking.apps.doctor import Doctor
-from mag_tracking.apps.host_stalls import load_findings
+from mag_tracking.apps.doctor import Doctor, load_findings
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import reading_of, readings_of
 from mag_tracking.messages.types import RAW_READINGS

@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 from mag_tracking.errors import MagTrackingError, RecordingError
 from mag_tracking.interrupts import recorded_signals
 from mag_tracking.messages.types import RAW_READINGS
-from mag_tracking.network.topics import namespaces_of
+from mag_tracking.network.sensor_network import namespaces_of
 from mag_tracking.nodes.calibration_node import CalibrationNode
 from mag_tracking.nodes.convert import track_of
 from mag_tracking.nodes.detection_node import DetectionNode

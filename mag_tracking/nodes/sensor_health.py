@@ -9,10 +9,9 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from numpy.typing import ArrayLike
 from rclpy.node import Node
 
-from mag_tracking.apps.doctor import network_findings
-from mag_tracking.apps.host_stalls import TIME_CAUSES, HostStalls, load_findings
+from mag_tracking.apps.doctor import TIME_CAUSES, HostStalls, load_findings, network_findings
 from mag_tracking.network import SensorNetwork
-from mag_tracking.network.topics import absolute
+from mag_tracking.network.sensor_network import absolute
 from mag_tracking.nodes.connections import SILENCE_TIMEOUT_S, no_message_finding, topic_findings
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import Readings, plain

@@ -30,7 +30,7 @@ from mag_tracking.messages.types import (
     decode,
 )
 from mag_tracking.network import SensorNetwork
-from mag_tracking.network.topics import absolute, namespaces_of
+from mag_tracking.network.sensor_network import absolute, namespaces_of
 from mag_tracking.recording.message_block import MessageBlock, Progress
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.truth import TRUTH_TYPES, TruthTopics

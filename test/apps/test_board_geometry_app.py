@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mag_tracking.apps.board_geometry import survey_geometry
+from mag_tracking.apps.calibrate import survey_geometry
 from mag_tracking.calibration.network_fit import (
     GeometrySettings,
     TrackedMagnet,

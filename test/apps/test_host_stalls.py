@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from mag_tracking.apps.doctor import Doctor
-from mag_tracking.apps.host_stalls import load_findings
+from mag_tracking.apps.doctor import Doctor, load_findings
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.stages.health.diagnosis import Cause, Finding, ranked
 from support.networks import line_network

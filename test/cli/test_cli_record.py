@@ -18,7 +18,7 @@ from mag_tracking.apps.record import Selection
 from mag_tracking.cli import nodes, recordings
 from mag_tracking.errors import OutputError, SettingsError
 from mag_tracking.messages.types import decode
-from mag_tracking.network.topics import absolute
+from mag_tracking.network.sensor_network import absolute
 from mag_tracking.nodes import record_node
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.recorder import Recorder

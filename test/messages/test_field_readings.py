@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mag_tracking.errors import RecordingError
 from mag_tracking.messages.schema import readings_dict, readings_of
 from mag_tracking.messages.types import FIELD_READINGS, MAGNETIC_FIELD, RAW_READINGS
-from mag_tracking.network.topics import absolute
+from mag_tracking.network.sensor_network import absolute
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter

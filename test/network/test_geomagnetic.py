@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mag_tracking.network.geomagnetic import Site, decimal_year, earth_field
+from mag_tracking.network.file import Site, decimal_year, earth_field
 from support.bundled import DATA
 
 ROWS = np.loadtxt(DATA / 'WMM2025_TEST_VALUES.txt')

@@ -13,8 +13,7 @@ from mag_tracking.geometry import (
     rotation_from_quaternion,
 )
 from mag_tracking.network import CalibrationRecord, SensorNetwork
-from mag_tracking.network.file import read_network, write_network
-from mag_tracking.network.geomagnetic import Site, earth_field
+from mag_tracking.network.file import Site, earth_field, read_network, write_network
 from mag_tracking.network.sensor_network import MAX_SENSORS
 
 VALID_FILE = '''

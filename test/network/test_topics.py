@@ -6,7 +6,7 @@ import pytest
 
 from mag_tracking.errors import NetworkError, RecordingError
 from mag_tracking.messages.types import MAGNETIC_FIELD
-from mag_tracking.network.topics import absolute, checked_namespace, namespaces_of
+from mag_tracking.network.sensor_network import absolute, checked_namespace, namespaces_of
 from mag_tracking.recording.reader import Recording
 from mag_tracking.recording.sample_reader import SampleReader
 from mag_tracking.recording.writer import RecordingWriter
