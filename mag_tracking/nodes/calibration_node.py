@@ -275,7 +275,7 @@ class CalibrationNode(StageNode):
             return None
         date = datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds')
         solution = self._survey.solve(fields, date)
-        surveyed = with_measured_noise(solution.network, self._stage)
+        surveyed = with_measured_noise(solution.network, self._stage.backgrounds())
         if save:
             try:
                 write_network(self._save_as, surveyed, 'Written by calibration_node.')
