@@ -19,8 +19,8 @@ VERSION = 1
 MIN_SAMPLES = 4
 """Minimum number of training examples of a class."""
 
-N_FOLDS = 5
-"""Number of folds of the cross-validation."""
+N_FOLDS, TEST_FRACTION = 5, 0.3
+"""Number of folds of the cross-validation, and fraction of a class in the test part of a split."""
 PENALTIES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Candidate values of C, the inverse regularisation strength of the logistic regression."""
 
@@ -177,17 +177,17 @@ def check_labels(labels: Sequence[str], groups: Sequence[str]) -> 'Counter[str]'
 
 def evaluate_splits(x: FloatArray, labels: Sequence[str], groups: Sequence[str],
                     axes: tuple[str, ...], unit: str, n_splits: int = 20,
-                    test_fraction: float = 0.3, progress: Any = iter) -> Evaluation:
+                    progress: Any = iter) -> Evaluation:
     """Train and test on stratified random splits.
 
     `progress` wraps the range of splits. Raises the errors of `train`, and LabelsError if no class
-    has enough examples for a test part of `test_fraction`.
+    has enough examples for a test part.
     """
     check_labels(labels, groups)
     y, g = np.array(labels), np.array(groups)
     parts = []
     for seed in progress(range(n_splits)):
-        train_rows, test_rows = _random_split(y, g, test_fraction, seed)
+        train_rows, test_rows = _random_split(y, g, seed)
         model = train(x[train_rows], y[train_rows].tolist(), g[train_rows].tolist(), axes, unit,
                       seed)
         parts.append((model, x[test_rows], y[test_rows]))
@@ -223,10 +223,9 @@ def _evaluate_parts(parts: Sequence[tuple[SignatureModel, FloatArray, Any]]) -> 
                       expected_calibration_error(np.array(probability), np.array(correct)))
 
 
-def expected_calibration_error(probability: FloatArray, correct: FloatArray, n_bins: int = 10
-                               ) -> float:
-    """Expected calibration error over `n_bins` equal-width bins of the probability."""
-    bins = np.minimum((probability * n_bins).astype(int), n_bins - 1)
+def expected_calibration_error(probability: FloatArray, correct: FloatArray) -> float:
+    """Expected calibration error over ten equal-width bins of the probability."""
+    bins = np.minimum((probability * 10).astype(int), 9)
     return float(sum(abs(probability[bins == b].mean() - correct[bins == b].mean())
                      * np.mean(bins == b) for b in np.unique(bins)))
 
@@ -262,14 +261,13 @@ def _folds(y: IntArray, groups: Sequence[str], n: int, seed: int) -> Any:
         np.zeros(len(y)), y, np.array(groups))
 
 
-def _random_split(y: Any, groups: Any, test_fraction: float, seed: int
-                  ) -> tuple[IntArray, IntArray]:
+def _random_split(y: Any, groups: Any, seed: int) -> tuple[IntArray, IntArray]:
     """Split each class at random without splitting groups; return (training, test) indices."""
     rng, test_groups = np.random.default_rng(seed), set[str]()
     for name in np.unique(y):
         class_groups = rng.permutation(np.unique(groups[y == name]))
         # At least `MIN_SAMPLES` examples must remain in the training part.
-        n = min(max(1, round(test_fraction * len(class_groups))),
+        n = min(max(1, round(TEST_FRACTION * len(class_groups))),
                 max(len(class_groups) - MIN_SAMPLES, 0))
         test_groups |= set(class_groups[:n].tolist())
     is_test = np.isin(groups, list(test_groups))

@@ -97,8 +97,8 @@ class QuietInterval:
     def _append(self, block: Block) -> None:
         """Append a block; if the interval is full, it replaces the oldest block."""
         i = self._count % len(self._window.time)
-        for values, value in zip(self._window, block, strict=True):
-            values[i] = value
+        time, mean, scatter, n = self._window
+        time[i], mean[i], scatter[i], n[i] = block
         self._count += 1
 
     def extend(self, block: Block) -> Iterator[Blocks]:

@@ -342,7 +342,7 @@ def solve(problem: GeometryProblem, iterations: int) -> tuple[Unknowns, Weights,
     """Minimise a `GeometryProblem` by Levenberg-Marquardt, from the median residuals as biases; the
     last value is whether it converged."""
     n, K, damping, converged = len(problem.network), len(problem.magnet.tool), 1e-3, False
-    x = np.zeros((n, N_SENSOR)), np.zeros(N_SHARED), np.zeros((K, N_POSE))
+    x: Unknowns = np.zeros((n, N_SENSOR)), np.zeros(N_SHARED), np.zeros((K, N_POSE))
     residuals = problem.field - problem.predicted(x)[0]
     for j, a in zip(*np.nonzero(problem.has_readings), strict=True):
         x[0][j, a] = np.nanmedian(residuals[j, :, a]) / problem.sensor_unit[j, a]

@@ -171,12 +171,12 @@ def pooled_bias_std(orientations: Sequence[Orientation], bias_std: float,
     return float(np.sqrt((weight * bias_std**2 + square) / (weight + n_observed)))
 
 
-def with_nominal_heading(orientation: Orientation, nominal: FloatArray, nominal_std: float,
-                         limit: float = 3.0) -> Orientation | None:
-    """Fuse a compass heading with a nominal one, std `nominal_std` rad; None beyond `limit` std."""
+def with_nominal_heading(orientation: Orientation, nominal: FloatArray,
+                         nominal_std: float) -> Orientation | None:
+    """Fuse a compass heading with a nominal one, std `nominal_std` rad; None beyond three std."""
     difference = yaw_between(orientation.R_ws, nominal)
     compass_std = orientation.std[2]
-    if abs(difference) > limit * np.hypot(compass_std, nominal_std):
+    if abs(difference) > 3.0 * np.hypot(compass_std, nominal_std):
         return None
     nominal_weight = compass_std**2 / (compass_std**2 + nominal_std**2)
     std = np.append(orientation.std[:2],
