@@ -78,7 +78,7 @@ def read_field_table(path: FilePath, options: TableOptions, with_times: bool = T
     columns = find_columns(table, options.columns, options.unit, options.sensor)
     if not with_times:
         columns, options = columns._replace(time=()), replace(options, rate=1.0)
-    decimal = _decimal(table, columns, options)
+    decimal = _decimal(table, options)
     rows = _Rows(table, columns, decimal, options)
     table.check_bad_rows(len(rows.lines))
     if not rows.names:
@@ -163,7 +163,7 @@ class _Rows:
         return f'{" ".join(parts[:-1])}.{parts[-1].zfill(_DECIMALS[unit])}'
 
 
-def _decimal(table: Table, columns: Columns, options: TableOptions) -> str:
+def _decimal(table: Table, options: TableOptions) -> str:
     """Return the decimal mark of a table; raises RecordingError if it is ambiguous."""
     if options.decimal not in ('', '.', ','):
         raise RecordingError(f"--decimal: expected . or ',', got {options.decimal!r}")

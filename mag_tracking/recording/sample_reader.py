@@ -84,7 +84,9 @@ def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindin
     faults: Counter[str] = Counter()
     latest_ns: Counter[str] = Counter()
     frames: dict[str, set[str]] = {}
-    for message in islice(_first_messages(recording, topics), N_FIRST_MESSAGES):
+    messages = (message for block in islice(recording.blocks(), MAX_FIRST_BLOCKS)
+                for message in block if message.topic in topics)
+    for message in islice(messages, N_FIRST_MESSAGES):
         try:
             header = decode(message).header
         except (RecordingError, AttributeError):
@@ -100,12 +102,6 @@ def examine_topics(recording: Recording, topics: Collection[str]) -> TopicFindin
     return TopicFindings(
         frozenset(topic for topic, n in n_zero.items() if n == 2),
         frozenset(topic for topic, ns in latest_ns.items() if ns > MIN_DATE_S * NS), frames)
-
-
-def _first_messages(recording: Recording, topics: Collection[str]) -> Iterator[RawMessage]:
-    """Iterate over the messages on some topics in the first blocks of a recording."""
-    for block in islice(recording.blocks(), MAX_FIRST_BLOCKS):
-        yield from (message for message in block if message.topic in topics)
 
 
 def fault_of(message: RawMessage) -> str:
