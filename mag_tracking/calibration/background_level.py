@@ -214,9 +214,8 @@ class LevelDeparture:
         return latest
 
     def relearn_time(self, observed_s: float, relearns_soon: bool) -> float:
-        """Time [s] on another steady level until it becomes the background, observed for
-        `observed_s`; 0 if it never does. It `relearns_soon` if the sensor or its surroundings may
-        have changed."""
+        """Time [s] on a steady level, observed for `observed_s`, until it becomes the background;
+        0 for never. `relearns_soon`: the sensor or its surroundings may have changed."""
         if relearns_soon:
             return min(self._relearn or inf, max(self._learn, MIN_RELEARN_S))
         if self.has_arrived:
