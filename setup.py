@@ -19,6 +19,7 @@ NAME = 'mag_tracking'
 PACKAGE = ElementTree.parse('package.xml').getroot()
 NODES = ('driver_node', 'replay_node', 'calibration_node', 'detection_node', 'tracker_node')
 
+
 class DataFilesDistribution(Distribution):
     """Workaround: `pip install -e` omits data_files, because setuptools queries the undefined
     `has_data`. Remove it when editable installs contain share/mag_tracking/package.xml without it.

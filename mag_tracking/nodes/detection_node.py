@@ -136,5 +136,4 @@ class DetectionNode(StageNode):
             send(self._frame_publisher, frame_dict(frame, self.network))
 
 
-
 main = partial(middleware.main, DetectionNode)

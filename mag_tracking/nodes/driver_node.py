@@ -182,5 +182,4 @@ class DriverNode(ManagedNode):
                                      values, hardware=driver.name)
 
 
-
 main = partial(middleware.main, DriverNode)

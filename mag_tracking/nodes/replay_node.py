@@ -243,5 +243,4 @@ def _selected_topics(recording: Recording, topics: Sequence[str]) -> set[str] | 
     return set(selected) or None
 
 
-
 main = partial(middleware.main, ReplayNode)

@@ -249,5 +249,4 @@ def _same_orientations(one: SensorNetwork, other: SensorNetwork) -> bool:
     return all(is_same_std) and bool(np.abs(one.R_ws - other.R_ws).max() < 1e-9)
 
 
-
 main = partial(middleware.main, TrackerNode)

@@ -41,7 +41,7 @@ def import_pyarrow() -> Any:
     """Import pyarrow with its Parquet module; raises MissingDependencyError."""
     try:
         import pyarrow.compute
-        import pyarrow.parquet
+        import pyarrow.parquet  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError(
             'Parquet requires pyarrow: run pip install "mag_tracking[archive]"') from error

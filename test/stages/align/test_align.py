@@ -325,6 +325,7 @@ def test_the_cost_of_a_sample_does_not_depend_on_the_number_of_sensors(changes):
     """The cost is the number of attribute look-ups; samples are lost and one sensor has a gap."""
     class CountedAlign(Align):
         lookups = Counter()
+
         def __getattribute__(self, name):
             CountedAlign.lookups[name] += 1
             return super().__getattribute__(name)
