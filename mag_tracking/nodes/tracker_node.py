@@ -26,15 +26,8 @@ from mag_tracking.calibration.doubtful_times import (
     merged,
 )
 from mag_tracking.event_records import Disturbance, VehiclePassage
-from mag_tracking.messages import schema
+from mag_tracking.messages import schema, standard
 from mag_tracking.messages.network import doubtful_times, frame_of, with_orientations
-from mag_tracking.messages.standard import (
-    delete_markers,
-    detections_3d_dict,
-    sensor_markers,
-    track_markers,
-    track_transform_dict,
-)
 from mag_tracking.messages.types import CALIBRATION_STATE, NETWORK_FRAME, MessageDict
 from mag_tracking.network import SensorNetwork
 from mag_tracking.nodes import middleware, stage_node
@@ -99,7 +92,7 @@ class TrackerNode(stage_node.StageNode):
         self._outputs = {topic: self.publisher(message_type, topic, qos)
                          for topic, (message_type, qos) in OUTPUTS.items()
                          if topic != '/tf' or self._publishes_tf}
-        self._send('~/sensor_markers', sensor_markers(self.network))
+        self._send('~/sensor_markers', standard.sensor_markers(self.network))
         self._poses_by_track: dict[int, deque[PoseStamped]] = {}
         self._is_silent, self._latest_id = False, -1
         self._doubtful_times: dict[str, DoubtfulTimes] = {}
@@ -150,7 +143,7 @@ class TrackerNode(stage_node.StageNode):
             return
         self.network = network
         self._stage.use_network(network)
-        self._send('~/sensor_markers', sensor_markers(network))
+        self._send('~/sensor_markers', standard.sensor_markers(network))
         self.get_logger().info('surveyed sensor orientations received; used from the next track on')
 
     def _receive(self, message: NetworkFrame) -> None:
@@ -211,10 +204,10 @@ class TrackerNode(stage_node.StageNode):
         content = schema.track_dict(track, frame)
         self._send('~/tracks', {'header': content['header'], 'tracks': [content]})
         if has_subscribers(self._outputs['~/detections_3d']):
-            self._send('~/detections_3d', detections_3d_dict(track, frame))
+            self._send('~/detections_3d', standard.detections_3d_dict(track, frame))
         if track.ended:
             self._poses_by_track.pop(track.id, None)
-            self._send('~/markers', delete_markers(track, frame))
+            self._send('~/markers', standard.delete_markers(track, frame))
         else:
             self._publish_views(track, frame)
         if track.id > self._latest_id:
@@ -229,7 +222,7 @@ class TrackerNode(stage_node.StageNode):
         child_frame = self._child_frame or f'track_{track.id}'
         self._send('~/odometry', schema.odometry_dict(track, frame, child_frame))
         if self._publishes_tf:
-            self._send('/tf', track_transform_dict(track, frame, child_frame))
+            self._send('/tf', standard.track_transform_dict(track, frame, child_frame))
         path = self._poses_by_track.setdefault(track.id, deque(maxlen=MAX_PATH_POSES))
         if track.topic_uncertainty is not None:
             path.append(to_message(PoseStamped, schema.pose_dict(
@@ -239,7 +232,7 @@ class TrackerNode(stage_node.StageNode):
                 and has_subscribers(self._outputs['~/path']):
             self._outputs['~/path'].publish(Path(header=path[-1].header, poses=list(path)))
         if has_subscribers(self._outputs['~/markers']):
-            self._send('~/markers', track_markers(track, frame))
+            self._send('~/markers', standard.track_markers(track, frame))
 
 
 def _same_orientations(one: SensorNetwork, other: SensorNetwork) -> bool:

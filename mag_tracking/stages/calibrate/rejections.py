@@ -6,16 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray, StructArray
-from mag_tracking.calibration import core
-from mag_tracking.calibration.reading_faults import (
-    MIN_JUMP,
-    ReadingFaults,
-    are_marked,
-    describe_marks,
-    reading_faults,
-    typical_change,
-    with_lost_readings,
-)
+from mag_tracking.calibration import core, reading_faults
 from mag_tracking.calibration.sensor_state import FIRST_WINDOW, N_WINDOW
 from mag_tracking.inference.covariances import are_valid_covariances
 from mag_tracking.records import Readings, plain
@@ -64,17 +55,17 @@ class DriverFaults:
         self._max_changes: dict[str, FloatArray] = {}
         self._n_skipped = dict.fromkeys(names, 0)
 
-    def of(self, sensor: str) -> ReadingFaults:
+    def of(self, sensor: str) -> reading_faults.ReadingFaults:
         """Faults of a sensor that have been found so far."""
         s = self._states[sensor]
-        return ReadingFaults(s['marks'][:s['n_marks']].copy(), float(s['repetition']),
-                             self._rates[sensor])
+        return reading_faults.ReadingFaults(
+            s['marks'][:s['n_marks']].copy(), float(s['repetition']), self._rates[sensor])
 
     def n_marked(self, sensor: str) -> int:
         """Number of readings of a sensor with a mark for a missing reading on any axis."""
         return int(self._states[sensor]['n_marked'])
 
-    def store(self, sensor: str, faults: ReadingFaults) -> None:
+    def store(self, sensor: str, faults: reading_faults.ReadingFaults) -> None:
         """Leave out faults of a sensor from now on."""
         s, self._rates[sensor] = self._states[sensor], faults.rate
         s['n_marks'], s['marks'][:len(faults.marks)] = len(faults.marks), faults.marks
@@ -94,22 +85,23 @@ class DriverFaults:
         if n == N_WINDOW and self._may_skip(sensor, s['window']):
             s['n_window'] = 0
             return float('nan')
-        faults = known.merged(reading_faults(s['window'][:n], s['window_ns'][:n]))
+        faults = known.merged(reading_faults.reading_faults(s['window'][:n], s['window_ns'][:n]))
         if n < N_WINDOW:
             s['window_due'] += FIRST_WINDOW
         else:
             s['n_window'] = self._n_skipped[sensor] = 0
         if faults == known:
             if n == N_WINDOW and not known:
-                limits = MIN_JUMP * np.array([typical_change(values) for values in s['window'].T])
+                limits = reading_faults.MIN_JUMP * np.array(
+                    [reading_faults.typical_change(values) for values in s['window'].T])
                 self._max_changes[sensor] = np.minimum(
                     limits, self._max_changes.get(sensor, np.inf))
             return float('nan')
         duration_s = (stamp_ns - int(s['window_ns'][0])) / NS
-        n_published = len(with_lost_readings(s['window'][:n], s['window_ns'][:n]))
+        n_published = len(reading_faults.with_lost_readings(s['window'][:n], s['window_ns'][:n]))
         rate = n_published / duration_s if duration_s > 0.0 else float('nan')
         self.store(sensor, replace(faults, rate=rate))
-        return float(are_marked(s['window'][:n], faults.marks).any(axis=1).mean())
+        return float(reading_faults.are_marked(s['window'][:n], faults.marks).any(axis=1).mean())
 
     def _may_skip(self, sensor: str, fields: FloatArray) -> bool:
         """Whether a window (n, 3) [T] need not be searched; counts the windows skipped."""
@@ -125,7 +117,7 @@ class DriverFaults:
         faults = self.of(sensor)
         if reason == core.MARKED:
             return (Cause.NO_READING_MARK,
-                    f'mark for a missing reading: {describe_marks(faults.marks)}')
+                    f'mark for a missing reading: {reading_faults.describe_marks(faults.marks)}')
         return Cause.REPEATED, (
             f'repetition: measured at {faults.rate / faults.repetition:.3g} Hz, published at '
             f'{faults.rate:.3g} Hz')

@@ -8,17 +8,10 @@ from functools import partial
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, Record, are_equal
-from mag_tracking.calibration import core
+from mag_tracking.calibration import core, doubtful_times
 from mag_tracking.calibration.agreement import FieldInconsistency
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
-from mag_tracking.calibration.doubtful_times import (
-    CONTRADICTS_EARTH_FIELD,
-    DOUBTFUL_BACKGROUND,
-    WRONG_TIMESTAMPS,
-    DoubtfulTimes,
-    shifted,
-)
 from mag_tracking.calibration.frequent_level import MostFrequentLevel
 from mag_tracking.calibration.level_change import SharedChanges
 from mag_tracking.calibration.reading_faults import ReadingFaults
@@ -27,14 +20,9 @@ from mag_tracking.calibration.survey import SurveySettings
 from mag_tracking.errors import NetworkError
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import Readings, plain
+from mag_tracking.stages.calibrate import rejections
 from mag_tracking.stages.calibrate.field_comparison import FieldComparison
 from mag_tracking.stages.calibrate.output_buffer import OutputBuffer
-from mag_tracking.stages.calibrate.rejections import (
-    MAX_MARKED,
-    REJECTIONS,
-    DriverFaults,
-    own_covariances,
-)
 from mag_tracking.stages.health.clocks import ClockSpan, TimestampMonitor, corrected
 from mag_tracking.stages.health.diagnosis import Cause
 from mag_tracking.stages.settings import CalibrateSettings
@@ -92,12 +80,12 @@ class Calibrate:
         self.rejections = {name: Counter[tuple[Cause, str]]() for name in network.names}
         self.settings, self._sensors = settings, new_sensors(len(network))
         self._batches = np.zeros(1, core.BATCH)
-        self.driver_faults = DriverFaults(network.names, self._sensors)
+        self.driver_faults = rejections.DriverFaults(network.names, self._sensors)
         self._limits = np.array([(
             settings.max_field, MAX_FORWARD_JUMP_S * NS, MAX_BACKWARD_JUMP_S * NS,
             settings.reject_stuck, settings.spike_std, settings.decimate_to_hz > 0.0,
             settings.trust_covariances)], core.LIMITS)
-        self._causes = {**REJECTIONS, core.TOO_LARGE: (
+        self._causes = {**rejections.REJECTIONS, core.TOO_LARGE: (
             Cause.TOO_LARGE, f'above {settings.max_field:g} T (gauss or microtesla published as '
             'tesla?)')}
         self._network, self._background_type = network, background_type
@@ -141,7 +129,7 @@ class Calibrate:
             if s[name] != NEVER:
                 s[name] += shift
         background = self._background[network.names[i]]
-        background.doubtful_times = shifted(background.doubtful_times, shift)
+        background.doubtful_times = doubtful_times.shifted(background.doubtful_times, shift)
         self._comparison.shift(network.names[i], shift)
         offset, correction = network.offset[i], network.correction[i]
         s['clock_offset_ns'] = network.clock_offset_ns[i]
@@ -163,12 +151,12 @@ class Calibrate:
         """Names of the sensors whose background is not known yet."""
         return [name for name, b in self._background.items() if not b.ready]
 
-    def input_doubts(self) -> dict[str, dict[str, DoubtfulTimes]]:
+    def input_doubts(self) -> dict[str, dict[str, doubtful_times.DoubtfulTimes]]:
         """{reason: {sensor: intervals}} in which backgrounds or timestamps were doubtful."""
-        out = {DOUBTFUL_BACKGROUND: {n: b.doubtful_times for n, b in self._background.items()
-                                     if b.doubtful_times},
-               CONTRADICTS_EARTH_FIELD: self._comparison.doubtful_times(),
-               WRONG_TIMESTAMPS: self.timestamps.doubtful_times()}
+        out = {doubtful_times.DOUBTFUL_BACKGROUND: {
+                   n: b.doubtful_times for n, b in self._background.items() if b.doubtful_times},
+               doubtful_times.CONTRADICTS_EARTH_FIELD: self._comparison.doubtful_times(),
+               doubtful_times.WRONG_TIMESTAMPS: self.timestamps.doubtful_times()}
         return {reason: by_sensor for reason, by_sensor in out.items() if by_sensor}
 
     def latest_doubt(self, sensor: str) -> tuple[int, int | None] | None:
@@ -187,9 +175,9 @@ class Calibrate:
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
         """Number of accepted and rejected readings of a sensor, the latter also by cause."""
-        rejections = self.rejections[sensor]
-        counts = Counter({f'rejected: {text}': n for (_, text), n in rejections.items()})
-        return counts + Counter(rejected=rejections.total(),
+        rejected = self.rejections[sensor]
+        counts = Counter({f'rejected: {text}': n for (_, text), n in rejected.items()})
+        return counts + Counter(rejected=rejected.total(),
                                 accepted=int(self._state_of(sensor)['accepted']))
 
     def lowest_rate(self, sensor: str) -> float:
@@ -203,7 +191,7 @@ class Calibrate:
     def feed(self, readings: Readings) -> list[Readings]:
         """Calibrate raw readings, and return those that are no longer held as at most one batch."""
         rows = readings.rows(self._index)
-        validity, covariances = own_covariances(readings)
+        validity, covariances = rejections.own_covariances(readings)
         stamps, fields = plain(readings.stamp_ns, np.int64), plain(readings.field)
         self.timestamps.add(rows, stamps - self._network.clock_offset_ns[rows], fields)
         out, batch = self._new_output(len(readings)), self._batches[0]
@@ -261,7 +249,7 @@ class Calibrate:
         if marked_fraction >= 0.0:
             self._reject_held(i, 'a fault of the driver was found')
             self.counts[FAULTS_FOUND] += 1
-            if marked_fraction > MAX_MARKED:
+            if marked_fraction > rejections.MAX_MARKED:
                 # The background has been learnt from the marks.
                 self._background[name].forget()
 

@@ -11,11 +11,7 @@ from scipy.optimize import minimize
 from mag_tracking.arrays import FloatArray
 from mag_tracking.calibration.background import RelearntBackground, RunningBackground
 from mag_tracking.event_records import SIGNATURE_SPAN, PassEvent
-from mag_tracking.inference.driving_direction import (
-    MAX_CONFIDENCE,
-    horizontal_field,
-    rotation_of_pass,
-)
+from mag_tracking.inference import driving_direction
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.passes import anderson_residual
 from mag_tracking.records import Detection, FieldFrame, Readings, plain
@@ -197,14 +193,14 @@ class _SensorEvents:
         # A slow sensor, or the end of a long stay, does not show a pass.
         if not self._is_slow and release_ns - onset_ns <= MAX_DURATION_S * NS:
             closest = closest_point(t, field, noise)
-            horizontal = horizontal_field(field, self._R_ws)
+            horizontal = driving_direction.horizontal_field(field, self._R_ws)
             is_complete = ~np.isnan(horizontal).any(axis=1)
-            rotation = rotation_of_pass(
+            rotation = driving_direction.rotation_of_pass(
                 horizontal[is_complete], float(np.nanmean(noise)) if is_complete.any() else 0.0,
                 int(np.count_nonzero(stamp < onset_ns)))
             if rotation is not None:
-                left_to_right = float(np.clip(rotation.left_to_right, 1.0 - MAX_CONFIDENCE,
-                                              MAX_CONFIDENCE))
+                limit = driving_direction.MAX_CONFIDENCE
+                left_to_right = float(np.clip(rotation.left_to_right, 1.0 - limit, limit))
         return PassEvent(
             self._name, 0, ended, onset_ns, release_ns, int(stamp[peak]), field[peak],
             float(np.sum(squared_field[is_detected]) * interval_s),

@@ -6,15 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mag_tracking.arrays import FloatArray, IntArray
+from mag_tracking.calibration import timestamps
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, doubtful_since, updated
-from mag_tracking.calibration.timestamps import (
-    MAX_ERROR_S,
-    WINDOW,
-    TimestampError,
-    TimestampFault,
-    latest_interval_s,
-    timestamp_fault,
-)
 from mag_tracking.network import SensorNetwork
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.stages.health.window import ReadingBuffer
@@ -49,15 +42,15 @@ MAX_RATIO_ERROR = 0.1
 UPDATE_INTERVAL = 64
 """Number of new readings of a sensor after which its timestamps are examined again."""
 CAUSES = {
-    TimestampError.ZERO: (Cause.ZERO_STAMPS, 'set the timestamps in the driver'),
-    TimestampError.COARSE: (
+    timestamps.TimestampError.ZERO: (Cause.ZERO_STAMPS, 'set the timestamps in the driver'),
+    timestamps.TimestampError.COARSE: (
         Cause.COARSE_STAMPS, 'let the driver set timestamps of a finer resolution'),
-    TimestampError.PACKET: (
+    timestamps.TimestampError.PACKET: (
         Cause.PACKET_STAMPS, 'let the driver set the timestamp of each reading'),
-    TimestampError.BURST: (
+    timestamps.TimestampError.BURST: (
         Cause.BURST_STAMPS, 'let the driver set the time of measurement instead of the time of '
         'arrival'),
-    TimestampError.UNIT: (
+    timestamps.TimestampError.UNIT: (
         Cause.MILLISECOND_STAMPS, 'correct the unit of the timestamps in the driver')}
 """Cause and remedy of each error of timestamps."""
 
@@ -155,9 +148,9 @@ def clock_findings(clocks: Mapping[str, ClockSpan]) -> Iterator[Finding]:
                           Cause.CLOCK_DIFFERS)
 
 
-def timestamp_finding(sensor: str, fault: TimestampFault) -> Finding:
+def timestamp_finding(sensor: str, fault: timestamps.TimestampFault) -> Finding:
     """Convert a fault of timestamps to a finding, serious if its error exceeds `MAX_ERROR_S`."""
-    is_serious, text = fault.error_s > MAX_ERROR_S, fault.text
+    is_serious, text = fault.error_s > timestamps.MAX_ERROR_S, fault.text
     if is_serious and np.isfinite(fault.error_s):
         text += (f'; the timestamps are wrong by up to {1e3 * fault.error_s:.0f} ms, which makes '
                  'tracks ambiguous')
@@ -174,7 +167,7 @@ class TimestampMonitor:
         self._buffer = ReadingBuffer(n, UPDATE_INTERVAL)
         self._stamps: list[IntArray] = [np.zeros(0, dtype=np.int64)] * n
         self._fields: list[FloatArray] = [np.zeros((0, 3))] * n
-        self._worst: dict[int, TimestampFault] = {}
+        self._worst: dict[int, timestamps.TimestampFault] = {}
         self._longest_s: FloatArray = np.zeros(n)
         self._doubtful_times: list[DoubtfulTimes] = [()] * n
         self._differing: set[str] = set()
@@ -189,22 +182,24 @@ class TimestampMonitor:
         """Examine the latest readings of sensor `j`, and update its doubtful times."""
         fault, first_ns = self._latest_fault(j), int(self._buffer.peek(j)[0][0])
         stamps, fields, _ = self._buffer.pop(j)
-        self._stamps[j] = np.append(self._stamps[j], stamps)[-WINDOW:]
-        self._fields[j] = np.append(self._fields[j], fields, axis=0)[-WINDOW:]
+        self._stamps[j] = np.append(self._stamps[j], stamps)[-timestamps.WINDOW:]
+        self._fields[j] = np.append(self._fields[j], fields, axis=0)[-timestamps.WINDOW:]
         if fault is not None:
             self._worst[j] = fault.after(self._worst.get(j))
         else:
-            self._longest_s[j] = max(self._longest_s[j], latest_interval_s(self._stamps[j]))
+            interval_s = timestamps.latest_interval_s(self._stamps[j])
+            self._longest_s[j] = max(self._longest_s[j], interval_s)
         times = self._doubtful_times[j]
         self._doubtful_times[j] = doubtful_since(times, first_ns) \
-            if fault is not None and fault.error_s > MAX_ERROR_S \
+            if fault is not None and fault.error_s > timestamps.MAX_ERROR_S \
             else updated(times, int(stamps[-1]), False)
 
-    def _latest_fault(self, j: int) -> TimestampFault | None:
+    def _latest_fault(self, j: int) -> timestamps.TimestampFault | None:
         """Fault in the latest readings of sensor `j`, including those in the buffer."""
         stamps, fields, _ = self._buffer.peek(j)
-        return timestamp_fault(np.append(self._stamps[j], stamps)[-WINDOW:],
-                               np.append(self._fields[j], fields, axis=0)[-WINDOW:])
+        return timestamps.timestamp_fault(
+            np.append(self._stamps[j], stamps)[-timestamps.WINDOW:],
+            np.append(self._fields[j], fields, axis=0)[-timestamps.WINDOW:])
 
     def compare_clocks(self, clocks: Mapping[str, ClockSpan]) -> None:
         """Mark all timestamps of sensors whose clocks differ from those of other sensors now."""
@@ -217,7 +212,7 @@ class TimestampMonitor:
                if self._doubtful_times[j]}
         return {**out, **dict.fromkeys(self._differing, ((0, None),))}
 
-    def worst_fault(self, sensor: str) -> TimestampFault | None:
+    def worst_fault(self, sensor: str) -> timestamps.TimestampFault | None:
         """Fault of a sensor with the largest error so far."""
         j = self._index[sensor]
         latest, worst = self._latest_fault(j), self._worst.get(j)
@@ -227,6 +222,6 @@ class TimestampMonitor:
         """Lowest rate [Hz] of a sensor without faults of the timestamps; inf if unknown."""
         j = self._index[sensor]
         stamps = np.append(self._stamps[j], self._buffer.peek(j)[0])
-        latest_s = latest_interval_s(stamps) if self.worst_fault(sensor) is None else 0.0
+        latest_s = timestamps.latest_interval_s(stamps) if self.worst_fault(sensor) is None else 0.0
         longest_s = max(float(self._longest_s[j]), latest_s)
         return 1.0 / longest_s if longest_s else float('inf')

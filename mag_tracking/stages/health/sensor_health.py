@@ -6,13 +6,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
-from mag_tracking.calibration import timestamps
-from mag_tracking.calibration.reading_faults import (
-    NO_FAULTS,
-    ReadingFaults,
-    isolated_readings,
-    saturated_readings,
-)
+from mag_tracking.calibration import reading_faults, timestamps
 from mag_tracking.calibration.sensor_state import COARSE_FRACTION, MIN_CHANGES, smallest_steps
 from mag_tracking.quantities import occurrences
 from mag_tracking.stages.health.clocks import ClockSpan, timestamp_finding
@@ -56,7 +50,7 @@ class SensorHealth:
     """
 
     def __init__(self, update_interval: int = UPDATE_INTERVAL,
-                 faults: ReadingFaults = NO_FAULTS) -> None:
+                 faults: reading_faults.ReadingFaults = reading_faults.NO_FAULTS) -> None:
         self.faults, self._update_interval = faults, update_interval
         self._counts: Counter[str] = Counter()
         self._largest_step_s = 0.0
@@ -186,13 +180,13 @@ class SensorHealth:
         self._steps = np.minimum(self._steps, smallest_steps(fields))
         # A comparison with NaN is false: while the noise is unknown, no spikes are counted.
         noise = np.maximum(self._noise, self._steps / np.sqrt(12.0))
-        spikes = list(map(isolated_readings, fields.T, SPIKE_STD * noise))
+        spikes = list(map(reading_faults.isolated_readings, fields.T, SPIKE_STD * noise))
         self._counts['spikes'] += len(np.unique(np.concatenate(spikes)))
         if self._n_since_stuck >= WINDOW:
             self._noise = self._cache['noise'] = sample_noise_std(self._fields)
         # A limit is recognised only after the excursion.
         known = np.append(self._is_saturated, np.zeros(n, dtype=bool))[-len(self._fields):]
-        self._is_saturated = known | saturated_readings(
+        self._is_saturated = known | reading_faults.saturated_readings(
             self._fields, MAX_PLATEAU_S * NS / self._interval_ns).any(axis=1)
         self._counts['saturated'] += int(np.count_nonzero(self._is_saturated & ~known))
 

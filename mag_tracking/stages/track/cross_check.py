@@ -9,16 +9,8 @@ import numpy as np
 from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.network import SensorNetwork
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track import doubts
+from mag_tracking.stages.track import doubts, pass_samples
 from mag_tracking.stages.track.disturbances import field_magnitudes
-from mag_tracking.stages.track.pass_samples import (
-    LONG_LENGTH,
-    MAX_MISFIT,
-    MAX_OFFSET,
-    MIN_DISTANCE,
-    RigidPass,
-    fit_rigid_pass,
-)
 from mag_tracking.stages.track.plausibility import moves_too_far
 from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.units import NS
@@ -115,14 +107,14 @@ class ClockComparison:
         return ClockOffset(j, None, float(median[k]), float(std[j, behind_k]),
                            int(self._n_passes[j]))
 
-    def add(self, rigid_pass: RigidPass, rows: IntArray) -> None:
+    def add(self, rigid_pass: pass_samples.RigidPass, rows: IntArray) -> None:
         """Add a pass with the sensors `rows` of the network; it is ignored if no straight path
         explains it, if a bent one is significantly better, or if the vehicle is too slow for the
         clocks to matter."""
-        is_slow = rigid_pass.speed * MAX_OFFSET < MIN_DISTANCE
+        is_slow = rigid_pass.speed * pass_samples.MAX_OFFSET < pass_samples.MIN_DISTANCE
         if is_slow or not (rigid_pass.is_explained and rigid_pass.is_straight):
             return
-        is_known = np.abs(rigid_pass.offset) <= MAX_OFFSET
+        is_known = np.abs(rigid_pass.offset) <= pass_samples.MAX_OFFSET
         is_known[rigid_pass.reference] = False
         compared, reference = np.flatnonzero(is_known), rows[rigid_pass.reference]
         offset, std = self._offsets()
@@ -145,7 +137,7 @@ class ClockComparison:
         offset, std = self._offsets()
         # An offset is harmless if a vehicle of average speed travels less than `MIN_DISTANCE` in
         # this time.
-        min_offset = MIN_DISTANCE * self._slowness / self._weight
+        min_offset = pass_samples.MIN_DISTANCE * self._slowness / self._weight
         self._offset_s = np.where(
             (offset > SIGNIFICANT_STDS * std) & (offset > min_offset), offset, 0.0)
 
@@ -181,7 +173,7 @@ class CrossCheck:
     """
 
     def __init__(self, network: SensorNetwork) -> None:
-        self.latest: RigidPass | None = None
+        self.latest: pass_samples.RigidPass | None = None
         self._network = network
         self._frames: list[FieldFrame] = []
         self._peak: _FrameSummary | None = None
@@ -219,7 +211,7 @@ class CrossCheck:
         if self.latest is not None and self._covers(self._current.stamp_ns):
             self.difference = self.latest.difference(self._current.stamp_ns, self._current.state)
         reasons = self._pass_doubts()
-        if clocks_apart_s * float(np.hypot(*self._current.state[3:5])) > MIN_DISTANCE:
+        if clocks_apart_s * float(np.hypot(*self._current.state[3:5])) > pass_samples.MIN_DISTANCE:
             reasons.add(doubts.CLOCKS_APART)
         return reasons
 
@@ -268,13 +260,13 @@ class CrossCheck:
         extrapolated = current.state.copy()
         extrapolated[:3] -= elapsed_s * extrapolated[3:]
         step = -(-len(frames) // MAX_FRAMES)
-        rigid_pass = fit_rigid_pass(self._network, frames[::step], peak.stamp_ns,
-                                    np.array([extrapolated, peak.state]))
+        rigid_pass = pass_samples.fit_rigid_pass(
+            self._network, frames[::step], peak.stamp_ns, np.array([extrapolated, peak.state]))
         if rigid_pass is None:
             return
         self.latest, self._is_whole_pass = rigid_pass, self._has_risen
         if elapsed_s <= STEADY_S:
-            self._is_misfit = rigid_pass.misfit > MAX_MISFIT
+            self._is_misfit = rigid_pass.misfit > pass_samples.MAX_MISFIT
 
     def _pass_doubts(self) -> set[str]:
         """Doubts about the track that follow from the latest fit."""
@@ -283,7 +275,7 @@ class CrossCheck:
             return set()
         return doubts.applying({
             # The middle of a long vehicle is uncertain by up to its length.
-            doubts.ANOTHER_PLACE: np.hypot(*self.difference[:2]) > LONG_LENGTH,
+            doubts.ANOTHER_PLACE: np.hypot(*self.difference[:2]) > pass_samples.LONG_LENGTH,
             doubts.NO_STEADY_PATH: self._is_misfit or latest.misfit > LATE_MISFIT,
             doubts.CLOCKS_APART: latest.needs_clock_offsets,
             doubts.FRAMES_TOO_LONG: latest.is_explained and moves_too_far(

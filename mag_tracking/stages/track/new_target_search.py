@@ -16,21 +16,13 @@ from scipy.linalg import block_diag
 
 from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference.filter_bank import FilterBank, log_sum_exp
+from mag_tracking.stages.track import window_search
 from mag_tracking.stages.track.bank_filter import DETECTABLE_ENERGY, BankFilter
 from mag_tracking.stages.track.initiation_vehicle import TURN_SHARE, moment_directions
 from mag_tracking.stages.track.joint import IMPROBABLE, JointExplanation
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.stages.track.steady_search import in_order_of
-from mag_tracking.stages.track.window_search import (
-    DEPTH_STD,
-    KnownVehicles,
-    VehicleState,
-    WindowSearch,
-    WindowStart,
-    inserted,
-    labels_of,
-    overlap_depth,
-)
+from mag_tracking.stages.track.window_search import KnownVehicles, WindowSearch, WindowStart
 
 PASSES, STEP = 3, 0.5
 """Number of Gauss-Newton steps along each path, and their damping factor."""
@@ -59,7 +51,7 @@ class NewTargetSearch:
     """
 
     def __init__(self, bank: FilterBank, window: Window, filter_of: Callable[[int], BankFilter],
-                 n_targets: int, vehicles: VehicleState, reason: str, may_add: bool
+                 n_targets: int, vehicles: window_search.VehicleState, reason: str, may_add: bool
                  ) -> None:
         self._is_improbable = reason == IMPROBABLE
         self._bank, self._window = bank, window
@@ -233,7 +225,7 @@ class NewTargetSearch:
             for theta, m, kind, label in zip(paths, moments, kinds, labels, strict=True):
                 at = n_known + (len(path) - 1) * self._n_one
                 mean, covariance = self._vehicles.prior(theta, m, times[0], kind, label)
-                x, P = np.insert(x, at, mean), inserted(P, covariance, at)
+                x, P = np.insert(x, at, mean), window_search.inserted(P, covariance, at)
                 path.append(self._vehicles.along(theta, m, times, kind))
             starts.append(WindowStart(
                 x, P, np.hstack([*path, known.path[:, n_known:]]), (*known.label, *labels),
@@ -263,16 +255,19 @@ class NewTargetSearch:
         n = len(starts)
         bank = FilterBank(
             np.array([s.x for s in starts]), np.array([s.P for s in starts]), np.zeros(n),
-            labels_of([s.label for s in starts]), labels_of([s.kind for s in starts]), np.arange(n),
-            np.full((n, len(self._vehicles.network)), np.nan))
+            *(window_search.labels_of(of) for of in zip(*((s.label, s.kind) for s in starts),
+                                                        strict=True)),
+            np.arange(n), np.full((n, len(self._vehicles.network)), np.nan))
         paths = np.array([s.path for s in starts])
         log_likelihood = self._run_along(bank, paths, len(starts[0].kind))
         is_usable: BoolArray = np.isfinite(log_likelihood) & np.isfinite(bank.x).all(axis=1) \
             & [self._are_plausible(s, x) for s, x in zip(starts, bank.x, strict=True)]
         log_likelihood = np.where(is_usable, log_likelihood, -np.inf)
-        log_w = log_likelihood + [s.log_w for s in starts] - 0.5 * np.square(
-            [overlap_depth(path, self._n_one, len(s.kind), self._vehicles.length_column) / DEPTH_STD
-             for s, path in zip(starts, paths, strict=True)])
+        depths = [window_search.overlap_depth(path, self._n_one, len(s.kind),
+                                              self._vehicles.length_column)
+                  for s, path in zip(starts, paths, strict=True)]
+        log_w = log_likelihood + [s.log_w for s in starts] \
+            - 0.5 * np.square(np.array(depths) / window_search.DEPTH_STD)
         return bank, log_likelihood, log_w, paths
 
     def _are_plausible(self, start: WindowStart, x: FloatArray) -> bool:

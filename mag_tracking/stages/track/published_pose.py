@@ -6,13 +6,8 @@ from typing import TypeAlias, TypedDict
 
 import numpy as np
 
+from mag_tracking import geometry
 from mag_tracking.arrays import BoolArray, FloatArray
-from mag_tracking.geometry import (
-    cross_matrix,
-    quaternion_between,
-    quaternions_from_yaw,
-    rotation_vectors_between,
-)
 from mag_tracking.inference.covariances import inflated_to_cover, second_moment
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.physics.bounds import are_possible
@@ -125,7 +120,7 @@ class VehicleOrientation:
 
     def quaternions(self, x: FloatArray) -> FloatArray:
         """Quaternions (n, 4) of states (n, n_t)."""
-        return quaternions_from_yaw(np.arctan2(x[:, 4], x[:, 3]))
+        return geometry.quaternions_from_yaw(np.arctan2(x[:, 4], x[:, 3]))
 
 
 @dataclass(frozen=True)
@@ -142,15 +137,15 @@ class MagnetOrientation:
         squared_norm = m @ m
         T = np.zeros((3, len(x)))
         # dm = w x m determines the part of w perpendicular to m: w = m x dm / |m|^2.
-        T[:, 6:9] = cross_matrix(m) / squared_norm
+        T[:, 6:9] = geometry.cross_matrix(m) / squared_norm
         along = np.outer(m, m) / squared_norm
         nearest = int(np.argmax(np.abs(self.axis)))
-        return (quaternion_between(self.axis, m), T, UNOBSERVED_VARIANCE * along,
+        return (geometry.quaternion_between(self.axis, m), T, UNOBSERVED_VARIANCE * along,
                 (nearest == 0, nearest == 1, nearest == 2))
 
     def quaternions(self, x: FloatArray) -> FloatArray:
         """Quaternions (n, 4) of states (n, n_t)."""
-        return np.array([quaternion_between(self.axis, m) for m in x[:, 6:9]])
+        return np.array([geometry.quaternion_between(self.axis, m) for m in x[:, 6:9]])
 
 
 Orientation: TypeAlias = VehicleOrientation | MagnetOrientation
@@ -247,8 +242,8 @@ def mixture_uncertainty(bank: FilterBank, best: int, is_separated: BoolArray, mo
         return PoseUncertainty(covariance, published['orientation_covariance'],
                                published['position_orientation_covariance'])
     weight = np.exp(log_w[rows])
-    rotations = rotation_vectors_between(published['orientation'],
-                                         orientation.quaternions(bank.x[rows, :n_t]))
+    rotations = geometry.rotation_vectors_between(
+        published['orientation'], orientation.quaternions(bank.x[rows, :n_t]))
     displacement = bank.x[rows, :3] - bank.x[best, :3]
     return PoseUncertainty(
         covariance, published['orientation_covariance']

@@ -17,15 +17,9 @@ from mag_tracking.inference.least_squares import distinct, refine
 from mag_tracking.inference.matrices import MarginalWhitener, ignoring_overflow, pseudo_inverse
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.passes import N_STRAIGHT, PATH, SteadyPass
+from mag_tracking.stages.track import initiation_vehicle
 from mag_tracking.stages.track.bank_filter import DETECTABLE_ENERGY
-from mag_tracking.stages.track.initiation_vehicle import (
-    CLIMB_STD,
-    CROSS_SPEED_STD,
-    LATERAL_STD,
-    MAX_START_DISTANCE,
-    SPEED_STD,
-    VehicleSettings,
-)
+from mag_tracking.stages.track.initiation_vehicle import LATERAL_STD, SPEED_STD, VehicleSettings
 from mag_tracking.stages.track.pass_samples import PassSamples
 
 N_DIPOLES = 3
@@ -86,8 +80,9 @@ class PathPrior:
         # The first combination is the mean of the row times the root of the number of dipoles.
         return cls(np.deg2rad(vehicle.arrival_headings_deg), network.centre[:2],
                    np.array([0.0, 0.0, height, speed, 0.0, 0.0, length]),
-                   np.array([np.inf, lateral_std, height_std, speed_std, CROSS_SPEED_STD,
-                             CLIMB_STD, length_std]),
+                   np.array([np.inf, lateral_std, height_std, speed_std,
+                             initiation_vehicle.CROSS_SPEED_STD, initiation_vehicle.CLIMB_STD,
+                             length_std]),
                    np.repeat([total / np.sqrt(N_DIPOLES)] + [difference] * (N_DIPOLES - 1), 3),
                    MIN_SPEED_RATIO * min(vehicle.speeds))
 
@@ -122,11 +117,11 @@ class PathPrior:
             along = np.array([np.cos(heading), np.sin(heading)])
             sensors = (network.positions[:, :2] - self.centre) @ along
             half_length = float(np.abs(sensors).max())
-            x = np.arange(-MAX_START_DISTANCE - half_length, GRID_MARGIN + half_length,
-                          GRID_STEP)
+            x = np.arange(-initiation_vehicle.MAX_START_DISTANCE - half_length,
+                          GRID_MARGIN + half_length, GRID_STEP)
             # No sensor senses a vehicle in a wide gap between the sensors.
             distance = np.abs(x[:, None] - sensors).min(axis=1)
-            x = x[distance <= MAX_START_DISTANCE + GRID_MARGIN]
+            x = x[distance <= initiation_vehicle.MAX_START_DISTANCE + GRID_MARGIN]
             x, y, v = (a.ravel() for a in np.meshgrid(x, offsets, speeds, indexing='ij'))
             grid = np.tile(self.mean, (len(x), 1))
             grid[:, :2] = self.centre + x[:, None] * along \

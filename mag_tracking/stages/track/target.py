@@ -13,24 +13,8 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.sources import SourceModel
 from mag_tracking.records import FieldFrame
-from mag_tracking.stages.track.initiation_magnet import (
-    MAX_STARTS,
-    is_lost_after,
-    magnet_model,
-    start_magnet,
-)
-from mag_tracking.stages.track.initiation_vehicle import (
-    moment_directions,
-    start_vehicle,
-    vehicle_model,
-)
+from mag_tracking.stages.track import initiation_magnet, initiation_vehicle, published_pose
 from mag_tracking.stages.track.observation import Observation
-from mag_tracking.stages.track.published_pose import (
-    MagnetOrientation,
-    Orientation,
-    UnobservedLength,
-    VehicleOrientation,
-)
 from mag_tracking.stages.track.settings import TrackSettings
 
 MAX_BYTES = 4 << 30
@@ -53,12 +37,12 @@ class Target:
     """Target that the tracker can follow: a vehicle or a magnet."""
 
     model: SourceModel
-    orientation: Orientation
+    orientation: published_pose.Orientation
     arrivals: Sequence[str]
     """Name of each arrival direction."""
     kinds: Sequence[str]
     """Name of each kind of target."""
-    unobserved_length: Callable[[], UnobservedLength | None]
+    unobserved_length: Callable[[], published_pose.UnobservedLength | None]
     """Factory, for each track, of the uncertainty of the middle of a vehicle due to its unobserved
     length; None for a magnet."""
     starts_anywhere: bool
@@ -80,26 +64,28 @@ def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
     """
     if settings.target == 'vehicle':
         vehicle = settings.vehicle
-        row = vehicle_model(vehicle, network)
+        row = initiation_vehicle.vehicle_model(vehicle, network)
         _check_vehicle_bank(settings, network, row)
-        return Target(row, VehicleOrientation(), vehicle.arrival_names,
+        return Target(row, published_pose.VehicleOrientation(), vehicle.arrival_names,
                       [kind.name for kind in vehicle.kinds],
-                      partial(UnobservedLength, [kind.length for kind in vehicle.kinds],
-                              [kind.length_std for kind in vehicle.kinds]),
-                      False, lambda s, network, frame, own_covariance: start_vehicle(
+                      partial(published_pose.UnobservedLength,
+                              [kind.length for kind in vehicle.kinds],
+                              [kind.length_std for kind in vehicle.kinds]), False,
+                      lambda s, network, frame, own_covariance: initiation_vehicle.start_vehicle(
                           s.vehicle, network, frame, s.background_std, own_covariance))
     if settings.target == 'magnet':
         magnet = settings.magnet
         if not any(magnet.axis):
             raise SettingsError('track.magnet.axis: the zero vector has no direction')
-        model = magnet_model(magnet)
-        _check_bank('track.magnet', {'optima': MAX_STARTS}, settings, _n_sensors(settings, network),
-                    model)
-        return Target(model, MagnetOrientation(np.array(magnet.axis)), ('',), ('',), lambda: None,
-                      True, lambda s, network, frame, own_covariance: start_magnet(
+        model = initiation_magnet.magnet_model(magnet)
+        _check_bank('track.magnet', {'optima': initiation_magnet.MAX_STARTS}, settings,
+                    _n_sensors(settings, network), model)
+        return Target(model, published_pose.MagnetOrientation(np.array(magnet.axis)), ('',), ('',),
+                      lambda: None, True,
+                      lambda s, network, frame, own_covariance: initiation_magnet.start_magnet(
                           s.magnet, network, frame, s.background_std, own_covariance,
                           s.field_error),
-                      lambda s, network, dt: is_lost_after(s.magnet, network, dt))
+                      lambda s, network, dt: initiation_magnet.is_lost_after(s.magnet, network, dt))
     raise SettingsError(f'track.target: expected vehicle or magnet, got {settings.target!r}')
 
 
@@ -123,7 +109,7 @@ def _vehicle_factors(settings: TrackSettings) -> dict[str, int]:
     vehicle = settings.vehicle
     return {**{name: len(getattr(vehicle, name))
                for name in ('kinds', 'arrival_names', 'lateral_offsets', 'speeds')},
-            'moment directions': len(moment_directions()),
+            'moment directions': len(initiation_vehicle.moment_directions()),
             'straight or turning': 2 if vehicle.turn_acceleration else 1}
 
 

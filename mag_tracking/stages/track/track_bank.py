@@ -9,15 +9,12 @@ import numpy as np
 from mag_tracking.arrays import FloatArray
 from mag_tracking.inference.filter_bank import FilterBank, InitialBank
 from mag_tracking.records import FieldFrame
+from mag_tracking.stages.track import sensor_selection
 from mag_tracking.stages.track.bank_filter import BankFilter
 from mag_tracking.stages.track.joint import JointExplanation
 from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.relinearisation import Relinearisation
-from mag_tracking.stages.track.sensor_selection import (
-    SensorRejection,
-    SensorSubset,
-    exchange_sensor_states,
-)
+from mag_tracking.stages.track.sensor_selection import SensorRejection, SensorSubset
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.stages.track.smoothing import NOT_SMOOTHED, FixedLag, TrackState, WholeTrack
 from mag_tracking.stages.track.target import MIN_WEIGHT, Target, max_hypotheses, max_sensors
@@ -198,7 +195,7 @@ class TrackBank:
         before, self.sensors = self.sensors.rows, sensors
         self.filter = self.filter_of(1)
         self._rejection = SensorRejection(sensors.network.names)
-        exchange_sensor_states(
+        sensor_selection.exchange_sensor_states(
             self.bank, before, sensors.rows, self.filter.observation.own_covariance,
             self.settings.background_std)
         self.lag.clear()

@@ -10,14 +10,8 @@ from mag_tracking.arrays import FloatArray, IntArray
 from mag_tracking.geometry import overlap, rotation_about_z
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.vehicles import RowVehicle
+from mag_tracking.stages.track import initiation_vehicle
 from mag_tracking.stages.track.bank_filter import BankFilter
-from mag_tracking.stages.track.initiation_vehicle import (
-    START_TURN_RATIO,
-    VehicleSettings,
-    soft_iron,
-    starting_covariance,
-    vehicle_model,
-)
 from mag_tracking.stages.track.pass_samples import PassSamples
 from mag_tracking.stages.track.relinearisation import Window
 from mag_tracking.stages.track.steady_search import PathPrior, StartGrid, SteadySearch
@@ -39,7 +33,7 @@ and relative standard deviation of their moments."""
 class VehicleState:
     """Conversion of straight paths (`PATH` of `steady_pass`) to states of `RowVehicle`."""
 
-    settings: VehicleSettings
+    settings: initiation_vehicle.VehicleSettings
     network: SensorNetwork
     background_std: float
     """[T] Standard deviation of each background."""
@@ -47,7 +41,7 @@ class VehicleState:
     @cached_property
     def _model(self) -> RowVehicle:
         """Vehicle model of the settings."""
-        return vehicle_model(self.settings, self.network)
+        return initiation_vehicle.vehicle_model(self.settings, self.network)
 
     @property
     def length_column(self) -> int | None:
@@ -67,7 +61,7 @@ class VehicleState:
         x[2], x[5] = s.kinds[kind].height, 0.0
         if self.length_column is not None:
             x[self.length_column] = s.kinds[kind].length
-        return x, starting_covariance(s, kind, R, float(theta[3]))
+        return x, initiation_vehicle.starting_covariance(s, kind, R, float(theta[3]))
 
     def along(self, theta: FloatArray, moments: FloatArray, times: FloatArray, kind: int
               ) -> FloatArray:
@@ -76,7 +70,7 @@ class VehicleState:
         d, s = self._model.n_dipoles, self.settings
         heading, length = float(theta[4]), float(theta[6])
         R = rotation_about_z(heading)
-        soft_D = soft_iron(s, kind)
+        soft_D = initiation_vehicle.soft_iron(s, kind)
         x = np.zeros((len(times), len(self._model.state_names)))
         velocity = np.array([theta[3] * np.cos(heading), theta[3] * np.sin(heading), theta[5]])
         x[:, :3], x[:, 3:6] = theta[:3] + times[:, None] * velocity, velocity
@@ -105,7 +99,7 @@ class VehicleState:
         n = len(self._model.state_names)
         first, w = target * n, (target + 1) * n - 1
         out = P.copy()
-        out[w, w] = START_TURN_RATIO**2 * self._model.turn_variance(
+        out[w, w] = initiation_vehicle.START_TURN_RATIO**2 * self._model.turn_variance(
             np.hypot(x[first + 3], x[first + 4]))
         return out
 

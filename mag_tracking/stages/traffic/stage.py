@@ -10,21 +10,11 @@ import numpy as np
 from mag_tracking.errors import SettingsError
 from mag_tracking.event_records import Disturbance, TrafficSummary, VehiclePassage
 from mag_tracking.geometry import heading_of, speed_of
-from mag_tracking.inference.driving_direction import (
-    MAX_CONFIDENCE,
-    fused_log_odds,
-    horizontal_field,
-    rotation_of_pass,
-)
+from mag_tracking.inference import driving_direction
+from mag_tracking.inference.driving_direction import MAX_CONFIDENCE, horizontal_field
 from mag_tracking.inference.identification import UNKNOWN, ClassPosterior, Feature, class_posterior
-from mag_tracking.network import SensorNetwork
-from mag_tracking.network.counting_line import (
-    CountingLine,
-    Crossing,
-    CrossingDetector,
-    Pose,
-    counting_lines,
-)
+from mag_tracking.network import SensorNetwork, counting_line
+from mag_tracking.network.counting_line import CountingLine, Crossing, CrossingDetector
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.traffic.intervals import TrafficIntervals
 from mag_tracking.stages.traffic.settings import TrafficSettings, VehicleClass
@@ -105,7 +95,7 @@ class Traffic:
         if any(c.name == UNKNOWN for c in settings.classes):
             raise SettingsError(f'traffic.classes.names: {UNKNOWN!r} is the name of vehicles that '
                                 'match no class')
-        self._lines = counting_lines(
+        self._lines = counting_line.counting_lines(
             names, [line.heading_deg for line in settings.lines],
             [line.offset for line in settings.lines], [line.half_width for line in settings.lines],
             network.centre) if counts_vehicles else []
@@ -259,7 +249,7 @@ def _is_running(record: Track | SmoothedPose | Disturbance) -> bool:
     return isinstance(record, Track) and not record.ended
 
 
-def _class_of(pose: Pose, classes: Sequence[VehicleClass]) -> ClassPosterior:
+def _class_of(pose: counting_line.Pose, classes: Sequence[VehicleClass]) -> ClassPosterior:
     """Class of a vehicle by the magnitude of its moment, and by its length if available."""
     magnitude, shares = float(np.linalg.norm(pose.moment)), [c.share for c in classes]
     if not magnitude > 0.0:
@@ -313,7 +303,7 @@ class FieldDirection:
                 odds.append(float(np.clip(log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS)))
                 # From a sensor to the left of the path, the vehicle moves from right to left.
                 same_side.append(bool(left[j] < 0.0))
-        fused = fused_log_odds(odds, same_side)
+        fused = driving_direction.fused_log_odds(odds, same_side)
         if not odds or len(odds) > 1 and abs(fused) < 0.5 * max(map(abs, odds)):
             return float('nan')
         return float(1.0 / (1.0 + np.exp(fused)))
@@ -329,5 +319,5 @@ class FieldDirection:
         variance = [np.nanmean(np.diagonal(frames[k].covariance[j]))
                     for k in np.flatnonzero(is_measured).tolist()]
         noise = float(np.sqrt(np.median(variance)))
-        rotation = rotation_of_pass(field[is_measured], noise, len(frames) // 4)
+        rotation = driving_direction.rotation_of_pass(field[is_measured], noise, len(frames) // 4)
         return None if rotation is None else rotation.log_odds
