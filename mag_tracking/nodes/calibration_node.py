@@ -43,8 +43,7 @@ from mag_tracking.stages.stage import Stage
 MIN_INTERVAL_S = 0.5
 """[s] Minimum interval between surveys, each of which delays the readings."""
 MIN_STEP_S = 0.01
-"""[s] Minimum interval between the steps of a round over the sensors. A round takes one second, or
-longer if there are many sensors."""
+"""[s] Minimum interval between the steps of a round, which takes at least one second."""
 DEFERRAL_S = 0.0055
 """[s] Delay of deferred work after a batch of readings has been published. It leaves the processor
 cores to the tracker until the tracker has computed a pose, even with a hundred sensors."""

@@ -45,8 +45,7 @@ def topic_findings(node: Node, sensor: str, topic: str) -> list[Finding]:
 
 
 def node_of(endpoint: TopicEndpointInfo) -> str | None:
-    """Absolute name of the node of an endpoint; None until the middleware, which announces both
-    separately, has announced the node."""
+    """Absolute name of the node of an endpoint; None until the middleware has announced it."""
     namespace = endpoint.node_namespace
     return absolute(endpoint.node_name, namespace) if namespace.startswith('/') else None
 
@@ -57,8 +56,7 @@ def is_latched(publisher: TopicEndpointInfo) -> bool:
 
 
 def subscriber_qos(depth: int, latched: bool) -> QoSProfile:
-    """QoS that matches every publisher or, if `latched`, receives earlier messages of latched
-    ones."""
+    """QoS that matches every publisher or, if `latched`, receives earlier messages."""
     if latched:
         return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE,
                           durability=DurabilityPolicy.TRANSIENT_LOCAL)

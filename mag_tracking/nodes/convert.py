@@ -33,8 +33,7 @@ def message_class(type_name: str) -> Any:
 
 
 def to_message(cls: Any, content: Mapping[str, Any]) -> Any:
-    """Convert nested dicts to a ROS message; a missing field keeps its default, an unknown one
-    raises AttributeError."""
+    """Convert nested dicts to a ROS message; an unknown field raises AttributeError."""
     message = cls()
     for name, value in content.items():
         if isinstance(value, dict):

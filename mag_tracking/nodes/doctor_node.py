@@ -74,8 +74,7 @@ class DoctorNode(Node):
 def listening(network: SensorNetwork, settings: Settings, seconds: float,
               stopped: Callable[[], bool], ros_arguments: Sequence[str] = ()
               ) -> Iterator[DoctorNode]:
-    """Receive readings for at most `seconds`, or until `stopped()`; yield the node, which is shut
-    down when the context ends."""
+    """Receive readings for at most `seconds`, or until `stopped()`; yield the node."""
     init_ros(list(ros_arguments))
     executor, node = make_executor(), DoctorNode(network, settings)
     try:

@@ -40,8 +40,7 @@ EXPECTED_COUNTS = ('samples: ', 'late arrivals: ', 'other messages: ', 'lines th
                    'conversions overwritten', 'packets not used')
 """Prefixes of counts that are reported but do not cause a warning."""
 STOP_TIMEOUT_S = 15.0
-"""[s] Maximum time for all drivers to stop. Disconnecting from an MQTT broker that does not answer
-takes several seconds."""
+"""[s] Maximum time for all drivers to stop; an MQTT broker may need several seconds."""
 
 
 class DriverNode(ManagedNode):

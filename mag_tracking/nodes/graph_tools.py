@@ -150,8 +150,7 @@ def as_text(message: Any) -> str:
 
 
 def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list[str]:
-    """Parameters of a node, or the named one, with values and descriptions; raises GraphError if it
-    does not exist."""
+    """Parameters of a node, or one, with descriptions; raises GraphError if missing."""
     names = [name] if name is not None else list(
         graph.call(srv.ListParameters, f'{node}/list_parameters').result.names)
     values = graph.call(srv.GetParameters, f'{node}/get_parameters', names=names).values
@@ -167,8 +166,7 @@ def parameter_lines(graph: Observer, node: str, name: str | None = None) -> list
 
 
 def set_parameter(graph: Observer, node: str, name: str, text: str) -> None:
-    """Set a parameter of a node to a value in YAML, also an integer for a float; raises GraphError
-    if it is invalid or rejected."""
+    """Set a parameter to a value in YAML; raises GraphError if invalid or rejected."""
     try:
         value = yaml.safe_load(text)
         (kind,) = graph.call(
@@ -197,8 +195,7 @@ def _possible_transitions(graph: Observer, node: str) -> list[Any]:
 
 
 def change_lifecycle_state(graph: Observer, node: str, transition: str) -> None:
-    """Request a transition of a lifecycle node by its label; raises GraphError if it is impossible
-    or fails."""
+    """Request a transition of a node by its label; raises GraphError on failure."""
     possible = _possible_transitions(graph, node)
     matches = [t for t in possible if t.label == transition]
     if not matches:

@@ -36,8 +36,7 @@ PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 WORKING_FOLDER_PROFILE = 'DEFAULT_FASTRTPS_PROFILES.xml'
 """Name of the profile that Fast DDS loads from the working folder by default."""
 SHUTDOWN_TIMEOUT_S = 4.0
-"""[s] Maximum time for the shutdown of the middleware. It usually takes 0.3 s; `ros2 launch` sends
-the next signal 5 s after the first."""
+"""[s] Maximum time for the shutdown, usually 0.3 s; `ros2 launch` waits 5 s."""
 HUNG_MESSAGE = (f'the middleware did not shut down within {SHUTDOWN_TIMEOUT_S:g} s; '
                 'the process was ended\n')
 
@@ -67,8 +66,7 @@ def init_ros(arguments: list[str] | None = None) -> None:
 
 
 def _with_ros_parameter_files(arguments: list[str] | None, folder: Path) -> list[str]:
-    """Arguments (None: `sys.argv`), with plain parameter files replaced by copies in `folder`,
-    which `rclpy.init` reads."""
+    """Arguments, with plain parameter files replaced by ROS copies in `folder`."""
     converted = list(sys.argv if arguments is None else arguments)
     for k, argument in enumerate(converted[:-1]):
         # rclpy reports missing files and invalid arguments.
@@ -84,9 +82,8 @@ def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: i
     """Close and destroy nodes and shut ROS down; end the process if the middleware hangs.
 
     Workaround: Fast DDS 2.14 blocks forever, while it holds the interpreter lock, if a participant
-    is destroyed while another one leaves (eProsima/Fast-DDS 6513). This happened to 1 of 1165 nodes
-    when five nodes were signalled at once. The deadline can be removed once Fast DDS is fixed.
-    `status` is the exit status if the deadline ends the process.
+    is destroyed while another one leaves (eProsima/Fast-DDS 6513). The deadline, which ends the
+    process with `status`, can be removed once Fast DDS is fixed.
     """
     try:
         for node in nodes:
@@ -107,8 +104,7 @@ def shut_down(nodes: Sequence[Node], executor: Executor | None = None, status: i
 
 
 def limit_exit_time(status: int) -> None:
-    """Limit the time until the process ends with `status`: a node that is destroyed with the
-    interpreter may hang."""
+    """Limit the time until the process ends with `status`: a remaining node may hang."""
     flush()
     end_within(SHUTDOWN_TIMEOUT_S, status, HUNG_MESSAGE.encode())
 

@@ -198,11 +198,8 @@ class PageNode(Node):
 
 def watch(host: str, port: int, report: Callable[[str], object],
           ros_arguments: Sequence[str] = (), ended: Callable[[], bool] = lambda: False) -> int:
-    """Serve the page of running nodes until SIGINT, SIGTERM or `ended`; return the exit status.
-
-    `report` receives a line with the address of the page. Raises DeviceError if the port cannot be
-    opened.
-    """
+    """Serve the page of running nodes until SIGINT, SIGTERM or `ended`; return the exit status, and
+    `report` the address; raises DeviceError if the port cannot be opened."""
     os.nice(NICENESS)
     scene = LiveScene('mag_tracking', EMPTY_LAYOUT)
     with recorded_signals(signal.SIGINT, signal.SIGTERM) as signals, \

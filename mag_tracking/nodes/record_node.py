@@ -40,8 +40,7 @@ DEFAULT_DEPTH = 100
 
 @functools.cache
 def definition_of(type_name: str) -> str | None:
-    """Definition of a message type and all nested types, in the format of a `ros2msg` schema; None
-    if the .msg file of a type is not installed."""
+    """Definition of a type with all nested types (`ros2msg`); None if one is not installed."""
     try:
         return types.definition(type_name)
     except RecordingError:
@@ -121,10 +120,9 @@ class _PolledSubscription:
 class RecordNode(Node):
     """Subscribes to the selected topics and passes their messages to a `Recorder`.
 
-    The node is polled: the events executor of the Jazzy wheels fails in callbacks that request time
-    and sequence number of a message, and the single-threaded executor uses most of a processor core
-    for twenty sensors. `report` is called with lines for the user; `refused` are the topics that
-    are not recorded, with the reason.
+    The node is polled: the events executor of the Jazzy wheels fails in callbacks that request
+    message info, and the single-threaded executor uses most of a core for twenty sensors. `report`
+    is called with lines for the user; `refused` are {topic that is not recorded: reason}.
     """
 
     def __init__(self, recorder: Recorder, selection: Selection,
@@ -195,8 +193,7 @@ class RecordNode(Node):
         self._report(f'{topic} is not recorded: {reason}')
 
     def _update_publishers(self, topic: str, infos: list[TopicEndpointInfo]) -> None:
-        """Update a topic's publishers; report other message types; replace a latched subscription
-        if a publisher is not latched."""
+        """Update a topic's publishers; replace a latched subscription if one is not."""
         polled = self._polled_subscriptions[topic]
         other_types = sorted({i.topic_type for i in infos} - {polled.type})
         if other_types and f'{topic} as {other_types[0]}' not in self.refused:
@@ -232,11 +229,8 @@ def log(text: str) -> None:
 
 def run(selection: Selection, out: Path, split_bytes: int = 10**9,
         split_ns: int = 3600 * 10**9, ros_arguments: Sequence[str] = ()) -> int:
-    """Record into folder `out` until SIGINT, SIGTERM or SIGHUP; return the exit status.
-
-    A new file begins at `split_bytes` or `split_ns`. Raises OutputError if the recording cannot be
-    written.
-    """
+    """Record into folder `out` until SIGINT, SIGTERM or SIGHUP, in files of `split_bytes` or
+    `split_ns`; return the exit status; raises OutputError if the recording cannot be written."""
     node, status = None, 1
     with recorded_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as signals:
         try:

@@ -43,8 +43,7 @@ MAX_MESSAGES_PER_TICK = 200
 
 
 class ReplayNode(ManagedNode):
-    """Publishes the messages of a recording, at a multiple of the recorded rate, until `finished`;
-    `counts` are those played and rejected."""
+    """Publishes the messages of a recording until `finished`; `counts` played and rejected ones."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__('replay_node', **node_arguments)

@@ -69,10 +69,8 @@ def pose_line(track: Track) -> str:
 
 
 def parameters(network_path: PathLike, settings: Settings, reliable: bool) -> list[Parameter]:
-    """ROS parameters of the nodes; `reliable` is the QoS of the sensors, needed for a replay.
-
-    Settings with their default values are omitted, so that ROS arguments can change them.
-    """
+    """ROS parameters of the nodes without default values, which ROS arguments can then change;
+    `reliable` is the QoS of the sensors, needed for a replay."""
     out = [Parameter('network', value=str(network_path)),
            Parameter('target', value=settings.track.target),
            Parameter('reliable_input', value=reliable)]
@@ -111,9 +109,8 @@ def run(network_path: PathLike, settings: Settings, recording: PathLike | None =
         batches: bool = False, ros_arguments: Sequence[str] = ()) -> int:
     """Run the nodes until Ctrl-C, or until a recording has been played; return the exit status.
 
-    `drivers` is a drivers file, with which a driver node also runs; `batches` puts many sensors in
-    one message. `observers` create additional nodes after `rclpy.init`, by default a
-    `TrackPrinter`. If the middleware hangs at the end, `shut_down` ends the process.
+    `drivers` is the file of a driver node, with many sensors in one message if `batches`.
+    `observers` create additional nodes, by default a `TrackPrinter`.
     """
     # The driver node is created last, so that its first messages have subscribers.
     sources: Sequence[Callable[[], Node]] = [partial(DriverNode, parameter_overrides=[

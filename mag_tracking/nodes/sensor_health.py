@@ -27,8 +27,7 @@ from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S, WINDOW, S
 from mag_tracking.stages.health.window import ReadingBuffer
 
 WINDOW_S = 60.0
-"""[s] Length of an evaluation window. A fault is reported for one to two windows after
-the fault has ended."""
+"""[s] Length of an evaluation window; a fault is reported until the end of the next window."""
 MIN_READINGS = 64
 """Number of readings in the current window below which the previous window is reported."""
 STARTUP_S = 3.0

@@ -83,11 +83,8 @@ class BackgroundStore:
 
 
 class SensorRounds:
-    """Processes the sensors of a network one after another, in steps of similar duration.
-
-    `is_live` returns whether the readings are not replayed. `publish_states` is called with the
-    calibration of all sensors, a list that is reused.
-    """
+    """Processes the sensors one after another, in steps of similar duration; `publish_states` is
+    called with the calibration of all sensors, a list that is reused."""
 
     def __init__(self, node: str, network: SensorNetwork, stage: Calibrate,
                  health: HealthDiagnostics, store: BackgroundStore, is_live: Callable[[], bool],

@@ -29,9 +29,8 @@ STREAM_QOS = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of subscriptions between the nodes, and of the topics of a replay, which may be fast. The
 queue does not overflow while the tracker initiates a track."""
 PUBLISHER_QOS = QoSProfile(depth=250, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS of publishers between the nodes. A restarted node can skip at most 256 older messages with a
-single request (RTPS 2.3, 8.3.5.5). With a longer history, a second request would follow seconds
-later, and the node would receive nothing until then."""
+"""QoS of publishers between the nodes. A restarted node can skip at most 256 older messages with
+one request (RTPS 2.3, 8.3.5.5); it would receive nothing until a second one."""
 SENSOR_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 """QoS of subscriptions to sensors; best effort matches reliable and best-effort publishers."""
 LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
@@ -106,8 +105,7 @@ class StageNode(Node):
         return {}
 
     def monitor_subscriber(self, role: str, topic: str, publishes: str) -> None:
-        """Report in diagnostics if the node of the next step no longer subscribes to a topic; see
-        `SubscriberMonitor`."""
+        """Report if the node of the next step stops subscribing to a topic."""
         self._subscriber_monitors.append(
             SubscriberMonitor(role, self.resolve_topic_name(topic), publishes))
 
@@ -123,11 +121,8 @@ class StageNode(Node):
 
     def subscription(self, message_type: Any, topic: str, callback: Callable[[Any], None],
                      qos: QoSProfile, source: str = '', batches: bool = False) -> Subscription:
-        """Create a subscription that logs publishers with incompatible QoS.
-
-        Diagnostics report throughput and latency of the messages of a `source`; with `batches`, the
-        topic is an alternative to its other topics.
-        """
+        """Create a subscription that logs publishers with incompatible QoS; a `source` is reported
+        in diagnostics; with `batches`, the topic is an alternative to its other topics."""
         flow = self.flows.setdefault(source, Flow(source)) if source else None
         if flow is not None:
             (flow.batches if batches else flow.topics).append(self.resolve_topic_name(topic))
@@ -149,11 +144,8 @@ class StageNode(Node):
 
     def direct_input(self, source: str, topics: Sequence[str], callback: Callable[[_Record], None],
                      stamp_of: Callable[[_Record], int]) -> Callable[[_Record], None]:
-        """Create a function that receives records of the preceding step without a topic.
-
-        Diagnostics report on `source`, the step, and the `topics` on which it publishes. `stamp_of`
-        returns the timestamp of a record in ns.
-        """
+        """Create a function that receives records of the step `source` directly instead of by the
+        `topics`; `stamp_of` returns the timestamp of a record in ns."""
         flow = self.flows.setdefault(source, Flow(source))
         flow.topics += map(self.resolve_topic_name, topics)
         return self._timed(flow, callback, stamp_of)

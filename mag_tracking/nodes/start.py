@@ -1,8 +1,7 @@
 """Entry points of the nodes, with signal handling before any slow import.
 
-As soon as this module runs, SIGINT and SIGTERM end the process with status 0: immediately during
-imports, which take seconds on a small computer, later through `middleware.main`. A node that is run
-as a module therefore calls its command, which does not return, before its imports.
+As soon as this module runs, SIGINT and SIGTERM end the process with status 0: at once during
+imports, later through `middleware.main`. A node that is run as a module calls its command first.
 """
 
 import signal

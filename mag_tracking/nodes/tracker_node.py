@@ -66,11 +66,8 @@ OUTPUTS = {
 
 
 class TrackerNode(stage_node.StageNode):
-    """Tracks targets with a bank of filters and publishes the results.
-
-    With `has_direct_input`, frames are passed to `receive_frame`. `after_pose` is called between
-    the pose and the track, to publish the frame from which they were computed.
-    """
+    """Tracks targets with a bank of filters; with `has_direct_input`, frames are passed to
+    `receive_frame`, and `after_pose`, called before the track is published, publishes the frame."""
 
     def __init__(self, has_direct_input: bool = False, **node_arguments: Any) -> None:
         super().__init__('tracker_node', 'track', **node_arguments)

@@ -7,8 +7,7 @@ from typing import Protocol, TypeVar
 In = TypeVar('In', contravariant=True)
 Out = TypeVar('Out')
 MAX_BACKWARD_JUMP_S = 1.0
-"""[s] Maximum backward jump of a timestamp. After a larger jump (a looped recording), all that was
-learnt is discarded."""
+"""[s] Maximum backward jump of a timestamp; a larger one (a loop) discards all."""
 
 
 class Stage(Protocol[In, Out]):

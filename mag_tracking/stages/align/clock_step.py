@@ -52,8 +52,7 @@ class ClockStepFilter:
             newest != self.newest for newest, _ in self._ahead_since.values())
 
     def feed(self, i: int, sample: HeldSample) -> tuple[SensorSamples, SensorSamples]:
-        """Check a sample of sensor `i`; return the samples that it causes to be accepted and
-        rejected, in order of arrival."""
+        """Check a sample of sensor `i`; return samples now accepted and rejected, in order."""
         stamp = sample.stamp_ns
         if not self._jumps(i, stamp):
             passed = self._accept([(i, sample)])
@@ -104,8 +103,7 @@ class ClockStepFilter:
         return 2 * len(following) > len(following | self._active_sensors())
 
     def _advances_alone(self, i: int, stamp: int) -> bool:
-        """Whether sensor `i` has advanced by `max_jump` since its jump, or since a newer timestamp
-        was accepted."""
+        """Whether sensor `i` has advanced by `max_jump` since its jump."""
         return stamp - self._ahead_since[i][1] >= self._max_jump
 
     def _release_expired(self, i: int, stamp: int) -> SensorSamples:

@@ -22,8 +22,7 @@ from mag_tracking.units import NS
 DEFAULT_PERIOD_S = 0.08
 """[s] Default frame period: 12.5 Hz, as in T10 section 6.3 for sensors nine metres apart."""
 MIN_AUTO_PERIOD_S = 0.02
-"""[s] Minimum automatic frame period. Shorter frames add little information, and at 100 frames per
-second tracking occupies a whole core."""
+"""[s] Minimum automatic frame period; 100 frames per second occupy a whole core."""
 MIN_PERIOD_S = 1e-4
 """[s] Minimum configurable frame period; no sensor has a shorter sample interval."""
 MAX_TARGET_SPEED = 20.0

@@ -12,8 +12,7 @@ from mag_tracking.network import SensorNetwork
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 
 MIN_CHANGE = 1e-7
-"""[T] Change of a background after which it is compared again; the smallest fault that distorts
-tracks changes it by about a hundred times as much."""
+"""[T] Change of a background after which it is compared again; harmful faults exceed 1e-5."""
 
 
 def compared_with_earth(network: SensorNetwork, survey: SurveySettings,

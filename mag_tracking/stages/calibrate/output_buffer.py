@@ -15,11 +15,8 @@ COUNTED = {'held back while learning': 'n_learning',
 
 
 class OutputBuffer:
-    """Arrays to which compiled code appends calibrated readings; resets the counters of `batch`.
-
-    `arrays` are sensor indices (capacity,), timestamps (capacity,) [ns], fields (capacity, 3) [T]
-    and covariances (capacity, 3, 3) [T²].
-    """
+    """Arrays for calibrated readings: sensor indices (n,), timestamps (n,) [ns], fields (n, 3) [T],
+    and covariances (n, 3, 3) [T²]; resets the counters of `batch`."""
 
     def __init__(self, names: tuple[str, ...], capacity: int, batch: Record) -> None:
         self._names, self._batch = names, batch

@@ -28,8 +28,7 @@ MIN_LEVEL_FRACTION = 1.0 / 3.0
 N_READINGS_AT_ONCE = 8
 """Number of readings per batch while the initial background is learnt."""
 N_BEGINNING = N_WINDOW + 1
-"""Number of readings per sensor in which faults of the drivers are searched before the
-backgrounds."""
+"""Number of readings per sensor in which faults of drivers are searched first."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +36,7 @@ class Prescan:
     """Backgrounds, resolutions and faults of drivers found by a first pass over a recording."""
 
     levels: dict[str, MostFrequentLevel]
-    """{sensor: most frequent level}; empty if no target is present at the start of the
-    recording."""
+    """{sensor: most frequent level}; empty if no target is present at the start."""
     steps: dict[str, FloatArray]
     """{sensor: (3,) smallest change of each axis, T}."""
     faults: dict[str, ReadingFaults]
@@ -47,8 +45,7 @@ class Prescan:
     """{sensor: timestamps and times of receipt}; empty if the times of receipt are unknown."""
 
     def segment_of(self, sensor: str) -> list[float] | None:
-        """Interval [begin, end] in which a sensor's background level was observed, s after its
-        first reading."""
+        """Interval [s after the first reading] in which a sensor's level was observed."""
         level = self.levels.get(sensor)
         return None if level is None else [level.begin, level.end]
 
@@ -60,8 +57,7 @@ class Prescan:
 
 def prescan(batches: Iterable[Readings], network: SensorNetwork,
             settings: CalibrateSettings) -> Prescan:
-    """Find the backgrounds of sensors, unless the network file contains all of them, if a target is
-    present at the start of the raw readings."""
+    """Find the backgrounds that the network file lacks if a target is present at the start."""
     without_background = [name for name, level in zip(network.names, network.background,
                                                       strict=True) if level is None]
     batches = iter(batches)
@@ -124,8 +120,7 @@ def _level_of(recorder: BlockRecorder, departed_at: float | None,
 
 def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
            learnt: dict[str, tuple[float, FloatArray]]) -> None:
-    """Feed readings to `learner`; update {sensor: first timestamp} and {sensor: (learning time
-    after the first reading [s], (3,) background [T])}."""
+    """Feed `learner`; update first timestamps, and learning times [s] with backgrounds (3,) [T]."""
     for i in range(0, len(readings), N_READINGS_AT_ONCE):
         if len(learnt) == len(learner.backgrounds()):
             learner.feed(readings.part(slice(i, None)))
@@ -142,8 +137,7 @@ def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
 
 def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: MostFrequentLevel,
                     recorder: BlockRecorder, settings: CalibrateSettings) -> bool:
-    """Whether the initial background was learnt early and, unless relearning is disabled, equals
-    the most frequent level."""
+    """Whether the initial background was learnt early and, if relearnt, is the level."""
     max_time = LEARNING_TOLERANCE_S + max(settings.learn_s, MIN_BLOCKS * level.block_s)
     if learnt is None or learnt[0] > max_time:
         return False

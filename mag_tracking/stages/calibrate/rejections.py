@@ -32,8 +32,7 @@ REJECTIONS = {
 
 
 def own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
-    """Validity (NONE, VALID or INVALID) of each reading, and the covariances, empty if there are
-    none."""
+    """Validity of each reading, and the covariances, empty if there are none."""
     if readings.covariance is None:
         return np.zeros(len(readings), dtype=np.int64), np.empty((0, 3, 3))
     C = plain(readings.covariance)

@@ -32,16 +32,13 @@ from mag_tracking.units import NEVER, NS
 MEMORY_S = 20.0
 """[s] Duration of the quiet interval to which level, drift and noise are fitted."""
 GUARD_S = 1.5
-"""[s] Delay before a quiet reading is included in the background, so that the slow approach of a
-target is excluded."""
+"""[s] Delay before a reading is included in the background, which excludes slow approaches."""
 BLOCK_S = 0.25
 """[s] Duration of a block. The quietness of a sensor is evaluated block by block."""
 FREEZE_STD = 2.0
-"""The background is frozen if the mean of a block deviates from it by more than this number of
-standard deviations of the noise."""
+"""Deviation of the mean of a block that freezes the background, in noise stds."""
 MAX_FORWARD_JUMP_S = 60.0
-"""[s] Maximum forward jump of a timestamp. A larger jump is treated as corrupt unless the next
-timestamp confirms it."""
+"""[s] Maximum forward jump of a timestamp, unless the next timestamp confirms it."""
 MAX_SYNCHRONOUS = 16
 """Maximum number of sensors whose blocks may end at the same time. In larger networks, the blocks
 are staggered, because evaluating all blocks at once would delay the readings."""
@@ -98,10 +95,8 @@ class Calibrate:
         self.update_network(network)
 
     def update_network(self, network: SensorNetwork) -> None:
-        """Apply a new calibration of the same sensors; raises NetworkError if their names differ.
-
-        The background of a sensor whose offset or correction has changed is learnt again.
-        """
+        """Apply a new calibration of the same sensors, and learn changed backgrounds again; raises
+        NetworkError if their names differ."""
         if network.names != tuple(self._index):
             raise NetworkError(f'the new network has the sensors {", ".join(network.names)}; '
                                f'expected {", ".join(self._index)}')
@@ -336,11 +331,9 @@ class Calibrate:
         return None if np.isnan(level).all() else StoredBackground(last, level, C)
 
     def idle(self) -> None:
-        """Evaluate the completed blocks now, instead of at the next reading of their sensors.
-
-        Only in a large network are completed blocks deferred, and there the reading that completes
-        a block is calibrated with the previous background.
-        """
+        """Evaluate the completed blocks now, instead of at the next readings; only in a large
+        network are blocks deferred, and the previous background is used for the reading in
+        between."""
         for i in np.flatnonzero(self._sensors['is_full']):
             self._evaluate_block(int(i))
 
@@ -363,8 +356,7 @@ class Calibrate:
             self.rejections[sensor][cause] += n
 
     def forget(self, sensors: Collection[str] = ()) -> None:
-        """Discard the backgrounds of sensors, by default of all, and learn them again; raises
-        NetworkError for an unknown sensor."""
+        """Learn backgrounds again, by default all; raises NetworkError for an unknown sensor."""
         for name in sensors:
             self._network.index(name)
         for name in sensors or self._network.names:

@@ -27,8 +27,7 @@ VARIANCE_REDUCTION = 20.0
 no noise of an axis that does not change without a target. In a network of two sensors, a single
 step of one axis, which background drift can cause, remains below the threshold."""
 RELEASE_PROBABILITY = 1e-2
-"""Probability that noise exceeds the release threshold, unless that of the detection is larger. A
-frame below that threshold is quiet."""
+"""Minimum probability that noise exceeds the threshold below which a frame is quiet."""
 RECOVERY_S = 5.0
 """[s] Approximate time in which the calibration learns the background again after a target."""
 

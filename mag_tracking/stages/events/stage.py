@@ -30,9 +30,8 @@ MAX_DURATION_S = 120.0
 SIGNATURE_POINTS = 33
 """Number of points of a signature."""
 MAX_SAMPLES, MIN_SAMPLES, MAX_STARTS = 200, 8, 5
-"""Maximum number of samples (blocks of a longer pass are averaged) and minimum number of complete
-samples in a fit, and number of grid points from which its search starts; with one axis it has
-several minima."""
+"""Maximum number of samples (blocks of a longer pass are averaged) and minimum number of samples in
+a fit, and number of starts of its search, which has several minima with one axis."""
 CORRELATION_TIME, CENTRE_OFFSET = 2.0, 0.15
 """[time scales] Correlation time of the residual when a dipole is fitted to a vehicle, and typical
 distance of its magnetic centre from the middle of its body."""
@@ -41,9 +40,8 @@ distance of its magnetic centre from the middle of its body."""
 class Events:
     """Converts calibrated readings to pass events, one for each detection at each sensor.
 
-    The events that one batch completes are returned sensor by sensor. An event contains no lengths,
-    because a single sensor does not observe the spatial scale. The track settings determine the
-    rate below which a pass is not resolved.
+    The events of one batch are returned sensor by sensor. A single sensor does not observe lengths.
+    The track settings determine the rate below which a pass is not resolved.
     """
 
     def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
@@ -238,8 +236,7 @@ class ClosestPoint(NamedTuple):
     """Closest point of approach of a pass, estimated from one sensor."""
 
     time: float
-    """[s] Time of the closest point; of the largest field if the closest point is not observable.
-    NaN without samples."""
+    """[s] Time of the closest point; if not observable, of the largest field, or NaN."""
     time_std: float
     """[s] Standard deviation of `time`; inf if the closest point is not observable."""
     time_scale: float

@@ -32,8 +32,7 @@ MIN_OPPOSITE = 0.5
 MAX_GAP_S, MAX_GAP_INTERVALS = 5.0, 3.0
 """[s] Maximum gap between events of one vehicle, to which intervals between readings are added."""
 MIN_APPROACH = 0.3
-"""Minimum decrease of the distance to the field without a vehicle, relative to the change of the
-background, for a vehicle to have left."""
+"""Minimum approach to the free field when a vehicle leaves, relative to the change."""
 MAX_OPEN = 8
 """Maximum number of vehicles that stand beside a sensor; the oldest is reported as not ended."""
 
@@ -46,8 +45,7 @@ class _Stay(NamedTuple):
 
 
 class _Held(NamedTuple):
-    """End of an event, None if it is complete, at which the field (3,) [T] of a vehicle
-    remained."""
+    """End of an event (None if complete) at which a vehicle's field (3,) [T] remained."""
 
     event: PassEvent | None
     level: FloatArray
@@ -76,11 +74,10 @@ class Stays:
 
     def add(self, event: PassEvent, readings: Readings,
             relearnt: Sequence[RelearntBackground]) -> list[PassEvent]:
-        """Add an event, and return the completed events; `readings` are the calibrated readings
-        from before its onset until after its release.
+        """Add an event, and return the completed events; `readings` extend over the whole event.
 
-        The departure of a parked vehicle completes the event of its arrival. The event of a vehicle
-        that was present from the start begins with the first reading.
+        A departure completes the event of the arrival; if the vehicle was present from the start,
+        its event begins with the first reading.
         """
         end_ns = int(readings.stamp_ns[-1])
         change = max((c for c in relearnt if event.onset_ns < c.stamp_ns <= end_ns),
@@ -137,8 +134,7 @@ class Stays:
 
     def _changed(self, event: PassEvent, level: FloatArray, tolerance: float, noise: float,
                  change: RelearntBackground, is_first: bool) -> list[PassEvent]:
-        """Events completed by an event before whose end the background changed; `level` (3,) [T] is
-        the field before."""
+        """Events completed if the background changed, with the field `level` (3,) [T] before."""
         for k in reversed(range(len(self._open))):
             if np.linalg.norm(self._open[k].level + level) <= tolerance:
                 return [_until(self._open.pop(k), event.onset_ns, True)]

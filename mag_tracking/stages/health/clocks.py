@@ -29,8 +29,7 @@ MAX_CHANGE = 0.1
 EARLIEST_DATE_S = 20.0 * 365.25 * 86400.0
 """[s] A clock that shows an earlier date (1990) than this counts from the start of its device."""
 MIN_SPAN_S = 0.2
-"""[s] Minimum time of receipt over which the unit of the timestamps, or the change of a difference,
-is known."""
+"""[s] Minimum time of receipt that shows the unit of timestamps or the change of a difference."""
 UNITS = ((1e3, 'the seconds of its timestamps are milliseconds'),
          (1e6, 'the seconds of its timestamps are microseconds'),
          (1e9, 'the seconds of its timestamps are nanoseconds'),

@@ -145,16 +145,12 @@ reported because the statement of the finding is then wrong)}."""
 _NETWORK_WIDE = frozenset({
     Cause.OVERLOADED, Cause.DAMAGED_RECORDING, Cause.UNDECODABLE,
     Cause.FRAMES_TOO_LONG, Cause.REJECTED, Cause.NO_DETECTION})
-"""Causes that are related to findings about every subject; other causes only to findings about
-their own subject."""
+"""Causes that are related to findings about other subjects."""
 
 
 def ranked(findings: Iterable[Finding]) -> list[Diagnosis]:
-    """Attach each finding to the cause that explains it; serious diagnoses come first.
-
-    A further finding of the same cause and subject is a consequence of the first one. Artefacts of
-    another finding are omitted.
-    """
+    """Attach each finding, unless an artefact, to the cause that explains it, or to the first one
+    of the same cause and subject; serious diagnoses come first."""
     same_fault: dict[tuple[str, Cause], list[Finding]] = {}
     for finding in findings:
         same_fault.setdefault((finding.subject, finding.cause), []).append(finding)

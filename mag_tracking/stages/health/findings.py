@@ -73,8 +73,7 @@ def sensor_findings(network: SensorNetwork, calibrate: Calibrate, settings: Trac
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
                         n_reported: int = 0) -> Iterator[Finding]:
-    """Diagnose the background of a sensor, frozen since `frozen_since_ns` or not (None), of which
-    `n_reported` were relearnt and reported earlier."""
+    """Diagnose a background; `n_reported` times it was relearnt and reported earlier."""
     background, last = calibrate.backgrounds()[name], calibrate.last_stamp_ns(name)
     if last is not None and not background.ready and background.stuck:
         yield Finding(True, name, 'its readings do not change, and the sensor is not used', 'move '
@@ -192,10 +191,8 @@ def covariance_findings(name: str, topic: str, calibrate: Calibrate) -> Iterator
 
 def no_detection_reason(network: SensorNetwork, calibrate: Calibrate, detect: Detect,
                         missing_topics: Sequence[str], rejected: Mapping[str, int]) -> str | None:
-    """Explain why nothing was detected in a whole recording; None if a target was detected.
-
-    `missing_topics` of the network were not recorded; `rejected` are readings, {cause: number}.
-    """
+    """Explain why nothing was detected in a recording without `missing_topics`, with `rejected`
+    readings {cause: number}; None if a target was detected."""
     if detect.counts['onsets']:
         return None
     n_accepted = sum(calibrate.counts_of(name)['accepted'] for name in network.names)

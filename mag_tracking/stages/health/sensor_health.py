@@ -26,8 +26,7 @@ clock; `apps.doctor` compares the clocks of the sensors."""
 GAP_RATIO = 1.5
 """Readings are counted as lost if the ratio of an interval to the median interval exceeds this."""
 MAX_JITTER = 0.3
-"""Maximum median absolute deviation of the intervals, relative to their median. Above it, lost
-readings are not counted."""
+"""Maximum relative deviation of the intervals up to which lost readings are counted."""
 STUCK_S = 1.0
 """[s] A sensor is stuck if its readings are identical for longer than this."""
 MIN_STUCK_READINGS = 8
@@ -35,11 +34,9 @@ MIN_STUCK_READINGS = 8
 MAX_PLATEAU_S = 0.5
 """[s] Maximum time for which a target that passes saturates a sensor."""
 MIN_MOVED_STEPS = 10.0
-"""A target that changes one axis by more than this number of quantisation steps is assumed to
-change every other axis by at least one step."""
+"""Steps by which a target that changes an axis changes every other axis by a step."""
 SPIKE_STD = 30.0
-"""Minimum difference of a spike from both neighbouring readings, in standard deviations of the
-noise; see `isolated_readings`."""
+"""Minimum difference of a spike from its neighbours, in stds (see `isolated_readings`)."""
 
 
 class SensorHealth:
@@ -164,8 +161,7 @@ class SensorHealth:
                 / self._interval_ns
 
     def _are_gaps(self, intervals: IntArray) -> BoolArray:
-        """Whether readings are missing in each of the latest intervals [ns]; the adjacent ones
-        compensate for a timestamp that is only late."""
+        """Whether intervals [ns] lack readings; the adjacent ones may compensate delays."""
         n, dt = len(intervals), self._interval_ns
         nearby = np.concatenate([[dt], np.diff(self._stamps), [dt]])[-n - 2:]
         spans = nearby[:-2] + intervals + nearby[2:]
@@ -298,11 +294,8 @@ class SensorHealth:
 
     def findings(self, name: str, noise_std: FloatArray | None = None,
                  max_field: float = 1e-3, is_live: bool = True) -> list[Finding]:
-        """Faults of the sensor `name`, without ranking.
-
-        `noise_std` (3,) [T] is that of the calibration. The timestamps of a replay (not `is_live`)
-        may be old or repeat, so clocks are not checked.
-        """
+        """Faults of the sensor `name`, without ranking; `noise_std` (3,) [T] is that of the
+        calibration. Clocks are not checked unless `is_live`."""
         n = self.counts['readings']
         if not n:
             return [Finding(True, name, 'no reading', 'check its cable, its driver and the topic '

@@ -29,8 +29,7 @@ class ReadingBuffer:
                                  self._field)
 
     def pop(self, j: int) -> tuple[IntArray, FloatArray, IntArray]:
-        """Remove and return the timestamps, fields and times of receipt of sensor `j`: views, which
-        the next readings of the sensor overwrite."""
+        """Remove and return timestamps, fields and times of receipt of a sensor, as views."""
         out = self.peek(j)
         self._count[j] = 0
         return out
@@ -43,8 +42,7 @@ class ReadingBuffer:
 
 def quantiles(values: Sequence[float] | FloatArray | IntArray,
               *probabilities: float) -> list[float]:
-    """Quantiles of finite values, as `numpy.quantile` but without its slow checks; NaN if there are
-    no values."""
+    """Quantiles of finite values, faster than those of numpy; NaN without values."""
     if not len(values):
         return [float('nan')] * len(probabilities)
     ordered, out = np.sort(values), []

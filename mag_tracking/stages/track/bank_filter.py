@@ -24,24 +24,20 @@ LINEAR_FRACTION, SAME_TIME_FRACTION = 0.25, 0.05
 nearest sensor, whose cube then changes by a factor of two; and fraction of the interval since the
 previous frame below which the samples of a frame count as simultaneous."""
 NEGLIGIBLE_ENERGY, WEAK_ENERGY = 0.1, 1.0
-"""Squared norm of the whitened field per frame below which a target that moves away is removed from
-a joint track, and up to which it does not disturb other targets; the latter is the limit if the
-track has the maximum number of targets."""
+"""Whitened squared field per frame below which a departing target is removed from a joint track,
+and up to which it does not disturb others: the limit if there are no more places."""
 DETECTABLE_ENERGY = 4.0
-"""Minimum squared norm of the whitened field of a detectable target: of a tracked vehicle in the
-last frame, of a new vehicle in a window at each sensor, and of a path in a search according to the
-prior of its moments."""
+"""Minimum squared norm of the whitened field of a detectable target: in the last frame, of a new
+vehicle in a window at each sensor, and of a path according to the prior of its moments."""
 
 
 class PathResult(NamedTuple):
     """Result of `BankFilter.run_along`; the first axis of every array is the hypothesis."""
 
     log_likelihood: FloatArray
-    """(n_hyp,) Log-likelihood of the frames used for updates; -inf if a dipole is at a sensor or a
-    variance is negative."""
+    """(n_hyp,) Log-likelihood of the used frames; -inf if the path is unusable."""
     max_shift: FloatArray
-    """(n_hyp,) Largest distance of the smoothed positions from the path in the last pass, in
-    standard deviations of the position."""
+    """(n_hyp,) Largest shift of the positions in the last pass, in their stds."""
     used: BoolArray
     """Whether the hypothesis was updated with each frame, (n_hyp, n)."""
     covariances: FloatArray
@@ -64,8 +60,7 @@ def compiled_filter(model: SourceModel, observation: Observation
 
 
 class BankFilter:
-    """Stateless prediction and update of a `FilterBank` of `n_targets` targets that share a state,
-    and whose fields add up."""
+    """Stateless filter of a `FilterBank` of `n_targets` targets whose fields add up."""
 
     def __init__(self, network: SensorNetwork, model: SourceModel, settings: TrackSettings,
                  n_targets: int = 1) -> None:
@@ -96,12 +91,8 @@ class BankFilter:
     def advance(self, bank: FilterBank, frame: FieldFrame, dt: float, keeps_prior: bool = False
                 ) -> tuple[FloatArray, FloatArray]:
         """Predict a bank in place to the time of a frame, if `dt` [s] is positive, and update it;
-        return the predicted states (n_hyp, n_x) and the log-likelihoods (n_hyp,), which are -inf if
-        a dipole is at a sensor.
-
-        With `keeps_prior`, new arrays replace `bank.x` and `bank.P` instead of overwriting them,
-        which is slower.
-        """
+        return the predicted states (n_hyp, n_x) and the log-likelihoods (n_hyp,), -inf if a dipole
+        is at a sensor; with `keeps_prior`, slower, new arrays replace `bank.x` and `bank.P`."""
         return self._advance(bank, frame, dt, dt > 0.0, self._settings.iterations, keeps_prior)
 
     def _advance(self, bank: FilterBank, frame: FieldFrame, dt: float, moves: bool,
@@ -199,14 +190,12 @@ class BankFilter:
 
     def field_of_others(self, bank: FilterBank, i: int, target: int, frame: FieldFrame,
                         dt: float) -> FloatArray:
-        """Field (n_sensors, 3) of all targets of hypothesis `i` except `target`, at the sampling
-        times of a frame, T, sensor frame."""
+        """Field (n_sensors, 3) [T] of all targets of a hypothesis except `target`."""
         others = [k for k in range(self.observation.n_targets) if k != target]
         return self.observation.field_of(bank.x[i], others, self.time_offset(frame, dt))
 
     def field_energies(self, target: int, x: FloatArray, frame: FieldFrame) -> FloatArray:
-        """Squared norm (n_sensors,) of the whitened field of a target of a state `x` (n_x,) at each
-        sensor."""
+        """Squared norm (n_sensors,) of the whitened field of one target of a state."""
         field = self.observation.field_of(x, [target], self._zero_offset)
         return whitened_energy(np.where(np.isnan(frame.field), np.nan, field), frame.covariance)[0]
 
@@ -215,34 +204,29 @@ class BankFilter:
         return self._near_field_lengths[kind].reshape(len(kind), -1)
 
     def are_long(self, kind: IntArray) -> BoolArray:
-        """Whether any target of each hypothesis is longer than a car; `kind` is (n,) or
-        (n, n_targets)."""
+        """Whether any target of each hypothesis, of a given kind, is longer than a car."""
         are_long: BoolArray = np.any(self._is_long_kind[kind].reshape(len(kind), -1), axis=1)
         return are_long
 
     def linear_range(self, x: FloatArray) -> FloatArray:
-        """Displacement (n_hyp,) over which the field of the targets of `x` (n_hyp, n_x) is
-        approximately linear, m."""
+        """Displacement (n_hyp,) over which the field is approximately linear, m."""
         return LINEAR_FRACTION * self.observation.distance_to_nearest(x)
 
     def is_implausible(self, bank: FilterBank, i: int, frame: FieldFrame) -> bool:
-        """Whether the normalised innovation squared of hypothesis `i`, after the update with
-        `frame`, exceeds `end_nis` per axis."""
+        """Whether the innovation of a hypothesis exceeds `end_nis` per axis."""
         n_y = np.count_nonzero(~np.isnan(frame.field))
         return bool(np.nansum(bank.nis[i]) > self._settings.end_nis * n_y)
 
 
 class NoTarget:
-    """Filter of the backgrounds without a target, the reference for the evidence of a target, with
-    an initial std of `background_std` [T] per axis."""
+    """Filter of the backgrounds without a target, with an initial std `background_std` [T]."""
 
     def __init__(self, n_sensors: int, background_std: float) -> None:
         self._x = np.zeros((n_sensors, 3))
         self._P = np.tile(background_std**2 * np.eye(3), (n_sensors, 1, 1))
 
     def log_density(self, frame: FieldFrame, dt: float, background_drift: float) -> float:
-        """Update the backgrounds, with a random walk of `background_drift` [T/√s], with a frame;
-        return its log-density given the previous frames."""
+        """Update the backgrounds with a frame; return its log-density given the others."""
         self._P += background_drift**2 * dt * np.eye(3)
         is_present = ~np.isnan(frame.field)
         both_present = is_present[:, :, None] & is_present[:, None, :]

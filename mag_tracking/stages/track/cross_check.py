@@ -16,25 +16,21 @@ from mag_tracking.stages.track.smoothing import TrackState
 from mag_tracking.units import NS
 
 SIGNIFICANT_STDS, PRIOR_STD_S = 4.0, 1e3
-"""Minimum number of standard deviations of a significant offset, and prior standard deviation [s]
-of the offset of each clock."""
+"""Significance of an offset [standard deviations], and prior std of each clock [s]."""
 MEMORY_PASSES = 20
 """Effective number of passes in the estimate; clocks drift and are adjusted."""
 FORGETTING_FACTOR, CONTRADICTED_FACTOR = 1.0 - 1.0 / MEMORY_PASSES, 0.5
-"""Factor on the previous information at a pass that agrees with the estimate, and at a pass that
-contradicts it."""
+"""Factors on earlier information at a pass that agrees, and at one that contradicts."""
 PASSED_FRACTION = 0.6
 """A vehicle has passed when the field is below this fraction of its maximum."""
 FIRST_CHECK_S, CHECK_INTERVAL_RATIO = 0.12, 1.7
-"""[s] Delay of the first fit after the maximum of the field, and ratio of the delays of successive
-fits."""
+"""[s] Delay of the first fit after the maximum of the field, and ratio of successive delays."""
 BEFORE_S, AFTER_S = 4.0, 3.0
 """[s] Duration of a pass before and after the maximum of the field."""
 MIN_FRAMES, MAX_FRAMES = 12, 128
 """Minimum and maximum number of frames in a fit. A longer pass is decimated."""
 STEADY_S, LATE_MISFIT = 1.5, 8.0
-"""[s] Time after the maximum of the field for which acceleration and turn rate are assumed to be
-constant, and maximum misfit (reduced chi-square) of a later fit."""
+"""[s] Time after the maximum with constant acceleration and turn rate; maximum later misfit."""
 
 
 @dataclass(frozen=True)
@@ -108,9 +104,8 @@ class ClockComparison:
                            int(self._n_passes[j]))
 
     def add(self, rigid_pass: pass_samples.RigidPass, rows: IntArray) -> None:
-        """Add a pass with the sensors `rows` of the network; it is ignored if no straight path
-        explains it, if a bent one is significantly better, or if the vehicle is too slow for the
-        clocks to matter."""
+        """Add a pass with the sensors `rows` of the network, unless no straight path explains it, a
+        bent one is significantly better, or the vehicle is slow."""
         is_slow = rigid_pass.speed * pass_samples.MAX_OFFSET < pass_samples.MIN_DISTANCE
         if is_slow or not (rigid_pass.is_explained and rigid_pass.is_straight):
             return
@@ -142,8 +137,7 @@ class ClockComparison:
             (offset > SIGNIFICANT_STDS * std) & (offset > min_offset), offset, 0.0)
 
     def _offsets(self) -> tuple[FloatArray, FloatArray]:
-        """Time by which the clock of each row is ahead of the clock of each column, and its std,
-        infinite on the diagonal, both (n, n) [s]."""
+        """Differences (n, n) [s] of row clocks from column clocks, and their stds."""
         # The common offset of all clocks is not observable; the prior fixes it.
         prior = np.eye(len(self._vector)) / PRIOR_STD_S**2
         covariance: FloatArray = np.linalg.inv(self._information + prior).astype(np.float64)
@@ -203,8 +197,7 @@ class CrossCheck:
         self._frames.append(frame)
 
     def doubts(self, clocks_apart_s: float) -> set[str]:
-        """Fit the pass if a fit is due, and return the doubts about the track; `clocks_apart_s` is
-        the largest significant offset between the clocks, from earlier passes."""
+        """Fit the pass if due, and return the doubts; `clocks_apart_s` is from earlier passes."""
         if self._current is None:
             return set()
         self._fit_if_due(self._current.magnitude)
@@ -227,8 +220,7 @@ class CrossCheck:
         return [in_pass[min(max(k, first), last) - first] for k in range(len(states))]
 
     def _covers(self, stamp_ns: int) -> bool:
-        """Whether the latest fit determines the position of the vehicle at a time; the part of a
-        pass after the maximum of the field alone could be on many paths."""
+        """Whether the latest fit determines the position at a time, from a whole pass."""
         return self.latest is not None and self._is_whole_pass \
             and _is_in_pass(stamp_ns, self.latest.stamp_ns)
 
@@ -238,8 +230,7 @@ class CrossCheck:
         return bool(self._pass_doubts())
 
     def finish(self, clocks: ClockComparison, rows: IntArray) -> None:
-        """Fit the pass if a fit is due at the end of the track, and add it to the clock comparison;
-        `rows` are the sensors of the track in the network."""
+        """Fit the pass at the end if due; add it to the comparison with sensors `rows`."""
         self._fit_if_due(0.0)
         if self.latest is not None:
             clocks.add(self.latest, rows)

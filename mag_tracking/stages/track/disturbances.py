@@ -23,15 +23,13 @@ from mag_tracking.records import FieldFrame
 FALSE_ALARM_PROBABILITY = 1e-6
 """Probability that the noise of a sensor alone marks it as affected in a frame."""
 GRADIENT_RATIO = 0.3
-"""Prior standard deviation of the change of a common field from the centre of the network to its
-edge, relative to that of the field."""
+"""Prior ratio of the change of a common field from centre to edge to the field."""
 MIN_STD = 1e-15
 """[T] Minimum standard deviation of the noise of a sensor in a network file."""
 UNKNOWN_FIELD_STD = 1e-4
 """Prior standard deviation of the field after a handover [T]."""
 MIN_GRADIENT_SENSORS = 3
-"""Minimum number of sensors for a common field with a gradient, which could explain any readings of
-fewer."""
+"""Minimum number of sensors that a gradient does not explain exactly."""
 MAX_COMMON_SENSORS = 8
 """Maximum number of sensors in the model of a common field, whose cost grows with its cube."""
 _Filters: TypeAlias = tuple[GaussMarkovVectors, GaussMarkovVectors, GaussMarkovVectors]
@@ -63,8 +61,7 @@ class Disturbances:
         self._sensed: BoolArray = np.zeros(len(names), dtype=bool)
 
     def begin(self, found: UnexplainedField, stamp_ns: int) -> list[Disturbance]:
-        """Start a disturbance after an unexplained track and return its record, or extend the
-        current one."""
+        """Begin a disturbance and return its record, or extend the current one."""
         if self._current is not None:
             self._largest = np.maximum(self._largest, found.largest)
             self._sensed |= found.sensed
@@ -128,9 +125,8 @@ class DisturbanceModel:
         return float(np.exp(self._log_w[1]))
 
     def log_density(self, frame: FieldFrame, dt: float, model_error: FloatArray) -> float | None:
-        """Update the models with a frame and the variance `model_error` (n_sensors,) [T²] per axis
-        that the tracker assumes; return its log-density given the previous frames, None for the
-        first one with readings after a handover, and 0 before the first reading."""
+        """Update the models with a frame and the variance `model_error` (n_sensors,) [T²] per axis;
+        return its log-density, None for the first one after a handover, 0 before readings."""
         is_present = np.isfinite(frame.field.ravel())
         noise = np.einsum('jii->ji', frame.covariance)
         variance = np.maximum(noise + model_error[:, None], MIN_STD**2).ravel()[is_present]

@@ -26,8 +26,7 @@ NO_STEADY_PATH = 'no_steady_path'
 ANOTHER_VEHICLE = 'another_vehicle'
 
 PERMANENT = frozenset({SENSORS_ROTATED, FRAMES_TOO_LONG, CLOCKS_APART})
-"""Doubts that persist until the end of a track, because they show that its path is distorted. Later
-frames may correct the causes of other doubts."""
+"""Doubts that persist until the end of a track, because they show that its path is distorted."""
 MEANINGS = {
     ANOTHER_PLACE: 'another position is still possible',
     ANOTHER_ARRIVAL: 'another arrival direction is still possible',

@@ -16,32 +16,26 @@ from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NS
 
 MAX_SINGLE_SENSOR_S = 0.5
-"""[s] Maximum total time in which only one of several sensors measures the target of an unambiguous
-track."""
+"""[s] Maximum total time in which only one of several sensors measures."""
 LOST, OUT_OF_REACH, UNEXPLAINED = 'target lost', 'out of reach', 'unexplained'
 """Reasons to end a track."""
 UNEXPLAINED_S = 3.0
-"""[s] Time after which a track ends that a disturbance explains better than a target, unless a
-target explained it better earlier."""
+"""[s] Time after which a track ends that a disturbance has always explained better."""
 CONTRADICTION = 1e-5
-"""Probability below which a field contradicts the track of a vehicle. The filter, which is still
-updated with it, may follow a wrong path that agrees with all later frames."""
+"""Probability below which a field contradicts a track, which may then follow a wrong path."""
 OVERFIT_NATS = float(np.log(1e4))
-"""[nats] Maximum excess of the log-likelihood in the filter over that along the path of the same
-hypothesis. A filter that linearises each frame at a different state may fit the frames better than
-any single path can."""
+"""[nats] Maximum excess of the log-likelihood in the filter, which linearises each frame at a
+different state, over that along the path of the same hypothesis."""
 MIN_OBSERVED_FRACTION = 0.5
 """Fraction of the lookback that the frames before the detection of an unambiguous track cover."""
 SENSED_LEVEL = 4.0
-"""Energy of the fields of a sensor that has sensed the target, in excess of the expected energy of
-its noise, in standard deviations."""
+"""Excess energy of a sensor that has sensed the target, in stds of the energy of noise."""
 TRANSIENT_DOUBTS = (doubts.OVERFIT, doubts.DISTURBANCE_MODEL, doubts.INNOVATIONS, doubts.MISFIT,
                     doubts.HEIGHT, doubts.BELOW_SENSORS, doubts.OFF_THE_ROAD,
                     doubts.NO_STEADY_PATH)
 """Doubts about the state of the filter in single frames, which smoothing resolves only in part."""
 TRANSIENT_S = 0.1
-"""[s] Time for which a transient doubt persists, because one that is absent from a single frame may
-reappear in the next."""
+"""[s] Time for which a transient doubt persists, as it may reappear in the next frame."""
 MAX_INTERVALS = 5000
 """Maximum number of stored intervals with doubtful poses; a track that is smoothed has fewer."""
 
@@ -96,8 +90,7 @@ class TrackEvidence:
 
     def flag_start(self, approach_unobserved: bool, network: SensorNetwork, starts_anywhere: bool
                    ) -> None:
-        """Mark the track as doubtful if its start was not observed, unless it `starts_anywhere`, or
-        if its range is not observable."""
+        """Flag an unobserved start, unless it `starts_anywhere`, or an unknown range."""
         # A target that was not seen approaching may already have passed.
         if approach_unobserved and not starts_anywhere:
             self.doubts.add(doubts.NOT_SEEN_APPROACHING)
@@ -120,8 +113,7 @@ class TrackEvidence:
             self.doubts.add(doubts.NOT_SEEN_APPROACHING)
 
     def add_frame(self, frame: FieldFrame, rows: IntArray, nis: FloatArray) -> None:
-        """Add the fields of the sensors `rows` of the network, and their normalised innovations
-        squared `nis` (n,) for the published hypothesis."""
+        """Add the fields of sensors `rows`, and their innovations squared `nis` (n,)."""
         energy, n_axes = whitened_energy(frame.field, frame.covariance)
         self._energy[rows] += energy - n_axes
         self._n_axes[rows] += n_axes
@@ -143,8 +135,7 @@ class TrackEvidence:
         return int(np.count_nonzero(self.sensed)) < 2
 
     def update_doubts(self, found: set[str], stamp_ns: int) -> set[str]:
-        """Store the doubts found in a frame, and return them with the earlier doubts that
-        persist."""
+        """Store the doubts found in a frame; return them with persisting ones."""
         transient = found.intersection(TRANSIENT_DOUBTS)
         self._doubtful_times = updated(
             self._doubtful_times, stamp_ns, bool(transient), MAX_INTERVALS)
@@ -153,12 +144,8 @@ class TrackEvidence:
                         if stamp_ns <= expiry_ns}
 
     def contradicts(self, nis: FloatArray, degrees_of_freedom: int) -> bool:
-        """Whether the innovations `nis` (n_sensors,) of a frame, NaN if missing, are too large for
-        the target model.
-
-        With at most two sensors, this marks the track as doubtful, because many paths fit the
-        fields. With more, later frames correct the track.
-        """
+        """Whether the innovations `nis` (n_sensors,) of a frame, NaN if missing, are too large;
+        with at most two sensors, for which many paths fit, this flags the whole track."""
         is_contradiction = bool(np.nansum(nis) > chdtri(degrees_of_freedom, CONTRADICTION))
         if is_contradiction and len(nis) <= 2:
             self.doubts.add(doubts.CONTRADICTION)
@@ -166,10 +153,8 @@ class TrackEvidence:
 
     def vehicle_doubts(self, nis: FloatArray, degrees_of_freedom: int,
                        min_bayes_factor: float) -> set[str]:
-        """Update and return the doubts that follow from the measurements of a vehicle.
-
-        `nis` (n_sensors,) is the normalised innovation squared of each sensor; NaN if missing.
-        """
+        """Update and return the doubts from the measurements of a vehicle, with the normalised
+        innovation squared `nis` (n_sensors,) of each sensor; NaN if missing."""
         if self.innovations.fails:
             self.doubts.add(doubts.INNOVATIONS)
         return doubts.applying({
@@ -179,12 +164,9 @@ class TrackEvidence:
             doubts.INNOVATIONS: self.innovations.excess > 1.0})
 
     def update_filter_doubt(self, gain: float, stamp_ns: int, window_s: float) -> bool:
-        """Update and return the doubt about the filter, which lasts from a frame with `gain` below
-        `-OVERFIT_NATS` for the duration `window_s` of the compared frames.
-
-        `gain` [nats] is the log-likelihood of these frames along the path of the hypothesis, minus
-        that in the filter.
-        """
+        """Update and return the doubt about the filter, which lasts for `window_s` after a frame
+        with `gain` [nats], the increase of the window's log-likelihood along the path of the
+        hypothesis over that in the filter, below `-OVERFIT_NATS`."""
         if gain < -OVERFIT_NATS:
             self._overfit_expiry_ns = stamp_ns + round(window_s * NS)
         return stamp_ns <= self._overfit_expiry_ns

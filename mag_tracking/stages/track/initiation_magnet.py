@@ -44,8 +44,7 @@ def magnet_model(settings: MagnetSettings) -> Magnet:
 
 
 def is_lost_after(settings: MagnetSettings, network: SensorNetwork, dt: float) -> bool:
-    """Whether a magnet may have moved anywhere near the sensors during a gap of `dt` seconds, so
-    that an update linearised at the prediction may diverge."""
+    """Whether a magnet may have moved anywhere near the sensors in a gap of `dt` seconds."""
     std = settings.acceleration * np.sqrt(dt**3 / 3.0)
     extent = np.ptp(network.positions, axis=0).max()
     return bool(std > 2.0 * START_MARGIN + extent)
@@ -57,10 +56,9 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
     """Hypotheses of a magnet at its first frame, at any position near the sensors ([PHD15]_ Paper A
     eq. (3)); None if the frame has fewer than six axes or no fit has a finite cost.
 
-    The moment is projected out at each point of a coarse grid, and each distinct optimum refined
-    from the best points becomes a hypothesis, weighted by its fit. `background_std` [T] and
-    `own_covariance` are as for `start_vehicle`; `relative_std` is the model error relative to the
-    field.
+    The moment is projected out at each point of a coarse grid, and each distinct optimum becomes a
+    hypothesis. The covariances are as for `start_vehicle`; `relative_std` is the relative model
+    error.
     """
     is_present = ~np.isnan(frame.field)
     if np.count_nonzero(is_present) < 6:
@@ -89,8 +87,7 @@ def start_magnet(settings: MagnetSettings, network: SensorNetwork, frame: FieldF
 
 
 def _start_grid(network: SensorNetwork) -> FloatArray:
-    """Grid (n, 3) [m] over the bounding box of the sensors with its margin; a side that is shorter
-    than half the spacing has one point, in its middle."""
+    """Grid (n, 3) [m] over the box of the sensors with its margin; one point on a short side."""
     low, high = network.positions.min(axis=0), network.positions.max(axis=0)
     extent, step, is_long = high - low + 2.0 * START_MARGIN, 0.0, np.full(3, True)
     while (extent[is_long] <= step / 2).any() or not step:
@@ -105,8 +102,7 @@ def _start_grid(network: SensorNetwork) -> FloatArray:
 def _distinct_optima(settings: MagnetSettings, network: SensorNetwork, start: FloatArray,
                      y: FloatArray, std: FloatArray, is_present: BoolArray
                      ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Refine the grid points `start`; return the states (n, 12), covariances (n, 12, 12) and costs
-    (n,) of the distinct optima."""
+    """Refine `start`; return states (n, 12), covariances and costs of distinct optima."""
     zero = np.zeros((len(start), 1, 3, 6))
     dr_dx, dm_dx = zero.copy(), zero.copy()
     dr_dx[:, 0, :, :3] = np.eye(3)

@@ -252,8 +252,7 @@ def _initial_states(settings: VehicleSettings, kind: int, positions: FloatArray,
 
 def starting_covariance(settings: VehicleSettings, kind: int, R: FloatArray, speed: float
                         ) -> FloatArray:
-    """Initial covariance (n_t, n_t) of a hypothesis that arrives along the x axis of `R` (3, 3), a
-    rotation to the world frame."""
+    """Initial covariance (n_t, n_t) of an arrival along the x axis of `R` (3, 3)."""
     d, of_kind = _n_dipoles(settings), settings.kinds[kind]
     soft_index = 6 + 3 * d
     soft_iron_std = settings.induced_share_std * _soft_iron_per_share(settings, kind)

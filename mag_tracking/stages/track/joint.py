@@ -15,11 +15,9 @@ from mag_tracking.units import NS
 FALSE_ALARM_PROBABILITY = 1e-3
 """Probability per test that noise alone triggers a comparison with other explanations."""
 WINDOW_S, MIN_INTERVAL_S = 0.25, 0.15
-"""[s] Duration of the tested frames, and minimum interval between any comparison and the next one
-that improbable innovations trigger."""
+"""[s] Duration of the tested frames, and minimum interval between comparisons."""
 LONG_INTERVAL_S, INTERVAL_GROWTH = 0.3, 1.5
-"""[s] Interval after which a long vehicle is compared with two vehicles, and factor by which this
-interval grows with each comparison."""
+"""[s] Interval after which a long vehicle is compared with two, and its growth factor."""
 ACCEPT_NATS, REPEATED_NATS, UNDECIDED_NATS = 10.0, 5.0, -5.0
 """[nats] Minimum log-odds of another explanation: to be accepted at once, to be accepted in two
 successive comparisons, and to mark the track as doubtful if it is not accepted."""
@@ -52,18 +50,14 @@ class NewTargetEvidence:
 
     def add(self, nis: float, degrees_of_freedom: int, stamp_ns: int, rejected: bool,
             is_long: bool) -> None:
-        """Add a frame with its normalised innovation squared `nis`; `is_long` refers to the best
-        hypothesis.
-
-        One `rejected` sensor of two triggers a comparison like improbable innovations do. With more
-        sensors, the majority shows that the rejected sensor is faulty.
-        """
+        """Add a frame with its normalised innovation squared `nis`; one `rejected` sensor of two
+        (of more, the majority decides) triggers a comparison, and so does a best hypothesis that
+        `is_long`."""
         self._latest.add(stamp_ns, [nis, degrees_of_freedom])
         self._was_rejected, self._is_long = rejected, is_long
 
     def due(self, stamp_ns: int) -> str | None:
-        """Return `IMPROBABLE` or `LONG_VEHICLE` if a comparison is due, and restart the interval;
-        else None."""
+        """Return the reason if a comparison is due, and restart the interval; else None."""
         total, freedom = self._latest.total
         elapsed_s = np.inf if self._last_comparison_ns is None \
             else (stamp_ns - self._last_comparison_ns) / NS
@@ -98,18 +92,14 @@ class JointExplanation:
     log_odds: float
     """Log-odds of this explanation against the current track [nats]."""
     replaced: int | None
-    """Index in the track of the vehicle that is replaced by the last vehicle, or by the last two
-    vehicles. None if no vehicle is replaced."""
+    """Index of the vehicle that the last vehicle, or the last two, replace, if any."""
     adds: bool
     """Whether the explanation has one vehicle more than the track."""
 
     def doubtful(self, n_one: int) -> tuple[int, ...]:
-        """Indices of the vehicles whose states may be wrong; each vehicle has `n_one` states.
-
-        These are all vehicles if the log-odds are low for them; otherwise a relocated vehicle, and
-        two vehicles that replace one and move in the same direction, because a long vehicle with
-        large model errors resembles two.
-        """
+        """Indices of the vehicles, of `n_one` states each, that may be wrong: all if the log-odds
+        are low for them; otherwise a relocated one, or two in one direction that replace one, which
+        a long vehicle with large model errors resembles."""
         n = self.bank.label.shape[1] if self.bank.label.ndim > 1 else 1
         x = self.bank.x[self.bank.best()]
         velocity = np.array([x[k * n_one + 3:k * n_one + 5] for k in range(n)])
@@ -123,8 +113,7 @@ class JointExplanation:
         return (n - 2, n - 1) if velocity[-2] @ velocity[-1] > 0.0 else ()
 
     def is_sensed_by_two(self) -> bool:
-        """Whether at least two sensors sense each new vehicle; a field that only one sensor
-        measures may be a fault of this sensor."""
+        """Whether at least two sensors sense each new vehicle."""
         n, best = self.bank.label.shape[1], self.bank.best()
         for i in range(n - (1 if self.replaced is None else 2), n):
             energy = sum(self.bank_filter.field_energies(i, path[best], frame) for path, frame in
@@ -135,8 +124,7 @@ class JointExplanation:
 
 
 def _are_implausible(velocity: FloatArray, n_new: int) -> bool:
-    """Whether one of the last `n_new` vehicles of `velocity` (n, 2) [m/s] crosses another vehicle,
-    or one overtakes the other too fast."""
+    """Whether one of the last `n_new` vehicles crosses, or overtakes too fast."""
     speed = np.linalg.norm(velocity, axis=1)
     for i in range(len(velocity) - n_new, len(velocity)):
         for k in range(i):

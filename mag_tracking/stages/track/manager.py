@@ -72,8 +72,7 @@ class TrackManager:
             self.counts[UNCERTAIN_ORIENTATIONS] = n_uncertain
 
     def use_network(self, network: SensorNetwork) -> None:
-        """Apply another calibration of the same sensors as soon as no track is running; raises
-        NetworkError if the sensors differ."""
+        """Apply another calibration when no track runs; raises NetworkError for other sensors."""
         if network.names != self._network.names:
             raise NetworkError(f'the calibration is for other sensors: {", ".join(network.names)}; '
                                f'the tracker uses {", ".join(self._network.names)}')
@@ -86,8 +85,7 @@ class TrackManager:
             self._track.configure(settings)
 
     def set_input_doubts(self, doubts: InputDoubts) -> None:
-        """Replace the times {reason: {sensor: times}} at which readings are doubtful; tracks with
-        frames at these times are marked as doubtful."""
+        """Replace {reason: {sensor: times}}, with which tracks become doubtful."""
         if doubts != self._input_doubts:
             self._input_doubts = doubts
             self._doubtful_rows = {reason: {self._network.index(name): t for name, t in
@@ -177,8 +175,7 @@ class TrackManager:
         return out
 
     def _delete_ended(self, stamp_ns: int) -> list[TrackRecord]:
-        """Delete the track if it has ended; return the records of a disturbance that explains its
-        fields."""
+        """Delete an ended track; return records of a disturbance that explains it."""
         track = self._track
         if track is None or track.ended is None:
             return []
@@ -258,8 +255,7 @@ class TrackManager:
 
 
 def _energy(frame: FieldFrame) -> float:
-    """Squared norm of the field, summed over all sensors [T²], not weighted with the noise, which
-    increases during a detection."""
+    """Squared norm of the field, summed over all sensors [T²], without the varying weights."""
     return float(np.nansum(np.square(frame.field)))
 
 

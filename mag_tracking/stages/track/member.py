@@ -68,16 +68,14 @@ class Member:
 
     def start_alongside(self, first: 'Member', sensors: SensorSubset, stamp_ns: int, ratio: float
                         ) -> None:
-        """Start as a new target of a track; it inherits from the first member the doubt that it was
-        not seen approaching, and the evidence for a target against a disturbance, with the minimum
-        Bayes factor `ratio`."""
+        """Start as a new target of a track, with the first member's doubt about its approach and
+        evidence against a disturbance (minimum Bayes factor `ratio`)."""
         self.evidence.flag_start(doubts.NOT_SEEN_APPROACHING in first.evidence.doubts,
                                  sensors.full_network, False)
         self.evidence.bayes_factor.add(first.evidence.bayes_factor.log_ratio, stamp_ns, ratio)
 
     def distance_from(self, stamps_ns: Sequence[int], path: FloatArray) -> float:
-        """Mean distance of the recently published positions from a path (n, 2) in the world frame,
-        m; 0 if none was published at its timestamps."""
+        """Mean distance [m] of the published positions from a path (n, 2); 0 if unknown."""
         position_at = dict(zip(stamps_ns, path, strict=True))
         distances = [float(np.hypot(*(position - position_at[stamp_ns])))
                      for stamp_ns, position in self._recent_positions if stamp_ns in position_at]
@@ -85,11 +83,8 @@ class Member:
 
     def publish(self, track: TrackBank, bank: FilterBank, best: int, frame: FieldFrame, dt: float
                 ) -> list[Track]:
-        """Create and store the `Track` record of this member for a frame of the sensors of `track`,
-        `dt` seconds after the previous one, from hypothesis `best` of the `bank` of this member.
-
-        The result is empty if the state is impossible, which ends the member.
-        """
+        """Create and store the record of this member from hypothesis `best` of its own `bank`, `dt`
+        seconds after the previous one; none if the state is impossible, which ends the member."""
         record = self._create_record(track, bank, best, frame, dt)
         self._impossible = impossible_reason(record.velocity, record.moment, record.mounting)
         if self._impossible:
@@ -131,11 +126,8 @@ class Member:
 
     @property
     def passed_below(self) -> bool:
-        """Whether the target passed below the sensors, and all else about it is plausible.
-
-        If two sensors are exchanged, a vehicle fits well at the opposite point, where the field of
-        a dipole is the same.
-        """
+        """Whether the target passed below the sensors, and all else is plausible: if two sensors
+        are exchanged, a vehicle fits well at the opposite point."""
         if self.last is None or self._target.starts_anywhere \
                 or set(self.last.doubts) - {doubts.HEIGHT, doubts.BELOW_SENSORS}:
             return False
@@ -174,8 +166,7 @@ class Member:
         return reasons | evidence.doubts
 
     def reason_to_end(self, sensors: SensorSubset, settings: TrackSettings) -> str | None:
-        """Update the end conditions with the latest record; return the reason to end the track, or
-        None."""
+        """Update the end conditions with the latest record; return the reason, if any."""
         if self._impossible:
             return self._impossible
         assert self.last is not None
@@ -193,17 +184,15 @@ class Member:
 
     def states_of(self, slot: int, n_one: int, states: Iterable[TrackState],
                   end_ns: float = np.inf) -> list[TrackState]:
-        """States of the target at index `slot` within its lifetime and before `end_ns`, from the
-        states of all members, with `n_one` each."""
+        """States of the target at index `slot` before `end_ns`, with `n_one` states each."""
         rows = slice(n_one * slot, n_one * (slot + 1))
         return [(stamp_ns, x[rows], P[rows, rows]) for stamp_ns, x, P in states
                 if self.begin_ns <= stamp_ns < end_ns]
 
     def smoothed(self, bank: FilterBank, best: int, complete: bool, states: list[TrackState],
                  doubtful: bool) -> list[SmoothedPose]:
-        """Smoothed poses for the states of hypothesis `best` in the bank of this member; `complete`
-        if they cover the whole track, all ambiguous if `doubtful`, and ambiguous where the filter
-        was, because smoothing corrects its errors only in part."""
+        """Smoothed poses of the states of hypothesis `best`; ambiguous if `doubtful`, and where the
+        filter was, as smoothing corrects its errors only in part."""
         ambiguous = doubtful or bool(ambiguities(bank, best, bank.is_separated(best)))
         poses = [smoothed_pose(
             self._target.model, self._target.orientation, x, P, stamp_ns=stamp_ns, id=self.id,

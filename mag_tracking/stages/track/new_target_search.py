@@ -1,9 +1,8 @@
 """Search for a new vehicle in the frames of a running track.
 
-Three other explanations of the frames in the relinearisation window are tried: an additional
-vehicle; two vehicles in place of one, which may have misled its filter; and one of the vehicles at
-another position. Each is filtered and smoothed along its path like any hypothesis, and its evidence
-is compared with that of the current track.
+Three other explanations are tried: an additional vehicle; two vehicles in place of one, which may
+have misled its filter; and one vehicle at another position. Each is filtered and smoothed along its
+path like any hypothesis, and its evidence is compared with that of the track.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,24 +29,19 @@ MAX_KNOWN, MAX_FIRST, MAX_SECOND = 2, 3, 2
 """Maximum numbers of tried hypotheses of a single tracked vehicle (only the best of several), of
 first new vehicles for each hypothesis, and of second new vehicles for each first one."""
 MAX_LOSS_NATS, MAX_EXPLANATIONS = 10.0, 12
-"""Maximum difference in log-probability between the best and another retained explanation [nats],
-and maximum number of retained explanations."""
+"""Maximum loss of retained explanations against the best [nats], and their maximum number."""
 LOG_P_ARRIVAL, LOG_P_LOST = np.log(0.05), np.log(0.01)
-"""Log-probabilities that another vehicle arrives during a pass, and that the track of a vehicle was
-at a wrong position during the whole window."""
+"""Log-probabilities that another vehicle arrives during a pass, or that a track is wrong."""
 MIN_DISPLACEMENT_M, MAX_RATIO, N_DISTANCES = 2.0, 5.0, 10
-"""Minimum distance [m] of a vehicle at another position from its track, maximum speed and moment of
-a new vehicle relative to the largest ones in the settings, and number of its possible positions on
-a line at the start of the window."""
+"""Minimum distance [m] of a relocated vehicle from its track, maximum ratio of speed and moment to
+the settings, and number of possible positions on a line."""
 
 
 class NewTargetSearch:
     """Search for explanations by an additional vehicle, if it `may_add` one, or by a vehicle at
-    another position.
+    another position; by two vehicles in place of one unless the `reason` is `IMPROBABLE`.
 
-    For a `reason` from `NewTargetEvidence.due` other than improbable innovations, the search is
-    restricted to two vehicles in place of one. `filter_of` returns the filter for a number of
-    vehicles; the track has `n_targets`.
+    `filter_of` returns the filter for a number of vehicles; the track has `n_targets`.
     """
 
     def __init__(self, bank: FilterBank, window: Window, filter_of: Callable[[int], BankFilter],
@@ -99,10 +93,7 @@ class NewTargetSearch:
 
     def _best_of(self, starts: Sequence[WindowStart], track_evidence: float
                  ) -> JointExplanation | None:
-        """Refine the starts; return their joint explanation, or None if no start is usable.
-
-        `track_evidence` is the log-evidence of the track.
-        """
+        """Joint explanation by refined starts, against `track_evidence`; None if unusable."""
         _, _, log_w, paths = self._run_starts(starts)
         order = np.argsort(-log_w, kind='stable')[:MAX_EXPLANATIONS]
         starts = self._add_turning_starts([replace(starts[k], path=paths[k]) for k in order.tolist()
@@ -129,11 +120,8 @@ class NewTargetSearch:
                                 starts[0].replaced, adds)
 
     def _current_track(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-        """Run the leading hypotheses of the current track along their paths.
-
-        Returns their indices in the bank (n,), log-likelihoods of the window (n,), log-weights
-        after the window (n,) and paths (n, n_frames, n_x).
-        """
+        """Run the leading hypotheses of the track along their paths; return their indices (n,),
+        log-likelihoods (n,), log-weights (n,) and paths (n, n_frames, n_x)."""
         window, bank = self._window, self._bank
         order = np.argsort(-bank.log_w, kind='stable')[:window.max_hypotheses]
         rows = window.rows_of(bank)[order]
@@ -145,8 +133,7 @@ class NewTargetSearch:
         return order, log_likelihood, anchor_log_w + log_likelihood, paths
 
     def _run_along(self, bank: FilterBank, paths: FloatArray, n_targets: int) -> FloatArray:
-        """Filter and smooth a bank along its paths, both in place; return the log-likelihoods (n,)
-        of the window, -inf for unusable paths."""
+        """Run a bank along its paths, both in place; return log-likelihoods (n,)."""
         result = self._filter_of(n_targets).run_along(
             bank, self._window.frames, self._window.intervals, paths, passes=PASSES, step=STEP,
             first_is_updated=self._window.is_updated)
@@ -182,8 +169,7 @@ class NewTargetSearch:
                     > MIN_DISPLACEMENT_M)
 
     def _remove_vehicle(self, known: KnownVehicles, i: int) -> KnownVehicles:
-        """Known vehicles without vehicle `i`; only the sensor states, as at the start of a track,
-        if no vehicle remains."""
+        """Known vehicles without vehicle `i`; initial sensor states if none remain."""
         n = self._n_one
         if self._n_targets == 1:
             observation, std = self._filter.observation, self._vehicles.background_std
@@ -215,8 +201,7 @@ class NewTargetSearch:
 
     def _starts_on(self, known: KnownVehicles, paths: FloatArray, moments: FloatArray,
                    replaced: int | None) -> list[WindowStart]:
-        """One start for each combination of kinds of k new vehicles on `paths` (k, 7) with
-        `moments` (k, 3, 3), which join the known vehicles."""
+        """One start for each combination of kinds of k vehicles on `paths` (k, 7)."""
         n_known, times = len(known.kind) * self._n_one, self._search.times
         labels = self._search.prior.nearest_line(paths)[0].tolist()
         starts = []
@@ -247,11 +232,8 @@ class NewTargetSearch:
 
     def _run_starts(self, starts: Sequence[WindowStart]
                     ) -> tuple[FilterBank, FloatArray, FloatArray, FloatArray]:
-        """Filter and smooth starts along their paths.
-
-        Returns the bank at the last frame, log-likelihoods (n,), log-weights (n,) and paths
-        (n, n_frames, n_x).
-        """
+        """Run starts along their paths; return the bank at the last frame, log-likelihoods (n,),
+        log-weights (n,) and paths (n, n_frames, n_x)."""
         n = len(starts)
         bank = FilterBank(
             np.array([s.x for s in starts]), np.array([s.P for s in starts]), np.zeros(n),

@@ -148,8 +148,7 @@ class Observation:
 
     def field_of(self, x: FloatArray, targets: Iterable[int], time_offset: FloatArray
                  ) -> FloatArray:
-        """Field (n_sensors, 3) of selected targets of a state `x` (n_x,), with mounting errors, T,
-        sensor frame, at the sampling time of each sensor."""
+        """Field (n_sensors, 3) [T] of selected targets of a state `x` (n_x,)."""
         n = self.n_one
         h, H = np.zeros((1, *self.positions.shape)), np.zeros((1, *self.positions.shape, 0))
         for target in targets:

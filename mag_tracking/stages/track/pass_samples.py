@@ -29,31 +29,25 @@ from mag_tracking.units import NS
 MODEL_ERROR = 0.04
 """Error of the field of a row of dipoles, relative to the field; treated as noise."""
 NEAR_ERROR_LENGTH = 0.2
-"""[m] Minimum product of the relative field error and the distance to the sensor, for samples with
-the model error near the sensors."""
+"""[m] Minimum product of relative field error and distance, near the sensors."""
 MAX_SENSORS = 4
 """Maximum number of sensors in a fit: those with the strongest fields."""
 N_STEPS, TOLERANCE = 30, 1e-3
 """Maximum number of steps of a fit, and relative improvement of the cost below which it ends."""
 N_SHORT, N_LONG = 3, 5
-"""Number of dipoles of the two rows: the long one explains any vehicle, and might compensate for
-clock offsets."""
+"""Numbers of dipoles of the two rows; the long one explains any vehicle, or clock offsets."""
 LENGTH, LONG_LENGTH = 3.0, 8.0
-"""[m] Start values of the distance from the first to the last dipole, for the short and the long
-row."""
+"""[m] Start values of the distance from the first to the last dipole, of either row."""
 SMALL_OFFSET, LARGE_OFFSET = 0.1, 0.3
 """[s] Start values of the clock offsets, used with both signs."""
 OFFSET_STD, MAX_OFFSET = 0.15, 0.5
-"""[s] Prior standard deviation of clock offsets, and their maximum, beyond which a turn has the
-same effect."""
+"""[s] Prior std of clock offsets, and their maximum: beyond it, a turn has the same effect."""
 START_TURN_RATE = 0.4
 """[rad/s] Start value of the turn rate of a bent path, used with both signs."""
 GOOD_MISFIT, MAX_MISFIT = 1.3, 1.5
-"""Maximum reduced chi-square of a path that explains a pass well, and of a path that may explain
-it."""
+"""Maximum reduced chi-square of a path that explains a pass well, and of one that may."""
 P_CLOCKS, P_BEND = 1e-5, 1e-3
-"""Probabilities that noise alone improves the fit significantly although the clocks are correct, or
-although the motion is straight."""
+"""Probabilities that noise alone makes clock offsets, or a bend, significant."""
 MIN_DISTANCE, MIDDLE_STD = 1.0, 0.5
 """[m] Motion of the target during a clock offset below which the offset is harmless, and standard
 deviation of the apparent magnetic centre of a vehicle from sensor to sensor."""
@@ -172,8 +166,7 @@ class PassSamples:
 
 @dataclass(frozen=True)
 class RigidPass:
-    """Fits of a vehicle on a steady path to its whole pass; costs are sums of squared whitened
-    residuals."""
+    """Fits of a vehicle to its whole pass; costs are sums of squared whitened residuals."""
 
     stamp_ns: int
     """Time of the strongest field; time zero of the paths."""
@@ -186,13 +179,11 @@ class RigidPass:
     degrees_of_freedom: int
     """Degrees of freedom of the fit with free clock offsets."""
     misfit: float
-    """Reduced chi-square of a bent path with a short or, if needed, a long row; about 1 if it
-    explains the pass."""
+    """Reduced chi-square of a bent path with a short or, if needed, a long row."""
     reference: int
     """Index of the sensor with the strongest field; its clock is the reference."""
     offset: FloatArray
-    """(n_sensors,) [s] Time by which each clock is ahead of the reference; NaN if not compared or
-    not observable."""
+    """(n_sensors,) [s] Time by which each clock is ahead of the reference; NaN if unknown."""
     offset_std: FloatArray
     """(n_sensors,) [s] Standard deviation due to noise and model error alone; reference: 0."""
     position: FloatArray
@@ -222,8 +213,7 @@ class RigidPass:
         return nearest
 
     def difference(self, stamp_ns: int, state: FloatArray) -> FloatArray:
-        """Horizontal difference (6,) of a state (6,) from the nearest of the `straight_paths` at
-        its time, m and m/s; zero if there are none."""
+        """Horizontal difference (6,) from the nearest of the `straight_paths`, or zero."""
         if not len(self.straight_paths):
             return np.zeros(6)
         differences = state - self.straight_paths
@@ -248,9 +238,8 @@ class RigidPass:
 
     @property
     def needs_clock_offsets(self) -> bool:
-        """Whether clock offsets explain the pass significantly better than a path without them,
-        straight or bent; they displace the target by `MIN_DISTANCE`, and are at most `MAX_OFFSET`.
-        """
+        """Whether clock offsets, up to `MAX_OFFSET`, displace the target and explain the pass
+        significantly better than any path without them."""
         offset = float(np.nanmax(np.abs(self.offset)))
         if not self.is_explained or offset > MAX_OFFSET or offset * self.speed < MIN_DISTANCE:
             return False
@@ -268,9 +257,8 @@ class RigidPass:
 
 def fit_rigid_pass(network: SensorNetwork, frames: Sequence[FieldFrame], stamp_ns: int,
                    starts: FloatArray) -> RigidPass | None:
-    """Fit straight and bent paths to the frames of a pass, from positions and velocities `starts`
-    (n, 6) [m, m/s] at the time `stamp_ns` of the strongest field; None if the frames do not
-    determine a path."""
+    """Fit straight and bent paths to the frames of a pass from the states `starts` (n, 6) [m, m/s]
+    at the strongest field; None if the frames do not determine a path."""
     data = PassSamples.of(network, frames, stamp_ns)
     n_clocks = data.n_clocks
     if n_clocks < 1 or data.n_free(N_LONG) <= N_PATH:
@@ -336,8 +324,7 @@ class _RowFits(NamedTuple):
 
 def _fit_long_row(data: PassSamples, straight: FloatArray, bent: FloatArray, adds_starts: bool
               ) -> _RowFits:
-    """Fit a long row of dipoles, starting at the `straight` and `bent` paths of a short row; the
-    bent fit starts at the fitted straight path and, if `adds_starts`, also at these two."""
+    """Fit a long row of dipoles from the paths of a short row; `adds_starts` for the bent fit."""
     near = data.with_near_field_error(bent)
     starts = np.array([straight, bent, straight, bent])
     starts[2:, PATH.index('length')] = LONG_LENGTH

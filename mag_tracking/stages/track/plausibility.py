@@ -16,36 +16,28 @@ from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NEVER, NS
 
 P_MOUNTING, P_HEIGHT = 0.05, 1e-3
-"""Probabilities that the mounting angles of correctly mounted sensors, and the height of a vehicle
-of its kind, are flagged."""
+"""Probabilities that correct mounting angles, and heights, are flagged."""
 LANE_STDS, LANE_STDS_LATER = 1.645, 3.0
-"""Maximum distance of a vehicle from the outermost configured lane, in standard deviations: at its
-closest point to any sensor, which one in twenty vehicles on that lane exceeds, and later, when it
-may have turned off."""
+"""Maximum distance of a vehicle from the outermost lane, in standard deviations: at its closest
+point to a sensor (exceeded by one in twenty), and later, when it may have turned off."""
 MAX_ONE_SIDED_WIDTH = 2.0
 """[m] Maximum lateral extent of sensors on one side of a road: no lane fits between them."""
 MIN_SPEED = 1.0
 """[m/s] Minimum speed of a vehicle at which its heading is defined."""
 MAX_RELATIVE_MOVE = 0.75
-"""Maximum motion of a target within a frame, relative to its distance to the second nearest sensor,
-because the error of a single sensor does not mislead a track. The relative error of the average
-over the frame is about half the square of this ratio."""
+"""Maximum motion within a frame, relative to the distance to the second nearest sensor, as one
+sensor alone does not mislead a track; the relative error is about half its square."""
 SENSED_LEVEL, GROWTH_RATIO = 2.5, 10.0
-"""RMS of the whitened field above which the target counts as sensed, and ratio of the highest level
-in the approach test to this one."""
+"""RMS of the whitened field of a sensed target, and range of levels in the approach test."""
 MIN_LOG2_RATIO = -0.25
-"""Minimum log2 ratio of the durations of the first and the second half of the growth. In theory it
-is 0.55 for an approach at constant speed, -0.83 for a start from rest next to a sensor, and near 0
-for a sudden jump of the field."""
+"""Minimum log2 ratio of the durations of both halves of the growth: in theory 0.55 for an approach
+at constant speed, -0.83 for a start next to a sensor, near 0 for a sudden jump."""
 FALL_FRACTION = 0.85
-"""Fraction of its previous maximum below which the field of a sensed target falls if the target has
-passed its first sensor, which passes the test."""
+"""Fraction of the maximum below which the field falls after the pass of a first sensor."""
 LEVEL_TIME_STD, MAX_FRAMES = 0.5, 1000
-"""Uncertainty of the time at which the field reached a level, in frame periods, and number of
-frames after which the test is skipped if the field has not grown enough."""
+"""Uncertainty of the time of a level [frame periods], and maximum number of frames of the test."""
 N_INTERVALS, MIN_INTERVALS = 8, 2
-"""Number of latest intervals of a sensor, most of which are too long if it is slow, and minimum
-number of these; single lost readings do not matter."""
+"""Number of latest intervals of a sensor, and minimum number of long ones if it is slow."""
 N_PATHS = 41
 """Number of paths between the outermost lanes that are compared."""
 
@@ -61,12 +53,8 @@ class Plausibility:
 
     def evaluate(self, observation: Observation, bank: FilterBank, best: int,
                  settings: VehicleSettings, mounting_std: float, dt: float) -> set[str]:
-        """Update the closest approach of all hypotheses; return the doubts about the published
-        hypothesis `best`, in a frame of duration `dt` [s].
-
-        `mounting_std` [rad] is the minimum std of the mounting angles of all sensors, because a
-        model error also rotates the field.
-        """
+        """Update the closest approach of all hypotheses; return the doubts about hypothesis `best`,
+        in a frame of duration `dt` [s], with mounting angles of at least `mounting_std` [rad]."""
         x, kind, positions = bank.x[best], settings.kinds[bank.kind[best]], observation.positions
         self._update_road_check(bank, settings, positions)
         return doubts.applying({
@@ -136,8 +124,7 @@ def _is_moving(x: FloatArray) -> BoolArray:
 
 def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positions: FloatArray
                   ) -> bool:
-    """Whether the motion of a target within a frame of duration `dt` [s] exceeds
-    `MAX_RELATIVE_MOVE`; False if there is only one sensor."""
+    """Whether a target moves too far in `dt` [s]; False with only one sensor."""
     distances = np.sort(np.linalg.norm(position - positions, axis=1))
     displacement = float(np.hypot(velocity[0], velocity[1])) * dt
     return len(distances) > 1 and bool(displacement > MAX_RELATIVE_MOVE * distances[1])

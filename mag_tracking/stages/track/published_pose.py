@@ -23,9 +23,8 @@ MIN_SPEED_STDS = 3.0
 UNOBSERVED_VARIANCE = np.pi**2
 """[rad^2] Variance of an angle that is not observable from the field."""
 NEGLIGIBLE_WEIGHT, AMBIGUOUS_WEIGHT = 1e-6, 0.05
-"""Weight relative to the heaviest hypothesis below which a hypothesis is excluded from covariances,
-and total weight of the hypotheses at other positions, or with other arrival directions, above which
-a track is ambiguous."""
+"""Relative weight below which a hypothesis is excluded from covariances, and total weight of other
+positions or arrival directions above which a track is ambiguous."""
 Flags: TypeAlias = tuple[bool, bool, bool]
 """Whether the rotation about the x, y and z axis of the body is unobservable."""
 OrientationEstimate: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, Flags]
@@ -52,9 +51,8 @@ class UnobservedLength:
         self._last_position: FloatArray = np.zeros(2)
 
     def update(self, x: FloatArray, P: FloatArray, positions: FloatArray, is_certain: bool) -> None:
-        """Update the direction of travel and, if the position is certain (unambiguous), the
-        distance travelled, with a target state `x` (n_t,) and the `positions` (n_sensors, 3) of the
-        sensors that measured."""
+        """Update the direction of travel and, if the position `is_certain`, the distance travelled;
+        `positions` (n_sensors, 3) are those of the sensors that measured."""
         self._forward = self._direction(x, P)
         if not is_certain or not len(positions):
             return
@@ -66,8 +64,7 @@ class UnobservedLength:
         self._last_position = x[:2].copy()
 
     def covariance(self, x: FloatArray, P: FloatArray, length: float, kind: int) -> FloatArray:
-        """Covariance (2, 2) of the middle, to be added to that of the horizontal position, m², for
-        a row of dipoles of a given length [m]."""
+        """Covariance (2, 2) [m²] of the middle, in addition to that of the position."""
         half_hidden = 0.5 * (self._lengths - length)
         second_moment = np.maximum(half_hidden, 0.0)**2 + 0.25 * self._stds**2
         # A longer vehicle would have been observed once its middle has passed a sensor.
@@ -128,8 +125,7 @@ class MagnetOrientation:
     """Orientation along the moment; the rotation about the moment is unobservable."""
 
     axis: FloatArray
-    """(3,) Direction of the moment in the frame of the magnet; the rotation about the body axis
-    nearest to it is flagged as unobservable."""
+    """(3,) Direction of the moment in the frame of the magnet."""
 
     def __call__(self, x: FloatArray, P: FloatArray) -> OrientationEstimate:
         """Orientation of a target state `x` (n_t,)."""
@@ -159,13 +155,11 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
                     stamp_ns: int, id: int, ended: bool, existence: float,
                     degrees_of_freedom: int, predicted: FloatArray, mounting: FloatArray,
                     mounting_covariance: FloatArray) -> Track:
-    """Track record of hypothesis `best` of a bank; the keyword parameters from `stamp_ns` are
-    entries of `Track`.
+    """Track record of hypothesis `best`; the keywords from `stamp_ns` are entries of `Track`.
 
-    `arrivals` and `kinds` are the names for each label and kind, and `found` the doubts about the
-    pose without the ambiguities of the bank. The covariance is multiplied by `excess`, the ratio of
-    the actual to the expected variance of the innovations, and covers the `difference` (6,) [m,
-    m/s] from another possible position and velocity.
+    `found` are the doubts without the ambiguities of the bank. The covariance is multiplied by
+    `excess`, the variance ratio of the innovations, and covers the `difference` (6,) [m, m/s] from
+    another possible position and velocity.
     """
     n_t = len(model.state_names)
     is_separated = bank.is_separated(best)
@@ -203,9 +197,8 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
 
 def covariance_about(bank: FilterBank, best: int, model: SourceModel, is_separated: BoolArray
                      ) -> FloatArray:
-    """Covariance (n_t, n_t) about the state of hypothesis `best`, from all hypotheses at the same
-    position, which differ in linearisation, kind and motion; hypotheses at other positions
-    (`is_separated`) make the track ambiguous instead."""
+    """Covariance (n_t, n_t) about the state of hypothesis `best` from all hypotheses at its
+    position; those at others (`is_separated`) make the track ambiguous instead."""
     return _second_moment(bank, best, model, np.where(is_separated, -np.inf, bank.log_w))
 
 
@@ -227,11 +220,8 @@ def _second_moment(bank: FilterBank, best: int, model: SourceModel,
 def mixture_uncertainty(bank: FilterBank, best: int, is_separated: BoolArray, model: SourceModel,
                         orientation: Orientation, published: PoseFields, P_unwidened: FloatArray,
                         excess: float) -> PoseUncertainty:
-    """Uncertainty of a pose if any of the hypotheses may be correct.
-
-    `published` is the pose from the hypotheses at the same position as `best`, with a wider
-    covariance than `P_unwidened`, the result of `covariance_about`.
-    """
+    """Uncertainty of a pose, `published` for hypothesis `best` with a wider covariance than
+    `P_unwidened` of `covariance_about`, if any hypothesis may be correct."""
     n_t = len(model.state_names)
     widening = published['covariance'] - excess * P_unwidened[:6, :6]
     covariance = widening + excess * _second_moment(bank, best, model, bank.log_w)[:6, :6]
@@ -264,8 +254,7 @@ def smoothed_pose(model: SourceModel, orientation: Orientation, x: FloatArray, P
                   unobserved_length: UnobservedLength | None, difference: FloatArray,
                   stamp_ns: int, id: int, kind: int, kinds: Sequence[str], ambiguous: bool,
                   complete: bool) -> SmoothedPose:
-    """Record of the pose that belongs to a smoothed state; `difference` is that of
-    `published_track`, and `complete` that of `SmoothedPose`."""
+    """Record of a smoothed state; `difference` is as for `published_track`."""
     n_t = len(model.state_names)
     return SmoothedPose(stamp_ns=stamp_ns, id=id, kind=kinds[kind], ambiguous=ambiguous,
                         complete=complete,

@@ -33,16 +33,13 @@ PASSES, STEP_SIZE = 3, 0.5
 """Number of Gauss-Newton steps per relinearisation, which continues from the previous one, and
 their damping factor. Undamped steps diverge where the field is strongly nonlinear."""
 CONVERGED = 0.3
-"""Maximum distance of the smoothed positions from a converged path in the last step, in standard
-deviations of the position."""
+"""Maximum shift of the positions of a converged path in the last step, in their stds."""
 ATTEMPTED, FAILED = 'paths relinearised', 'paths relinearised without success'
 """Keys of the event counts: all relinearised paths, and paths whose states were not adopted."""
 MAX_FRAMES = 64
-"""Maximum number of frames in a window; at most half of it remain when the window moves. Without
-this limit, a window of several seconds at 100 Hz would exceed the capacity of one core."""
+"""Maximum number of frames in a window, for the capacity of one core; half remain when it moves."""
 MAX_ELEMENTS = 5_000_000
-"""Maximum product of frames, hypotheses and squared number of states. With many sensors, fewer
-hypotheses are relinearised."""
+"""Maximum product of frames, hypotheses and squared states; limits the hypotheses."""
 
 
 @dataclass
@@ -82,11 +79,8 @@ class Window:
 
 
 class Relinearisation:
-    """Relinearisation of a bank over a window of the latest frames ([Bell94]_; [JulierUhlmann01]_).
-
-    Hypotheses are relinearised at intervals of at least `interval_s`, and at most `max_hypotheses`.
-    A window of duration 0 disables relinearisation.
-    """
+    """Relinearisation of a bank over a window of frames ([Bell94]_; [JulierUhlmann01]_), at
+    intervals of `interval_s`, of at most `max_hypotheses`; a window of duration 0 disables it."""
 
     def __init__(self, interval_s: float, window_s: float, max_hypotheses: int) -> None:
         self._interval_ns, self._window_ns, self._max_hypotheses = \
@@ -115,9 +109,8 @@ class Relinearisation:
 
     def add(self, bank: FilterBank, predicted: FloatArray, log_likelihood: FloatArray,
             evidence: float, frame: FieldFrame, dt: float) -> None:
-        """Add a frame with which the bank has been updated, the states `predicted` (n_hyp, n_x) at
-        which it was first linearised, and its log-density for each hypothesis, `log_likelihood`
-        (n_hyp,), and over all hypotheses, `evidence`."""
+        """Add a frame with which the bank has been updated, its linearisation points `predicted`
+        (n_hyp, n_x), and its log-densities, by hypothesis (n_hyp,) and over all, `evidence`."""
         if self._is_stale:
             self.begin(bank.copy(), True)
         window = self._window
@@ -177,8 +170,7 @@ class Relinearisation:
             else self._window
 
     def without_target(self, bank_filter: BankFilter, bank: FilterBank, i: int) -> None:
-        """Remove target `i` from the window of a bank and filter that include it, and the frames up
-        to the last one in which its field is strong on the path of the best hypothesis."""
+        """Remove target `i`, and the frames up to the last one in which its field is strong."""
         window, best = self.window, bank.best()
         is_strong = [] if window is None else [
             bank_filter.field_energies(i, path[window.rows_of(bank)[best]], frame).sum()

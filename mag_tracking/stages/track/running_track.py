@@ -93,8 +93,7 @@ class RunningTrack:
                 member.use(self._bank.sensors)
 
     def flag_doubtful_sensors(self, sensors: Mapping[str, Sequence[int]]) -> None:
-        """Mark the track as doubtful if it uses one of the `sensors` with doubtful readings, given
-        as indices by reason."""
+        """Flag the track if it uses one of `sensors`, given by reason."""
         for reason, rows in sensors.items():
             if not np.isin(self._final_sensors.rows, rows).any():
                 continue
@@ -126,8 +125,7 @@ class RunningTrack:
         return self.step(frame, dt)
 
     def step(self, frame: FieldFrame, dt: float, publish: bool = True) -> list[TrackRecord]:
-        """Predict, update and weight the bank with a frame of the whole network; return its records
-        if `publish`."""
+        """Advance the bank with a frame of the whole network; return records if `publish`."""
         if self.ended is not None:
             return []
         for member in () if self._target.starts_anywhere else self.members:
@@ -160,8 +158,7 @@ class RunningTrack:
         return [*out, *lagged_poses, *self._end_lost_members(frame)]
 
     def _view(self, i: int, best: int) -> tuple[FilterBank, int]:
-        """Bank of member `i` alone, and the index of its published hypothesis; `best` is that of
-        the joint hypotheses."""
+        """Bank of member `i` alone, and its published hypothesis, if `best` is the joint one."""
         bank = self.bank.extract_target(i, self._bank.single_target.n_target)
         return bank, best if bank is self.bank else bank.best()
 
@@ -221,8 +218,7 @@ class RunningTrack:
         return out
 
     def end(self, reason: str) -> list[TrackRecord]:
-        """End all members; return for each its last record, marked as ended, and its smoothed
-        poses."""
+        """End all members; return their last records, marked as ended, and smoothed poses."""
         self.ended = reason
         return [record for i in range(len(self.members))
                 for record in self._close_member(i, reason)]
@@ -294,8 +290,7 @@ class RunningTrack:
         return None
 
     def admit(self, joint: JointExplanation, id: int) -> None:
-        """Replace the hypotheses by a joint explanation, and add its new vehicle, if any, with the
-        track identifier `id`."""
+        """Continue with a joint explanation, and its new vehicle, if any, as track `id`."""
         begin_ns, now_ns = (joint.window.frames[k].stamp_ns for k in (0, -1))
         n, sensors = self._bank.single_target.n_target, self._bank.sensors
         ratio = self._settings.min_bayes_factor

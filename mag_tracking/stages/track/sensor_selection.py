@@ -89,8 +89,7 @@ class SensorSubset:
         return bool(offset @ track.velocity[:2] < 0.0)
 
     def for_whole_network(self, track: Track, settings: TrackSettings) -> Track:
-        """Extend a track record of these sensors to all sensors of the network, with NaN and the
-        prior covariance of the mounting angles for the others."""
+        """Extend a record to all sensors, with NaN and prior mounting angles."""
         if not self.is_part:
             return track
         n_sensors, rows = len(self.full_network), self.rows

@@ -1,9 +1,7 @@
 """Smoothing of a track with the frames before and after each of its poses.
 
-The best hypothesis at the end of a track is filtered again through all frames, smoothed backward,
-and relinearised once. Frames that contradict it are excluded, because one such frame would distort
-the whole track. The last smoothed pose may differ from the last published pose, because the two are
-linearised at different states.
+The best hypothesis at the end is filtered again through all frames that do not contradict it,
+smoothed backward, and relinearised once, so that its last pose may differ from the published one.
 """
 
 from collections import deque
@@ -27,9 +25,8 @@ State: TypeAlias = tuple[FloatArray, FloatArray]
 TrackState: TypeAlias = tuple[int, FloatArray, FloatArray]
 """Timestamp [ns], state (n_x,) and covariance (n_x, n_x)."""
 RELINEARISATIONS = 1
-"""Number of relinearisations of a track along its previous result, for inaccurate predictions far
-from the sensors. Four would converge and improve the tracks of turning cars and trucks, but degrade
-the track of a car along a corridor of sensors."""
+"""Number of relinearisations along the previous result. Four would improve the tracks of turning
+cars and trucks, but degrade that of a car along a corridor of sensors."""
 MAX_ELEMENTS = 10_000_000
 """Maximum product of frames and squared number of states: 80 MB, less than a second."""
 
@@ -38,13 +35,12 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
                    intervals: Sequence[float], updated: bool = False,
                    relinearisations: int = RELINEARISATIONS, path: Sequence[FloatArray] = ()
                    ) -> tuple[list[State], int]:
-    """Smoothed states of the only hypothesis of a bank at each frame, and the number of frames
-    excluded because they contradict it.
+    """Smoothed states of the only hypothesis of a bank, and number of contradicting frames
+    excluded.
 
-    `intervals` [s] are the times since the previous frame, `updated` tells whether the bank at the
-    first frame has been updated with it, each of the `relinearisations` is a pass along the result
-    of the previous one, and `path` contains known states (n_x,) at the first frames, at which the
-    first pass is linearised.
+    `intervals` [s] are times since the previous frame; `updated` tells whether the bank includes
+    the first frame; each of the `relinearisations` is a pass along the previous result; `path` are
+    known states (n_x,) at the first frames, for the first pass.
     """
     paths = np.full((1, len(frames), bank.x.shape[1]), np.nan)
     for at, known in zip(paths[0], path, strict=False):
@@ -82,8 +78,7 @@ class WholeTrack:
         self._origin: IntArray = np.zeros(0, dtype=np.int64)
 
     def begin(self, bank: FilterBank | InitialBank, bank_filter: BankFilter) -> None:
-        """Discard all frames, and start with a bank at the first frame and a copy of its filter;
-        the caller must not modify the bank afterwards."""
+        """Discard all frames; start with a bank, not to be modified, and a copy of its filter."""
         self.abandon(False)
         if self._max_duration_s:
             self._start = copy(bank_filter), bank
@@ -99,8 +94,7 @@ class WholeTrack:
             self.add(anchor, frame, dt, True)
 
     def add(self, bank: FilterBank, frame: FieldFrame, dt: float, published: bool) -> None:
-        """Add a frame with which the bank has been updated, and whether a pose was published for
-        it."""
+        """Add a frame with which the bank has been updated, and whether it was published."""
         if self._start is None:
             return
         self._duration_s += dt
@@ -116,11 +110,8 @@ class WholeTrack:
             start.keep(np.isin(start.origin, bank.origin))
 
     def smoothed(self, bank: FilterBank, best: int) -> tuple[list[TrackState], int]:
-        """Smoothed states of the published frames for hypothesis `best`, and the number of frames
-        excluded because they contradict it.
-
-        The states are empty if the track cannot be smoothed as a whole.
-        """
+        """Smoothed states of the published frames for hypothesis `best`, if possible, and the
+        number of frames excluded because they contradict it."""
         if self._start is None or not self._frames:
             return [], 0
         bank_filter, start = self._start
@@ -145,8 +136,7 @@ class _LaggedFrame(NamedTuple):
 
 
 class FixedLag:
-    """Fixed-lag smoother, with the latest frames of a track and the bank after each frame; a
-    `lag_s` of 0 disables it."""
+    """Fixed-lag smoother of the latest frames of a track; a `lag_s` of 0 disables it."""
 
     def __init__(self, lag_s: float) -> None:
         self._lag_s = lag_s
@@ -158,8 +148,7 @@ class FixedLag:
 
     def smoothed(self, bank_filter: BankFilter, bank: FilterBank, best: int, frame: FieldFrame,
                  dt: float, published: bool) -> list[TrackState]:
-        """Add a frame with which the bank has been updated; return the states of hypothesis `best`
-        at the published frames older than the lag: usually none or one."""
+        """Add a frame; return the states of hypothesis `best` at frames older than the lag."""
         if not self._lag_s:
             return []
         self._frames.append(_LaggedFrame(
@@ -176,8 +165,7 @@ class FixedLag:
         return out
 
     def remaining(self, bank_filter: BankFilter, bank: FilterBank, best: int) -> list[TrackState]:
-        """Smoothed states of hypothesis `best` at the published frames that have not been returned,
-        without relinearisation."""
+        """Smoothed states of hypothesis `best` at published frames not returned yet."""
         if not self._frames:
             return []
         oldest = self._frames[0]

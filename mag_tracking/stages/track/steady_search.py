@@ -29,19 +29,16 @@ GRID_STEP, GRID_MARGIN = 3.0, 12.0
 SPEED_COLUMN = PATH.index('speed')
 """Column of the speed in a path."""
 MIN_STD = 1e-3
-"""[m], [m/s], [A m^2] Minimum standard deviation of a parameter without a spread in the settings,
-such as the length of a point."""
+"""[m], [m/s], [A m^2] Minimum std of a parameter without a spread in the settings."""
 MIN_SPEED_RATIO = 0.2
 """Minimum speed of an arriving vehicle, relative to the lowest starting speed."""
 N_STARTS, N_STEPS, TOLERANCE = 10, 12, 1e-3
-"""Maximum numbers of refined distinct starts and of steps, and relative improvement of the cost
-below which the refinement ends."""
+"""Maximum numbers of refined starts and of steps, and relative improvement that ends them."""
 START_TOLERANCE: FloatArray = np.array([4.0, 2.5, 1.0, 5.0, 0.3, 1.0, 3.0])
 PATH_TOLERANCE: FloatArray = np.array([1.0, 1.0, 1.0, 2.0, 0.3, 1.0, 9.0])
 """[m], [m/s], [rad] Differences up to which two starts, or two refined paths, are identical."""
 FIRST_PATH_STD: FloatArray = np.array([2.0, 1.5, 0.2, 3.0, 0.1, 0.1, 1.5])
-"""[m], [m/s], [rad] Standard deviations of the path of the first vehicle in a search for a second
-one."""
+"""[m], [m/s], [rad] Std of the path of the first vehicle in a search for a second."""
 
 
 @dataclass(frozen=True)
@@ -87,15 +84,13 @@ class PathPrior:
                    MIN_SPEED_RATIO * min(vehicle.speeds))
 
     def nearest_line(self, theta: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Index in `headings` of the arrival line (n,) nearest in heading to each path (n, 7), and
-        the heading of the path relative to it, rad."""
+        """Arrival line (n,) nearest in heading to paths (n, 7), and relative heading."""
         relative_headings = (theta[:, 4, None] - self.headings + np.pi) % (2.0 * np.pi) - np.pi
         line: IntArray = np.abs(relative_headings).argmin(axis=1)
         return line, relative_headings[np.arange(len(theta)), line]
 
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Normalised residuals (n, 7) of paths (n, 7) with respect to the prior, and the
-        derivatives (n, 7, 7) of the negative residuals."""
+        """Normalised residuals (n, 7) of paths, and negative derivatives."""
         line, relative_heading = self.nearest_line(theta)
         normals = np.stack([-np.sin(self.headings), np.cos(self.headings)], axis=1)[line]
         relative = theta.copy()
@@ -106,8 +101,7 @@ class PathPrior:
         return (self.mean - relative) / self.std, J
 
     def starts(self, vehicle: VehicleSettings, network: SensorNetwork) -> FloatArray:
-        """Grid (n, 7) of start paths; their positions at time zero cover the arrival lines near
-        sensors."""
+        """Grid (n, 7) of start paths, whose positions cover the arrival lines near sensors."""
         offsets = np.array(vehicle.lateral_offsets)
         offsets = np.unique(np.append(offsets, 0.5 * (offsets[1:] + offsets[:-1])))
         speeds = np.array(vehicle.speeds)
@@ -154,19 +148,15 @@ class StartGrid:
 
 @dataclass(frozen=True)
 class SteadySearch:
-    """Search for vehicles in the samples of a window, given the known vehicles.
-
-    In shapes, n is the number of joint paths of m vehicles, with 7 m parameters and 9 m moments,
-    and y the number of whitened measurements.
-    """
+    """Search for vehicles in the samples of a window, given the known vehicles; n are joint paths
+    of m vehicles, with 7 m parameters and 9 m moments, and y whitened measurements."""
 
     samples: PassSamples
     prior: PathPrior
     known: FloatArray
     """(y,) Whitened field of the known vehicles."""
     columns: FloatArray
-    """(y, q) Whitened field of each nuisance term (backgrounds and errors of the known vehicles) at
-    one standard deviation."""
+    """(y, q) Whitened field of one std of each background or error of known vehicles."""
 
     @cached_property
     def _model(self) -> SteadyPass:
@@ -199,8 +189,7 @@ class SteadySearch:
         return np.tile(self.prior.moment_std, _n_vehicles(theta))
 
     def cost(self, grid: StartGrid) -> FloatArray:
-        """Cost (n,) of a point target on each path of a grid: minus twice the log-density of the
-        frames, up to a constant."""
+        """Cost (n,) of a point target on each path of a grid: -2 log-density + constant."""
         n, std = len(grid.theta), self.prior.moment_std[0] * np.sqrt(N_DIPOLES)
         with ignoring_overflow():
             factor = self._marginal_whitener.correction_factor(grid.bases).reshape(
@@ -244,15 +233,13 @@ class SteadySearch:
         return path, np.where(are_moving & are_detectable, cost, np.inf)
 
     def best(self, grid: StartGrid, max_paths: int) -> FloatArray:
-        """At most `max_paths` paths (n, 7) of a single vehicle that explain the frames best, the
-        best first."""
+        """At most `max_paths` paths (n, 7) of one vehicle that explain the frames best."""
         path, cost = self.refined(
             _best_distinct(grid.theta, self.cost(grid), START_TOLERANCE, N_STARTS))
         return _best_distinct(path, cost, PATH_TOLERANCE, max_paths)
 
     def moments(self, theta: FloatArray) -> FloatArray:
-        """Moments (m, 3, 3) of the rows of dipoles on paths (7 m,), from the tail to the head of
-        each row, A m², world frame."""
+        """Moments (m, 3, 3) on paths (7 m,), from tail to head, A m², world frame."""
         _, _, _, p = self._solve(theta[None])
         moments: FloatArray = self._model.combinations @ p.reshape(-1, N_DIPOLES, 3)
         return moments

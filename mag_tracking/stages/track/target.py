@@ -18,8 +18,7 @@ from mag_tracking.stages.track.observation import Observation
 from mag_tracking.stages.track.settings import TrackSettings
 
 MAX_BYTES = 4 << 30
-"""[bytes] Memory for the covariances of all starting hypotheses above which settings are rejected;
-the peak memory is 1.5 times as large."""
+"""[bytes] Maximum memory for the covariances of starting hypotheses; the peak is 1.5 times it."""
 START_BYTES = 250_000_000
 """[bytes] Memory for the covariances with which a track starts. Sensors that need more are added
 after the frames before the detection if few hypotheses are then probable, otherwise later."""
@@ -43,25 +42,19 @@ class Target:
     kinds: Sequence[str]
     """Name of each kind of target."""
     unobserved_length: Callable[[], published_pose.UnobservedLength | None]
-    """Factory, for each track, of the uncertainty of the middle of a vehicle due to its unobserved
-    length; None for a magnet."""
+    """Factory of the uncertainty due to unobserved length; None for a magnet."""
     starts_anywhere: bool
     """Whether a track may start anywhere, like a magnet, or on an arrival line, like a vehicle."""
     start: Callable[[TrackSettings, SensorNetwork, FieldFrame, FloatArray], FilterBank | None]
-    """Function that returns the first hypotheses from the settings, a network, a frame and the
-    covariances (n_sensors, n_own, n_own) of mounting angles and model errors; None if the frame
-    does not allow a start."""
+    """First hypotheses from settings, network, frame and the covariances (n_sensors, n_own, n_own)
+    of mounting angles and model errors; None if the frame does not allow a start."""
     is_lost_after: Callable[[TrackSettings, SensorNetwork, float], bool] = lambda *_: False
-    """Function that returns whether the target may be anywhere after a gap [s], so that its
-    hypotheses are started again."""
+    """Whether the target may be anywhere after a gap [s], and must start again."""
 
 
 def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
-    """Target that the settings select.
-
-    Raises SettingsError if the target is unknown, if its settings contradict each other, or if the
-    start of a track would need too much memory.
-    """
+    """Target that the settings select; raises SettingsError if it is unknown, if settings
+    contradict each other, or if the start of a track would need too much memory."""
     if settings.target == 'vehicle':
         vehicle = settings.vehicle
         row = initiation_vehicle.vehicle_model(vehicle, network)
@@ -91,8 +84,7 @@ def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
 
 def _check_vehicle_bank(settings: TrackSettings, network: SensorNetwork,
                         model: SourceModel) -> None:
-    """Raise SettingsError if the starting hypotheses of a vehicle, or `MIN_HYPOTHESES` with the
-    maximum number of sensors, exceed `MAX_BYTES`."""
+    """Raise SettingsError if the hypotheses of a vehicle at the start, or later, need too much."""
     _check_bank('track.vehicle', _vehicle_factors(settings), settings,
                 sensors_at_start(settings, network, model), model)
     n = _n_sensors(settings, network)
@@ -123,8 +115,7 @@ def sensors_at_start(settings: TrackSettings, network: SensorNetwork, model: Sou
 
 
 def max_sensors(observation: Observation, n_hyp: int) -> int:
-    """Maximum number of sensors for which a bank of `n_hyp` hypotheses stays within `START_BYTES`,
-    but at least `MIN_SENSORS_AT_START`."""
+    """Maximum number of sensors within `START_BYTES`, at least `MIN_SENSORS_AT_START`."""
     return _max_affordable_sensors(n_hyp, observation.n_target, observation.n_own + 3)
 
 
@@ -135,8 +126,7 @@ def _max_affordable_sensors(n_hyp: int, n_target: int, n_per_sensor: int) -> int
 
 
 def max_hypotheses(observation: Observation, n_sensors: int) -> int:
-    """Maximum number of hypotheses that a track retains when it changes to `n_sensors` sensors:
-    those within `WIDER_BYTES`, but at least `MIN_HYPOTHESES`."""
+    """Maximum number of hypotheses with `n_sensors` within `WIDER_BYTES`, or the minimum."""
     return max(MIN_HYPOTHESES, WIDER_BYTES // (_FLOAT_BYTES * observation.n_states(n_sensors)**2))
 
 

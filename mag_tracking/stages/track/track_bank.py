@@ -21,11 +21,9 @@ from mag_tracking.stages.track.target import MIN_WEIGHT, Target, max_hypotheses,
 from mag_tracking.units import NS
 
 PRUNE_RATIO = 1e-12
-"""Weight, relative to the heaviest hypothesis, below which a hypothesis is dropped ([T10]_
-Alg. 3)."""
+"""Relative weight below which a hypothesis is dropped ([T10]_ Alg. 3)."""
 MAX_INITIAL_HYPOTHESES = 1200
-"""Maximum number of hypotheses in the frames before the detection, if larger than `max_hypotheses`.
-With fewer, the correct one is often lost, because these frames hardly show a target's origin."""
+"""Maximum number of hypotheses before the detection, where frames hardly show the origin."""
 RELINEARISE_INTERVAL_S, MAX_RELINEARISED = 0.15, 20
 """[s] Interval between relinearisations, and maximum number of relinearised hypotheses."""
 
@@ -88,8 +86,7 @@ class TrackBank:
         self.relinearisation.restart()
 
     def begin(self, first: FieldFrame, detection: FieldFrame) -> None:
-        """Move the bank back from the frame of the detection, at which it was created, to the first
-        frame of the track, and start to store frames."""
+        """Move the bank back from the detection to the first frame, and begin to store frames."""
         if first is not detection:
             self.filter.move(self.bank, (first.stamp_ns - detection.stamp_ns) / NS)
         start = InitialBank.of(self.bank, self.filter.observation.n_target)
@@ -97,8 +94,7 @@ class TrackBank:
         self.relinearisation.begin(start)
 
     def advance(self, frame: FieldFrame, dt: float) -> FrameUpdate:
-        """Predict and update the bank with a frame of the sensors in use, and weight the
-        hypotheses."""
+        """Predict and update the bank with a frame, and weight the hypotheses."""
         predicted, log_likelihood, used, rejected = self._rejection.advance(
             self.filter, self.bank, frame, dt)
         self._counts.update(rejected)
@@ -123,8 +119,7 @@ class TrackBank:
         return states
 
     def store_and_prune(self, update: FrameUpdate, publish: bool) -> None:
-        """Store a frame, drop improbable hypotheses, and relinearise the leading ones if due;
-        `publish` if a pose is published for the frame."""
+        """Store a frame, drop improbable hypotheses, and relinearise if due."""
         s, bank = self.settings, self.bank
         self.relinearisation.add(bank, update.predicted, update.log_likelihood, update.evidence,
                                  update.frame, update.dt)
@@ -160,8 +155,7 @@ class TrackBank:
         self.lag.clear()
 
     def hand_over(self, best: int) -> bool:
-        """Switch to the sensors near the predicted position of hypothesis `best`; return whether
-        they have changed."""
+        """Switch to the sensors near the predicted position; return whether they changed."""
         sensors = self.sensors.ahead_of(self.bank.x[best], min(
             self.settings.max_sensors, max_sensors(self.filter.observation, len(self.bank))))
         if sensors is self.sensors:
@@ -174,10 +168,7 @@ class TrackBank:
 
     def widen(self, dt: float) -> bool:
         """Add the remaining sensors from the next frame on, in `dt` seconds, if few hypotheses are
-        probable; return whether the sensors have changed.
-
-        Otherwise a later handover adds these sensors.
-        """
+        probable, else at a later handover; return whether the sensors have changed."""
         sensors, self.later_sensors = self.later_sensors or self.sensors, None
         n, n_hyp = len(sensors.rows), max_hypotheses(self.filter.observation, len(sensors.rows))
         if n == len(self.sensors.rows) or not self.bank.is_concentrated_in(n_hyp, MIN_WEIGHT):

@@ -25,8 +25,7 @@ rows of dipoles, and standard deviation of the overlap depth due to uncertain pa
 MAX_SAMPLES = 320
 """Maximum number of samples of a search; windows with more are decimated."""
 KNOWN_STD, KNOWN_MOMENT_RATIO = 0.7, 0.3
-"""[m], [m/s] Standard deviation of the positions and velocities of tracked vehicles in a search,
-and relative standard deviation of their moments."""
+"""[m], [m/s] Std of known positions and velocities, and relative std of known moments."""
 
 
 @dataclass(frozen=True)
@@ -86,14 +85,12 @@ class VehicleState:
         return x
 
     def hard_moments(self, x: FloatArray) -> FloatArray:
-        """Hard iron moments (d, 3) of the dipoles of a vehicle with state `x` (n_t,), A m², vehicle
-        frame."""
+        """Hard iron moments (d, 3) of a state `x` (n_t,), A m², vehicle frame."""
         hard: FloatArray = x[6:6 + 3 * self._model.n_dipoles].reshape(-1, 3)
         return hard
 
     def turning(self, x: FloatArray, P: FloatArray, target: int) -> FloatArray | None:
-        """Return `P` with the turn-rate variance of one target of a joint state `x` (n_x,) set to
-        its initial value; None if turning is disabled."""
+        """Return `P` with one target's initial turn-rate variance; None if disabled."""
         if not self._model.turn_acceleration:
             return None
         n = len(self._model.state_names)

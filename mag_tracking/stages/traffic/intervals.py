@@ -39,11 +39,8 @@ class TrafficIntervals:
         self._observed.setdefault(begin, 0)
 
     def close_until(self, before_ns: int, now_ns: int) -> list[TrafficSummary]:
-        """Close the intervals that end by `before_ns`, and return their summaries.
-
-        All passages before `before_ns` must have been added; `now_ns` is the time of the latest
-        frame.
-        """
+        """Close and return the intervals that end by `before_ns`, until which all passages have
+        been added; `now_ns` is the time of the latest frame."""
         self._observe(now_ns)
         return self._close([begin for begin in self._observed
                             if begin + self._length <= before_ns])

@@ -26,9 +26,8 @@ contradicts the direction of the crossing; the track does not reach the line."""
 MAX_DIRECTION_ERROR = 0.9
 """Error probability above which the fields contradict the direction of a crossing."""
 INTERFERENCE_S, SMOOTHED_LEAD_S, MAX_WAIT_S = 2.0, 3.0, 120.0
-"""[s] Time around a crossing in which another tracked vehicle prevents the check of its direction,
-maximum time from the first smoothed to the first published pose of a track, and maximum time that
-passages and summaries wait for a running track."""
+"""[s] Time around a crossing in which another track prevents the check of its direction, maximum
+lead of the smoothed poses, and maximum time that passages wait for a running track."""
 REACQUIRED_S, REACQUIRED_M = 1.0, 3.0
 """[s], [m] Maximum separation in time and along the line of two crossings of one vehicle, whose
 track was lost and reacquired near the line."""
@@ -272,8 +271,7 @@ class FieldDirection:
         self._frames: deque[FieldFrame] = deque()
 
     def add(self, frame: FieldFrame, since_ns: int) -> None:
-        """Store a frame, and drop frames not needed for crossings from `since_ns` on, and all if
-        time jumps back."""
+        """Store a frame; drop frames not needed from `since_ns` on, and all after a jump back."""
         if self._frames and frame.stamp_ns <= self._frames[-1].stamp_ns:
             self._frames.clear()
         self._frames.append(frame)
@@ -283,8 +281,7 @@ class FieldDirection:
             self._frames.popleft()
 
     def error_probability(self, crossing: Crossing) -> float:
-        """Probability that the direction of a crossing is wrong; NaN if it is not observable, or if
-        the sensors contradict each other."""
+        """Probability that a direction is wrong; NaN if unknown or contradictory."""
         velocity = crossing.pose.velocity[:2]
         speed = float(np.hypot(*velocity))
         if not self._frames or speed < 0.1:
