@@ -50,11 +50,8 @@ cores to the tracker until the tracker has computed a pose, even with a hundred 
 
 
 class CalibrationNode(StageNode):
-    """Calibrates the readings of each sensor; topics of calibrated fields end in `_calibrated`.
-
-    Of `next_steps`, nodes in the same process, the detection node receives the calibrated readings
-    directly and the tracker node the intervals in which backgrounds are doubtful.
-    """
+    """Calibrates the readings of each sensor; of `next_steps`, the detection node receives the
+    calibrated readings directly, and the tracker node the intervals of doubtful backgrounds."""
 
     def __init__(self, next_steps: tuple[DetectionNode, TrackerNode] | None = None,
                  **node_arguments: Any) -> None:

@@ -165,11 +165,8 @@ class Flow:
 
 
 class SubscriberMonitor:
-    """Checks that the node of the next processing step still subscribes to an absolute topic.
-
-    The node, which messages call by its `role`, may have any name: among the subscribers, it is
-    identified by `publishes`, the message type that it publishes.
-    """
+    """Checks that a node with the `role` of the next processing step, which is identified by the
+    message type that it `publishes`, still subscribes to an absolute topic."""
 
     def __init__(self, role: str, topic: str, publishes: str) -> None:
         self.role, self.topic, self._publishes = role, topic, publishes

@@ -29,10 +29,7 @@ def status_of(name: str, message: str, level: bytes = OK,
 
 
 class DiagnosticsPublisher:
-    """Publishes statuses of a node on /diagnostics and logs faults.
-
-    `title` is the name of the node in diagnostics, including its namespace.
-    """
+    """Publishes statuses on /diagnostics and logs faults; `title` names the node."""
 
     def __init__(self, node: Node) -> None:
         self._node, self.log = node, StatusLog(node.get_logger())

@@ -26,10 +26,7 @@ from mag_tracking.stages.health.diagnosis import Cause, Finding
 
 
 class DoctorNode(Node):
-    """Passes the readings of a network, with their times of arrival, to a `Doctor`.
-
-    `status` is the exit status of the process if the middleware hangs.
-    """
+    """Passes readings to a `Doctor`; `status` is that of the process if the middleware hangs."""
 
     def __init__(self, network: SensorNetwork, settings: Settings) -> None:
         super().__init__('doctor', namespace=network.namespace)

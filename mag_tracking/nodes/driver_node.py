@@ -1,8 +1,4 @@
-"""driver_node: reads devices and publishes magnetic fields and accelerations.
-
-A lifecycle node: configuration reads the drivers file, activation opens the devices. With
-`autostart` (the default), the node configures and activates itself at startup.
-"""
+"""driver_node: a lifecycle node that reads devices and publishes fields and accelerations."""
 
 if __name__ == '__main__':
     from mag_tracking.nodes.start import driver_node

@@ -43,11 +43,8 @@ class Observer:
         return condition()
 
     def call(self, service_type: Any, name: str, once: bool = False, **fields: Any) -> Any:
-        """Call a service; raises GraphError if it does not exist or does not respond in time.
-
-        A query is repeated, because the response of a server that has not yet discovered the client
-        is lost. A change of the server is requested only `once`, after a wait for discovery.
-        """
+        """Call a service, only `once` (after discovery) if it changes the server, because the first
+        response may be lost; raises GraphError if the service is missing or does not respond."""
         with valid_names():
             client = self.node.create_client(service_type, name)
         try:
@@ -100,11 +97,8 @@ def topics(graph: Observer) -> list[tuple[str, str, int, int]]:
 
 def receive_messages(graph: Observer, topic: str, handle: Callable[[Any], bool],
                      stopped: Callable[[], bool]) -> None:
-    """Receive messages of a topic, to be resolved, until `handle` returns False or `stopped()`.
-
-    Messages published earlier are received only if all publishers are latched. Raises GraphError if
-    the name is invalid, the topic has no publisher, or its type is not installed.
-    """
+    """Receive messages of a topic, and earlier ones if all publishers are latched, until `handle`
+    returns False or `stopped()`; raises GraphError if topic or type are unknown."""
     with valid_names():
         name = graph.node.resolve_topic_name(topic)
         graph.node.count_publishers(name)

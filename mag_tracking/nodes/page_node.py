@@ -45,11 +45,8 @@ EMPTY_LAYOUT = SensorLayout('', (), np.zeros((0, 3)))
 
 
 class PageNode(Node):
-    """Subscribes to the topics of the tracker and adds their messages to a scene.
-
-    The topics `tracker_node/tracks` and `network_frame` are relative and can be remapped. A tracker
-    with another name is found by the message type of its tracks, if it is the only one.
-    """
+    """Adds the messages of the tracker to a scene; a tracker whose topics are neither
+    `tracker_node/tracks` nor remapped is found by its message type if it is the only one."""
 
     def __init__(self, scene: LiveScene) -> None:
         super().__init__('mag_tracking_page', start_parameter_services=False)

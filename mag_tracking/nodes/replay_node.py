@@ -1,8 +1,7 @@
 """replay_node: plays a recording on topics, with /clock, pause, resume and seek.
 
-A lifecycle node: configuration opens the recording and advertises its topics, activation starts
-playback, deactivation stops it. With `autostart` (the default), the node configures and activates
-itself at startup.
+A lifecycle node: configuration opens the recording, activation starts playback, deactivation stops
+it. By default (`autostart`), the node configures and activates itself.
 """
 
 if __name__ == '__main__':

@@ -41,10 +41,8 @@ def _descriptor(p: Parameter) -> msg.ParameterDescriptor:
 
 
 def declare_settings(node: Node, settings: Settings, group: str) -> Settings:
-    """Declare the settings of a group as parameters of a node; return all, with its overrides.
-
-    A parameter file may contain settings of other groups. Raises SettingsError if one is invalid.
-    """
+    """Declare the settings of a group, and return all settings, with the overrides of a node;
+    raises SettingsError if one is invalid."""
     overrides = node._parameter_overrides  # rclpy has no public accessor
     current = replace(settings, {
         name: _without_array(p.value) for name, p in overrides.items()

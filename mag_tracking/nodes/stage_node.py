@@ -46,9 +46,8 @@ _Record = TypeVar('_Record')
 class StageNode(Node):
     """Node that reads the network file and the settings of one group of stages.
 
-    `settings` are the defaults of the target, overridden by parameters; `flows` the statistics of
-    the inputs, by source; `now_ns` the arrival time of the current message, by the ROS clock.
-    Raises SettingsError for an invalid parameter, and NetworkError for an invalid network file.
+    `flows` are the statistics of the inputs, by source; `now_ns` is the arrival time of the current
+    message. Raises SettingsError and NetworkError for invalid parameters and network files.
     """
 
     def __init__(self, name: str, group: str, **node_arguments: Any) -> None:

@@ -17,83 +17,37 @@ COMPLETE: int
 class Alignment:
     """Queues the pending samples of a network and combines them into frames.
 
-    Parameters
-    ----------
-    n_sensors : int
-    period : int, ns
-        Length of a frame.
-    wait : int, ns
-        Maximum time for which frames wait for a silent sensor.
-    limit : int, ns
-        A larger forward jump of a timestamp is reported as CLOCK_STEP.
-    jump_back : int, ns
-        A larger backward jump of a timestamp is reported as JUMPED_BACK.
-    most : int
-        Maximum number of pending samples per sensor.
-    is_burst : bool
-        Whether the sensors are read sequentially.
-
-    Attributes
-    ----------
-    next : int
-        Index of the next sample of the batch.
-    row : int
-        Index of the sensor that the latest reason refers to.
-    passed : int, ns
-        Newest timestamp that passed the clock step filter, or NEVER.
-    is_calm : bool
-        Whether no clock step is suspected, so that samples within `limit` bypass the clock step
-        filter.
-    n_pending : int
-        Number of pending samples.
+    A frame has the length `period` [ns], and waits for a silent sensor for at most `wait` [ns].
+    Timestamps that jump forward by more than `limit` or backward by more than `jump_back` [ns] are
+    reported as CLOCK_STEP or JUMPED_BACK; `most` is the maximum number of pending samples per
+    sensor.
     """
 
     next: int
+    """Index of the next sample of the batch."""
     passed: int
+    """Newest timestamp that passed the clock step filter [ns], or NEVER."""
     is_calm: bool
+    """Whether samples within `limit` bypass the clock step filter."""
     @property
-    def row(self) -> int: ...
+    def row(self) -> int:
+        """Index of the sensor that the latest reason refers to."""
     @property
     def n_pending(self) -> int: ...
     def __init__(self, n_sensors: int, period: int, wait: int, limit: int, jump_back: int,
                  most: int, is_burst: bool) -> None: ...
     def hold(self, is_checked: bool, passed: IntArray, rows: IntArray, stamps: IntArray,
              fields: FloatArray, covariances: FloatArray) -> int:
-        """Queue samples, starting at `next`, until an event must be handled.
+        """Queue n samples, starting at `next`, until an event must be handled; return its reason.
 
-        Parameters
-        ----------
-        is_checked : bool
-            Whether the samples have passed the clock step filter.
-        passed : (n_sensors,) int array, ns
-            Latest timestamp of each sensor that passed the clock step filter; updated in place.
-        rows : (n,) int array
-            Index of the sensor of each sample; negative for an unknown sensor.
-        stamps : (n,) int array, ns
-        fields : (n, 3) array, T
-        covariances : (n, 3, 3) array, T^2
-
-        Returns
-        -------
-        int
-            Reason code: DONE, or an event of sensor `row`.
+        Unless the samples have passed the clock step filter (`is_checked`), they update `passed`
+        (n_sensors,), the latest timestamps that have. Unknown sensors have negative `rows`.
         """
 
     def frame(self, is_final: bool) -> tuple[int, FloatArray, FloatArray, IntArray,
                                              FloatArray] | None:
-        """Remove the samples of the next frame from the queue and return the frame.
-
-        Parameters
-        ----------
-        is_final : bool
-            Whether the input has ended, so that incomplete frames are returned too.
-
-        Returns
-        -------
-        tuple or None
-            Timestamp [ns], field, covariance, number of samples and time offset, as in
-            `records.FieldFrame`. None if there is no such frame.
-        """
+        """Remove the next frame, even if incomplete at the end of the input (`is_final`), from the
+        queue; return its entries in the order of `records.FieldFrame`."""
 
     def drop(self, i: int) -> None:
         """Drop the oldest pending sample of sensor `i`, if there is one."""

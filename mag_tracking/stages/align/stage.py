@@ -55,12 +55,9 @@ def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
 
 
 def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
-    """Frame period [s]: the setting, or a period derived from the geometry if the setting is 0.
-
-    A longer frame than the delay between two sensors mixes their signals, so in a compact network
-    the period is half the shortest delay. In a larger one, tracking does not use this delay. Raises
-    SettingsError if the setting is below `MIN_PERIOD_S`.
-    """
+    """Frame period [s]: the setting or, if it is 0 and the network compact, half the shortest delay
+    between two sensors, whose signals longer frames mix; raises SettingsError if it is too
+    short."""
     if 0.0 < settings.period_s < MIN_PERIOD_S:
         raise SettingsError(f'align.period_s: {settings.period_s:g} s is shorter than the minimum '
                             f'of {MIN_PERIOD_S:g} s; set it to 0 for an automatic period')
@@ -86,10 +83,7 @@ def frame_period_warning(settings: AlignSettings, network: SensorNetwork) -> str
 
 
 class Align(Stage[Readings, FieldFrame]):
-    """Combines calibrated readings into frames; memory is bounded by `max_buffered`.
-
-    The rules are in `alignment.hpp`; this class handles the events that compiled code reports.
-    """
+    """Combines calibrated readings into frames, by the rules in `alignment.hpp`."""
 
     def __init__(self, network: SensorNetwork, settings: AlignSettings) -> None:
         self.counts: Counter[str] = Counter()

@@ -106,11 +106,8 @@ def _beginning(batches: Iterator[Readings], network: SensorNetwork, settings: Ca
 
 def _level_of(recorder: BlockRecorder, departed_at: float | None,
               learnt: tuple[float, FloatArray] | None) -> tuple[MostFrequentLevel | None, bool]:
-    """Return (most frequent level or None, whether a target was present at the start).
-
-    Then only readings after its departure at `departed_at` [s] count. If the field later returns to
-    the level `learnt` at the start, no target was present.
-    """
+    """Most frequent level, if any, and whether a target was present at the start: if it departed at
+    `departed_at` [s], unless the field later returns to the level `learnt` at the start."""
     level = recorder.quiet_level()
     if level is None or departed_at is None or learnt is None \
             or recorder.has_returned(learnt[1], level, departed_at):

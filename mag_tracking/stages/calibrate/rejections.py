@@ -41,10 +41,8 @@ def own_covariances(readings: Readings) -> tuple[IntArray, FloatArray]:
 
 
 class DriverFaults:
-    """Marks for missing readings, and repetitions, in the latest raw readings of several sensors.
-
-    The compiled code leaves out the faults that are stored in `sensors`, a (n,) SENSOR array.
-    """
+    """Marks for missing readings, and repetitions, in raw readings; the compiled code leaves out
+    those that are stored in `sensors`, a (n,) SENSOR array."""
 
     def __init__(self, names: Sequence[str], sensors: StructArray) -> None:
         self._states = dict(zip(names, sensors, strict=True))
@@ -75,10 +73,8 @@ class DriverFaults:
         s['repeats'] = s['changes'] = s['run'] = 0
 
     def examine(self, sensor: str, stamp_ns: int) -> float:
-        """Search the latest raw readings of a sensor, before that of `stamp_ns`.
-
-        Return the fraction of readings with a mark if a fault was found and stored, otherwise NaN.
-        """
+        """Search the latest raw readings before `stamp_ns`; return the fraction of readings with a
+        mark if a fault was found and stored, otherwise NaN."""
         s, known = self._states[sensor], self.of(sensor)
         n = int(s['n_window'])
         if n == N_WINDOW and self._may_skip(sensor, s['window']):

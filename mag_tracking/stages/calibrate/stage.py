@@ -60,14 +60,11 @@ class StoredBackground:
 class Calibrate:
     """Subtracts the background from raw readings, and attaches a noise covariance.
 
-    The clock offset and the corrections of hard and soft iron in the network file are applied
-    first. The field remains in the sensor frame. The covariance is taken from the reading if
-    available (unless the measured noise contradicts it), otherwise from the network file; otherwise
-    it is estimated. The rules are in `calibration/readings.hpp`; this class handles the events that
-    the compiled code reports.
-
-    A `background_type` estimates the background of each sensor; `survey` has the settings of the
-    comparison with the Earth's field. `rejections` are {sensor: {(cause, description): number}}.
+    The corrections in the network file are applied first; the field remains in the sensor frame.
+    The covariance is that of the reading (unless the measured noise contradicts it), that of the
+    network file, or an estimate. The rules are in `calibration/readings.hpp`; this class handles
+    the events that the compiled code reports. `rejections` are {sensor: {(cause, description):
+    number}}.
     """
 
     def __init__(self, network: SensorNetwork, settings: CalibrateSettings,

@@ -1,7 +1,4 @@
-"""Detect: chi-square energy test on whitened frames.
-
-The test of T10 section 5.4, eq. (5.14)-(5.19), is applied to all sensors together.
-"""
+"""Detect: chi-square energy test on the whitened frames of all sensors ([T10], section 5.4)."""
 
 from collections import Counter
 from dataclasses import replace
@@ -33,10 +30,7 @@ RECOVERY_S = 5.0
 
 
 class Detect(Stage[FieldFrame, FieldFrame | Detection]):
-    """Decides for each frame whether a target is present, and reports onset and release.
-
-    `max_consecutive_above` is the largest number of consecutive frames above the threshold.
-    """
+    """Decides for each frame whether a target is present, by T10 eq. (5.14)-(5.19)."""
 
     def __init__(self, network: SensorNetwork, settings: DetectSettings) -> None:
         self.counts: Counter[str] = Counter()

@@ -38,11 +38,9 @@ distance of its magnetic centre from the middle of its body."""
 
 
 class Events:
-    """Converts calibrated readings to pass events, one for each detection at each sensor.
-
-    The events of one batch are returned sensor by sensor. A single sensor does not observe lengths.
-    The track settings determine the rate below which a pass is not resolved.
-    """
+    """Converts calibrated readings to pass events, one for each detection at each sensor, without
+    lengths, which one sensor does not observe; track settings give the rate that resolves a
+    pass."""
 
     def __init__(self, network: SensorNetwork, align: AlignSettings, detect: DetectSettings,
                  track: TrackSettings) -> None:

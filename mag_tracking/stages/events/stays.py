@@ -1,10 +1,9 @@
 """Stays: events of vehicles that stand beside a sensor until their field is its background.
 
-The calibration learns the field of a parked vehicle as the new background (`calibrate.relearn_s`).
-The calibrated field then steps to zero, and the event ends although the vehicle has not left. When
-it leaves, the calibrated field steps to the opposite of its field, until it is learnt or another
-vehicle takes the place. Both events are joined to one, and so are those of a weak field whose
-detection is interrupted by the uncertainty of the background.
+The calibration learns their field as the new background (`calibrate.relearn_s`): the calibrated
+field steps to zero, and the event ends although the vehicle has not left. When it leaves, the field
+steps to the opposite, until it is learnt or another vehicle takes the place. Both events are
+joined, and so are those of a weak field whose detection is interrupted.
 """
 
 from collections.abc import Sequence
@@ -53,18 +52,9 @@ class _Held(NamedTuple):
 
 
 class Stays:
-    """Joins the arrivals and the departures of vehicles that park beside one sensor.
-
-    Parameters
-    ----------
-    free_field : (3,) array, T, sensor frame
-        Field without a vehicle, towards which the background changes if a vehicle that was present
-        from the start leaves; NaN if unknown.
-
-    Attributes
-    ----------
-    first_ns : int, ns, time of the first reading
-    """
+    """Joins the arrivals and departures of vehicles that park beside one sensor; the background
+    approaches `free_field` (3,) [T], NaN if unknown, if one that was present from the start
+    leaves."""
 
     def __init__(self, free_field: FloatArray) -> None:
         self._free_field = free_field
@@ -74,11 +64,9 @@ class Stays:
 
     def add(self, event: PassEvent, readings: Readings,
             relearnt: Sequence[RelearntBackground]) -> list[PassEvent]:
-        """Add an event, and return the completed events; `readings` extend over the whole event.
-
-        A departure completes the event of the arrival; if the vehicle was present from the start,
-        its event begins with the first reading.
-        """
+        """Add an event, with all its `readings`, and return the completed events; a departure
+        completes the event of the arrival, or one that begins with the first reading
+        (`first_ns`)."""
         end_ns = int(readings.stamp_ns[-1])
         change = max((c for c in relearnt if event.onset_ns < c.stamp_ns <= end_ns),
                      key=_size, default=None)

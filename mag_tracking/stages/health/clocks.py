@@ -89,10 +89,8 @@ class ClockSpan(NamedTuple):
         return self._replace(first_ns=self.first_ns - offset_ns, last_ns=self.last_ns - offset_ns)
 
     def ahead_s(self, reference: 'ClockSpan') -> tuple[float, bool]:
-        """Time [s] by which this clock is ahead of another, and whether it is too large for delays.
-
-        Clocks that do not advance like the time of receipt (a fast replay) cannot be compared.
-        """
+        """Time [s] by which this clock is ahead of another, and whether it is too large for delays;
+        never so in a fast replay."""
         ahead_s = reference.delay_s - self.delay_s
         first_s = (reference.first_received_ns - reference.first_ns) / NS \
             - (self.first_received_ns - self.first_ns) / NS

@@ -40,11 +40,8 @@ SPIKE_STD = 30.0
 
 
 class SensorHealth:
-    """Monitors the readings of one sensor, in a window.
-
-    Statistics are updated after every `update_interval` readings, before each query, and for each
-    batch. The marks and repetitions of `faults` are not evaluated as readings.
-    """
+    """Monitors the latest readings of one sensor, without the marks and repetitions of `faults`;
+    statistics are updated every `update_interval` readings, and for each batch or query."""
 
     def __init__(self, update_interval: int = UPDATE_INTERVAL,
                  faults: reading_faults.ReadingFaults = reading_faults.NO_FAULTS) -> None:
@@ -97,10 +94,8 @@ class SensorHealth:
                            np.array(received, dtype=np.int64))
 
     def add_batch(self, stamps: IntArray, fields: FloatArray, received: IntArray) -> None:
-        """Add at most `WINDOW` readings directly to the window, and update the statistics.
-
-        An unknown time of receipt is `NEVER`. Use either `add` or `add_batch`.
-        """
+        """Add at most `WINDOW` readings directly to the window, with times of receipt or `NEVER`,
+        and update the statistics; not together with `add`."""
         n, self._cache, self._delays = len(stamps), {}, None
         if not n:
             return
@@ -260,10 +255,8 @@ class SensorHealth:
 
     @property
     def dead_axes(self) -> str:
-        """Axes, such as 'xz', that did not change within the window although another axis changed.
-
-        With coarse resolution, they have never changed, and the other one by `MIN_MOVED_STEPS`.
-        """
+        """Axes, such as 'xz', that did not change within the window (with coarse resolution: ever)
+        although another axis changed."""
         self.update()
         if len(self._fields) < WINDOW:
             return ''

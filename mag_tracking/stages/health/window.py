@@ -20,10 +20,8 @@ class ReadingBuffer:
 
     def add(self, rows: IntArray, stamps: IntArray, fields: FloatArray, received_ns: int,
             first: int) -> int:
-        """Add readings from index `first` until a buffer is full; return the next index.
-
-        Readings with a negative index in `rows`, that of the sensor, are skipped.
-        """
+        """Add readings from index `first` until a buffer is full, except negative `rows`; return
+        the next index."""
         return core.add_readings(plain(rows, np.int64), plain(stamps, np.int64), plain(fields),
                                  received_ns, first, self._count, self._stamp, self._received,
                                  self._field)

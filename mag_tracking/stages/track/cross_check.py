@@ -157,14 +157,8 @@ class _FrameSummary(NamedTuple):
 
 
 class CrossCheck:
-    """Cross-check of a track against fits of a steady path to all frames of the pass.
-
-    Attributes
-    ----------
-    latest : latest fit; None before the vehicle has passed
-    difference : (6,) array, `RigidPass.difference` of the latest state in the pass, m and m/s; zero
-        before the first fit
-    """
+    """Cross-check of a track against fits of a steady path to all frames of the pass; `difference`
+    (6,) is `RigidPass.difference` of the latest state [m, m/s], first zero."""
 
     def __init__(self, network: SensorNetwork) -> None:
         self.latest: pass_samples.RigidPass | None = None

@@ -1,9 +1,8 @@
 """Disturbances: smooth fields that start a track, but that no target explains.
 
-Two models of a smooth field compete with a target. In the first, each sensor has an independent
-field (temperature, a knock, a cable). In the second, one field with a gradient covers the network
-(a geomagnetic storm, a power line, a tram). Both allow for the same model error as the tracker;
-otherwise a smooth field would be favoured whenever a target is near.
+Two models compete with a target: an independent field at each sensor (temperature, a knock, a
+cable), and a field with a gradient (a geomagnetic storm, a power line, a tram). Both allow for the
+model error of the tracker; otherwise they would be favoured whenever a target is near.
 """
 
 from dataclasses import dataclass, replace
@@ -167,11 +166,8 @@ class DisturbanceModel:
 
 
 def _common_field_matrix(network: SensorNetwork) -> FloatArray:
-    """Matrix (3 n_sensors, m) that maps a common field and the backgrounds to the sensor axes.
-
-    The five parameters of the gradient, symmetric and traceless without sources inside the network,
-    are the changes of the field [T] from the centre of the network to its edge.
-    """
+    """Matrix (3 n_sensors, m) that maps a common field and the backgrounds to the sensor axes; the
+    gradient, symmetric and traceless, is in changes [T] from centre to edge."""
     n, R_sw = len(network), network.R_sw
     field = np.tile(np.eye(3), (n, 1, 1))
     if n >= MIN_GRADIENT_SENSORS:

@@ -41,15 +41,8 @@ MAX_INTERVALS = 5000
 
 
 class TrackEvidence:
-    """Evidence for a target, and doubts about its track.
-
-    Attributes
-    ----------
-    doubts : doubts about the whole track
-    bayes_factor : evidence for a target against a disturbance
-    innovations : consistency of the innovations with their covariance
-    largest : (n_sensors,) array, magnitude of the largest field measured by each sensor, T
-    """
+    """Evidence for a target, and doubts about its whole track; `largest` (n_sensors,) [T] is the
+    largest magnitude at each sensor."""
 
     def __init__(self, n_sensors: int) -> None:
         self.doubts: set[str] = set()
@@ -194,12 +187,10 @@ class TrackEvidence:
 
     def reason_to_end(self, track: Track, spread: float, is_approaching: bool,
                       settings: TrackSettings) -> str | None:
-        """Update the end conditions with the latest pose; return the reason to end the track, or
-        None.
+        """Update the end conditions with the latest pose; return the reason, if any.
 
-        `spread` [m] is the std of the horizontal position of the published hypothesis alone,
-        because differences between hypotheses do not depend on the distance to the target. A target
-        that `is_approaching` is not out of reach, however uncertain its position.
+        `spread` [m] is the std of the horizontal position of the published hypothesis alone, which
+        depends on the distance. A target that `is_approaching` is not out of reach.
         """
         if self.bayes_factor.disfavoured_s(track.stamp_ns) > UNEXPLAINED_S:
             return UNEXPLAINED

@@ -120,11 +120,8 @@ class VehicleSettings:
 
 
 def vehicle_model(settings: VehicleSettings, network: SensorNetwork) -> RowVehicle:
-    """Source model of a vehicle; without an earth field, soft iron has no effect.
-
-    Raises SettingsError if the arrivals have more or fewer headings than names, or if a kind
-    without length has a std of the length or of the moment differences.
-    """
+    """Source model of a vehicle; raises SettingsError if there is not one heading per arrival name,
+    or if a kind without length has a std of it or of the moment differences."""
     n = len(settings.arrival_names)
     if len(settings.arrival_headings_deg) != n:
         raise SettingsError(
@@ -168,12 +165,11 @@ def moment_directions() -> FloatArray:
 def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: FieldFrame,
                   background_std: float, own_covariance: FloatArray) -> FilterBank:
     """Hypotheses of a vehicle at its first frame ([ICASSP11]_ section 2.2; [T10]_ Alg. 3, which has
-    one hypothesis per arrival), for a std of each background of `background_std` [T] and
-    covariances `own_covariance` (n_sensors, n_own, n_own) of the states of each sensor.
+    one per arrival), with covariances `own_covariance` (n_sensors, n_own, n_own) of each sensor.
 
-    There is one hypothesis for each combination of kind, arrival line (its label), moment
-    direction, lateral offset and speed, and a turning copy of each if turning is enabled. A
-    hypothesis starts at the first position on its line at which its field has the measured energy.
+    There is one for each combination of kind, arrival line (its label), moment direction, lateral
+    offset and speed, and a turning copy of each if enabled. It starts at the first position on its
+    line at which its field has the measured energy.
     """
     states: list[FloatArray] = []
     covariances: list[FloatArray] = []

@@ -35,11 +35,8 @@ MIN_MOVING_SPEED = 1.0
 
 
 class NewTargetEvidence:
-    """Decides when to compare a track with other explanations, and whether to accept one.
-
-    A comparison is due when the latest innovations are improbable, and at intervals for a long
-    vehicle, whose model may explain two short vehicles without improbable innovations.
-    """
+    """Decides when to compare a track with other explanations: if innovations are improbable, or at
+    intervals, as a long vehicle may explain two short ones; and whether to accept."""
 
     def __init__(self) -> None:
         self._latest = SlidingSum(WINDOW_S)

@@ -36,16 +36,11 @@ energy of the lost track: the field of a departing vehicle only decreases."""
 
 
 class TrackManager:
-    """Track management: turns frames with a detection verdict into tracks.
+    """Turns frames with a detection verdict into tracks, and continues a clock comparison.
 
-    While a target is present, the manager returns one `Track` per frame and target, smoothed poses
-    with a fixed lag, and at the end of a track those of the whole track. Vehicles that appear
-    during a track become its members. A given clock comparison is continued. Raises SettingsError
-    if the settings contradict each other.
-
-    Attributes
-    ----------
-    counts : number of events, by description
+    It returns one `Track` per frame and target, smoothed poses with a fixed lag, and at the end
+    those of the whole track. Vehicles that appear during a track become its members. Raises
+    SettingsError if the settings contradict each other.
     """
 
     def __init__(self, network: SensorNetwork, settings: TrackSettings,

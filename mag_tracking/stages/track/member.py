@@ -27,16 +27,10 @@ MAX_POSITIONS = 64
 
 
 class Member:
-    """Target of a running track.
+    """Target of a running track; updates the event counts of the track manager.
 
-    The event counts of the track manager are updated in place.
-
-    Attributes
-    ----------
-    last : latest record
-    ended : reason for the end; None while the target is tracked
-    early : smoothed states from the time before the target shared its state with other targets
-    slot : index of the target in the joint states that are stored for smoothing
+    `early` are smoothed states from before the target shared its state with others, and `slot` is
+    its index in the joint states that are stored for smoothing.
     """
 
     def __init__(self, id: int, target: Target, sensors: SensorSubset, counts: 'Counter[str]',

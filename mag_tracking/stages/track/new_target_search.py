@@ -38,11 +38,8 @@ the settings, and number of possible positions on a line."""
 
 
 class NewTargetSearch:
-    """Search for explanations by an additional vehicle, if it `may_add` one, or by a vehicle at
-    another position; by two vehicles in place of one unless the `reason` is `IMPROBABLE`.
-
-    `filter_of` returns the filter for a number of vehicles; the track has `n_targets`.
-    """
+    """Search for explanations by an additional vehicle, if it `may_add` one, by a vehicle at
+    another position, or (only, unless `reason` is `IMPROBABLE`) by two in place of one."""
 
     def __init__(self, bank: FilterBank, window: Window, filter_of: Callable[[int], BankFilter],
                  n_targets: int, vehicles: window_search.VehicleState, reason: str, may_add: bool

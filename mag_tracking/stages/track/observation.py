@@ -30,26 +30,18 @@ def angle_priors(network: SensorNetwork, mounting_std: float) -> FloatArray:
 class Observation:
     """Predicted fields of a network for hypotheses, and the layout of the sensor states.
 
-    The state begins with the states of `n_targets` targets of one model, one after the other; the
-    fields of the targets are added. The states of each sensor follow: three mounting angles [rad]
-    unless `mounting_std` [rad], which applies to sensors without `orientation_std`, is 0, and three
-    model errors in units of their std unless `error_time` is 0. The backgrounds of all sensors [T]
-    come last, as described in `inference/hypothesis.hpp`.
+    The state begins with those of `n_targets` targets, whose fields add up. The states of each
+    sensor follow: three mounting angles [rad] unless `mounting_std` [rad], for sensors without
+    `orientation_std`, is 0, and three model errors in units of their std unless `error_time` is 0.
+    The backgrounds of all sensors [T] come last, as described in `inference/hypothesis.hpp`.
 
-    The model errors represent the field that the target model neglects near a vehicle. They are
-    first-order Gauss-Markov processes with the correlation time `error_time` [s], so that their
-    weight does not depend on the frame period; if it is 0, they are noise in every frame.
+    The model errors represent the field that the target model neglects near a vehicle, as
+    Gauss-Markov processes with the correlation time `error_time` [s], so that their weight does not
+    depend on the frame period; if it is 0, they are noise in every frame.
 
-    Attributes
-    ----------
-    positions : (n_sensors, 3) array, m, world frame
-    R_sw : (n_sensors, 3, 3) array, world to sensor
-    n_angles : number of estimated mounting angles per sensor, 3 or 0
-    n_one : number of states per target
-    n_target : number of states of all targets
-    own_covariance : (n_sensors, n_own, n_own) array, covariance of the mounting angles and model
-        errors of each sensor at the start of a track
-    single_target : measurement model of one target
+    `n_angles`, `n_one` and `n_target` count angles per sensor, states per target, and of all
+    targets; `own_covariance` (n_sensors, n_own, n_own) is that of the sensor states at the start of
+    a track.
     """
 
     def __init__(self, network: SensorNetwork, model: SourceModel, mounting_std: float,

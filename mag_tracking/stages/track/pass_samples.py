@@ -1,9 +1,8 @@
 """Frames of a pass as whitened arrays, and the fit of steady paths to the whole pass of a vehicle.
 
-A filter bends the path of its target to fit clock offsets, a clipped field, or a second vehicle. A
-path with steady acceleration and turn rate cannot. If no such path explains a pass, a sensor is
-faulty or there are several vehicles. If a straight path explains the pass only with free clock
-offsets, the clocks differ.
+A filter bends its path to fit clock offsets, a clipped field, or a second vehicle. A path with
+steady acceleration and turn rate cannot: if none explains a pass, a sensor is faulty or there are
+several vehicles; if a straight one does only with free clock offsets, the clocks differ.
 
 The fit of a row of dipoles at constant velocity follows TSP14 sections III.A and V.
 """

@@ -85,9 +85,8 @@ def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray
                  n_stds: float) -> BoolArray:
     """Whether states (n, n_x) pass all sensors (n_sensors, 3) on one side, beyond the lanes.
 
-    The distance of such a vehicle is hardly observable: a train on another line resembles a truck
-    nearby. Lanes are on both sides of the centre of the network. In a network that extends beyond
-    the road, a vehicle may be as far outside the outermost sensors as a lane is from the centre.
+    The distance is hardly observable: a train on another line resembles a truck nearby. In a
+    network that extends beyond the road, a lane may be as far outside it as from its centre.
     """
     speed = np.maximum(np.hypot(x[:, 3], x[:, 4]), MIN_SPEED)
     offsets = positions[:, :2, None] - x[:, :2].T
@@ -177,13 +176,12 @@ def typical_speed(settings: TrackSettings) -> float:
 
 
 def required_rate(network: SensorNetwork, settings: TrackSettings) -> float:
-    """Minimum rate of readings that shows the pass of a vehicle, Hz; 0 for a magnet, which may be
-    at rest.
+    """Minimum rate of readings that shows the pass of a vehicle, Hz; 0 for a magnet.
 
     Between two readings, a vehicle at `typical_speed` must not move further than
-    `MAX_RELATIVE_MOVE` times its distance d from the nearest sensor: the spectrum of its field
-    decreases like exp(-2 pi f d / v). The distance is that of the path between the outermost lanes
-    that keeps furthest from all sensors, plus `LATERAL_STD`: a lower rate is too low in every lane.
+    `MAX_RELATIVE_MOVE` times its distance d: the spectrum of its field decreases like exp(-2 pi f d
+    / v). The path is that between the outermost lanes that keeps furthest from all sensors, plus
+    `LATERAL_STD`.
     """
     if settings.target != 'vehicle':
         return 0.0

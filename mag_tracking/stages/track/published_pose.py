@@ -35,13 +35,10 @@ the target state, variance (3, 3) [rad²] of the unobservable part, to be added,
 class UnobservedLength:
     """Uncertainty of the middle of a vehicle due to the part that no sensor has observed yet.
 
-    Until its rear has passed a sensor, an apparent car may be the engine of a truck; both models
-    are too inaccurate for a reliable comparison. The iron of a long vehicle is at its engine, axles
-    and load, so the row of dipoles is shorter than the vehicle. Until the rear has been observed,
-    the rest is assumed to be behind the row; afterwards, the middle is uniformly distributed
-    between the cases that it is at either end.
-
-    All kinds of vehicle, with `lengths` and `length_stds` in m, are equally frequent.
+    Until its rear has passed a sensor, an apparent car may be the engine of a truck. The iron of a
+    long vehicle is at its engine, axles and load, so the row of dipoles is shorter than the
+    vehicle: the rest is assumed to be behind it and, once observed, at either end. All kinds of
+    vehicle, with `lengths` and `length_stds` in m, are equally frequent.
     """
 
     def __init__(self, lengths: Sequence[float], length_stds: Sequence[float]) -> None:

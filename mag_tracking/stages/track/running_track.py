@@ -1,9 +1,7 @@
 """A running track: its members, their published poses, and the evidence for and against them.
 
-A track usually has one target. Targets whose fields overlap at the sensors are members of one track
-and share a state, so that no field is attributed to the wrong target.
-
-Source: ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
+Targets whose fields overlap at the sensors are members of one track and share a state. Source:
+ICASSP11 section 2, T10 Alg. 2 and 3; PHD15 Paper A for the magnet.
 """
 
 from collections import Counter
@@ -41,16 +39,8 @@ TrackRecord = Track | SmoothedPose | Disturbance
 
 
 class RunningTrack:
-    """Track of a single target, or of several targets that share a state.
-
-    The event counts of the stage are updated in place.
-
-    Attributes
-    ----------
-    members : running members, in the order of their states
-    ended : reason why the last member has ended; None while the track runs
-    is_lost : whether the last member ended while it was still detected
-    """
+    """Track of a target, or of several `members` in the order of their states; `ended` is the
+    reason why the last one has ended, and `is_lost` whether it was then still detected."""
 
     def __init__(self, id: int, bank: TrackBank, counts: 'Counter[str]', clocks: ClockComparison
                  ) -> None:
@@ -258,10 +248,8 @@ class RunningTrack:
         return [u for u in found if u is not None]
 
     def new_target(self) -> JointExplanation | None:
-        """Search for another explanation of the latest frames, if due; None if none is probable.
-
-        One that is nearly as probable as the track marks it as doubtful for a limited time.
-        """
+        """Search for another explanation of the latest frames, if due; one that is nearly as
+        probable as the track marks it as doubtful for a limited time."""
         window, n = self._bank.relinearisation.window, len(self.members)
         if self.ended is not None or self._target.starts_anywhere or window is None \
                 or self.members[0].last is None:

@@ -1,10 +1,8 @@
 """Sensors that a track uses in a large network, and rejection of those that contradict the others.
 
-The cost of an update is cubic in the number of sensors, and distant ones add little information.
-
-A sensor with swapped axes, one that was knocked over, or one near another vehicle pulls a track
-away from all others. If a frame fits the leading hypothesis only without one or a few sensors,
-these are rejected.
+The cost of an update is cubic in the number of sensors, and distant ones add little information. A
+sensor that was knocked over, or is near another vehicle, pulls a track away from all others. If a
+frame fits the leading hypothesis only without a few sensors, these are rejected.
 """
 
 from collections import Counter
@@ -50,15 +48,7 @@ def part_of_frame(frame: FieldFrame, rows: IntArray) -> FieldFrame:
 
 
 class SensorSubset:
-    """Sensors that a track uses: all sensors of a network, or a selection in a large network.
-
-    Attributes
-    ----------
-    full_network : the network from which they are selected
-    is_part : whether the sensors are a selection
-    rows : (n,) int array, indices of the sensors in the full network, ascending
-    network : network of the selected sensors
-    """
+    """Sensors that a track uses: all, or a selection of ascending `rows` of a large network."""
 
     def __init__(self, full_network: SensorNetwork, rows: IntArray | None = None) -> None:
         self.full_network = full_network
@@ -106,12 +96,10 @@ class SensorSubset:
 
 def exchange_sensor_states(bank: FilterBank, before: IntArray, after: IntArray,
                            own_covariance: FloatArray, background_std: float) -> None:
-    """Replace the sensor states of a bank, in place, by the states of other sensors, given by their
-    indices in the network.
+    """Replace the sensor states of a bank, in place, by those of other sensors.
 
-    The states and correlations of sensors in both sets are retained. `own_covariance`
-    (n_after, n_own, n_own) is the initial covariance of the mounting angles and model errors of
-    each new sensor, and `background_std` [T] the std of its background.
+    States of sensors in both sets are retained; new ones have the initial `own_covariance`
+    (n_after, n_own, n_own) of angles and model errors, and `background_std` [T].
     """
     n_own = own_covariance.shape[1]
     n_t = bank.x.shape[1] - (n_own + 3) * len(before)
@@ -151,11 +139,8 @@ class SensorRejection:
 
     def advance(self, bank_filter: BankFilter, bank: FilterBank, frame: FieldFrame, dt: float
                 ) -> 'tuple[FloatArray, FloatArray, FieldFrame, Counter[str]]':
-        """Predict and update a bank with a frame, without sensors that contradict the others.
-
-        Returns the predicted states (n_hyp, n_x), log-likelihoods (n_hyp,), the frame without the
-        rejected sensors, and the counts of each rejected sensor.
-        """
+        """Predict and update a bank with a frame, without contradicting sensors; return predicted
+        states (n_hyp, n_x), log-likelihoods (n_hyp,), the frame used, and rejections."""
         # Copying all states takes as long as the update. If the frame fits the hypothesis that
         # leads before the update, it usually also fits the hypothesis that leads afterwards.
         leader = bank.alone(int(np.argmax(bank.log_w)))

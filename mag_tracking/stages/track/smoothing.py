@@ -54,12 +54,7 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
 
 class WholeTrack:
     """Stored frames of a running track, for smoothing at its end; a `max_duration_s` of 0 disables
-    it.
-
-    Attributes
-    ----------
-    is_abandoned : whether the track exceeded a limit or changed its sensors, and cannot be smoothed
-    """
+    it, and it `is_abandoned` above a limit or after a change of sensors."""
 
     def __init__(self, max_duration_s: float) -> None:
         self._max_duration_s = max_duration_s

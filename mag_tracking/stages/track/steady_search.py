@@ -1,9 +1,7 @@
 """Search for vehicles on straight paths in the frames of a window, given known vehicles.
 
-The terms in which the field is linear have Gaussian priors and are marginalised: the moments of the
-vehicle, the backgrounds, and the errors of known vehicles. The path is searched from a grid.
-
-Source: TSP14 sections III.A and V for the row of dipoles; variable projection with priors.
+The linear terms have Gaussian priors and are marginalised: moments, backgrounds, and errors of
+known vehicles. Source: TSP14 sections III.A and V for the row of dipoles; variable projection.
 """
 
 from collections.abc import Iterable
@@ -126,15 +124,10 @@ class PathPrior:
 
 
 class StartGrid:
-    """Grid of start paths, with the field of a point target on each path, for all searches of a
-    window.
+    """Grid of start paths `theta` (n, 7), with the field of a point target on each path.
 
-    Attributes
-    ----------
-    theta : (n, 7) array, see `PathPrior.starts`
-    bases : (3 n_samples, 3 n) array, whitened fields of unit moments, three columns for each path
-    gram : (n, 3, 3) array, Gram matrix A'A of the three columns A of each path
-    prior_cost : (n,) array, squared normalised difference of each path from the mean of the prior
+    `bases` (3 n_samples, 3 n) are whitened fields of unit moments A, `gram` (n, 3, 3) are A'A, and
+    `prior_cost` (n,) is the squared normalised difference from the mean of the prior.
     """
 
     def __init__(self, samples: PassSamples, prior: PathPrior, theta: FloatArray) -> None:

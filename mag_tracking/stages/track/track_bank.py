@@ -46,17 +46,8 @@ class FrameUpdate(NamedTuple):
 
 
 class TrackBank:
-    """Hypotheses of the targets of a track, with their filter, sensors and frames.
-
-    The event counts of the stage are updated in place.
-
-    Attributes
-    ----------
-    sensors : sensors in use
-    later_sensors : sensors that will be used as soon as the bank is small enough; None after the
-        switch to them
-    lag : fixed-lag smoother
-    """
+    """Hypotheses of the targets of a track, with their filter, sensors and frames; `later_sensors`
+    will be used as soon as the bank is small enough, and are None afterwards."""
 
     def __init__(self, target: Target, settings: TrackSettings, sensors: SensorSubset,
                  bank_filter: BankFilter, bank: FilterBank, counts: 'Counter[str]',

@@ -178,12 +178,7 @@ def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length_column: i
 
 
 class WindowSearch:
-    """Samples of a relinearisation window, prepared for searches for vehicles.
-
-    Attributes
-    ----------
-    times : (n,) array, times of the frames relative to the last frame, s
-    """
+    """Samples of a window for searches for vehicles; `times` (n,) [s] end with zero."""
 
     def __init__(self, window: Window, vehicles: VehicleState) -> None:
         network, frames = vehicles.network, window.frames

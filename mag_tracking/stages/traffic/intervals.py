@@ -13,10 +13,7 @@ MAX_GAP_S = 5.0
 
 
 class TrafficIntervals:
-    """Counts passages in time intervals of equal length and summarises each interval.
-
-    Passages that are counted in a later interval are added to `counts`.
-    """
+    """Counts passages in time intervals, those that are too late in a later one."""
 
     def __init__(self, line_names: Sequence[str], interval_s: float,
                  counts: 'Counter[str]') -> None:

@@ -81,10 +81,9 @@ class _PendingCrossing(NamedTuple):
 class Traffic:
     """Converts tracked frames to passages and summaries.
 
-    A vehicle is counted when its track has ended, from its smoothed poses if available, and only
-    with `counts_vehicles`. Passages are returned in chronological order, unless a track lasts
-    longer than `MAX_WAIT_S`. Raises SettingsError if a class has the name of vehicles that match no
-    class.
+    A vehicle is counted when its track has ended, from its smoothed poses if available. Passages
+    are in chronological order, unless a track lasts longer than `MAX_WAIT_S`. Raises SettingsError
+    if a class has the name of vehicles that match no class.
     """
 
     def __init__(self, network: SensorNetwork, settings: TrafficSettings,
