@@ -80,9 +80,8 @@ class DetectionNode(StageNode):
 
     def stages(self) -> dict[str, Stage[Any, Any]]:
         """Stages whose counts are published in diagnostics, by name."""
-        events: dict[str, Stage[Any, Any]] = \
-            {} if self._events is None else {'events': self._events}
-        return {'align': self._align, 'detect': self._detect, **events}
+        return {'align': self._align, 'detect': self._detect,
+                **({} if self._events is None else {'events': self._events})}
 
     def queues(self) -> dict[str, int]:
         """Number of queued readings of each stage, by name."""

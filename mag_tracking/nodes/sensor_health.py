@@ -11,7 +11,6 @@ from rclpy.node import Node
 
 from mag_tracking.apps.doctor import TIME_CAUSES, HostStalls, load_findings, network_findings
 from mag_tracking.network import SensorNetwork
-from mag_tracking.network.sensor_network import absolute
 from mag_tracking.nodes.connections import SILENCE_TIMEOUT_S, no_message_finding, topic_findings
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import Readings, plain
@@ -40,12 +39,11 @@ class HealthDiagnostics:
     """Monitors the raw readings of a network; `node` resolves the sensor topics and examines their
     publishers; with `is_replayed`, old timestamps are not a fault."""
 
-    def __init__(self, network: SensorNetwork, settings: Settings, node: Node | None = None,
+    def __init__(self, network: SensorNetwork, settings: Settings, node: Node,
                  is_replayed: bool = False) -> None:
         self._node, self._is_replayed = node, is_replayed
-        resolve = absolute if node is None else node.resolve_topic_name
-        self._topics = {name: resolve(topic) for name, topic in zip(
-            network.names, network.topics, strict=True)}
+        self._topics = dict(zip(network.names, map(node.resolve_topic_name, network.topics),
+                                strict=True))
         self._settings = settings
         self._index = {name: j for j, name in enumerate(network.names)}
         # Time of the latest reading by the monotonic clock [s]; NaN before the first reading.
@@ -85,13 +83,6 @@ class HealthDiagnostics:
     def update(self, j: int) -> None:
         """Evaluate the buffered readings of sensor `j`."""
         self._current_window[self._network.names[j]].add_batch(*self._buffer.pop(j))
-
-    def statuses(self, node: str, calibrate: Calibrate) -> list[DiagnosticStatus]:
-        """Evaluate all buffered readings; return one status per sensor, titled by the `node`."""
-        self.begin_round(calibrate)
-        for j in range(len(self._network)):
-            self.update(j)
-        return [self.status(node, j, calibrate) for j in range(len(self._network))]
 
     def begin_round(self, calibrate: Calibrate) -> None:
         """Compare the sensors, before `status` is called for each; begin a new window if due."""
@@ -134,8 +125,7 @@ class HealthDiagnostics:
     def _diagnoses(self, j: int, name: str, calibrate: Calibrate) -> list[Diagnosis]:
         """Diagnoses of a sensor, most serious first."""
         silent_s = time.monotonic() - self._last_received[j]
-        graph_findings = [] if self._node is None else topic_findings(
-            self._node, name, self._topics[name])
+        graph_findings = topic_findings(self._node, name, self._topics[name])
         if not silent_s <= SILENCE_TIMEOUT_S:
             return ranked([*graph_findings, *self._silence_findings(name, silent_s)])
         findings = [*graph_findings, *self._network_findings[name], *self._clock_findings(name)]
@@ -177,9 +167,7 @@ class HealthDiagnostics:
         # Nodes that are launched together do not start at the same time.
         if time.monotonic() - self._start_time < STARTUP_S:
             return []
-        return [no_message_finding(self._node, name, topic, self._topics) if self._node else
-                Finding(True, name, 'no message received', 'check its cable, its driver and '
-                        f'the topic {topic}', Cause.NO_MESSAGES)]
+        return [no_message_finding(self._node, name, topic, self._topics)]
 
     def _clock_findings(self, name: str) -> list[Finding]:
         """Return a fault if a sensor's timestamps differ from the computer's time by over a day."""

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections import deque
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import MagneticField
 
 from mag_tracking.network.file import read_network
+from mag_tracking.network.sensor_network import absolute
 from mag_tracking.nodes import sensor_health
 from mag_tracking.nodes.convert import to_message
 from mag_tracking.nodes.doctor_node import DoctorNode
@@ -27,6 +29,8 @@ from support.spoilt_stamps import bursts, coarse, packets, regular
 
 STEP_NS = 10_000_000
 EARTH_FIELD = np.array([2e-6, 1.55e-5, -4.9e-5])
+SILENT_GRAPH = SimpleNamespace(resolve_topic_name=absolute,
+                               get_publishers_info_by_topic=lambda topic: [])
 OTHER_PUBLISHER = """
 import time
 import rclpy
@@ -240,6 +244,14 @@ def test_the_doctor_finds_faults_of_a_live_system(ros, publish_until):
         doctor.destroy_node()
 
 
+def statuses_of(health, node, calibrate):
+    """Evaluate all buffered readings; return one status per sensor."""
+    health.begin_round(calibrate)
+    for j in range(len(calibrate.rejections)):
+        health.update(j)
+    return [health.status(node, j, calibrate) for j in range(len(calibrate.rejections))]
+
+
 def test_a_new_clock_offset_is_no_clock_step():
     """Readings in the buffer have the old offsets when a survey sets new clock offsets."""
     network, settings = read_network(NETWORK_FILE), settings_for('vehicle')
@@ -254,7 +266,7 @@ def test_a_new_clock_offset_is_no_clock_step():
     feed(0, 90)
     health.use_network(dataclasses.replace(network, clock_offset=np.array([0.5, -0.5])))
     feed(90, 300)
-    for status in health.statuses('node', stage):
+    for status in statuses_of(health, 'node', stage):
         texts = [status.message, *(v.value for v in status.values)]
         assert not any('clock' in t or 'went back' in t for t in texts), texts
 
@@ -266,7 +278,8 @@ def test_past_faults_expire_after_two_windows(monkeypatch):
     network = read_network(NETWORK_FILE)
     settings = settings_for('vehicle', {'calibrate.relearn_s': 4.0})
     stage = Calibrate(network, settings.calibrate)
-    health, rng, reports = HealthDiagnostics(network, settings), np.random.default_rng(1), []
+    health, rng = HealthDiagnostics(network, settings, SILENT_GRAPH), np.random.default_rng(1)
+    reports = []
     for k in range(250 * 20):
         now[0] = k / 20
         for name in network.names:
@@ -276,7 +289,7 @@ def test_past_faults_expire_after_two_windows(monkeypatch):
             health.add(one(sample), sample.stamp_ns)
             stage.feed(one(sample))
         if k % 100 == 99:
-            reports.append((now[0], [s.message for s in health.statuses('node', stage)]))
+            reports.append((now[0], [s.message for s in statuses_of(health, 'node', stage)]))
     times = [t for t, messages in reports if 'background was relearnt once' in messages[0]]
     assert 20.0 < min(times) < 35.0
     assert sensor_health.WINDOW_S < max(times) - min(times) <= 2.0 * sensor_health.WINDOW_S + 5.0
@@ -289,14 +302,15 @@ def test_past_faults_expire_after_two_windows(monkeypatch):
 def test_the_diagnostics_name_the_fault_of_the_timestamps_first(modify, rate, text):
     """The status of a live sensor; its readings arrive at the true times."""
     network, settings = read_network(NETWORK_FILE), settings_for('vehicle')
-    health, calibrate = HealthDiagnostics(network, settings), Calibrate(network, settings.calibrate)
+    health = HealthDiagnostics(network, settings, SILENT_GRAPH)
+    calibrate = Calibrate(network, settings.calibrate)
     rng, true = np.random.default_rng(0), regular(rate, 600)
     for stamp, received in zip(modify(true).tolist(), true.tolist(), strict=True):
         for name in network.names:
             readings = one(MagSample(stamp, name, EARTH_FIELD + 1.2e-8 * rng.standard_normal(3)))
             calibrate.feed(readings)
             health.add(readings, received)
-    for status in health.statuses('calibration_node', calibrate):
+    for status in statuses_of(health, 'calibration_node', calibrate):
         assert status.level == DiagnosticStatus.ERROR and text in status.message
         assert 'NTP' not in status.message and 'chrony' not in status.message
         lost = next(v.value for v in status.values if v.key == 'lost')

@@ -55,7 +55,7 @@ def test_all_poses_are_flagged_and_the_doctor_names_the_same_sensors(network, fa
     pipeline, tracks, smoothed = run(network, *FAULTS[fault])
     assert tracks and all(CONTRADICTS_EARTH_FIELD in t.doubts for t in tracks)
     assert all(p.ambiguous for p in smoothed)
-    found = pipeline.calibrate.field_inconsistencies()
+    found = pipeline.calibrate.comparison.inconsistencies()
     assert found and all(EXPLANATIONS[fault] in str(d) for d in found)
     doctor = findings(NAME, *FAULTS[fault])
     for d in found:
@@ -68,7 +68,7 @@ def test_offsets_of_uncalibrated_sensors_change_no_flag(network, flags):
                spoiler.offset('mag_2', [-2e-6, 3e-6, -9e-6])]
     pipeline, tracks, _ = run(network, *offsets)
     assert not all(flags) and [t.ambiguous for t in tracks] == flags
-    assert pipeline.calibrate.field_inconsistencies() == []
+    assert pipeline.calibrate.comparison.inconsistencies() == []
 
 
 def test_the_flags_do_not_depend_on_the_batches(network):

@@ -9,7 +9,6 @@ import numpy as np
 
 from mag_tracking.arrays import FloatArray, Record, are_equal
 from mag_tracking.calibration import core, doubtful_times
-from mag_tracking.calibration.agreement import FieldInconsistency
 from mag_tracking.calibration.background import RunningBackground
 from mag_tracking.calibration.decimation import Decimator
 from mag_tracking.calibration.frequent_level import MostFrequentLevel
@@ -88,7 +87,7 @@ class Calibrate:
         self._changes = SharedChanges()
         self._stored: dict[str, StoredBackground] = {}
         self.timestamps = TimestampMonitor(network.names)
-        self._comparison = FieldComparison(network, survey or SurveySettings())
+        self.comparison = FieldComparison(network, survey or SurveySettings())
         self.update_network(network)
 
     def update_network(self, network: SensorNetwork) -> None:
@@ -98,7 +97,7 @@ class Calibrate:
             raise NetworkError(f'the new network has the sensors {", ".join(network.names)}; '
                                f'expected {", ".join(self._index)}')
         previous, self._network = self._network if self._background else None, network
-        self._comparison.use(network)
+        self.comparison.use(network)
         self._decimators = {name: Decimator(self.settings.decimate_to_hz) for name in network.names}
         for i, name in enumerate(network.names):
             is_unchanged = previous is not None \
@@ -122,7 +121,7 @@ class Calibrate:
                 s[name] += shift
         background = self._background[network.names[i]]
         background.doubtful_times = doubtful_times.shifted(background.doubtful_times, shift)
-        self._comparison.shift(network.names[i], shift)
+        self.comparison.shift(network.names[i], shift)
         offset, correction = network.offset[i], network.correction[i]
         s['clock_offset_ns'] = network.clock_offset_ns[i]
         s['offset'] = 0.0 if offset is None else offset
@@ -147,7 +146,7 @@ class Calibrate:
         """{reason: {sensor: intervals}} in which backgrounds or timestamps were doubtful."""
         out = {doubtful_times.DOUBTFUL_BACKGROUND: {
                    n: b.doubtful_times for n, b in self._background.items() if b.doubtful_times},
-               doubtful_times.CONTRADICTS_EARTH_FIELD: self._comparison.doubtful_times(),
+               doubtful_times.CONTRADICTS_EARTH_FIELD: self.comparison.doubtful_times(),
                doubtful_times.WRONG_TIMESTAMPS: self.timestamps.doubtful_times()}
         return {reason: by_sensor for reason, by_sensor in out.items() if by_sensor}
 
@@ -155,15 +154,10 @@ class Calibrate:
         """Latest interval [ns] in which the background or the timestamps of a sensor were doubtful,
         if any; an open one, with the end None, comes first."""
         times = [interval for by_sensor in (
-            self._background[sensor].doubtful_times, self._comparison.times_of(sensor),
+            self._background[sensor].doubtful_times, self.comparison.times_of(sensor),
             self.timestamps.doubtful_times().get(sensor, ()))
             for interval in by_sensor[-1:]]
         return max(times, key=lambda t: (t[1] is None, t[0]), default=None)
-
-    def field_inconsistencies(self) -> list[FieldInconsistency]:
-        """Latest inconsistency of each sensor whose background has contradicted the Earth's field
-        so much that tracks are wrong, in the order of the network."""
-        return self._comparison.inconsistencies()
 
     def counts_of(self, sensor: str) -> 'Counter[str]':
         """Number of accepted and rejected readings of a sensor, the latter also by cause."""
@@ -277,7 +271,7 @@ class Calibrate:
         if s['is_full']:
             self._background[name].evaluate_block()
             if self._background[name].ready:
-                self._comparison.update(i, self.background(name), int(s['first_ns']),
+                self.comparison.update(i, self.background(name), int(s['first_ns']),
                                         int(s['last_ns']))
 
     @property

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -29,18 +30,23 @@ RECOVERY_S = 5.0
 """[s] Approximate time in which the calibration learns the background again after a target."""
 
 
+@cache
+def threshold(probability: float, degrees_of_freedom: int) -> float:
+    """Energy threshold of the measured axes that noise exceeds with `probability`."""
+    return float(energy_threshold(probability, degrees_of_freedom))
+
+
 class Detect(Stage[FieldFrame, FieldFrame | Detection]):
     """Decides for each frame whether a target is present, by T10 eq. (5.14)-(5.19)."""
 
     def __init__(self, network: SensorNetwork, settings: DetectSettings) -> None:
         self.counts: Counter[str] = Counter()
         self._names, self.settings = network.names, settings
-        self._thresholds: dict[tuple[float, int], float] = {}
         self._next_id = 1
         self._max_ratio, self._max_ratios = 0.0, np.zeros(len(network))
         # Thresholds for a single sensor, by its number of axes.
         self._single_thresholds = np.array([np.inf, *(
-            self.threshold(settings.false_alarm_probability, k) for k in (1, 2, 3))])
+            threshold(settings.false_alarm_probability, k) for k in (1, 2, 3))])
         self.max_consecutive_above = 0
         # Number of frames without a target, and mean square of the field in them, for each axis.
         self._n_quiet: FloatArray = np.zeros((len(network), 3))
@@ -53,13 +59,6 @@ class Detect(Stage[FieldFrame, FieldFrame | Detection]):
         self._last_ns: int | None = None
         self._last_active_ns: int | None = None
         self._onset_ns: int | None = None
-
-    def threshold(self, probability: float, degrees_of_freedom: int) -> float:
-        """Energy threshold of the measured axes that noise exceeds with `probability`; cached."""
-        key = probability, degrees_of_freedom
-        if key not in self._thresholds:
-            self._thresholds[key] = float(energy_threshold(probability, degrees_of_freedom))
-        return self._thresholds[key]
 
     def feed(self, frame: FieldFrame) -> list[FieldFrame | Detection]:
         """Test a frame: return an onset or release, if any, and the frame with its detection flag,
@@ -81,7 +80,7 @@ class Detect(Stage[FieldFrame, FieldFrame | Detection]):
         self.counts['frames'] += 1
         if n:
             if not self._present:
-                self._max_ratio = max(self._max_ratio, statistic / self.threshold(
+                self._max_ratio = max(self._max_ratio, statistic / threshold(
                     self.settings.false_alarm_probability, n))
                 np.maximum(self._max_ratios, energy / self._single_thresholds[axes],
                            out=self._max_ratios)
@@ -115,13 +114,13 @@ class Detect(Stage[FieldFrame, FieldFrame | Detection]):
                          per_axis: FloatArray) -> list[Detection]:
         """Update the detection state, and return the onset or release, if there is one."""
         s = self.settings
-        if statistic > self.threshold(s.false_alarm_probability, n):
+        if statistic > threshold(s.false_alarm_probability, n):
             self.counts['frames above the threshold'] += 1
             self._n_above += 1
             self.max_consecutive_above = max(self.max_consecutive_above, self._n_above)
         else:
             self._n_above = 0
-        if statistic > self.threshold(max(RELEASE_PROBABILITY, s.false_alarm_probability), n):
+        if statistic > threshold(max(RELEASE_PROBABILITY, s.false_alarm_probability), n):
             self._last_active_ns = stamp_ns
         if not self._present and self._n_above >= s.onset_frames:
             self._present, self._last_active_ns = True, stamp_ns
@@ -153,4 +152,4 @@ class Detect(Stage[FieldFrame, FieldFrame | Detection]):
         """Create the onset or release record of the current detection."""
         p = self.settings.false_alarm_probability
         return Detection(stamp_ns, self._next_id, onset, statistic, n,
-                         self.threshold(p, n) if n else float('nan'), p, strongest)
+                         threshold(p, n) if n else float('nan'), p, strongest)

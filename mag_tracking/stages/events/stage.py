@@ -19,6 +19,7 @@ from mag_tracking.stages.align.stage import Align
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.events.stays import Stays
 from mag_tracking.stages.settings import AlignSettings, DetectSettings
+from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.track.plausibility import SampleRates
 from mag_tracking.stages.track.settings import TrackSettings
 from mag_tracking.units import NEVER, NS
@@ -37,7 +38,7 @@ CORRELATION_TIME, CENTRE_OFFSET = 2.0, 0.15
 distance of its magnetic centre from the middle of its body."""
 
 
-class Events:
+class Events(Stage[Readings, PassEvent]):
     """Converts calibrated readings to pass events, one for each detection at each sensor, without
     lengths, which one sensor does not observe; track settings give the rate that resolves a
     pass."""
@@ -64,9 +65,6 @@ class Events:
         for j in np.unique(rows[rows >= 0]).tolist():
             out += self._sensors[j].feed(readings.part(rows == j))
         return out
-
-    def idle(self) -> None:
-        """Do nothing: no work is deferred."""
 
     def flush(self) -> list[PassEvent]:
         """Return the events that are still in progress at the end of the input."""

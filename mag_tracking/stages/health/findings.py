@@ -68,7 +68,7 @@ def sensor_findings(network: SensorNetwork, calibrate: Calibrate, settings: Trac
         found += rejection_findings(name, calibrate)
         found += background_findings(name, calibrate, None)
         found += covariance_findings(name, topic, calibrate)
-    return [*found, *earth_field_findings(calibrate.field_inconsistencies())]
+    return [*found, *earth_field_findings(calibrate.comparison.inconsistencies())]
 
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,

@@ -160,8 +160,7 @@ class SensorHealth:
         n, dt = len(intervals), self._interval_ns
         nearby = np.concatenate([[dt], np.diff(self._stamps), [dt]])[-n - 2:]
         spans = nearby[:-2] + intervals + nearby[2:]
-        are_gaps: BoolArray = (intervals > GAP_RATIO * dt) & (spans > (2.0 + GAP_RATIO) * dt)
-        return are_gaps
+        return (intervals > GAP_RATIO * dt) & (spans > (2.0 + GAP_RATIO) * dt)
 
     def _check_fields(self, n: int) -> None:
         """Count the faults in the fields of the `n` latest readings."""

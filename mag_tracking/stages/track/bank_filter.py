@@ -69,10 +69,6 @@ class BankFilter:
         self.observation = Observation(network, model, np.deg2rad(settings.mounting_std_deg),
                                        settings.model_error_time_s, n_targets)
         self._compiled = compiled_filter(model, self.observation)
-        self.configure(settings)
-
-    def configure(self, settings: TrackSettings) -> None:
-        """Apply new values of the live settings."""
         self._settings = settings
         is_vehicle = settings.target == 'vehicle'
         self._near_field_lengths: FloatArray = np.array(
@@ -205,8 +201,7 @@ class BankFilter:
 
     def are_long(self, kind: IntArray) -> BoolArray:
         """Whether any target of each hypothesis, of a given kind, is longer than a car."""
-        are_long: BoolArray = np.any(self._is_long_kind[kind].reshape(len(kind), -1), axis=1)
-        return are_long
+        return np.any(self._is_long_kind[kind].reshape(len(kind), -1), axis=1)
 
     def linear_range(self, x: FloatArray) -> FloatArray:
         """Displacement (n_hyp,) over which the field is approximately linear, m."""

@@ -96,8 +96,7 @@ class Disturbances:
 
 def field_magnitudes(frame: FieldFrame) -> FloatArray:
     """Magnitude (n_sensors,) of the field of a frame, T; 0 if the reading is missing."""
-    magnitude: FloatArray = np.sqrt(np.nansum(np.square(frame.field), axis=1))
-    return magnitude
+    return np.sqrt(np.nansum(np.square(frame.field), axis=1))
 
 
 class DisturbanceModel:

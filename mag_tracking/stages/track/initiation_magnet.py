@@ -9,7 +9,6 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.inference.least_squares import project_out_linear, refine
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import dipole_jacobians, sensor_fields
-from mag_tracking.physics.sources import Magnet
 from mag_tracking.records import FieldFrame
 from mag_tracking.settings import param
 
@@ -36,11 +35,6 @@ class MagnetSettings:
     axis: tuple[float, ...] = param(
         (0.0, 0.0, 1.0), 'Direction of the moment in the frame of the magnet.',
         '', (-1.0, 1.0), length=3)
-
-
-def magnet_model(settings: MagnetSettings) -> Magnet:
-    """Source model of a magnet with the given settings."""
-    return Magnet(np.full(3, settings.acceleration**2), settings.angular_acceleration**2)
 
 
 def is_lost_after(settings: MagnetSettings, network: SensorNetwork, dt: float) -> bool:

@@ -50,15 +50,10 @@ class Member:
         # Timestamps and positions of the latest published poses.
         self._recent_positions: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_POSITIONS)
 
-    def use(self, sensors: SensorSubset) -> None:
-        """Restart the cross-check with the sensors of the track."""
-        self.cross_check = CrossCheck(sensors.network)
-
     def restart(self, sensors: SensorSubset) -> None:
         """Drop the doubts caused by the field of another vehicle, and restart the checks."""
         self.evidence.drop_explained_doubts()
-        self.use(sensors)
-        self._plausibility = Plausibility()
+        self.cross_check, self._plausibility = CrossCheck(sensors.network), Plausibility()
 
     def start_alongside(self, first: 'Member', sensors: SensorSubset, stamp_ns: int, ratio: float
                         ) -> None:

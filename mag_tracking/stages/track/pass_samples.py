@@ -52,9 +52,7 @@ MIN_DISTANCE, MIDDLE_STD = 1.0, 0.5
 deviation of the apparent magnetic centre of a vehicle from sensor to sensor."""
 MAX_DISTANCE, MAX_SPEED = 30.0, 100.0
 """[m], [m/s] Maximum distance of a vehicle from the nearest sensor, and its maximum speed."""
-_STRAIGHT = np.arange(N_STRAIGHT)
-
-_BENT = np.arange(N_PATH)
+_STRAIGHT, _BENT = np.arange(N_STRAIGHT), np.arange(N_PATH)
 
 
 @dataclass(frozen=True)
@@ -208,8 +206,7 @@ class RigidPass:
         offsets = positions - self.position
         squared_speed = max(float(self.velocity @ self.velocity), 1e-12)
         points = self.position + (offsets @ self.velocity / squared_speed)[:, None] * self.velocity
-        nearest: FloatArray = points[np.argmin(np.linalg.norm(points - positions, axis=1))]
-        return nearest
+        return points[np.argmin(np.linalg.norm(points - positions, axis=1))]
 
     def difference(self, stamp_ns: int, state: FloatArray) -> FloatArray:
         """Horizontal difference (6,) from the nearest of the `straight_paths`, or zero."""
@@ -218,8 +215,7 @@ class RigidPass:
         differences = state - self.straight_paths
         differences[:, :3] -= (stamp_ns - self.stamp_ns) / NS * self.straight_paths[:, 3:]
         differences[:, [2, 5]] = 0.0
-        nearest: FloatArray = differences[np.argmin(np.hypot(*differences[:, :2].T))]
-        return nearest
+        return differences[np.argmin(np.hypot(*differences[:, :2].T))]
 
     @cached_property
     def speed(self) -> float:

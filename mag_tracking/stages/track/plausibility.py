@@ -96,8 +96,7 @@ def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray
     edge = np.maximum(outermost + n_stds * LATERAL_STD,
                       half_width + np.minimum(outermost, half_width - outermost))
     on_one_side = (lateral > 0.0).all(axis=0) | (lateral < 0.0).all(axis=0)
-    is_off_road: BoolArray = on_one_side & (np.abs(lateral.mean(axis=0)) > edge) & _is_moving(x)
-    return is_off_road
+    return on_one_side & (np.abs(lateral.mean(axis=0)) > edge) & _is_moving(x)
 
 
 def lane_note(settings: VehicleSettings, network: SensorNetwork) -> str | None:
@@ -117,8 +116,7 @@ def lane_note(settings: VehicleSettings, network: SensorNetwork) -> str | None:
 
 def _is_moving(x: FloatArray) -> BoolArray:
     """Whether states (n, n_x) are fast enough to have a heading."""
-    is_moving: BoolArray = np.hypot(x[:, 3], x[:, 4]) >= MIN_SPEED
-    return is_moving
+    return np.hypot(x[:, 3], x[:, 4]) >= MIN_SPEED
 
 
 def moves_too_far(position: FloatArray, velocity: FloatArray, dt: float, positions: FloatArray
@@ -245,5 +243,4 @@ class SampleRates:
         """Whether most of the latest intervals of each sensor are too long, (n_sensors,)."""
         n_long = np.count_nonzero(self._intervals_s > self._max_interval_s, axis=1)
         n_known = np.minimum(self._next, N_INTERVALS)
-        are_slow: BoolArray = (n_long >= MIN_INTERVALS) & (2 * n_long > n_known)
-        return are_slow
+        return (n_long >= MIN_INTERVALS) & (2 * n_long > n_known)

@@ -16,7 +16,7 @@ from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.stages.track import doubts
 from mag_tracking.stages.track.bank_filter import NEGLIGIBLE_ENERGY, WEAK_ENERGY, NoTarget
-from mag_tracking.stages.track.cross_check import ClockComparison
+from mag_tracking.stages.track.cross_check import ClockComparison, CrossCheck
 from mag_tracking.stages.track.disturbances import DisturbanceModel, UnexplainedField
 from mag_tracking.stages.track.evidence import MIN_OBSERVED_FRACTION, OUT_OF_REACH
 from mag_tracking.stages.track.joint import UNDECIDED_NATS, JointExplanation, NewTargetEvidence
@@ -62,7 +62,7 @@ class RunningTrack:
         self._disturbance_model = DisturbanceModel(sensors.network, self._settings.background_std,
                                                    is_handover)
         for member in self.members:
-            member.use(sensors)
+            member.cross_check = CrossCheck(sensors.network)
 
     @property
     def bank(self) -> FilterBank:
@@ -80,7 +80,7 @@ class RunningTrack:
         self._bank.configure(settings)
         if not settings.cross_check:
             for member in self.members:
-                member.use(self._bank.sensors)
+                member.cross_check = CrossCheck(self._bank.sensors.network)
 
     def flag_doubtful_sensors(self, sensors: Mapping[str, Sequence[int]]) -> None:
         """Flag the track if it uses one of `sensors`, given by reason."""

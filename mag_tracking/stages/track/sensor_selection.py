@@ -37,8 +37,7 @@ def nearest_sensors(positions: FloatArray, position: FloatArray, n: int) -> IntA
 
 def offset_from_nearest(position: FloatArray, positions: FloatArray) -> FloatArray:
     """Horizontal vector (2,) from the nearest sensor to a position (2,), m."""
-    offset: FloatArray = position - positions[nearest_sensors(positions, position, 1)[0], :2]
-    return offset
+    return position - positions[nearest_sensors(positions, position, 1)[0], :2]
 
 
 def part_of_frame(frame: FieldFrame, rows: IntArray) -> FieldFrame:

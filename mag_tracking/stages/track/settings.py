@@ -113,5 +113,4 @@ def acceleration_density(settings: TrackSettings) -> FloatArray:
     if settings.target == 'magnet':
         return np.full(3, settings.magnet.acceleration**2)
     v = settings.vehicle
-    density: FloatArray = np.square([v.acceleration, v.acceleration, v.climb_acceleration])
-    return density
+    return np.square([v.acceleration, v.acceleration, v.climb_acceleration])

@@ -6,7 +6,6 @@ smoothed backward, and relinearised once, so that its last pose may differ from 
 
 from collections import deque
 from collections.abc import Sequence
-from copy import copy
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -73,10 +72,10 @@ class WholeTrack:
         self._origin: IntArray = np.zeros(0, dtype=np.int64)
 
     def begin(self, bank: FilterBank | InitialBank, bank_filter: BankFilter) -> None:
-        """Discard all frames; start with a bank, not to be modified, and a copy of its filter."""
+        """Discard all frames; start with a bank, not to be modified, and its filter."""
         self.abandon(False)
         if self._max_duration_s:
-            self._start = copy(bank_filter), bank
+            self._start = bank_filter, bank
 
     def resume(self, window: Window, bank_filter: BankFilter) -> None:
         """Restart with a window of another filter; the frames of the window count as published."""

@@ -234,8 +234,7 @@ class SteadySearch:
     def moments(self, theta: FloatArray) -> FloatArray:
         """Moments (m, 3, 3) on paths (7 m,), from tail to head, A m², world frame."""
         _, _, _, p = self._solve(theta[None])
-        moments: FloatArray = self._model.combinations @ p.reshape(-1, N_DIPOLES, 3)
-        return moments
+        return self._model.combinations @ p.reshape(-1, N_DIPOLES, 3)
 
     def beside(self, path: FloatArray) -> 'SteadySearch':
         """Search for another vehicle beside a found one on an approximate path (7,)."""
@@ -265,8 +264,7 @@ class SteadySearch:
     def _information_of_moments(self, theta: FloatArray) -> FloatArray:
         """Information matrices (n, 9 m, 9 m) of the moments, in units of the prior information."""
         std = self._moment_std(theta)
-        information: FloatArray = self._solve(theta)[1] * np.outer(std, std)
-        return information
+        return self._solve(theta)[1] * np.outer(std, std)
 
 
 def _log_determinant(A: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from mag_tracking.arrays import FloatArray
 from mag_tracking.errors import SettingsError
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.network import SensorNetwork
-from mag_tracking.physics.sources import SourceModel
+from mag_tracking.physics.sources import Magnet, SourceModel
 from mag_tracking.records import FieldFrame
 from mag_tracking.stages.track import initiation_magnet, initiation_vehicle, published_pose
 from mag_tracking.stages.track.observation import Observation
@@ -70,7 +70,7 @@ def target_of(settings: TrackSettings, network: SensorNetwork) -> Target:
         magnet = settings.magnet
         if not any(magnet.axis):
             raise SettingsError('track.magnet.axis: the zero vector has no direction')
-        model = initiation_magnet.magnet_model(magnet)
+        model = Magnet(np.full(3, magnet.acceleration**2), magnet.angular_acceleration**2)
         _check_bank('track.magnet', {'optima': initiation_magnet.MAX_STARTS}, settings,
                     _n_sensors(settings, network), model)
         return Target(model, published_pose.MagnetOrientation(np.array(magnet.axis)), ('',), ('',),

@@ -73,7 +73,7 @@ class TrackBank:
     def configure(self, settings: TrackSettings) -> None:
         """Apply new values of the live settings."""
         self.settings = settings
-        self.filter.configure(settings)
+        self.filter = self.filter_of(self.filter.observation.n_targets)
         self.relinearisation.restart()
 
     def begin(self, first: FieldFrame, detection: FieldFrame) -> None:

@@ -86,8 +86,7 @@ class VehicleState:
 
     def hard_moments(self, x: FloatArray) -> FloatArray:
         """Hard iron moments (d, 3) of a state `x` (n_t,), A m², vehicle frame."""
-        hard: FloatArray = x[6:6 + 3 * self._model.n_dipoles].reshape(-1, 3)
-        return hard
+        return x[6:6 + 3 * self._model.n_dipoles].reshape(-1, 3)
 
     def turning(self, x: FloatArray, P: FloatArray, target: int) -> FloatArray | None:
         """Return `P` with one target's initial turn-rate variance; None if disabled."""
@@ -107,8 +106,7 @@ def _resampled(moments: FloatArray, d: int) -> FloatArray:
         return np.tile(moments.sum(axis=0) / d, (d, 1))
     coordinates = np.linspace(0.0, d - 1.0, len(moments))
     weights = np.maximum(1.0 - np.abs(coordinates - np.arange(d)[:, None]), 0.0)
-    resampled: FloatArray = weights @ moments
-    return resampled
+    return weights @ moments
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from mag_tracking.inference.identification import UNKNOWN, ClassPosterior, Featu
 from mag_tracking.network import SensorNetwork, counting_line
 from mag_tracking.network.counting_line import CountingLine, Crossing, CrossingDetector
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
+from mag_tracking.stages.stage import Stage
 from mag_tracking.stages.traffic.intervals import TrafficIntervals
 from mag_tracking.stages.traffic.settings import TrafficSettings, VehicleClass
 from mag_tracking.units import NS
@@ -78,7 +79,7 @@ class _PendingCrossing(NamedTuple):
     direction_error: float
 
 
-class Traffic:
+class Traffic(Stage[TrackedFrame, TrafficRecord]):
     """Converts tracked frames to passages and summaries.
 
     A vehicle is counted when its track has ended, from its smoothed poses if available. Passages
@@ -125,9 +126,6 @@ class Traffic:
         out += self._count_ended(frame.stamp_ns)
         return [*out, *self._intervals.close_until(
             self._complete_before(frame.stamp_ns), frame.stamp_ns)]
-
-    def idle(self) -> None:
-        """Do nothing: no work is deferred."""
 
     def flush(self) -> list[TrafficRecord]:
         """End all tracks; return the remaining passages and the summary of the current interval."""
