@@ -256,7 +256,7 @@ def test_a_new_clock_offset_is_no_clock_step():
     """Readings in the buffer have the old offsets when a survey sets new clock offsets."""
     network, settings = read_network(NETWORK_FILE), settings_for('vehicle')
     stage, rng = Calibrate(network, settings.calibrate), np.random.default_rng(2)
-    health = HealthDiagnostics(network, settings)
+    health = HealthDiagnostics(network, settings, SILENT_GRAPH)
 
     def feed(begin, end):
         for k in range(begin, end):
