@@ -174,8 +174,7 @@ class SubscriberMonitor:
 
     def status(self, node: str, names: Collection[str],
                types_of: Callable[[str], Collection[str]]) -> DiagnosticStatus:
-        """Diagnostics of the connection, under the title of the `node`; `names` are the nodes that
-        now subscribe, `types_of` returns the message types that a node publishes."""
+        """Diagnostics of the connection, now to the nodes `names`, titled by the `node`."""
         self._known_nodes |= {name for name in set(names) - self._known_nodes
                               if self._publishes in types_of(name)}
         missing_nodes = sorted(self._known_nodes - set(names))

@@ -82,8 +82,7 @@ def parameters(network_path: PathLike, settings: Settings, reliable: bool) -> li
 def make_nodes(network_path: PathLike, settings: Settings, recording: PathLike | None = None,
                rate: float = 1.0, loop: bool = False
                ) -> tuple[list[StageNode], ReplayNode | None]:
-    """Create the calibration, detection and tracker nodes, each of which passes its results to the
-    next directly, and the paused replay node of a recording, if any."""
+    """Create the nodes, which call each other directly, and the paused replay node, if any."""
     overrides = parameters(network_path, settings, reliable=recording is not None)
     tracker = TrackerNode(has_direct_input=True, parameter_overrides=overrides)
     detection = DetectionNode(tracker, parameter_overrides=overrides)

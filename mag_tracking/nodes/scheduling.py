@@ -20,8 +20,7 @@ def steady_timer(node: Node, seconds: float, call: Callable[[], None],
 
 
 class Deferred:
-    """Calls a function `delay_s` after a request, once for all requests in the meantime, so that
-    the processes that receive the published messages come first."""
+    """Calls a function `delay_s` after requests, so that receivers of messages come first."""
 
     def __init__(self, node: Node, delay_s: float, call: Callable[[], None]) -> None:
         self._call = call

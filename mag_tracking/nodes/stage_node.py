@@ -26,8 +26,7 @@ from mag_tracking.stages.stage import Stage
 RESULT_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of results for users."""
 STREAM_QOS = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS of subscriptions between the nodes, and of the topics of a replay, which may be fast. The
-queue does not overflow while the tracker initiates a track."""
+"""QoS of subscriptions between the nodes, and of a replay, which may be fast."""
 PUBLISHER_QOS = QoSProfile(depth=250, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of publishers between the nodes. A restarted node can skip at most 256 older messages with
 one request (RTPS 2.3, 8.3.5.5); it would receive nothing until a second one."""

@@ -107,8 +107,7 @@ class ClockStepFilter:
         return stamp - self._ahead_since[i][1] >= self._max_jump
 
     def _release_expired(self, i: int, stamp: int) -> SensorSamples:
-        """Remove and return held samples of sensor `i` that precede `stamp` by over `max_jump`,
-        and the oldest one if there are more than `max_held`."""
+        """Remove and return held samples of sensor `i` that are too old or too many."""
         own_samples = [s for j, s, _ in self.held if j == i]
         oldest = own_samples[0] if len(own_samples) > self._max_held else None
         return self._release(lambda j, s, _: j == i and (

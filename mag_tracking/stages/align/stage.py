@@ -70,8 +70,7 @@ def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
 
 
 def frame_period_warning(settings: AlignSettings, network: SensorNetwork) -> str | None:
-    """Warning if the setting exceeds the travel time of a target between two sensors, except in
-    burst mode, where a frame is one round of the sensors."""
+    """Warning if the setting exceeds the travel time between sensors, except in bursts."""
     shortest, period = shortest_delay(network), frame_period(settings, network)
     if not settings.period_s or settings.burst or shortest is None or period <= shortest[0]:
         return None

@@ -151,8 +151,7 @@ class Calibrate:
         return {reason: by_sensor for reason, by_sensor in out.items() if by_sensor}
 
     def latest_doubt(self, sensor: str) -> tuple[int, int | None] | None:
-        """Latest interval [ns] in which the background or the timestamps of a sensor were doubtful,
-        if any; an open one, with the end None, comes first."""
+        """Latest interval [ns] of doubt about a sensor, if any, preferably an open one."""
         times = [interval for by_sensor in (
             self._background[sensor].doubtful_times, self.comparison.times_of(sensor),
             self.timestamps.doubtful_times().get(sensor, ()))
@@ -287,8 +286,7 @@ class Calibrate:
 
     def start_from(self, levels: Mapping[str, MostFrequentLevel],
                    steps: Mapping[str, FloatArray], faults: Mapping[str, ReadingFaults]) -> None:
-        """Initialise the stage with the results of a first pass: `levels` of the sensors that are
-        not quiet at the start, and `steps` (3,) [T], the resolution of their axes."""
+        """Initialise the stage with a first pass: `levels`, and `steps` (3,) [T] of the axes."""
         for name, found in faults.items():
             if found:
                 self.driver_faults.store(name, found)

@@ -18,8 +18,7 @@ MAX_CLOCK_DIFFERENCE_S = 60.0
 MAX_BOOT_DIFFERENCE_S = 1.0
 """[s] The same for clocks that count from the start of their devices."""
 MAX_LATENCY_S = 0.25
-"""[s] Difference that does not change above which it is due to the clocks. Readings that are
-transmitted in packets have larger delays, but these vary."""
+"""[s] Constant difference above which clocks differ; delays of packets vary."""
 MAX_CLOCK_ERROR_S = 0.1
 """[s] The same if timestamps are later than their receipt, which no delay explains."""
 MIN_AHEAD_S = 0.02

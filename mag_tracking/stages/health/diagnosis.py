@@ -140,8 +140,7 @@ _EXPLAINED = {
     Cause.CONSTANT: _explained('NO_BACKGROUND NO_DETECTION MISSED_TARGETS'),
     Cause.NO_BACKGROUND: _explained('NO_DETECTION'),
 }
-"""{cause: (causes that follow from it and are reported as consequences, causes that are not
-reported because the statement of the finding is then wrong)}."""
+"""{cause: (consequences, causes whose statement is then wrong and not reported)}."""
 _NETWORK_WIDE = frozenset({
     Cause.OVERLOADED, Cause.DAMAGED_RECORDING, Cause.UNDECODABLE,
     Cause.FRAMES_TOO_LONG, Cause.REJECTED, Cause.NO_DETECTION})

@@ -152,8 +152,7 @@ def driver_findings(name: str, calibrate: Calibrate) -> Iterator[Finding]:
 
 
 def likely_cause(declared: float, measured: float) -> str:
-    """Probable meaning of a covariance, such as 'a placeholder', if the noise std [T] declared in
-    messages differs from that measured in quiet readings."""
+    """Probable meaning of a covariance whose std [T] is not that of quiet readings."""
     if abs(np.log(declared**2 / measured)) < np.log(MAX_MISMATCH):
         return 'the standard deviation instead of the variance'
     exponent = 2.0 * np.log10(declared)

@@ -21,8 +21,7 @@ UPDATE_INTERVAL = 64
 CLOCK_STEP_S = 0.25
 """[s] Minimum jump of a timestamp that counts as a clock step if the time of receipt is regular."""
 MAX_LIVE_DELAY_S = 86400.0
-"""[s] Maximum age of live timestamps. Older timestamps come from a replay or an unsynchronised
-clock; `apps.doctor` compares the clocks of the sensors."""
+"""[s] Maximum age of live timestamps; `apps.doctor` compares the clocks of sensors."""
 GAP_RATIO = 1.5
 """Readings are counted as lost if the ratio of an interval to the median interval exceeds this."""
 MAX_JITTER = 0.3
@@ -160,7 +159,8 @@ class SensorHealth:
         n, dt = len(intervals), self._interval_ns
         nearby = np.concatenate([[dt], np.diff(self._stamps), [dt]])[-n - 2:]
         spans = nearby[:-2] + intervals + nearby[2:]
-        return (intervals > GAP_RATIO * dt) & (spans > (2.0 + GAP_RATIO) * dt)
+        are_gaps: BoolArray = (intervals > GAP_RATIO * dt) & (spans > (2.0 + GAP_RATIO) * dt)
+        return are_gaps
 
     def _check_fields(self, n: int) -> None:
         """Count the faults in the fields of the `n` latest readings."""
@@ -201,8 +201,7 @@ class SensorHealth:
 
     def _count_runs(self, is_repeated: BoolArray, unchanged_since: IntArray,
                     stamps: IntArray) -> None:
-        """Count repeated and changed readings; `unchanged_since` (n,) [ns] is the start of the run
-        of identical readings to which each reading belongs."""
+        """Count repeated and changed readings, with the starts [ns] of equal runs."""
         changed = np.flatnonzero(~is_repeated)
         if not len(changed):
             self._run_length += len(is_repeated)

@@ -20,9 +20,8 @@ from mag_tracking.stages.track.observation import TIME_RESOLUTION_S, Observation
 from mag_tracking.stages.track.settings import TrackSettings
 
 LINEAR_FRACTION, SAME_TIME_FRACTION = 0.25, 0.05
-"""Displacement over which the field is approximately linear, as a fraction of the distance to the
-nearest sensor, whose cube then changes by a factor of two; and fraction of the interval since the
-previous frame below which the samples of a frame count as simultaneous."""
+"""Relative displacement over which the field, inverse to the cube of the distance, is about linear,
+and fraction of the interval between frames in which samples are simultaneous."""
 NEGLIGIBLE_ENERGY, WEAK_ENERGY = 0.1, 1.0
 """Whitened squared field per frame below which a departing target is removed from a joint track,
 and up to which it does not disturb others: the limit if there are no more places."""
@@ -150,8 +149,7 @@ class BankFilter:
         return out
 
     def time_offset(self, frame: FieldFrame, dt: float) -> FloatArray:
-        """Sampling time (n_sensors,) of each sensor relative to the timestamp of a frame, s, in
-        multiples of `TIME_RESOLUTION_S`; 0 if simultaneous."""
+        """Sampling time (n_sensors,) of each sensor in a frame, s; 0 if simultaneous."""
         offset: FloatArray = frame.time_offset
         if dt <= 0.0 or offset.max() - offset.min() < SAME_TIME_FRACTION * dt:
             return self._zero_offset
@@ -201,7 +199,8 @@ class BankFilter:
 
     def are_long(self, kind: IntArray) -> BoolArray:
         """Whether any target of each hypothesis, of a given kind, is longer than a car."""
-        return np.any(self._is_long_kind[kind].reshape(len(kind), -1), axis=1)
+        are_long: BoolArray = np.any(self._is_long_kind[kind].reshape(len(kind), -1), axis=1)
+        return are_long
 
     def linear_range(self, x: FloatArray) -> FloatArray:
         """Displacement (n_hyp,) over which the field is approximately linear, m."""

@@ -96,7 +96,8 @@ class Disturbances:
 
 def field_magnitudes(frame: FieldFrame) -> FloatArray:
     """Magnitude (n_sensors,) of the field of a frame, T; 0 if the reading is missing."""
-    return np.sqrt(np.nansum(np.square(frame.field), axis=1))
+    magnitude: FloatArray = np.sqrt(np.nansum(np.square(frame.field), axis=1))
+    return magnitude
 
 
 class DisturbanceModel:

@@ -94,8 +94,7 @@ class TrackEvidence:
 
     def flag_interval(self, reason: str, stamp_ns: int, seconds: float,
                       since_ns: int | None = None) -> None:
-        """Mark the poses within `seconds` after `stamp_ns` as doubtful, for a reason from `doubts`;
-        from the earlier time `since_ns` on, if given, also the smoothed poses."""
+        """Flag the poses within `seconds`, and smoothed ones from `since_ns` on."""
         self._expiry_ns[reason] = until_ns = stamp_ns + round(seconds * NS)
         if since_ns is not None:
             self._smoothed_intervals.append((since_ns, until_ns))

@@ -171,10 +171,8 @@ def start_vehicle(settings: VehicleSettings, network: SensorNetwork, frame: Fiel
     offset and speed, and a turning copy of each if enabled. It starts at the first position on its
     line at which its field has the measured energy.
     """
-    states: list[FloatArray] = []
-    covariances: list[FloatArray] = []
-    labels: list[int] = []
-    kinds: list[int] = []
+    states, covariances = list[FloatArray](), list[FloatArray]()
+    labels, kinds = list[int](), list[int]()
     model = vehicle_model(settings, network)
     energy, whitening = _measured_energy(network, frame)
     for kind, of_kind in enumerate(settings.kinds):

@@ -28,8 +28,7 @@ CONFIDENT_NATS, IMPLAUSIBLE_NATS = 15.0, 60.0
 evidence treats model errors as independent between frames; and higher if a new vehicle crosses or
 overtakes another, which is rarer than a flipped axis or a train with a similar field."""
 CROSSING_COSINE, OVERTAKING_RATIO = 0.9, 1.8
-"""Absolute cosine of the angle between velocities below which two vehicles cross, and maximum
-plausible speed ratio of two vehicles that move in the same direction."""
+"""Cosine of the angle below which vehicles cross, and maximum plausible speed ratio."""
 MIN_MOVING_SPEED = 1.0
 """[m/s] Minimum speed of vehicles whose directions are compared."""
 

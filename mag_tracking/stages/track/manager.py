@@ -1,5 +1,4 @@
-"""Track management: tracks are initiated with a detection, maintained with each frame, and deleted
-with the release of the detection, or when the target is lost."""
+"""Track management: tracks begin with a detection, and end with it or if the target is lost."""
 
 from collections import Counter, deque
 
@@ -31,8 +30,7 @@ UNCERTAIN_ORIENTATIONS = ('sensors with an orientation uncertainty above '
                           f'{np.degrees(MAX_ROTATION):g} degrees')
 """Keys of event counts that others use."""
 RESTART_ENERGY_RATIO = 4.0
-"""Minimum energy of the frame in which a track starts after a lost track, relative to the maximum
-energy of the lost track: the field of a departing vehicle only decreases."""
+"""Minimum energy of the first frame after a lost track, relative to its maximum."""
 
 
 class TrackManager:

@@ -163,8 +163,7 @@ class Member:
         return self.evidence.reason_to_end(self.last, self._position_std, is_approaching, settings)
 
     def unexplained(self, uniform: float) -> UnexplainedField | None:
-        """Field of the track, if all its poses were ambiguous and a disturbance explains it better;
-        `uniform` is the probability of a common field over the network."""
+        """Field of a never unambiguous track that a disturbance explains better, if it is."""
         if self._was_unambiguous or self.last is None \
                 or self.evidence.bayes_factor.disfavoured_s(self.last.stamp_ns) <= 0.0:
             return None

@@ -231,12 +231,11 @@ class NewTargetSearch:
                     ) -> tuple[FilterBank, FloatArray, FloatArray, FloatArray]:
         """Run starts along their paths; return the bank at the last frame, log-likelihoods (n,),
         log-weights (n,) and paths (n, n_frames, n_x)."""
-        n = len(starts)
+        n, labels_of = len(starts), window_search.labels_of
         bank = FilterBank(
             np.array([s.x for s in starts]), np.array([s.P for s in starts]), np.zeros(n),
-            *(window_search.labels_of(of) for of in zip(*((s.label, s.kind) for s in starts),
-                                                        strict=True)),
-            np.arange(n), np.full((n, len(self._vehicles.network)), np.nan))
+            labels_of([s.label for s in starts]), labels_of([s.kind for s in starts]), np.arange(n),
+            np.full((n, len(self._vehicles.network)), np.nan))
         paths = np.array([s.path for s in starts])
         log_likelihood = self._run_along(bank, paths, len(starts[0].kind))
         is_usable: BoolArray = np.isfinite(log_likelihood) & np.isfinite(bank.x).all(axis=1) \

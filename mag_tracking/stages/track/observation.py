@@ -95,7 +95,8 @@ class Observation:
     def distance_to_nearest(self, x: FloatArray) -> FloatArray:
         """Smallest distance (n_hyp,) between a target and a sensor, m."""
         targets = x[:, :self.n_target].reshape(len(x), self.n_targets, self.n_one)[:, :, None, :3]
-        return np.linalg.norm(targets - self.positions, axis=3).min(axis=(1, 2))
+        nearest: FloatArray = np.linalg.norm(targets - self.positions, axis=3).min(axis=(1, 2))
+        return nearest
 
     def drift(self, dt: FloatArray, background_density: float) -> tuple[FloatArray, FloatArray]:
         """Decay factor and added variance of the sensor states over intervals `dt` (...) [s], both
@@ -146,7 +147,8 @@ class Observation:
             h = h + self._single_target_field(x[None, target * n:(target + 1) * n], time_offset)[0]
         if self.n_angles:
             h, _ = rotated_fields(h, H, np.ascontiguousarray(self.own(x[None])[..., :3]))
-        return h[0]
+        field: FloatArray = h[0]
+        return field
 
     def fields(self, x: FloatArray, time_offset: FloatArray, near_field_length: FloatArray,
                field_error: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -182,4 +184,5 @@ class Observation:
 
 def _proportional_variance(h: FloatArray, field_error: float) -> FloatArray:
     """Variance (n_hyp, n_sensors) [T^2] of a model error that is proportional to the field."""
-    return field_error**2 * np.einsum('pji,pji->pj', h, h)
+    variance: FloatArray = field_error**2 * np.einsum('pji,pji->pj', h, h)
+    return variance

@@ -206,7 +206,8 @@ class RigidPass:
         offsets = positions - self.position
         squared_speed = max(float(self.velocity @ self.velocity), 1e-12)
         points = self.position + (offsets @ self.velocity / squared_speed)[:, None] * self.velocity
-        return points[np.argmin(np.linalg.norm(points - positions, axis=1))]
+        nearest: FloatArray = points[np.argmin(np.linalg.norm(points - positions, axis=1))]
+        return nearest
 
     def difference(self, stamp_ns: int, state: FloatArray) -> FloatArray:
         """Horizontal difference (6,) from the nearest of the `straight_paths`, or zero."""
@@ -215,7 +216,8 @@ class RigidPass:
         differences = state - self.straight_paths
         differences[:, :3] -= (stamp_ns - self.stamp_ns) / NS * self.straight_paths[:, 3:]
         differences[:, [2, 5]] = 0.0
-        return differences[np.argmin(np.hypot(*differences[:, :2].T))]
+        nearest: FloatArray = differences[np.argmin(np.hypot(*differences[:, :2].T))]
+        return nearest
 
     @cached_property
     def speed(self) -> float:

@@ -96,12 +96,12 @@ def _is_off_road(x: FloatArray, settings: VehicleSettings, positions: FloatArray
     edge = np.maximum(outermost + n_stds * LATERAL_STD,
                       half_width + np.minimum(outermost, half_width - outermost))
     on_one_side = (lateral > 0.0).all(axis=0) | (lateral < 0.0).all(axis=0)
-    return on_one_side & (np.abs(lateral.mean(axis=0)) > edge) & _is_moving(x)
+    is_off_road: BoolArray = on_one_side & (np.abs(lateral.mean(axis=0)) > edge) & _is_moving(x)
+    return is_off_road
 
 
 def lane_note(settings: VehicleSettings, network: SensorNetwork) -> str | None:
-    """Explanation of which lanes are covered if the sensors are in a line along most of the arrival
-    directions, else None; also None for one sensor and for a compact network."""
+    """Explanation of the covered lanes if the sensors are in a line along the road, else None."""
     headings = np.deg2rad(settings.arrival_headings_deg)
     across = np.array([-np.sin(headings), np.cos(headings)])
     is_one_sided = np.ptp(network.positions[:, :2] @ across, axis=0) < MAX_ONE_SIDED_WIDTH
@@ -243,4 +243,5 @@ class SampleRates:
         """Whether most of the latest intervals of each sensor are too long, (n_sensors,)."""
         n_long = np.count_nonzero(self._intervals_s > self._max_interval_s, axis=1)
         n_known = np.minimum(self._next, N_INTERVALS)
-        return (n_long >= MIN_INTERVALS) & (2 * n_long > n_known)
+        are_slow: BoolArray = (n_long >= MIN_INTERVALS) & (2 * n_long > n_known)
+        return are_slow

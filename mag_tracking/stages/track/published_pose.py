@@ -72,7 +72,8 @@ class UnobservedLength:
             is_sensed = self._distance_travelled >= half_hidden[kind]
             variance += second_moment[kind] / (3.0 if is_sensed else 1.0)
         forward = self._direction(x, P)
-        return variance * np.outer(forward, forward)
+        covariance: FloatArray = variance * np.outer(forward, forward)
+        return covariance
 
     def _direction(self, x: FloatArray, P: FloatArray) -> FloatArray:
         """Unit vector (2,) of the motion; the previous one if the target hardly moves."""

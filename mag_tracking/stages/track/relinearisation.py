@@ -92,8 +92,7 @@ class Relinearisation:
         self._gain: dict[int, float] = {}
 
     def begin(self, anchor: FilterBank | InitialBank, is_updated: bool = False) -> None:
-        """Start the window with the bank at the first frame of a track, before the update with it
-        unless it `is_updated`; the caller must not modify the bank afterwards."""
+        """Start the window with a bank, not to be modified, before its first update."""
         if self._window_ns:
             self.resume(Window(anchor, is_updated, self._max_hypotheses))
 

@@ -30,8 +30,7 @@ from mag_tracking.stages.track.window_search import VehicleState
 from mag_tracking.units import NS
 
 UNDECIDED_S, DOUBTED_S = 1.0, 3.0
-"""[s] Duration of the doubt after another explanation was about as probable as the track, and of
-that about the uncertain vehicles of an accepted explanation."""
+"""[s] Durations of doubt after another explanation was not accepted, and was accepted."""
 BELOW_SENSORS = 'vehicles that appear to pass below the sensors'
 
 TrackRecord = Track | SmoothedPose | Disturbance

@@ -104,8 +104,7 @@ class WholeTrack:
             start.keep(np.isin(start.origin, bank.origin))
 
     def smoothed(self, bank: FilterBank, best: int) -> tuple[list[TrackState], int]:
-        """Smoothed states of the published frames for hypothesis `best`, if possible, and the
-        number of frames excluded because they contradict it."""
+        """Smoothed states of published frames, if possible, and number of excluded frames."""
         if self._start is None or not self._frames:
             return [], 0
         bank_filter, start = self._start

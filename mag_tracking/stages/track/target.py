@@ -25,9 +25,8 @@ after the frames before the detection if few hypotheses are then probable, other
 MIN_SENSORS_AT_START = 4
 """Minimum number of sensors at the start of a track, those nearest to the strongest field."""
 WIDER_BYTES, MIN_HYPOTHESES, MIN_WEIGHT = 100_000_000, 100, 0.999
-"""Limits when the remaining sensors are added: maximum memory of the covariances [bytes], minimum
-number of retained hypotheses even beyond it, and minimum total weight of these, so that the track
-does not appear more certain than the frames justify."""
+"""Limits when the remaining sensors are added: memory of the covariances [bytes], minimum number of
+hypotheses even beyond it, and minimum weight of these, so that doubt is not lost."""
 _FLOAT_BYTES = 8
 
 

@@ -121,8 +121,7 @@ class TrackBank:
         self._whole_track.add(bank, update.frame, update.dt, publish)
 
     def smoothed(self, best: int, counts: bool = True) -> list[TrackState]:
-        """Smoothed states of hypothesis `best` at the published frames, empty if smoothing is
-        disabled or impossible; excluded frames are counted if `counts`."""
+        """Smoothed states of hypothesis `best` at published frames, if any."""
         states, n_excluded = self._whole_track.smoothed(self.bank, best)
         if counts:
             self._counts['frames left out of smoothing'] += n_excluded

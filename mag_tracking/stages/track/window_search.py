@@ -160,8 +160,7 @@ def labels_of(labels: Sequence[tuple[int, ...]]) -> IntArray:
 
 
 def overlap_depth(path: FloatArray, n_one: int, n_targets: int, length_column: int | None) -> float:
-    """Maximum depth by which any two vehicles, of `n_one` states each, overlap along a joint path
-    (n, n_x), m; `length_column` is None if all vehicles are points."""
+    """Maximum depth [m] by which two vehicles overlap along a joint path (n, n_x)."""
     x = path[:, :n_one * n_targets].reshape(len(path), n_targets, n_one)
     depth = 0.0
     for i in range(n_targets):

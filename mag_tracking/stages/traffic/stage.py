@@ -169,8 +169,7 @@ class Traffic(Stage[TrackedFrame, TrafficRecord]):
             path.add(track)
 
     def _count_ended(self, now_ns: int | None) -> list[VehiclePassage]:
-        """Find the crossings of ended tracks, and return the passages that are due: all that no
-        earlier passage can follow, or all if `now_ns` is None."""
+        """Find the crossings of ended tracks; return the passages that none can precede."""
         ended = {id: track for id, track in self._open.items() if track.ended}
         self._ended += ended.values()
         for id, track in ended.items():
