@@ -86,13 +86,11 @@ class Align(Stage[Readings, FieldFrame]):
 
     def __init__(self, network: SensorNetwork, settings: AlignSettings) -> None:
         self.counts: Counter[str] = Counter()
-        self._n = len(network)
         self._noise = np.array([np.full((3, 3), np.nan) if std is None else np.diag(std ** 2)
                                 for std in network.noise_std]).reshape(-1, 3, 3)
         self._index = {name: i for i, name in enumerate(network.names)}
         self._names, self._settings = network.names, settings
         self._period = int(round(frame_period(settings, network) * NS))
-        self._wait = int(round(settings.max_wait_s * NS))
         self._reset()
 
     def _reset(self) -> None:
@@ -100,10 +98,9 @@ class Align(Stage[Readings, FieldFrame]):
         settings = self._settings
         longest_jump = int(round(settings.max_clock_jump_s * NS)) or UNLIMITED_NS
         self._alignment = core.Alignment(
-            self._n, self._period, self._wait, longest_jump,
-            int(round(MAX_BACKWARD_JUMP_S * NS)),
-            settings.max_buffered, settings.burst)
-        self._clock_steps = ClockStepFilter(self._n, longest_jump,
+            len(self._names), self._period, int(round(settings.max_wait_s * NS)), longest_jump,
+            int(round(MAX_BACKWARD_JUMP_S * NS)), settings.max_buffered, settings.burst)
+        self._clock_steps = ClockStepFilter(len(self._names), longest_jump,
                                             min(settings.max_buffered, MAX_HELD))
 
     @property

@@ -52,9 +52,8 @@ class _Held(NamedTuple):
 
 
 class Stays:
-    """Joins the arrivals and departures of vehicles that park beside one sensor; the background
-    approaches `free_field` (3,) [T], NaN if unknown, if one that was present from the start
-    leaves."""
+    """Joins the arrivals and departures of vehicles that park beside one sensor with the field
+    `free_field` (3,) [T] without a vehicle, NaN if unknown."""
 
     def __init__(self, free_field: FloatArray) -> None:
         self._free_field = free_field

@@ -173,9 +173,8 @@ class BankFilter:
 
     def fields_at(self, x: FloatArray, kind: IntArray, frame: FieldFrame, dt: float
                   ) -> tuple[FloatArray, FloatArray]:
-        """Fields (n_sensors, 3) of the targets of a state `x` (n_x,) with kinds `kind` (1,) or
-        (1, n_targets) at the sampling times of a frame, T, sensor frame, without backgrounds and
-        model errors, and their derivatives (n_sensors, 3, n_target)."""
+        """Fields (n_sensors, 3) [T] of the targets of a state `x` (n_x,) with kinds (1,) or (1,
+        n_targets) in a frame, without backgrounds and model errors, and their derivatives."""
         without_errors = x[None].copy()
         self.observation.own(without_errors)[..., self.observation.n_angles:] = 0.0
         h, H, _ = self.observation.fields(without_errors, self.time_offset(frame, dt),

@@ -51,7 +51,7 @@ class TrackEvidence:
         self._approach = Approach()
         self._log_odds = 0.0
         self._single_sensor_s = 0.0
-        self._n_consecutive_misfits = 0
+        self.n_consecutive_misfits = 0
         self._overfit_expiry_ns = -1
         # Expiry of each transient doubt, and of each doubt that was flagged for a limited time.
         self._expiry_ns: dict[str, int] = {}
@@ -77,7 +77,7 @@ class TrackEvidence:
         self.doubts -= {doubts.CONTRADICTION, doubts.INNOVATIONS, doubts.SENSORS_CONTRADICT,
                         *doubts.PERMANENT}
         self.innovations = InnovationConsistency(len(self.largest))
-        self._n_consecutive_misfits, self._overfit_expiry_ns = 0, -1
+        self.n_consecutive_misfits, self._overfit_expiry_ns = 0, -1
         for reason in TRANSIENT_DOUBTS:
             self._expiry_ns.pop(reason, None)
 
@@ -156,9 +156,8 @@ class TrackEvidence:
             doubts.INNOVATIONS: self.innovations.excess > 1.0})
 
     def update_filter_doubt(self, gain: float, stamp_ns: int, window_s: float) -> bool:
-        """Update and return the doubt about the filter, which lasts for `window_s` after a frame
-        with `gain` [nats], the increase of the window's log-likelihood along the path of the
-        hypothesis over that in the filter, below `-OVERFIT_NATS`."""
+        """Update and return the doubt about the filter, for `window_s` after a frame with a `gain`
+        [nats] of the path over the filter below `-OVERFIT_NATS`."""
         if gain < -OVERFIT_NATS:
             self._overfit_expiry_ns = stamp_ns + round(window_s * NS)
         return stamp_ns <= self._overfit_expiry_ns
@@ -179,23 +178,15 @@ class TrackEvidence:
         """Probability that there is a target."""
         return float(1.0 / (1.0 + np.exp(-np.clip(self._log_odds, -700.0, 700.0))))
 
-    @property
-    def ends_in_misfit(self) -> bool:
-        """Whether the latest field contradicted the track."""
-        return self._n_consecutive_misfits > 0
-
     def reason_to_end(self, track: Track, spread: float, is_approaching: bool,
                       settings: TrackSettings) -> str | None:
-        """Update the end conditions with the latest pose; return the reason, if any.
-
-        `spread` [m] is the std of the horizontal position of the published hypothesis alone, which
-        depends on the distance. A target that `is_approaching` is not out of reach.
-        """
+        """Update the end conditions with the latest pose; return the reason, if any; `spread` [m]
+        is the std of the horizontal position of the published hypothesis alone."""
         if self.bayes_factor.disfavoured_s(track.stamp_ns) > UNEXPLAINED_S:
             return UNEXPLAINED
         misfit = track.nis > settings.end_nis * track.degrees_of_freedom
-        self._n_consecutive_misfits = self._n_consecutive_misfits + 1 if misfit else 0
-        if self._n_consecutive_misfits > 1:
+        self.n_consecutive_misfits = self.n_consecutive_misfits + 1 if misfit else 0
+        if self.n_consecutive_misfits > 1:
             return LOST
         if spread > settings.end_std > self._min_spread and not is_approaching:
             return LOST if misfit else OUT_OF_REACH

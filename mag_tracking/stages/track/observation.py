@@ -156,10 +156,9 @@ class Observation:
         derivatives H (n_hyp, n_sensors, 3, n_target + n_own), and the variance (n_hyp, n_sensors)
         of the model error [T²], 0 if the model errors are states.
 
-        `field_error` is the model error relative to the field, and `near_field_length`
-        (n_hyp, n_targets) [m] relative to the field gradient, as in [ICASSP11]_ eq. (9), which
-        treats the error as noise. H neglects that the std of the model error depends on the state:
-        a few per cent of the derivative where the error is large.
+        The error is relative to the field (`field_error`) and its gradient (`near_field_length`,
+        (n_hyp, n_targets) [m]), as noise in [ICASSP11]_ eq. (9). H neglects that its std depends on
+        the state.
         """
         h, H, variance = self.target_fields(x, time_offset, near_field_length)
         variance = variance + _proportional_variance(h, field_error)

@@ -192,11 +192,6 @@ class RigidPass:
     paths of a short and of a long row that explain the pass about as well as bent paths."""
 
     @property
-    def n_clocks(self) -> int:
-        """Number of clocks that were compared with the reference."""
-        return int(np.count_nonzero(~np.isnan(self.offset))) - 1
-
-    @property
     def is_explained(self) -> bool:
         """Whether a straight path explains the pass, if necessary with free clock offsets."""
         return self.cost_with_offsets <= GOOD_MISFIT * self.degrees_of_freedom
@@ -243,7 +238,8 @@ class RigidPass:
         gains = (np.array([self.straight_cost, self.bent_cost])
                  - self.cost_with_offsets) / self.widening
         prior_cost = float(np.nansum(np.square(self.offset / OFFSET_STD)))
-        return bool((gains - prior_cost > chdtri(self.n_clocks, [P_CLOCKS, P_BEND])).all())
+        n_clocks = np.count_nonzero(~np.isnan(self.offset)) - 1
+        return bool((gains - prior_cost > chdtri(n_clocks, [P_CLOCKS, P_BEND])).all())
 
     @property
     def is_straight(self) -> bool:

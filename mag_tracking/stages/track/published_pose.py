@@ -155,8 +155,7 @@ def published_track(bank: FilterBank, best: int, model: SourceModel, orientation
     """Track record of hypothesis `best`; the keywords from `stamp_ns` are entries of `Track`.
 
     `found` are the doubts without the ambiguities of the bank. The covariance is multiplied by
-    `excess`, the variance ratio of the innovations, and covers the `difference` (6,) [m, m/s] from
-    another possible position and velocity.
+    `excess`, and covers the `difference` (6,) [m, m/s] from another possible state.
     """
     n_t = len(model.state_names)
     is_separated = bank.is_separated(best)

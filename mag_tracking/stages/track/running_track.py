@@ -93,9 +93,8 @@ class RunningTrack:
 
     def begin(self, frame: FieldFrame, recent: list[FieldFrame], approach_unobserved: bool = False
               ) -> list[TrackRecord]:
-        """Process the `recent` frames (oldest first), which do not show the approach of the target
-        if `approach_unobserved`, and the frame of the detection, all of the whole network; return
-        the records of the detection frame."""
+        """Process the `recent` frames (oldest first), and return the records of the detection
+        frame; both are of the whole network, and may not show the approach of the target."""
         frames, first = [*recent, frame], self.members[0]
         first.evidence.flag_start(
             approach_unobserved or frame.stamp_ns - frames[0].stamp_ns
@@ -226,7 +225,7 @@ class RunningTrack:
             member.evidence.doubts.add(doubts.BELOW_SENSORS)
         best = self.bank.best()
         view = self._view(i, best)
-        doubtful = member.evidence.ends_in_misfit or member.is_doubtful(self._settings)
+        doubtful = member.evidence.n_consecutive_misfits > 0 or member.is_doubtful(self._settings)
         return [replace(member.last, ended=True),
                 *self._smoothed(i, view, False, self._bank.lag.remaining(
                     self._bank.filter, self.bank, best), doubtful),

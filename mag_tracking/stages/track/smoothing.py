@@ -38,8 +38,7 @@ def smoothed_track(bank_filter: BankFilter, bank: FilterBank, frames: Sequence[F
     excluded.
 
     `intervals` [s] are times since the previous frame; `updated` tells whether the bank includes
-    the first frame; each of the `relinearisations` is a pass along the previous result; `path` are
-    known states (n_x,) at the first frames, for the first pass.
+    the first frame; `path` are known states (n_x,) at the first frames, for the first pass.
     """
     paths = np.full((1, len(frames), bank.x.shape[1]), np.nan)
     for at, known in zip(paths[0], path, strict=False):

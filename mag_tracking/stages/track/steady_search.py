@@ -167,11 +167,10 @@ class SteadySearch:
         return self._marginal_whitener(self.samples.y - self.known)
 
     def _solve(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Whitened fields of unit moments (n, y, 9 m) of vehicles on given paths, the information
-        matrices of the moments (n, 9 m, 9 m), their inverses, which are NaN or meaningless for a
-        path through a sensor, and the estimated moments (n, 9 m)."""
+        """Whitened fields of unit moments (n, y, 9 m) of vehicles on paths, information matrices of
+        the moments (n, 9 m, 9 m), their inverses (NaN at a sensor), and the moments (n, 9 m)."""
         basis = self._model.basis(theta.reshape(-1, N_STRAIGHT))
-        A = self._marginal_whitener(_joined_columns(basis, _n_vehicles(theta)))
+        A = self._marginal_whitener(_joined_columns(basis, theta.shape[1] // N_STRAIGHT))
         At = np.swapaxes(A, 1, 2)
         information = At @ A + np.diag(self._moment_std(theta)**-2.0)
         inverse = pseudo_inverse(information)
@@ -179,7 +178,7 @@ class SteadySearch:
 
     def _moment_std(self, theta: FloatArray) -> FloatArray:
         """Prior standard deviations (9 m,) of the moments of m vehicles."""
-        return np.tile(self.prior.moment_std, _n_vehicles(theta))
+        return np.tile(self.prior.moment_std, theta.shape[1] // N_STRAIGHT)
 
     def cost(self, grid: StartGrid) -> FloatArray:
         """Cost (n,) of a point target on each path of a grid: -2 log-density + constant."""
@@ -198,7 +197,7 @@ class SteadySearch:
     def residual_and_jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (n, y + 16 m) of measurements, moments and paths (n, 7 m), with the Jacobian of
         Kaufman (1975), the derivative (n, y + 16 m, 7 m) of the negative residual."""
-        n, m, std = len(theta), _n_vehicles(theta), self._moment_std(theta)
+        n, m, std = len(theta), theta.shape[1] // N_STRAIGHT, self._moment_std(theta)
         paths = theta.reshape(-1, N_STRAIGHT)
         A, _, inverse, p = self._solve(theta)
         derivative = self._model.derivative(paths, p.reshape(len(paths), -1))
@@ -211,9 +210,8 @@ class SteadySearch:
                                 _block_diagonal(prior_J, m)], axis=1))
 
     def refined(self, theta: FloatArray, n_steps: int = N_STEPS) -> tuple[FloatArray, FloatArray]:
-        """Paths (n, 7 m) refined by Levenberg-Marquardt steps, and their costs (n,): infinite if a
-        vehicle is too slow, moves backwards, or is not detectable because its position along the
-        arrival line, which the prior does not constrain, is far away."""
+        """Paths (n, 7 m) refined by Levenberg-Marquardt steps, and costs (n,): infinite if a
+        vehicle is too slow, moves backwards, or is too far along the line to be detectable."""
         if not len(theta):
             return theta, np.zeros(0)
         path, cost, _, _ = refine(self.residual_and_jacobian, theta, n_steps, TOLERANCE)
@@ -271,11 +269,6 @@ def _log_determinant(A: FloatArray) -> FloatArray:
     """Log-determinants (n,) of matrices (n, k, k); infinite if the determinant is not positive."""
     sign, value = np.linalg.slogdet(A)
     return np.where(sign > 0.0, value, np.inf)
-
-
-def _n_vehicles(theta: FloatArray) -> int:
-    """Number of vehicles whose paths form a row of theta (n, 7 m)."""
-    return theta.shape[1] // N_STRAIGHT
 
 
 def _joined_columns(A: FloatArray, m: int) -> FloatArray:
