@@ -76,7 +76,8 @@ class PageNode(Node):
         self._tracker_subscriptions = [
             self.create_subscription(MarkerArray, f'{base}/sensor_markers', self._receive_sensors,
                                      LATCHED_QOS),
-            self.create_subscription(TrackArray, tracks_topic, self._receive_tracks, STREAM_QOS),
+            self.create_subscription(TrackArray, tracks_topic, lambda message: self._tracks.extend(
+                message.tracks), STREAM_QOS),
             self.create_subscription(SmoothedTrack, f'{base}/smoothed', self._receive_smoothed,
                                      RESULT_QOS)]
 
@@ -111,10 +112,6 @@ class PageNode(Node):
             self._layout = layout
             self._scene.subtitle = f'{quantity(len(layout), "sensor")}, frame {layout.frame}'
             self._scene.use_network(layout)
-
-    def _receive_tracks(self, message: TrackArray) -> None:
-        """Store tracks for the next tick."""
-        self._tracks.extend(message.tracks)
 
     def _receive_smoothed(self, message: SmoothedTrack) -> None:
         """Add the smoothed path of an ended track to the scene."""

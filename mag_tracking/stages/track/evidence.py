@@ -180,8 +180,11 @@ class TrackEvidence:
 
     def reason_to_end(self, track: Track, spread: float, is_approaching: bool,
                       settings: TrackSettings) -> str | None:
-        """Update the end conditions with the latest pose; return the reason, if any; `spread` [m]
-        is the std of the horizontal position of the published hypothesis alone."""
+        """Update the end conditions with the latest pose; return the reason, if any.
+
+        `spread` [m] is the std of the horizontal position of the published hypothesis alone,
+        because differences between hypotheses do not depend on the distance to the target.
+        """
         if self.bayes_factor.disfavoured_s(track.stamp_ns) > UNEXPLAINED_S:
             return UNEXPLAINED
         misfit = track.nis > settings.end_nis * track.degrees_of_freedom

@@ -163,7 +163,7 @@ class Member:
         return self.evidence.reason_to_end(self.last, self._position_std, is_approaching, settings)
 
     def unexplained(self, uniform: float) -> UnexplainedField | None:
-        """Field of a never unambiguous track that a disturbance explains better, if it is."""
+        """Field of a track with only ambiguous poses, if a disturbance explains it better."""
         if self._was_unambiguous or self.last is None \
                 or self.evidence.bayes_factor.disfavoured_s(self.last.stamp_ns) <= 0.0:
             return None
