@@ -73,7 +73,7 @@ def sensor_findings(network: SensorNetwork, calibrate: Calibrate, settings: Trac
 
 def background_findings(name: str, calibrate: Calibrate, frozen_since_ns: int | None,
                         n_reported: int = 0) -> Iterator[Finding]:
-    """Diagnose a background; `n_reported` times it was relearnt and reported earlier."""
+    """Diagnose a background, which was relearnt and reported `n_reported` times earlier."""
     background, last = calibrate.backgrounds()[name], calibrate.last_stamp_ns(name)
     if last is not None and not background.ready and background.stuck:
         yield Finding(True, name, 'its readings do not change, and the sensor is not used', 'move '

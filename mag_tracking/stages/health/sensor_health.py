@@ -286,7 +286,7 @@ class SensorHealth:
     def findings(self, name: str, noise_std: FloatArray | None = None,
                  max_field: float = 1e-3, is_live: bool = True) -> list[Finding]:
         """Faults of the sensor `name`, without ranking; `noise_std` (3,) [T] is that of the
-        calibration. Clocks are not checked unless `is_live`."""
+        calibration, and clocks are checked only if `is_live`."""
         n = self.counts['readings']
         if not n:
             return [Finding(True, name, 'no reading', 'check its cable, its driver and the topic '
