@@ -193,7 +193,7 @@ class RecordNode(Node):
         self._report(f'{topic} is not recorded: {reason}')
 
     def _update_publishers(self, topic: str, infos: list[TopicEndpointInfo]) -> None:
-        """Update a topic's publishers; replace a latched subscription if one is not."""
+        """Update a topic's publishers; replace a latched subscription if a publisher is not."""
         polled = self._polled_subscriptions[topic]
         other_types = sorted({i.topic_type for i in infos} - {polled.type})
         if other_types and f'{topic} as {other_types[0]}' not in self.refused:

@@ -134,7 +134,7 @@ def _learn(learner: Calibrate, readings: Readings, first_ns: dict[str, int],
 
 def _begins_quietly(learnt: tuple[float, FloatArray] | None, level: MostFrequentLevel,
                     recorder: BlockRecorder, settings: CalibrateSettings) -> bool:
-    """Whether the initial background was learnt early and, if relearnt, is the level."""
+    """Whether the initial background was learnt early and, with relearning, equals `level`."""
     max_time = LEARNING_TOLERANCE_S + max(settings.learn_s, MIN_BLOCKS * level.block_s)
     if learnt is None or learnt[0] > max_time:
         return False
