@@ -90,9 +90,8 @@ class CalibrationNode(StageNode):
                               source='sensors')
         for sensor, imu_topic in zip(self.network.names, self.network.imu_topics, strict=True):
             if imu_topic is not None:
-                self.subscription(Imu, imu_topic, partial(
-                    lambda sensor, message: self._survey.feed(
-                        schema.acceleration_of(message, sensor)), sensor), self.input_qos)
+                self.subscription(Imu, imu_topic, partial(self._receive_acceleration, sensor),
+                                  self.input_qos)
         self._readings_publisher = self.publisher(FieldReadings, CALIBRATED_READINGS, PUBLISHER_QOS)
         self.subscription(FieldReadings, RAW_READINGS, self._receive_batch, STREAM_QOS,
                           source='sensors', batches=True)
@@ -212,6 +211,10 @@ class CalibrationNode(StageNode):
             self._health.add(raw, now_ns)
         self._rounds.step_if_due()
         self._rounds.report_doubts()
+
+    def _receive_acceleration(self, sensor: str, message: Imu) -> None:
+        """Pass an acceleration to the survey."""
+        self._survey.feed(schema.acceleration_of(message, sensor))
 
     def _publish_states(self, states: list[SensorCalibration]) -> None:
         """Publish the calibration of all sensors."""

@@ -61,8 +61,8 @@ class PageNode(Node):
         self._subscribe_to_tracker(self.resolve_topic_name('tracker_node/tracks'))
         # Frames are frequent and large, so only displayed frames are deserialised.
         self._frames_topic = self.resolve_topic_name(NETWORK_FRAME)
-        self.create_subscription(NetworkFrame, NETWORK_FRAME,
-                                 lambda message: self._frames.append(message), STREAM_QOS, raw=True)
+        self.create_subscription(NetworkFrame, NETWORK_FRAME, self._receive_frame, STREAM_QOS,
+                                 raw=True)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._receive_diagnostics,
                                  STREAM_QOS)
         steady_timer(self, UPDATE_INTERVAL_S, self._tick)
@@ -76,8 +76,7 @@ class PageNode(Node):
         self._tracker_subscriptions = [
             self.create_subscription(MarkerArray, f'{base}/sensor_markers', self._receive_sensors,
                                      LATCHED_QOS),
-            self.create_subscription(TrackArray, tracks_topic, lambda message: self._tracks.extend(
-                message.tracks), STREAM_QOS),
+            self.create_subscription(TrackArray, tracks_topic, self._receive_tracks, STREAM_QOS),
             self.create_subscription(SmoothedTrack, f'{base}/smoothed', self._receive_smoothed,
                                      RESULT_QOS)]
 
@@ -112,6 +111,14 @@ class PageNode(Node):
             self._layout = layout
             self._scene.subtitle = f'{quantity(len(layout), "sensor")}, frame {layout.frame}'
             self._scene.use_network(layout)
+
+    def _receive_frame(self, message: bytes) -> None:
+        """Store a serialised frame for the next tick."""
+        self._frames.append(message)
+
+    def _receive_tracks(self, message: TrackArray) -> None:
+        """Store tracks for the next tick."""
+        self._tracks.extend(message.tracks)
 
     def _receive_smoothed(self, message: SmoothedTrack) -> None:
         """Add the smoothed path of an ended track to the scene."""

@@ -15,13 +15,8 @@ from mag_tracking.nodes.connections import SILENCE_TIMEOUT_S, no_message_finding
 from mag_tracking.pipeline import Settings
 from mag_tracking.records import Readings, plain
 from mag_tracking.stages.calibrate.stage import Calibrate
+from mag_tracking.stages.health import findings
 from mag_tracking.stages.health.diagnosis import Cause, Diagnosis, Finding, ranked
-from mag_tracking.stages.health.findings import (
-    background_findings,
-    covariance_findings,
-    driver_findings,
-    rate_findings,
-)
 from mag_tracking.stages.health.sensor_health import MAX_LIVE_DELAY_S, WINDOW, SensorHealth
 from mag_tracking.stages.health.window import ReadingBuffer
 
@@ -128,17 +123,17 @@ class HealthDiagnostics:
         graph_findings = topic_findings(self._node, name, self._topics[name])
         if not silent_s <= SILENCE_TIMEOUT_S:
             return ranked([*graph_findings, *self._silence_findings(name, silent_s)])
-        findings = [*graph_findings, *self._network_findings[name], *self._clock_findings(name)]
+        found = [*graph_findings, *self._network_findings[name], *self._clock_findings(name)]
         # A background that is being learnt is not a fault until the timeout.
         timeout_s = 5.0 + LEARNING_TIMEOUT_FACTOR * self._settings.calibrate.learn_s
         if calibrate.backgrounds()[name].ready:
             self._unready_since.pop(name, None)
         unready_since = self._unready_since.setdefault(name, time.monotonic())
         if calibrate.backgrounds()[name].ready or time.monotonic() - unready_since > timeout_s:
-            findings += background_findings(name, calibrate, self._frozen_since_ns.get(name),
-                                            self._relearnt_counts[0][name])
-        findings += covariance_findings(name, self._topics[name], calibrate)
-        findings += driver_findings(name, calibrate)
+            found += findings.background_findings(
+                name, calibrate, self._frozen_since_ns.get(name), self._relearnt_counts[0][name])
+        found += findings.covariance_findings(name, self._topics[name], calibrate)
+        found += findings.driver_findings(name, calibrate)
         in_windows: dict[Cause, Finding] = {}
         for health in (self._previous_window[name], self._current_window[name]):
             if health is not None and health.counts['readings']:
@@ -147,16 +142,16 @@ class HealthDiagnostics:
                                          not self._is_replayed):
                     in_windows.setdefault(f.cause, f)
         reported = self._reported_window(name)
-        findings += rate_findings(name, reported.rate / reported.faults.repetition, self._network,
-                                  self._settings.track)
-        findings += in_windows.values()
-        self._late_findings[name] = [f for f in findings if f.cause in TIME_CAUSES]
+        rate = reported.rate / reported.faults.repetition
+        found += findings.rate_findings(name, rate, self._network, self._settings.track)
+        found += in_windows.values()
+        self._late_findings[name] = [f for f in found if f.cause in TIME_CAUSES]
         if not self._is_replayed and self._late_findings[name]:
-            late = [f for found in self._late_findings.values() for f in found]
-            findings += [*load_findings(late, self._network.names, os.getloadavg()[0],
-                                        os.cpu_count() or 1),
-                         *self._stalls.findings(), *self._previous_stalls.findings()]
-        return ranked(findings)
+            late = [f for of_sensor in self._late_findings.values() for f in of_sensor]
+            found += [*load_findings(late, self._network.names, os.getloadavg()[0],
+                                     os.cpu_count() or 1),
+                      *self._stalls.findings(), *self._previous_stalls.findings()]
+        return ranked(found)
 
     def _silence_findings(self, name: str, silent_s: float) -> list[Finding]:
         """Return the fault of a silent sensor, if any; without readings, `silent_s` is NaN."""

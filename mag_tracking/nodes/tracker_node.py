@@ -20,11 +20,7 @@ from tf2_msgs.msg import TFMessage
 from vision_msgs.msg import Detection3DArray
 from visualization_msgs.msg import MarkerArray
 
-from mag_tracking.calibration.doubtful_times import (
-    DOUBTFUL_BACKGROUND,
-    DoubtfulTimes,
-    merged,
-)
+from mag_tracking.calibration.doubtful_times import DOUBTFUL_BACKGROUND, DoubtfulTimes, merged
 from mag_tracking.event_records import Disturbance, VehiclePassage
 from mag_tracking.messages import schema, standard
 from mag_tracking.messages.network import doubtful_times, frame_of, with_orientations

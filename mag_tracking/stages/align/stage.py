@@ -55,9 +55,8 @@ def shortest_delay(network: SensorNetwork) -> tuple[float, str, str] | None:
 
 
 def frame_period(settings: AlignSettings, network: SensorNetwork) -> float:
-    """Frame period [s]: the setting or, if it is 0 and the network compact, half the shortest delay
-    between two sensors, whose signals longer frames mix; raises SettingsError if it is too
-    short."""
+    """Frame period [s]: the setting or, if 0 in a compact network, half the shortest delay between
+    two sensors, whose signals longer frames mix; raises SettingsError if it is too short."""
     if 0.0 < settings.period_s < MIN_PERIOD_S:
         raise SettingsError(f'align.period_s: {settings.period_s:g} s is shorter than the minimum '
                             f'of {MIN_PERIOD_S:g} s; set it to 0 for an automatic period')

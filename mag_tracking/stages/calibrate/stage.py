@@ -320,9 +320,8 @@ class Calibrate:
         return None if np.isnan(level).all() else StoredBackground(last, level, C)
 
     def idle(self) -> None:
-        """Evaluate the completed blocks now, instead of at the next readings; only in a large
-        network are blocks deferred, and the previous background is used for the reading in
-        between."""
+        """Evaluate the completed blocks, which only in a large network are deferred; the reading
+        that completes one is calibrated with the previous background."""
         for i in np.flatnonzero(self._sensors['is_full']):
             self._evaluate_block(int(i))
 

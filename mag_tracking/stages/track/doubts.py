@@ -2,7 +2,11 @@
 
 from collections.abc import Mapping, Set
 
-from mag_tracking.calibration import doubtful_times
+from mag_tracking.calibration.doubtful_times import (
+    CONTRADICTS_EARTH_FIELD,
+    DOUBTFUL_BACKGROUND,
+    WRONG_TIMESTAMPS,
+)
 
 ANOTHER_PLACE = 'another_place'
 ANOTHER_ARRIVAL = 'another_arrival'
@@ -38,13 +42,11 @@ MEANINGS = {
                 'the track',
     FELT_BY_ONE_SENSOR: 'only one sensor senses the target: range and moment are not observable '
                         'and follow from the settings',
-    doubtful_times.DOUBTFUL_BACKGROUND: 'the background of a sensor is doubtful',
-    doubtful_times.CONTRADICTS_EARTH_FIELD:
-        "a sensor contradicts the Earth's field: its axes, its gain or its orientation in the "
-        'network file are wrong',
-    doubtful_times.WRONG_TIMESTAMPS:
-        'the timestamps of a sensor are wrong by more than 20 ms: they are coarse, those of '
-        'packets or bursts, or those of another clock',
+    DOUBTFUL_BACKGROUND: 'the background of a sensor is doubtful',
+    CONTRADICTS_EARTH_FIELD: 'a sensor contradicts the Earth\'s field: its axes, its gain or its '
+                             'orientation in the network file are wrong',
+    WRONG_TIMESTAMPS: 'the timestamps of a sensor are wrong by more than 20 ms: they are coarse, '
+                      'those of packets or bursts, or those of another clock',
     SENSORS_CONTRADICT: 'the sensors contradict each other, and no majority agrees',
     MISFIT: 'the field does not fit the best hypothesis',
     CONTRADICTION: 'the probability of the field given the best hypothesis is below 1e-5',

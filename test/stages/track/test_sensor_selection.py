@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mag_tracking.calibration.doubtful_times import DOUBTFUL_BACKGROUND
 from mag_tracking.inference.filter_bank import FilterBank
 from mag_tracking.pipeline import Pipeline, settings_for
 from mag_tracking.records import FieldFrame, SmoothedPose, Track
 from mag_tracking.simulation.scenario import Path
 from mag_tracking.stages.track import manager, target, track_bank
+from mag_tracking.stages.track.doubts import DOUBTFUL_BACKGROUND
 from mag_tracking.stages.track.plausibility import Approach
 from mag_tracking.stages.track.sensor_selection import (
     exchange_sensor_states,
