@@ -11,12 +11,7 @@ from mag_tracking.quantities import occurrences, quantity
 from mag_tracking.stages.calibrate.field_comparison import earth_field_findings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
-from mag_tracking.stages.health.clocks import (
-    ClockSpan,
-    clock_findings,
-    corrected,
-    timestamp_finding,
-)
+from mag_tracking.stages.health import clocks
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 from mag_tracking.stages.track.plausibility import low_rate_fault
 from mag_tracking.stages.track.settings import TrackSettings
@@ -53,16 +48,16 @@ MAX_NOISE_RATIO = 3.0
 
 
 def sensor_findings(network: SensorNetwork, calibrate: Calibrate, settings: TrackSettings,
-                    missing_topics: Sequence[str], clocks: Mapping[str, ClockSpan]
+                    missing_topics: Sequence[str], spans: Mapping[str, clocks.ClockSpan]
                     ) -> list[Finding]:
-    """Findings about the sensors, without ranking, after all readings; `clocks` may be unknown."""
-    found = list(clock_findings(corrected(clocks, network)))
+    """Findings about the sensors, without ranking, after all readings; `spans` may be unknown."""
+    found = list(clocks.clock_findings(clocks.corrected(spans, network)))
     for name, topic in zip(network.names, network.absolute_topics, strict=True):
         if topic in missing_topics:
             found.append(Finding(True, name, f'no messages on {topic}', 'check the topic in the '
                                  'network file', Cause.NO_MESSAGES))
         if (fault := calibrate.timestamps.worst_fault(name)) is not None:
-            found.append(timestamp_finding(name, fault))
+            found.append(clocks.timestamp_finding(name, fault))
         found += rate_findings(name, calibrate.lowest_rate(name), network, settings)
         found += driver_findings(name, calibrate)
         found += rejection_findings(name, calibrate)
