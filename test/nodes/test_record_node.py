@@ -97,7 +97,7 @@ def test_selected_topics_are_recorded(ros, record):
 
 
 def test_messages_lost_in_the_queue_are_counted(ros, record, monkeypatch):
-    monkeypatch.setattr(record_node, 'DEPTHS', {record_node.MAGNETIC_FIELD: 30})
+    monkeypatch.setattr(record_node, 'DEPTHS', {record_node.types.MAGNETIC_FIELD: 30})
     node, _ = ros
     publisher = node.create_publisher(MagneticField, FIELDS[0], QoSProfile(depth=500))
     session = record(Selection(FIELDS[:1]))
