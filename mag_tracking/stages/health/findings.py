@@ -12,6 +12,7 @@ from mag_tracking.stages.calibrate.field_comparison import earth_field_findings
 from mag_tracking.stages.calibrate.stage import Calibrate
 from mag_tracking.stages.detect.stage import Detect
 from mag_tracking.stages.health.clocks import (
+    ZERO_STAMP,
     ClockSpan,
     clock_findings,
     corrected,
@@ -24,8 +25,6 @@ from mag_tracking.units import NS
 
 MAX_FROZEN_S = 30.0
 """Time for which a background may be frozen before it is reported [s]."""
-ZERO_STAMP = 'message with header.stamp 0'
-"""Cause for which a message without a timestamp is rejected."""
 MIN_SERIOUS = 100
 """Number of readings rejected for one cause above which results are assumed to be wrong."""
 ADVICE = {
