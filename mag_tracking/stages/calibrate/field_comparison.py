@@ -5,9 +5,14 @@ from collections.abc import Iterable
 import numpy as np
 
 from mag_tracking.arrays import FloatArray
-from mag_tracking.calibration.agreement import FieldInconsistency, consensus, disagreements
+from mag_tracking.calibration.agreement import (
+    COMPASS_BIAS_STD,
+    FieldInconsistency,
+    SurveySettings,
+    consensus,
+    disagreements,
+)
 from mag_tracking.calibration.doubtful_times import DoubtfulTimes, shifted, updated
-from mag_tracking.calibration.survey import COMPASS_BIAS_STD, SurveySettings
 from mag_tracking.network import SensorNetwork
 from mag_tracking.stages.health.diagnosis import Cause, Finding
 
