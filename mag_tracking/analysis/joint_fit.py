@@ -12,17 +12,10 @@ from itertools import combinations
 
 import numpy as np
 
+from mag_tracking.analysis import pass_fit
 from mag_tracking.analysis.fitted_pass import order_criteria
 from mag_tracking.analysis.pass_data import PassData, background_columns, separable_problem
 from mag_tracking.analysis.pass_description import PATH_TOLERANCE, assignment, fits_at_minimum
-from mag_tracking.analysis.pass_fit import (
-    COARSE_ERROR,
-    DEFAULT_ERRORS,
-    centred_on_peak,
-    shorter_rows,
-    starting_paths,
-    unusable_reason,
-)
 from mag_tracking.analysis.pass_result import MAX_COST_RATIO, PassFit
 from mag_tracking.analysis.pass_trust import has_plausible_residual
 from mag_tracking.arrays import BoolArray, FloatArray
@@ -92,10 +85,10 @@ def fit_joint(data: PassData, paths: FloatArray, ground: GroundPrior,
     zero of `data` and velocities [m/s].
     """
     n_targets, begin_ns = len(paths), data.stamp_ns
-    orders = [n for n in orders if not unusable_reason(data, n_targets * (n,))]
+    orders = [n for n in orders if not pass_fit.unusable_reason(data, n_targets * (n,))]
     if not orders:
         return ()
-    data, averaged = centred_on_peak(data)
+    data, averaged = pass_fit.centred_on_peak(data)
     paths = propagated_path(paths, (data.stamp_ns - begin_ns) / NS)
     initial_paths = np.vstack([paths.ravel(), _initial_paths(averaged, n_targets, ground)])
     fits = _JointFits(data, averaged, initial_paths, ground)
@@ -126,11 +119,11 @@ def _initial_paths(averaged: PassData, n_targets: int, ground: GroundPrior) -> F
         create_model, prior = partial(SuperposedPasses.from_orders, orders), ground.prior(orders)
         starts = [np.hstack([np.tile(known_path, (len(target_starts), 1)), target_starts])
                   for known_path, target_starts in zip(
-                      paths, (starting_paths(r, 1) for r in residuals), strict=True)]
+                      paths, (pass_fit.starting_paths(r, 1) for r in residuals), strict=True)]
         coarse = separable_problem(averaged, create_model, prior=prior)
-        paths, _ = coarse_minima(separable_problem(averaged, create_model, COARSE_ERROR, prior),
-                                 coarse, np.concatenate(starts), np.tile(PATH_TOLERANCE[:6], n),
-                                 N_REFINED, N_STEPS, N_CONVERGED)
+        smooth = separable_problem(averaged, create_model, pass_fit.COARSE_ERROR, prior)
+        paths, _ = coarse_minima(smooth, coarse, np.concatenate(starts), np.tile(
+            PATH_TOLERANCE[:6], n), N_REFINED, N_STEPS, N_CONVERGED)
         if n < n_targets:
             model = create_model(averaged.t, averaged.positions,
                                  averaged.network.R_sw[averaged.sensor])
@@ -175,7 +168,7 @@ class _JointFits:
         starts = [_with_orders(paths, orders) for paths in self._initial_paths]
         if previous is not None and all(len(fit.x) for fit in previous):
             paths = _with_orders([fit.x[:6 + (fit.n_dipoles > 1)] for fit in previous], orders)
-            rows = [paths[k], *(shorter_rows(paths[k]) if orders[k] > 1 else ())]
+            rows = [paths[k], *(pass_fit.shorter_rows(paths[k]) if orders[k] > 1 else ())]
             starts += [[*paths[:k], row, *paths[k + 1:]] for row in rows]
         return np.array([np.concatenate(paths) for paths in starts])
 
@@ -203,7 +196,7 @@ class _JointFits:
             minimum.theta, fine.linear(minimum.theta))
         unexplained = max(minimum.cost - self._noise_dof, 0.0) / (fine.energy - self._noise_dof)
         return fits_at_minimum(data, orders, replace(minimum, theta=theta), p, 1.0 - unexplained,
-                               DEFAULT_ERRORS, path_std=prior[1])
+                               pass_fit.DEFAULT_ERRORS, path_std=prior[1])
 
 
 def _exclude_solutions(cost: FloatArray, is_allowed: BoolArray, max_ratio: float) -> FloatArray:

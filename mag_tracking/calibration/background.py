@@ -57,9 +57,8 @@ class RelearntBackground(NamedTuple):
     has_departed: bool
     """Whether a target in the background has departed, or else another level lasted or returned."""
     before: FloatArray
-    """Previous background, (3,) T, sensor frame. NaN for a missing axis."""
     after: FloatArray
-    """New background, (3,) T, sensor frame. NaN for a missing axis."""
+    """Previous and new background, (3,) T, sensor frame. NaN for a missing axis."""
 
 
 class RunningBackground(BackgroundLevel):
@@ -176,7 +175,10 @@ class RunningBackground(BackgroundLevel):
     @property
     def scatter_std(self) -> FloatArray:
         """Standard deviation (3,) T of quiet readings, with quantisation; NaN if unknown."""
-        variance = self._quiet.scatter() + self._state['step_variance']
+        covariance = pooled_covariance(self._quiet.blocks()) if self._quiet else None
+        if covariance is None:
+            return np.full(3, np.nan)
+        variance = covariance.diagonal() + self._state['step_variance']
         return np.where(variance > 0.0, np.sqrt(variance), np.nan)
 
     @property

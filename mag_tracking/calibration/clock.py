@@ -28,21 +28,14 @@ _Series: TypeAlias = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class Lag:
-    """Clock offset of one sensor relative to another."""
+    """Clock offset [s] of one sensor relative to another, and its std; NaN if unknown."""
 
-    offset: float
-    """[s] Clock offset; NaN if it is unknown."""
-    std: float
-    """[s] Standard deviation of the offset."""
-    correlation: float
-    """Correlation at the offset, 0 to 1, even if the offset was rejected; NaN if not computed."""
-    reason: str
+    reason: str = ''
     """Reason for an unknown offset; empty if the offset is known."""
-
-
-def _no_lag(reason: str, correlation: float = float('nan')) -> Lag:
-    """Create a `Lag` with an unknown offset and the reason for it."""
-    return Lag(float('nan'), float('nan'), correlation, reason)
+    correlation: float = float('nan')
+    """Correlation at the offset, 0 to 1, even if the offset was rejected; NaN if not computed."""
+    offset: float = float('nan')
+    std: float = float('nan')
 
 
 def shock(acceleration: FloatArray) -> FloatArray:
@@ -67,14 +60,14 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
     a, b = _without_cut_knocks(*a), _without_cut_knocks(*b)
     separation = _knock_separation(a, b, max_lag)
     if separation is not None:
-        return _no_lag(f'the knocks are {separation:.3g} s apart, maximum {max_lag:g} s')
+        return Lag(f'the knocks are {separation:.3g} s apart, maximum {max_lag:g} s')
     a, b = _around_knocks(a, b, max_lag), _around_knocks(b, a, max_lag)
     for name, (_, s) in (('reference', a), ('sensor', b)):
         if not _has_knock(s):
-            return _no_lag(f'the {name} measured no knock')
+            return Lag(f'the {name} measured no knock')
     lag, correlation, reason = _coarse_lag(a, b, max_lag)
     if reason:
-        return _no_lag(reason, correlation)
+        return Lag(reason, correlation)
     # The series with the higher rate is interpolated.
     if _sampling_interval(*a) <= _sampling_interval(*b):
         offset, std = _refined_lag(a, b, lag)
@@ -82,8 +75,8 @@ def knock_lag(t_reference: FloatArray, reference: FloatArray, t: FloatArray, sig
         offset, std = _refined_lag(b, a, -lag)
         offset = -offset
     if not abs(offset) <= max_lag:
-        return _no_lag(f'the knocks are {offset:.3f} s apart, maximum {max_lag:g} s', correlation)
-    return Lag(offset, std, correlation, '')
+        return Lag(f'the knocks are {offset:.3f} s apart, maximum {max_lag:g} s', correlation)
+    return Lag('', correlation, offset, std)
 
 
 def _validated_series(t: FloatArray, s: FloatArray, name: str) -> _Series:

@@ -51,13 +51,11 @@ class MostFrequentLevel:
     """The most frequent level of a sensor."""
 
     n_blocks: int
-    """Number of blocks at the level."""
     n_rival: int
     """Number of blocks at the second most frequent level."""
     begin: float
-    """[s] Time of the first block at the level."""
     end: float
-    """[s] Time of the last block at the level."""
+    """[s] Times of the first and the last block at the level."""
     level: FloatArray
     """(3,) [T] Mean of the earliest blocks at the level; NaN for an unreported axis."""
     covariance: FloatArray

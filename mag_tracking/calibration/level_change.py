@@ -9,7 +9,6 @@ package.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -50,38 +49,14 @@ MAX_TIME_DIFFERENCE_S = 3.0
 """[s] Maximum time between the starts of the new levels at sensors near the same target."""
 
 
-@dataclass(frozen=True)
-class Growth:
-    """Durations of the four quarters in which the magnitude of a change grows by a factor q.
+def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> FloatArray | None:
+    """Durations (4,) [s] of the quarters, on a logarithmic scale, of a growth from `low` to `high`.
 
-    If it grows with the inverse cube of a distance, each quarter takes q**(1/12) times as long as
-    the next; if with the square of time, q**(1/8) times as long as the previous one.
-    """
-
-    quarters: tuple[float, ...]
-    """(4,) [s] Duration of each quarter of the growth, on a logarithmic scale of the magnitude."""
-
-    @property
-    def early(self) -> float:
-        """Duration of the first two quarters [s]."""
-        return self.quarters[0] + self.quarters[1]
-
-    @property
-    def late(self) -> float:
-        """Duration of the last two quarters [s]."""
-        return self.quarters[2] + self.quarters[3]
-
-    @property
-    def duration(self) -> float:
-        """Total duration [s]."""
-        return self.early + self.late
-
-
-def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> Growth | None:
-    """Measure the growth of `size` (k,) at increasing times (k,) in s, between `low` and `high`.
-
-    It ends where `size` first exceeds `high` and starts where it was last below `low` before. None
-    if it never exceeds `high`, was never below `low` before, or has a gap in between.
+    If `size` (k,), at increasing times (k,) in s, grows by a factor q with the inverse cube of a
+    distance, each quarter takes q**(1/12) times as long as the next; if with the square of time,
+    q**(1/8) times as long as the previous one. The growth ends where `size` first exceeds `high`
+    and starts where it was last below `low` before. None if it never exceeds `high`, was never
+    below `low` before, or has a gap in between.
     """
     times, end, begin = [], int(np.flatnonzero(size > high).min(initial=len(size))), 0
     for level in np.geomspace(low, high, 5):
@@ -94,7 +69,8 @@ def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> Gr
         begin = begin or i
     if np.diff(time[begin - 1:end + 1]).max() > MAX_GAP * np.median(np.diff(time)):
         return None
-    return Growth(tuple(b - a for a, b in pairwise(times)))
+    quarters: FloatArray = np.diff(times)
+    return quarters
 
 
 @dataclass(frozen=True)
@@ -154,15 +130,17 @@ def _asymmetry(time: FloatArray, distance_before: FloatArray, distance_after: Fl
     block_length = float(np.median(np.diff(time)))
     first = growth_of(time, distance_before, detection_limit, largest)
     last = growth_of(-time[::-1], distance_after[::-1], detection_limit, largest)
-    if largest < MIN_GROWTH * detection_limit or first is None or last is None \
-            or max(first.duration, last.duration) < MIN_BLOCKS * block_length \
-            or any(max(end.quarters) > MAX_QUARTER_FRACTION * end.duration + block_length
-                   for end in (first, last)):
+    if largest < MIN_GROWTH * detection_limit or first is None or last is None:
+        return 0.0
+    quarters = np.array([first, last])
+    halves = quarters.reshape(2, 2, 2).sum(axis=2)
+    durations = halves.sum(axis=1)
+    if durations.max() < MIN_BLOCKS * block_length or (
+            quarters.max(axis=1) > MAX_QUARTER_FRACTION * durations + block_length).any():
         return 0.0
     # The position of an end within a block is unknown.
-    duration_ratio = (last.duration + 0.5 * block_length) / (first.duration + 0.5 * block_length)
-    rise, fall = ((end.early + 0.25 * block_length) / (end.late + 0.25 * block_length)
-                  for end in (first, last))
+    duration_ratio = np.divide(*(durations[::-1] + 0.5 * block_length))
+    rise, fall = np.divide(*(halves.T + 0.25 * block_length))
     starts_slowly = (rise if duration_ratio > 1.0 else fall) < MAX_START_RATIO
     return float(np.log2(duration_ratio * fall / rise)) if starts_slowly else 0.0
 

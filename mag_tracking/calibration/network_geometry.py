@@ -11,11 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import FloatArray, IntArray
-from mag_tracking.calibration.magnet_pose import (
-    PoseSettings,
-    check_moment_and_noise,
-    locate_magnet,
-)
+from mag_tracking.calibration import magnet_pose
 from mag_tracking.calibration.network_fit import (
     N_POSE,
     N_SENSOR,
@@ -35,7 +31,7 @@ from mag_tracking.network import SensorNetwork
 COARSE_ERROR = 0.1
 """Assumed error relative to the field in the first stage, while the poses are inaccurate."""
 
-INITIAL_POSE_SETTINGS = PoseSettings(field_error=COARSE_ERROR, ambient_std=1e-6)
+INITIAL_POSE_SETTINGS = magnet_pose.PoseSettings(field_error=COARSE_ERROR, ambient_std=1e-6)
 """Settings of the search for the initial poses, while the biases are inaccurate."""
 
 
@@ -258,7 +254,7 @@ def _check_input(network: SensorNetwork, field: FloatArray, positions: FloatArra
                          f'{field.shape}, {positions.shape}, {axes.shape}')
     if K == 0:
         raise ValueError('there are no poses; at least one pose is required')
-    check_moment_and_noise(network, field, moment)
+    magnet_pose.check_moment_and_noise(network, field, moment)
     for k in range(K):
         if not (np.isfinite(positions[k]).all() and abs(np.linalg.norm(axes[k]) - 1.0) <= 1e-3):
             raise ValueError(f'pose {k}: expected a finite position and a unit axis, got '
@@ -310,8 +306,8 @@ def _initial_poses(network: SensorNetwork, field: FloatArray, moment: float, low
     median = np.zeros(field.shape[1:])
     for j, a in zip(*np.nonzero((~np.isnan(field)).any(axis=0)), strict=True):
         median[j, a] = np.nanmedian(field[:, j, a])
-    poses = [locate_magnet(network, B - median, moment, low, high, INITIAL_POSE_SETTINGS)
-             for B in field]
+    poses = [magnet_pose.locate_magnet(network, B - median, moment, low, high,
+                                       INITIAL_POSE_SETTINGS) for B in field]
     rows = np.flatnonzero([pose.converged for pose in poses])
     positions, axes = (np.array([getattr(poses[k], name) for k in rows]).reshape(-1, 3)
                        for name in ('position', 'axis'))

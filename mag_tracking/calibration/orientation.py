@@ -7,6 +7,7 @@ a calibration with a known target, because vehicle model errors are similar in a
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,19 +38,12 @@ MIN_INFORMATION_FRACTION = 0.05
 """Minimum information about a compared direction, relative to the track's best-known direction."""
 
 
-@dataclass(frozen=True)
-class UpDirection:
-    """Up direction of a sensor at rest."""
+class UpDirection(NamedTuple):
+    """Up direction of a sensor at rest, (3,) unit vector, sensor frame."""
 
     direction: FloatArray
-    """(3,) unit vector, sensor frame."""
-    size: float
-    """[m/s²] Measured magnitude of gravity."""
     std: float
     """[rad] Standard deviation of the direction, about each level axis."""
-    n: int
-    n_excluded: int
-    """Number of readings excluded as knocks or because they are not finite."""
 
 
 def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
@@ -76,8 +70,7 @@ def up_direction(acceleration: FloatArray, bias: float) -> UpDirection:
         raise ValueError(f'the acceleration at rest is {size:.3g}, not {GRAVITY} m/s^2'
                          + (' (is its unit g?)' if 0.8 < size < 1.2 else ''))
     scatter = float(at_rest.std(axis=0).max()) / np.sqrt(len(at_rest))
-    return UpDirection(mean / size, size, float(np.hypot(scatter, bias)) / GRAVITY, len(at_rest),
-                       len(a) - len(at_rest))
+    return UpDirection(mean / size, float(np.hypot(scatter, bias)) / GRAVITY)
 
 
 @dataclass(frozen=True)

@@ -65,30 +65,11 @@ def field_rotation(field: FloatArray, noise_std: float, lag: int) -> FieldRotati
     n = len(field) - 2 * lag
     if lag < 1 or n < 1:
         raise ValueError(f'lag: expected 1 to {(len(field) - 1) // 2} samples, got {lag}')
-    floor = 2.0 * n / lag**2 * noise_std**4
-    estimate = noise_std**2 / lag**2 * _squared_lag_differences(field, lag) - floor
-    return FieldRotation(_correlation(field, lag), max(estimate, floor))
-
-
-def expected_rotation(signal: FloatArray, noise_std: float, lag: int) -> FieldRotation:
-    """Mean and variance of `field_rotation` for a noise-free field (n, 2) [T] that is zero outside
-    the window; PHD15 Paper B eq. (12), (14)."""
-    padded = np.pad(signal, ((lag, lag), (0, 0)))
-    return FieldRotation(
-        _correlation(padded, lag), noise_std**2 / lag**2 * _squared_lag_differences(padded, lag)
-        + 2.0 * len(signal) / lag**2 * noise_std**4)
-
-
-def _correlation(field: FloatArray, lag: int) -> float:
-    """Correlation [T²] of the axes at a lag without the first `lag` samples; PHD15 Paper B
-    eq. (5a)."""
     current, delayed = field[lag:-lag], field[2 * lag:]
-    return float(np.sum(current[:, 0] * delayed[:, 1] - current[:, 1] * delayed[:, 0])) / lag
-
-
-def _squared_lag_differences(field: FloatArray, lag: int) -> float:
-    """Sum over both axes of the squared differences of samples two lags apart [T²]."""
-    return float(np.sum(np.square(field[2 * lag:] - field[:-2 * lag])))
+    correlation = float(np.sum(current[:, 0] * delayed[:, 1] - current[:, 1] * delayed[:, 0])) / lag
+    floor = 2.0 * n / lag**2 * noise_std**4
+    estimate = noise_std**2 / lag**2 * float(np.sum(np.square(delayed - field[:-2 * lag]))) - floor
+    return FieldRotation(correlation, max(estimate, floor))
 
 
 def lag_of(field: FloatArray, noise_std: float, max_lag: int) -> int:

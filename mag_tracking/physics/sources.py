@@ -14,13 +14,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mag_tracking import geometry
 from mag_tracking.arrays import FloatArray
-from mag_tracking.geometry import (
-    cross_matrix,
-    left_jacobian,
-    quaternion_from_rotation_vector,
-    rotation_from_quaternion,
-)
 from mag_tracking.physics import core
 
 _INTEGRAL, _RATE = np.arange(3), np.arange(3, 6)
@@ -149,15 +144,16 @@ class Magnet:
         magnitude would overestimate the distance.
         """
         n, rotation_vector = len(x), dt * x[:, 9:12]
-        R = rotation_from_quaternion(quaternion_from_rotation_vector(rotation_vector))
+        R = geometry.rotation_from_quaternion(
+            geometry.quaternion_from_rotation_vector(rotation_vector))
         predicted = x.copy()
         predicted[:, :3] += dt * x[:, 3:6]
         predicted[:, 6:9] = np.einsum('nij,nj->ni', R, x[:, 6:9])
-        C = -cross_matrix(predicted[:, 6:9])
+        C = -geometry.cross_matrix(predicted[:, 6:9])
         F = np.tile(np.eye(12), (n, 1, 1))
         F[:, :6, :6] = constant_velocity(dt)
         F[:, 6:9, 6:9] = R
-        F[:, 6:9, 9:12] = dt * C @ left_jacobian(rotation_vector)
+        F[:, 6:9, 9:12] = dt * C @ geometry.left_jacobian(rotation_vector)
         G = np.zeros((n, 6, 6))
         G[:, :3, :3] = C
         G[:, 3:, 3:] = np.eye(3)
