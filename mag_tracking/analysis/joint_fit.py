@@ -27,28 +27,20 @@ from mag_tracking.units import NS
 N_REFINED, N_STEPS, N_CONVERGED, N_FINE_STARTS = 150, 6, 10, 2
 """Number of starting points that are refined in the coarse search, steps of each, number of coarse
 solutions that are refined until convergence, and of those from which the final fit starts."""
-
 INITIAL_LENGTH = 3.0
 """[m] Initial length of a row of dipoles that replaces a point."""
-
 MIN_GAP, VEHICLE_WIDTH = 3.0, 1.5
 """[m] Minimum distance between the rows of two vehicles, along and across their heading."""
-
 MAX_DETECTION_RANGE = 15.0
 """[m] Maximum distance at which a sensor detects a target."""
-
 MAX_ROUNDS = 3
 """Maximum number of rounds of the order selection, each of all targets in turn."""
-
 MAX_VELOCITY_DIFFERENCE, MAX_TRACK_DISTANCE = 0.5, 5.0
 """Maximum relative difference of velocity, and distance [m], of two fits, or of fit and track."""
-
 MAX_TARGETS = 3
 """Maximum number of targets in a joint fit, each with about twelve unknowns."""
-
 MAX_LENGTH = 18.75
 """[m] Maximum length of the iron of one vehicle: the limit for road trains (Directive 96/53/EC)."""
-
 MAX_VELOCITY_SPREAD = 0.25
 """Maximum relative difference of the velocity of a part of a vehicle from the mean of all parts."""
 

@@ -18,10 +18,8 @@ from mag_tracking.physics.passes import SuperposedPasses
 MIDDLE_FRACTION, MIN_MIDDLE_STD, MIDDLE_ACROSS_STD = 0.15, 0.4, 0.1
 """Standard deviation of the distance from the centre of the row to the middle of the vehicle: along
 the vehicle relative to the length of the row, and at least [m]; across it and vertically [m]."""
-
 PATH_TOLERANCE = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2, 0.3])
 """Maximum difference between equal paths: position [m], velocity [m/s] and length [m]."""
-
 CPA_UNIT_STD = 1e-4
 """[m] Standard deviation of an assumed CPA range. Such a range only defines the unit of length."""
 

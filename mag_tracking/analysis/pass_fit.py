@@ -16,13 +16,10 @@ from mag_tracking.physics.passes import RowPass
 
 N_COARSE = 24
 """Number of averaged samples per sensor in the coarse search."""
-
 COARSE_ERROR = 0.1
 """Assumed error relative to the field in the coarse search; it smooths the cost function."""
-
 FALSE_ALARM_PROBABILITY = 1e-6
 """False alarm probability of the energy threshold of a pass."""
-
 DEFAULT_ERRORS = SensorErrors()
 """Errors of uncalibrated sensors that were mounted by hand."""
 

@@ -8,16 +8,12 @@ from mag_tracking.arrays import FloatArray
 
 N_SAMPLES, MIN_SAMPLES = 64, 8
 """Number of samples of a resampled signature, and minimum number of a recorded one."""
-
 BASELINE_FRACTION, TAIL_FRACTION = 0.1, 0.005
 """Fraction of a signature, at each end, for the baseline, and of its energy that is cut off."""
-
 MIN_PROMINENCE = 0.1
 """Minimum prominence of an extremum relative to the range of its axis."""
-
 AUTOCORRELATION_LAGS = (2, 4, 8, 16)
 """Lags of the autocorrelation of the field magnitude, in samples."""
-
 N_DCT_COEFFICIENTS = 8
 """Number of coefficients of the discrete cosine transform of the field magnitude."""
 

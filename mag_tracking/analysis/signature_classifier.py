@@ -18,15 +18,12 @@ VERSION = 1
 """Version of the model file format."""
 MIN_SAMPLES = 4
 """Minimum number of training examples of a class."""
-
 N_FOLDS, TEST_FRACTION = 5, 0.3
 """Number of folds of the cross-validation, and fraction of a class in the test part of a split."""
 PENALTIES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Candidate values of C, the inverse regularisation strength of the logistic regression."""
-
 KNOWN_QUANTILE = 0.99
 """Quantile of the distances of held-out examples to their class, beyond which it is `unknown`."""
-
 TEMPERATURES = np.geomspace(0.3, 10.0, 40)
 """Candidate temperatures of the logits."""
 

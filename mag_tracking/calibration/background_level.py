@@ -18,22 +18,16 @@ from mag_tracking.units import NS
 
 TYPICAL_DRIFT, STEEP_DRIFT = 3e-9, 1e-8
 """[T/s] Typical and maximum drift of a background; the latter while a sensor is warming up."""
-
 MIN_SLOPE_STDS = 4.0
 """Number of standard deviations by which a slope must exceed `STEEP_DRIFT`."""
-
 MAX_AGE_S, MAX_DRIFT = 600.0, 4.0
 """Maximum age [s] of a former level, and its maximum drift in tolerances of a block mean."""
-
 MIN_RELEARN_S = 10.0
 """[s] Minimum duration of another steady level that replaces a resumed or short background."""
-
 SHORTENED_FRACTION = 2.0 / 3.0
 """Required duration of a former level, or of that after a departure, relative to the usual one."""
-
 MAX_EVALUATED_BLOCKS = 240
 """Maximum number of blocks (a minute of the usual length) of an evaluated arrival or departure."""
-
 Line: TypeAlias = tuple[float, FloatArray, FloatArray, float]
 """Centre [s], mean (3,) [T], slope (3,) [T/s], and horizon [s], after which it is constant."""
 

@@ -12,16 +12,12 @@ from mag_tracking.arrays import BoolArray, FloatArray
 
 KNOCK_THRESHOLD = 10.0
 """Minimum magnitude of a knock in standard deviations of the signal at rest."""
-
 MIN_CORRELATION = 0.7
 """Minimum correlation of two sensors that measured the same knocks."""
-
 MAX_RIVAL_RATIO = 0.9
 """Maximum correlation at a second lag, relative to the best one, of an unambiguous lag."""
-
 CONTEXT_S, MARGIN_S = 5.0, 0.1
 """[s] Interval beside the first and last knock that is compared, and beside a knock."""
-
 _Series: TypeAlias = tuple[FloatArray, FloatArray]
 """Times (n,) [s] and values (n,)."""
 

@@ -13,30 +13,22 @@ from mag_tracking.calibration import ellipsoid, reading_faults
 
 MIN_READINGS, MIN_DIRECTIONS = 50, 18
 """Minimum number of readings, and of cells with readings: two for each of the nine parameters."""
-
 MIN_COVERAGE, GOOD_COVERAGE = 0.01, 0.1
 """Coverage at which errors of adjacent directions are amplified ten times (rejected), and three
 times (warning)."""
-
 MIN_THICKNESS = 0.05
 """Minimum ratio of smallest to largest spread of the readings; one axis of rotation has less."""
-
 MAX_AXIS_RATIO = 5.0
 """Maximum ratio of longest to shortest axis; soft iron on a sensor's board causes about two."""
-
 MAX_SCATTER = 0.1
 """Maximum scatter about the ellipsoid relative to its radius, without outliers: 0.01 to 0.03 is
 typical, the noise of a sensor at rest 0.3 to 0.4."""
-
 MAX_OFFSET_STD = 0.1
 """Maximum standard deviation of the offset relative to the radius, in the worst direction."""
-
 GOOD_RESIDUAL = 0.05
 """Coefficient of variation (std/mean) of corrected magnitudes above which a warning is issued."""
-
 GOOD_OUTLIER_FRACTION, MAX_OUTLIER_FRACTION = 0.01, 0.2
 """Fraction of outliers above which a warning is issued, or the scatter is not meaningful."""
-
 MIN_GLITCH_DISTANCE, MAX_GLITCH_FRACTION = 5.0, 0.02
 """Minimum distance of glitches (data transfer errors) from the median, in median distances, and
 their maximum fraction; more are due to a sensor that was mostly at rest."""

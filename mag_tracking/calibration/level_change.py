@@ -18,33 +18,24 @@ from mag_tracking.calibration.blocks import Blocks
 
 MAX_GAP = 2.5
 """Maximum interval between blocks, in median intervals."""
-
 MAX_SMALL_FRACTION = 0.3
 """Maximum magnitude of the evaluated ends of a change, as a fraction of the total magnitude."""
-
 DETECTION_STDS = 3.0
 """Detection limit of a change in standard deviations of the mean of a block, per axis."""
-
 MIN_ASYMMETRY = 0.8
 """Minimum asymmetry of a change for a decision, as a binary logarithm; 0 for equal ends."""
-
 MIN_GROWTH = 3.5
 """Minimum ratio of the largest evaluated magnitude to the detection limit."""
-
 MAX_QUARTER_FRACTION = 0.5
 """Maximum duration of a quarter, less one block, relative to the growth time; longer is a stall.
 The theoretical fraction is 0.3 to 0.54 for growth by a factor of 4 to 300."""
-
 MAX_START_RATIO = 0.9
 """Maximum ratio of the first to the second half of the growth time at the near end. The theoretical
 ratio is 0.7 to 0.24 at the near end and 1.3 to 2.6 at the far end."""
-
 MIN_BLOCKS = 2.0
 """Minimum duration of the longer end in blocks; a step is neither an arrival nor a departure."""
-
 CLEAR_SIZE = 60.0
 """Minimum magnitude, in std of one reading, of a change that is classified alone."""
-
 MAX_TIME_DIFFERENCE_S = 3.0
 """[s] Maximum time between the starts of the new levels at sensors near the same target."""
 

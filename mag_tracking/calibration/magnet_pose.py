@@ -14,17 +14,13 @@ from mag_tracking.physics.dipole import dipole_jacobians, sensor_fields
 
 N_UNKNOWNS = 5
 """Number of unknowns of a pose; the roll of a dipole is not observable."""
-
 N_GRID, N_STARTS, MAX_STEPS = 7, 8, 60
 """Number of grid points per axis of the search box, number of the best ones that are refined, and
 maximum number of steps."""
-
 EXACT_COST = 1e-9
 """Maximum sum of squared residuals of exact readings, which rounding keeps above zero."""
-
 MAX_COST = 100.0
 """Maximum normalised cost; a larger cost means that the readings do not fit the dipole."""
-
 _Problem: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Function that maps states (n, 9) to residuals (n, n_y) and Jacobians (n, n_y, 9)."""
 

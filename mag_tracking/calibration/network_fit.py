@@ -20,22 +20,16 @@ N_SENSOR, N_SHARED, N_POSE = 10, 12, 8
 """Numbers of unknowns: per sensor (bias, gain, rotation, position); shared (shift and rotation of
 the board, offset and tilt of the magnet in the tool, log of the moment); per pose (position, tilt,
 ambient field)."""
-
 Prediction: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 """Predicted readings and their derivatives; see `predicted_readings`."""
-
 OUTLIER_PROBABILITY = 1e-3
 """Readings whose residuals are less probable than this under the noise are down-weighted."""
-
 STEP_TOLERANCE = 1e-3
 """Squared norm of a step, in posterior standard deviations, below which the fit has converged."""
-
 MAX_DAMPING = 1e10
 """Damping factor at which the search for a step that reduces the cost is abandoned."""
-
 Unknowns: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 """Unknowns of the sensors (n, 10), shared unknowns (12,) and unknowns of the poses (K, 8)."""
-
 Weights: TypeAlias = tuple[FloatArray, Unknowns, float, FloatArray]
 """Return values of `GeometryProblem.weights`."""
 

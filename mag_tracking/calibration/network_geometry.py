@@ -30,7 +30,6 @@ from mag_tracking.network import SensorNetwork
 
 COARSE_ERROR = 0.1
 """Assumed error relative to the field in the first stage, while the poses are inaccurate."""
-
 INITIAL_POSE_SETTINGS = magnet_pose.PoseSettings(field_error=COARSE_ERROR, ambient_std=1e-6)
 """Settings of the search for the initial poses, while the biases are inaccurate."""
 
@@ -107,15 +106,12 @@ class NetworkGeometry:
 
 MIN_POSES = 3
 """Minimum number of poses that separates the bias of a sensor from the field of the magnet."""
-
 MIN_POSE_VARIATION = 0.1
 """Minimum variation of the axis [rad], or of the position relative to the distance of the nearest
 sensor, of poses that determine the geometry."""
-
 MAX_CORRECTION, MAX_RESIDUAL_RATIO = 4.0, 3.0
 """Maximum correction in prior standard deviations, and residual relative to the median, of a sensor
 or pose that is not suspect."""
-
 MAX_COST = 100.0
 """Maximum normalised cost; a larger cost means that the readings do not fit the model."""
 

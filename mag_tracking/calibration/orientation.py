@@ -24,16 +24,12 @@ from mag_tracking.records import Track
 
 GRAVITY, MAX_GRAVITY_DIFFERENCE = 9.81, 1.0
 """[m/s²] Gravity, and maximum difference of the magnitude of the acceleration at rest."""
-
 OUTLIER_STDS = 5.0
 """Distance from the median, in standard deviations, beyond which a reading is a knock."""
-
 MAX_RIVAL_COST, MAX_EQUAL_COST = 9.0, 1.0
 """Maximum cost difference of a rival heading, and of equally good headings."""
-
 MAX_HEADING_STD = np.deg2rad(60.0)
 """[rad] Maximum standard deviation of a heading."""
-
 MIN_INFORMATION_FRACTION = 0.05
 """Minimum information about a compared direction, relative to the track's best-known direction."""
 

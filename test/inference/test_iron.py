@@ -11,6 +11,8 @@ from support.vehicle_5 import TABLE
 H = np.array([2e-6, 1.55e-5, -4.9e-5]) / MU0
 """(3,) A/m, ambient field strength B0/mu0, world frame."""
 HARD, SOFT = np.array([-200.0, 120.0, -270.0]), 4.0
+EQUAL = np.tile(np.eye(3), (20, 1, 1))
+"""Covariances (20, 3, 3) of moments with equal weights."""
 
 
 def moments_at(headings):
@@ -24,7 +26,7 @@ def test_fit_reproduces_the_published_iron():
     """The fit uses equal weights and 3 B0/mu0 as in T10 eq. (6.16); the published D is 1.23."""
     B0 = 1.7e-7 * np.array([0.0, 0.31, -0.95])
     fit = hard_and_soft_iron(TABLE[:, 1:4], np.deg2rad(TABLE[:, 0]), 3.0 * B0 / MU0,
-                             np.tile(np.eye(3), (len(TABLE), 1, 1)))
+                             EQUAL[:len(TABLE)])
     print(f'T10 Table 6.9: m0 = {fit.hard.round(3)}, D = {fit.soft:.3f}')
     np.testing.assert_allclose(fit.hard, [-0.47, 0.29, -0.56], atol=0.005)
     assert fit.soft == pytest.approx(1.22, abs=0.005)
@@ -32,7 +34,7 @@ def test_fit_reproduces_the_published_iron():
 
 def test_exact_moments_give_exact_iron():
     headings = np.deg2rad([0.0, 80.0, 200.0])
-    fit = hard_and_soft_iron(moments_at(headings), headings, H, np.tile(np.eye(3), (3, 1, 1)))
+    fit = hard_and_soft_iron(moments_at(headings), headings, H, EQUAL[:3])
     np.testing.assert_allclose(fit.hard, HARD, rtol=1e-10)
     assert fit.soft == pytest.approx(SOFT, rel=1e-10)
     assert fit.normalised_cost < 1e-18
@@ -60,16 +62,16 @@ def test_covariance_agrees_with_the_errors():
 def test_inseparable_hard_and_soft_iron_is_rejected(headings, field_strength):
     headings = np.array(headings)
     with pytest.raises(ValueError, match='separated'):
-        hard_and_soft_iron(moments_at(headings), headings, field_strength)
+        hard_and_soft_iron(moments_at(headings), headings, field_strength, EQUAL[:len(headings)])
 
 
 def test_invalid_arguments_raise_value_error():
     headings = np.array([0.0, 1.0, 2.0])
     m = moments_at(headings)
     with pytest.raises(ValueError, match=r'expected moments \(n, 3\)'):
-        hard_and_soft_iron(m[:2], headings, H)
+        hard_and_soft_iron(m[:2], headings, H, EQUAL[:3])
     with pytest.raises(ValueError, match='finite'):
-        hard_and_soft_iron(m * [np.nan, 1.0, 1.0], headings, H)
+        hard_and_soft_iron(m * [np.nan, 1.0, 1.0], headings, H, EQUAL[:3])
     with pytest.raises(ValueError, match=r'expected covariances \(3, 3, 3\)'):
         hard_and_soft_iron(m, headings, H, np.eye(3))
     with pytest.raises(ValueError, match='definite'):
