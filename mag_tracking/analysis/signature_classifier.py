@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.special import softmax
 
 from mag_tracking.analysis.signature import Signature, features
 from mag_tracking.arrays import FloatArray, IntArray
@@ -61,7 +62,8 @@ class SignatureModel:
     def posterior(self, x: FloatArray) -> FloatArray:
         """Posterior probabilities (n, n_classes) for features `x` (n, n_features)."""
         z = (x - self.mean) / self.scale
-        return _softmax((z @ self.weights.T + self.offsets) / self.temperature)
+        logits = (z @ self.weights.T + self.offsets) / self.temperature
+        return np.asarray(softmax(logits, axis=1))
 
     def is_known(self, x: FloatArray) -> FloatArray:
         """Whether each signature is within `limit` of the nearest class centre."""
@@ -136,8 +138,9 @@ def train(x: FloatArray, labels: Sequence[str], groups: Sequence[str], axes: tup
             weights, offsets = _weights_and_offsets(
                 create_estimator().fit(z[train_rows], y[train_rows]), len(classes))
             held_out_logits[test_rows] = z[test_rows] @ weights.T + offsets
-        losses = [float(-np.mean(np.log(np.maximum(
-            _softmax(held_out_logits / t)[np.arange(len(y)), y], 1e-300)))) for t in TEMPERATURES]
+        probabilities = (softmax(held_out_logits / t, axis=1)[np.arange(len(y)), y]
+                         for t in TEMPERATURES)
+        losses = [float(-np.mean(np.log(np.maximum(p, 1e-300)))) for p in probabilities]
         k = int(np.argmin(losses))
         candidates.append((losses[k], name, create_estimator, float(TEMPERATURES[k])))
     _, name, create_estimator, temperature = min(candidates, key=lambda s: s[0])
@@ -288,10 +291,3 @@ def _squared_distances(z: FloatArray, centres: FloatArray, precision: FloatArray
     e = z[:, None] - centres
     distances: FloatArray = np.einsum('nci,ij,ncj->nc', e, precision, e)
     return distances
-
-
-def _softmax(logits: FloatArray) -> FloatArray:
-    """Convert logits to probabilities (n, n_classes)."""
-    p = np.exp(logits - logits.max(axis=1, keepdims=True))
-    out: FloatArray = p / p.sum(axis=1, keepdims=True)
-    return out

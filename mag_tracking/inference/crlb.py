@@ -105,33 +105,6 @@ def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
     return covariance
 
 
-def marginal(information: ArrayLike, keep: ArrayLike) -> FloatArray:
-    """Fisher information about the states `keep` (indices or mask) if all others are unknown.
-
-    This is the Schur complement J_kk - J_ko J_oo^-1 J_ok (TSP14 eq. (44)); its inverse is the block
-    of the bound. It is zero in directions that `bound` finds unobservable; eliminated states need
-    not be observable.
-    """
-    J = np.asarray(information, dtype=float)
-    try:
-        selected = np.arange(len(J))[np.asarray(keep)]
-    except IndexError as error:
-        raise ValueError(f'keep is not valid for {len(J)} states: {error}') from error
-    if len(set(selected.tolist())) != selected.size:
-        raise ValueError(f'keep contains a state twice: {selected.tolist()}')
-    scale, root, kernel = _inverse_root(J)
-    # The complement is not computed by subtraction: eliminated states that are barely observable
-    # would leave rounding errors that look like information. First find the directions (columns
-    # of U) outside the kernel ...
-    U, kernel_components, _ = np.linalg.svd(kernel[selected])
-    U = U[:, np.count_nonzero(kernel_components > _KERNEL_TOLERANCE):]
-    U = np.where(np.linalg.norm(U, axis=1, keepdims=True) > _KERNEL_TOLERANCE, U, 0.0)
-    # ... then invert the bound in these directions, U (U'PU)^-1 U'.
-    R = triangular_factor((U.T @ root[selected]).T)
-    W = scale[selected, None] * np.linalg.solve(R.T, U.T).T
-    return W @ W.T
-
-
 def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
     """Fisher information (9, 9) about [r0, v0, m] of a known range at the CPA (closest approach).
 

@@ -126,9 +126,9 @@ class FilterBank:
         """Whether the `n` heaviest hypotheses have at least a given fraction of the weight."""
         return bool(np.exp(np.sort(self.log_w)[-n:]).sum() >= fraction)
 
-    def is_separated(self, i: int, distance: float = 3.0) -> BoolArray:
-        """Flag the hypotheses (n_hyp,) whose position differs from hypothesis `i` by more than the
-        Mahalanobis `distance`."""
+    def is_separated(self, i: int) -> BoolArray:
+        """Flag the hypotheses (n_hyp,) whose position differs from hypothesis `i` by a Mahalanobis
+        distance of more than three."""
         difference = self.x[:, :3] - self.x[i, :3]
         C = self.P[:, :3, :3] + self.P[i, :3, :3]
         try:
@@ -141,7 +141,7 @@ class FilterBank:
             # Directions without variance do not count.
             varies = variance > _SINGULAR_TOLERANCE * variance[:, -1:]
             z = (along**2 / np.where(varies, variance, np.inf)).sum(axis=1)
-        is_separated: BoolArray = z > distance**2
+        is_separated: BoolArray = z > 9.0
         return is_separated
 
     def reweight(self, log_likelihood: FloatArray) -> float:

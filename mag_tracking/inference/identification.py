@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtri
+from scipy.special import chdtri, softmax
 
 from mag_tracking.arrays import FloatArray
 
@@ -203,11 +203,11 @@ def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance
         log_p[vehicle.name] = -0.5 * (distances[vehicle.name] + float(np.linalg.slogdet(P)[1]))
     if not log_p:
         return Identification(UNKNOWN, {}, {})
-    p = np.exp(np.array(list(log_p.values())) - max(log_p.values()))
+    p = softmax(list(log_p.values()))
     best = max(log_p, key=lambda name: log_p[name])
     return Identification(
         best if min(distances.values()) <= chdtri(3, SIGNIFICANCE_LEVEL) else UNKNOWN,
-        dict(zip(log_p, (p / p.sum()).tolist(), strict=True)), distances)
+        dict(zip(log_p, p.tolist(), strict=True)), distances)
 
 
 def _wrapped(angle: FloatArray | float) -> FloatArray:
