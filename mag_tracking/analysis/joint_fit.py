@@ -248,8 +248,7 @@ def _finished(fits: Sequence[PassFit], best: int,
 
 
 def _agrees_with_path(fit: PassFit, path: FloatArray) -> bool:
-    """Whether position and velocity of a fit agree at the strongest field with a path (6 or more,)
-    of the same time zero."""
+    """Whether a fit agrees at its strongest field with a path (6 or more,), same time zero."""
     if not len(fit.x):
         return False
     seconds = _fitted_peak_s(fit)

@@ -69,8 +69,7 @@ def features(signature: Signature) -> FloatArray:
 
 
 def _resample(t: FloatArray, field: FloatArray) -> FloatArray:
-    """Subtract the line through both ends of a signature, cut off its tails and resample the rest
-    to (N_SAMPLES, n_axes)."""
+    """Subtract the line through both ends, cut off the tails, resample to (N_SAMPLES, n_axes)."""
     n = max(2, round(BASELINE_FRACTION * len(t)))
     ends = np.r_[:n, len(t) - n:len(t)]
     A = np.stack([np.ones_like(t), (t - t[0]) / (t[-1] - t[0])], axis=1)

@@ -84,8 +84,7 @@ class UnflaggedPoses(TypedDict):
 
 
 WRONG_M, WRONG_STD = 2.0, 3.0
-"""A pose is wrong if its horizontal error exceeds both this distance [m] and this number of
-standard deviations in the direction of the error."""
+"""A pose is wrong if its horizontal error exceeds this distance [m], and these stds along it."""
 
 
 def unflagged_poses(logs: Iterable[TrackLog], truths: Iterable[Truth]) -> UnflaggedPoses:

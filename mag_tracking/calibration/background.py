@@ -10,7 +10,6 @@ covariance of a target-free interval; the line and the freezing are additions of
 
 from collections import deque
 from collections.abc import Sequence
-from functools import partial
 from math import inf
 from typing import NamedTuple
 
@@ -41,7 +40,7 @@ from mag_tracking.calibration.frequent_level import (
     MostFrequentLevel,
     ProvisionalLevel,
 )
-from mag_tracking.calibration.level_change import ChangeEvaluator, SharedChanges
+from mag_tracking.calibration.level_change import ChangeEvaluator
 from mag_tracking.calibration.sensor_state import corrected_steps
 from mag_tracking.units import NS
 
@@ -91,7 +90,7 @@ class RunningBackground(BackgroundLevel):
     def __init__(self, learn: float, memory: float, guard: float, block: float,
                  freeze_std: float, relearn: float, background: FloatArray | None = None,
                  noise_std: FloatArray | None = None, phase: float | None = None, *,
-                 sensors: StructArray, evaluate_change: ChangeEvaluator | None = None) -> None:
+                 sensors: StructArray, evaluate_change: ChangeEvaluator) -> None:
         self._learn, self._block_length, self._relearn = learn, block, relearn
         super().__init__(sensors, freeze_std)
         self._state['length'], self._state['phase'] = block, np.nan if phase is None else phase
@@ -108,9 +107,7 @@ class RunningBackground(BackgroundLevel):
         self._departure_level: FloatArray = np.full(3, np.nan)
         self.doubtful_times: DoubtfulTimes = ()
         self._provisional = ProvisionalLevel(learn)
-        self._departure = LevelDeparture(
-            learn, relearn, sensors, self,
-            evaluate_change or partial(SharedChanges().evaluate_change, 0))
+        self._departure = LevelDeparture(learn, relearn, sensors, self, evaluate_change)
         self.forget()
 
     def forget(self) -> None:

@@ -15,8 +15,7 @@ from mag_tracking.physics.dipole import dipole_jacobians, sensor_fields
 N_UNKNOWNS = 5
 """Number of unknowns of a pose; the roll of a dipole is not observable."""
 N_GRID, N_STARTS, MAX_STEPS = 7, 8, 60
-"""Number of grid points per axis of the search box, number of the best ones that are refined, and
-maximum number of steps."""
+"""Grid points per axis of the search box, number of the best ones to refine, maximum steps."""
 EXACT_COST = 1e-9
 """Maximum sum of squared residuals of exact readings, which rounding keeps above zero."""
 MAX_COST = 100.0
@@ -66,7 +65,9 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
     moment or box, or a sensor without `noise_std`. PHD15 Paper A eq. (3).
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
-    _check_input(network, field, moment, low, high)
+    if not (np.isfinite(high - low).all() and (high > low).all()):
+        raise ValueError(f'the box from {low.tolist()} to {high.tolist()} m has no volume')
+    check_moment_and_noise(network, field, moment)
     is_measured = ~np.isnan(field)
     n_values = int(np.count_nonzero(is_measured))
     if n_values <= N_UNKNOWNS:
@@ -144,17 +145,6 @@ def _pose_of_minimum(x: FloatArray, covariance: FloatArray, cost: float, converg
     else:
         reason = ''
     return MagnetPose(x[:3], u, max(1.0, cost) * T @ covariance @ T.T, float(cost), reason)
-
-
-def _check_input(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
-                 high: FloatArray) -> None:
-    """Raise ValueError if an input is invalid."""
-    if field.shape != (len(network), 3) or low.shape != (3,) or high.shape != (3,):
-        raise ValueError(f'expected field ({len(network)}, 3) and corners (3,), got '
-                         f'{field.shape}, {low.shape}, {high.shape}')
-    if not (np.isfinite(high - low).all() and (high > low).all()):
-        raise ValueError(f'the box from {low.tolist()} to {high.tolist()} m has no volume')
-    check_moment_and_noise(network, field, moment)
 
 
 def check_moment_and_noise(network: SensorNetwork, field: FloatArray, moment: float) -> None:

@@ -123,9 +123,8 @@ def calibrate_geometry(network: SensorNetwork, field: FloatArray, positions: Flo
 
     The posterior is maximised by the Levenberg-Marquardt method with robust weights. A rotation of
     the board has the same effect as a rotation of all sensors; the priors resolve this ambiguity.
-    PHD15 Paper A section 8 proposes such a calibration. Raises ValueError if a pose is invalid, has
-    no readings or is at a sensor, a reading is infinite, a sensor has no `noise_std`, or the moment
-    is not positive.
+    PHD15 Paper A section 8 proposes such a calibration. Raises ValueError if a pose is invalid or
+    at a sensor, a reading is infinite, a sensor has no `noise_std`, or the moment is not positive.
 
     `field` (K, n, 3) [T, sensor frame] contains the constant background; NaN if not measured.
     `positions` (K, 3) [m] are tracked points in a frame that differs from the world frame only by a
@@ -244,21 +243,15 @@ def _failure_reason(problem: GeometryProblem, x: Unknowns, converged: bool, cost
 def _check_input(network: SensorNetwork, field: FloatArray, positions: FloatArray,
                  axes: FloatArray, moment: float) -> None:
     """Raise ValueError if an input is invalid."""
-    K, n = len(positions), len(network)
-    if field.shape != (K, n, 3) or positions.shape != (K, 3) or axes.shape != (K, 3):
-        raise ValueError(f'expected field (K, {n}, 3), positions and axes (K, 3), got '
-                         f'{field.shape}, {positions.shape}, {axes.shape}')
-    if K == 0:
+    if not len(positions):
         raise ValueError('there are no poses; at least one pose is required')
     magnet_pose.check_moment_and_noise(network, field, moment)
-    for k in range(K):
+    for k in range(len(positions)):
         if not (np.isfinite(positions[k]).all() and abs(np.linalg.norm(axes[k]) - 1.0) <= 1e-3):
             raise ValueError(f'pose {k}: expected a finite position and a unit axis, got '
                              f'{positions[k].tolist()} and {axes[k].tolist()}')
         if (network.positions == positions[k]).all(axis=1).any():
             raise ValueError(f'pose {k}: {positions[k].tolist()} m is the position of a sensor')
-        if np.isnan(field[k]).all():
-            raise ValueError(f'pose {k}: no sensor has a reading')
 
 
 def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: float,
@@ -297,8 +290,6 @@ def calibrate_geometry_blind(network: SensorNetwork, field: FloatArray, moment: 
 def _initial_poses(network: SensorNetwork, field: FloatArray, moment: float, low: FloatArray,
                    high: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
     """Locate the magnet in each reading; return rows, positions and axes of the valid poses."""
-    if field.ndim != 3 or field.shape[1:] != (len(network), 3):
-        raise ValueError(f'expected field (K, {len(network)}, 3), got {field.shape}')
     median = np.zeros(field.shape[1:])
     for j, a in zip(*np.nonzero((~np.isnan(field)).any(axis=0)), strict=True):
         median[j, a] = np.nanmedian(field[:, j, a])

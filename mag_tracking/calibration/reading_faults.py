@@ -295,8 +295,7 @@ def reading_faults(fields: FloatArray, stamps: IntArray | None = None) -> Readin
 
 
 def isolated_readings(values: FloatArray) -> IntArray:
-    """Indices of single readings (n,), not beside NaN, that differ from two neighbours that agree
-    with each other."""
+    """Indices of readings (n,), not beside NaN, that differ from two neighbours that agree."""
     if len(values) < 5:
         return np.zeros(0, dtype=np.int64)
     change = np.diff(values)

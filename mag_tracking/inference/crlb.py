@@ -46,8 +46,7 @@ class Observability:
     """Observability of the states near the point at which a model is linearised."""
 
     eigenvalues: FloatArray
-    """Eigenvalues of the scaled information, (n_x,), ascending; zeros are subject to rounding of
-    either sign."""
+    """Ascending eigenvalues of the scaled information, (n_x,); zeros are subject to rounding."""
     condition_number: float
     """Largest over smallest eigenvalue, T10 eq. (5.8); infinite if there is a kernel."""
     kernel: FloatArray

@@ -25,16 +25,14 @@ target at the height of the sensor. For 0.6 % of random moments, the field rotat
 direction if the target is above the sensor by half its lateral distance, and for 2.2 % if it is
 above by the whole distance."""
 MAX_VERTICAL_COSINE = 0.2
-"""Maximum direction cosine between a missing axis and a horizontal axis at which the missing axis
-is treated as vertical."""
+"""Maximum direction cosine to a horizontal axis of a missing axis that counts as vertical."""
 
 
 class FieldRotation(NamedTuple):
     """Statistic of the sense of rotation of a field, treated as normally distributed."""
 
     correlation: float
-    """Correlation of the horizontal axes, T²; negative for a target that moves from left to
-    right."""
+    """Correlation of the horizontal axes, T²; negative for a target moving left to right."""
     variance: float
     """Variance of the correlation, T⁴."""
 

@@ -13,11 +13,9 @@ from mag_tracking.arrays import BoolArray, FloatArray, IntArray
 from mag_tracking.inference import core
 
 _NEGLIGIBLE_LOG_RATIO = np.log(100.0)
-"""[nats] Maximum log-weight difference from the heaviest hypothesis. Lighter hypotheses do not
-affect the choice of the published hypothesis."""
+"""[nats] Log-weight difference from the heaviest hypothesis of those that `best` ignores."""
 _SINGULAR_TOLERANCE = 1e-15
-"""Fraction of the largest variance at or below which a variance counts as zero, as in
-`numpy.linalg.pinv`."""
+"""Fraction of the largest variance that counts as zero, as in `numpy.linalg.pinv`."""
 
 
 def log_sum_exp(a: ArrayLike) -> float:
@@ -46,8 +44,7 @@ class FilterBank:
     origin: IntArray
     """Index that each hypothesis had when the bank was created, (n_hyp,)."""
     nis: FloatArray
-    """Normalised innovation squared of the latest measurement, (n_hyp, n_sensors); NaN before the
-    first measurement and for missing sensors."""
+    """Normalised innovation squared of the latest frame, (n_hyp, n_sensors); NaN if missing."""
 
     @classmethod
     def from_targets(cls, x: FloatArray, P: FloatArray, label: IntArray, n_sensors: int,

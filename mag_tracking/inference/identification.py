@@ -13,8 +13,7 @@ from mag_tracking.arrays import FloatArray
 UNKNOWN = 'unknown'
 """Name that is returned for an object that matches no class."""
 SIGNIFICANCE_LEVEL = 0.01
-"""Significance level of the chi-square tests; what is rejected for every class, or for every
-enrolled vehicle, is `UNKNOWN`."""
+"""Significance level of the chi-square tests; what every class or vehicle rejects is `UNKNOWN`."""
 
 
 class Feature(NamedTuple):
@@ -62,8 +61,7 @@ class Iron:
     covariance: FloatArray
     """Covariance of [m0, D], (4, 4), in the squared units of m0 [A m²] and D [m³]."""
     normalised_cost: float
-    """Chi-square of the residuals per degree of freedom; about 1 if the model and the covariances
-    are correct."""
+    """Chi-square of the residuals per degree of freedom; about 1 if the model is correct."""
 
 
 def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, field_strength: ArrayLike,
@@ -114,8 +112,7 @@ covariance of the fits (T10 Table 6.9: 14, 18 and 21 on the three axes)."""
 MIN_HEADING_SEPARATION = np.deg2rad(45.0)
 """Minimum difference of headings that separates hard from soft iron [rad]."""
 HEADING_TOLERANCE = np.deg2rad(10.0)
-"""[rad] Maximum difference of headings at which a pass is compared with a vehicle that is enrolled
-at a single heading."""
+"""[rad] Maximum difference of the headings of a pass and of a vehicle enrolled at one heading."""
 
 
 @dataclass(frozen=True)

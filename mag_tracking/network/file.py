@@ -57,8 +57,7 @@ _NUMBERS: dict[str, tuple[tuple[int, ...], Callable[[FloatArray], Any], str]] = 
                      ": {0[0]} s exceeds 3600 s; set the sensor's clock"),
     'earth_field': ((3,), lambda B: np.linalg.norm(B) <= 1e-3,
                     ': {} T exceeds a millitesla; is the value in microtesla or gauss?')}
-"""How many numbers a key has, which are valid, and the error otherwise. One number may stand for
-three equal ones."""
+"""Lengths, validity and error of the numbers of a key; one may stand for three equal ones."""
 
 
 def _numbers(prefix: str, key: str, value: object) -> FloatArray:

@@ -69,7 +69,6 @@ def test_a_rejected_pose_has_a_reason():
     assert not pose.converged and 'normalised cost' in pose.reason
     valid = reading([0.06, 0.05, 0.08], MOMENT)
     for change, message in (
-            ({'field': valid[:8]}, r'expected field \(9, 3\)'),
             ({'moment': -1.0}, 'moment is -1.0'),
             ({'high': LOW}, 'has no volume'), ({'field': valid * np.inf}, 'infinite'),
             ({'network': replace(network, noise_std=(None,) * 9)}, 'noise_std is None')):
