@@ -71,9 +71,6 @@ def observability(information: ArrayLike, names: Sequence[str],
     J = np.asarray(information, dtype=float)
     unit_diagonal('information', J)
     scale = np.ones(len(J)) if scale is None else np.asarray(scale, dtype=float)
-    if len(names) != len(J) or scale.shape != (len(J),) or not np.all(scale > 0.0):
-        raise ValueError(f'expected names and positive scales of {len(J)} states, '
-                         f'got {list(names)} and {scale.tolist()}')
     w, V = np.linalg.eigh(scale[:, None] * J * scale)
     zero = w <= RANK_TOLERANCE * w[-1]
     return Observability(w, np.inf if zero.any() else w[-1] / w[0], scale[:, None] * V[:, zero],
@@ -108,22 +105,14 @@ def cpa_information(r0: ArrayLike, v0: ArrayLike, std: float) -> FloatArray:
     """Fisher information (9, 9) about [r0, v0, m] of a known range at the CPA (closest approach).
 
     `r0` [m] is the position at time zero relative to the sensor, `std` [m] that of the range
-    (zero in TSP14). TSP14 eq. (35)-(37); the gradient with respect to v0 printed in the proof of
+    (zero in TSP14). A range of zero, if `r0` is parallel to `v0`, does not make the scale
+    observable. TSP14 eq. (35)-(37); the gradient with respect to v0 printed in the proof of
     Proposition 2 lacks a minus sign.
     """
     r0, v0 = np.asarray(r0, dtype=float), np.asarray(v0, dtype=float)
-    if r0.shape != (3,) or v0.shape != (3,):
-        raise ValueError(f'r0 and v0 must have shape (3,), got {r0.shape} and {v0.shape}')
-    if not (np.isfinite(std) and std > 0.0 and v0 @ v0 > 0.0):
-        raise ValueError('std must be positive and finite and v0 non-zero, got '
-                         f'{std} and {v0.tolist()}')
     t_cpa = -(r0 @ v0) / (v0 @ v0)
     r_cpa = r0 + t_cpa * v0
-    cpa_range = np.linalg.norm(r_cpa)
-    if not cpa_range > 1e-9 * np.linalg.norm(r0):
-        raise ValueError(f'r0 = {r0.tolist()} is parallel to v0 = {v0.tolist()}: a CPA range of '
-                         'zero does not make the scale observable (TSP14 Proposition 2)')
-    gradient = np.concatenate([r_cpa, t_cpa * r_cpa, np.zeros(3)]) / (cpa_range * std)
+    gradient = np.concatenate([r_cpa, t_cpa * r_cpa, np.zeros(3)]) / (np.linalg.norm(r_cpa) * std)
     return np.outer(gradient, gradient)
 
 
@@ -137,8 +126,6 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
     singular. If P0 refers to the first measurement, pass F[0] = I and Q[0] = 0.
     """
     A = whitened(H, C)
-    if A.ndim < 3:
-        raise ValueError(f'H requires a leading axis of steps, got {np.shape(H)}')
     n_steps, n_x = len(A), A.shape[-1]
     F = leading_broadcast('F', F, (n_steps, n_x, n_x))
     Q = leading_broadcast('Q', Q, (n_steps, n_x, n_x))

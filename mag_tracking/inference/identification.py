@@ -74,9 +74,6 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, field_strength: 
     moments, headings, field_strength, covariances = (
         np.asarray(a, dtype=float) for a in (moments, headings, field_strength, covariances))
     n = len(headings)
-    if moments.shape != (n, 3) or headings.shape != (n,) or field_strength.shape != (3,):
-        raise ValueError(f'expected moments (n, 3), headings (n,) and field_strength (3,), got '
-                         f'{moments.shape}, {headings.shape}, {field_strength.shape}')
     if not (np.isfinite(moments).all() and np.isfinite(headings).all()
             and np.isfinite(field_strength).all()):
         raise ValueError('moments, headings and field_strength must be finite')
@@ -85,8 +82,6 @@ def hard_and_soft_iron(moments: ArrayLike, headings: ArrayLike, field_strength: 
     A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = c, -s, s, c
     A[:, 2, 2] = 1.0
     A[:, :, 3] = field_strength
-    if covariances.shape != (n, 3, 3):
-        raise ValueError(f'expected covariances ({n}, 3, 3), got {covariances.shape}')
     try:
         W = np.linalg.inv(np.linalg.cholesky(covariances))
     except np.linalg.LinAlgError:

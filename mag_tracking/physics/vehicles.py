@@ -123,9 +123,6 @@ class RowVehicle:
 
     def dipoles(self, x: FloatArray) -> Dipoles:
         """Compute the dipoles of target states (n_hyp, n_t)."""
-        if x.shape[1:] != (len(self.state_names),):
-            raise ValueError(f'{self.n_dipoles} dipoles need {len(self.state_names)} states, '
-                             f'got an array of shape {x.shape}')
         return Dipoles(*core.row_dipoles(np.ascontiguousarray(x, dtype=float), self.n_dipoles,
                                          self.field_strength))
 

@@ -68,11 +68,7 @@ def test_inseparable_hard_and_soft_iron_is_rejected(headings, field_strength):
 def test_invalid_arguments_raise_value_error():
     headings = np.array([0.0, 1.0, 2.0])
     m = moments_at(headings)
-    with pytest.raises(ValueError, match=r'expected moments \(n, 3\)'):
-        hard_and_soft_iron(m[:2], headings, H, EQUAL[:3])
     with pytest.raises(ValueError, match='finite'):
         hard_and_soft_iron(m * [np.nan, 1.0, 1.0], headings, H, EQUAL[:3])
-    with pytest.raises(ValueError, match=r'expected covariances \(3, 3, 3\)'):
-        hard_and_soft_iron(m, headings, H, np.eye(3))
     with pytest.raises(ValueError, match='definite'):
         hard_and_soft_iron(m, headings, H, -np.tile(np.eye(3), (3, 1, 1)))

@@ -193,8 +193,7 @@ def test_model_of_a_stationary_vehicle_is_finite(name):
 
 
 def test_states_of_another_model_are_rejected():
-    with pytest.raises(ValueError,
-                       match=r'3 dipoles .*19 states.*\(2, 10\)'):
+    with pytest.raises(ValueError, match='too few states for 3 dipoles'):
         EXAMPLES['RowVehicle'].dipoles(np.zeros((2, 10)))
 
 
