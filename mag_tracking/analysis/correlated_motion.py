@@ -172,8 +172,7 @@ class _SensorReadings:
         from scipy.ndimage import gaussian_filter1d
 
         resampled = np.stack([np.interp(t, self.t, v) for v in self.field.T], axis=1)
-        smooth: FloatArray = gaussian_filter1d(resampled, width / (t[1] - t[0]), axis=0)
-        return smooth
+        return gaussian_filter1d(resampled, width / (t[1] - t[0]), axis=0)
 
 
 @dataclass(frozen=True)

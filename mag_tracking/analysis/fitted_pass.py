@@ -26,8 +26,7 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
     cost_scale = max(1.0, highest_order.normalised_cost)
     criteria: FloatArray = np.array([f.cost / cost_scale + f.n_unknowns * np.log(f.data.n_values)
                                      if f.determined else np.inf for f in fits])
-    relative: FloatArray = criteria - criteria.min()
-    return relative
+    return criteria - criteria.min()
 
 
 def choose_order(fits: Sequence[PassFit]) -> PassFit | None:

@@ -58,8 +58,7 @@ def robust_covariance(data: PassData, whitened: FloatArray, residuals: FloatArra
         P = np.zeros((6, 6))
         P[:3, :3], P[3:, 3:] = rotation_covariance, errors.gain_std**2 * np.eye(3)
         sensor_error += shift @ P @ shift.T
-    robust: FloatArray = covariance + model_error + sensor_error
-    return robust
+    return covariance + model_error + sensor_error
 
 
 def shape_covariance(data: PassData, whitened: FloatArray, covariance: FloatArray,
@@ -84,9 +83,8 @@ def shape_covariance(data: PassData, whitened: FloatArray, covariance: FloatArra
     field_error = np.einsum('nai,ni->na', whitened[:, :, xyz], apparent)
     shift = covariance[xyz] @ np.einsum('nax,na->x', whitened, field_error)
     along_variance = max(MIN_MIDDLE_STD, MIDDLE_FRACTION * length)**2
-    total: FloatArray = np.outer(shift, shift) + MIDDLE_ACROSS_STD**2 * np.eye(3) \
+    return np.outer(shift, shift) + MIDDLE_ACROSS_STD**2 * np.eye(3) \
         + (along_variance - MIDDLE_ACROSS_STD**2) * np.outer(forward, forward)
-    return total
 
 
 def _split_by_sensor(data: PassData, whitened: FloatArray, residuals: FloatArray) -> tuple[

@@ -85,9 +85,8 @@ def _resample(t: FloatArray, field: FloatArray) -> FloatArray:
     width = max(1, round((sample_indices[-1] - sample_indices[0]) / N_SAMPLES))
     smooth = np.stack([np.convolve(axis, np.ones(width) / width, 'same') for axis in fine_field.T],
                       axis=1)
-    out: FloatArray = np.stack([np.interp(sample_indices, np.arange(len(even_times)), axis)
-                                for axis in smooth.T], axis=1)
-    return out
+    return np.stack([np.interp(sample_indices, np.arange(len(even_times)), axis)
+                     for axis in smooth.T], axis=1)
 
 
 def _axis_features(axis: FloatArray, energy_fraction: float, max_magnitude: float) -> list[float]:

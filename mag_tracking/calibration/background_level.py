@@ -111,8 +111,7 @@ class BackgroundLevel:
         """Background (k, 3) T at times (k,) in s; it must be ready."""
         assert self.line is not None
         centre, mean, slope, horizon = self.line
-        out: FloatArray = mean + (np.minimum(times, horizon) - centre)[:, None] * slope
-        return out
+        return mean + (np.minimum(times, horizon) - centre)[:, None] * slope
 
     def difference(self, time: float, field: FloatArray) -> FloatArray:
         """Field (3,) T minus the background; raises ValueError if the background is not ready."""

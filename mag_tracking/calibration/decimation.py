@@ -23,8 +23,7 @@ def lowpass(factor: int) -> FloatArray:
     from scipy.signal import firwin, kaiserord
 
     n, beta = kaiserord(ATTENUATION_DB, 2.0 * (1.0 - PASS_FRACTION) / factor)
-    taps: FloatArray = firwin(n | 1, 1.0 / factor, window=('kaiser', beta))
-    return taps
+    return firwin(n | 1, 1.0 / factor, window=('kaiser', beta))
 
 
 class Decimator:

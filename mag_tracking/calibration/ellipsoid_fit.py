@@ -80,8 +80,7 @@ class EllipsoidFit:
 
     def correct(self, readings: FloatArray) -> FloatArray:
         """Field (n, 3), in the unit of `field_magnitude`, of readings in the unit of `offset`."""
-        field: FloatArray = (np.asarray(readings, dtype=float) - self.offset) @ self.correction
-        return field
+        return (np.asarray(readings, dtype=float) - self.offset) @ self.correction
 
 
 def fit_ellipsoid(readings: FloatArray, field_magnitude: float | None = None) -> EllipsoidFit:

@@ -60,8 +60,7 @@ def growth_of(time: FloatArray, size: FloatArray, low: float, high: float) -> Fl
         begin = begin or i
     if np.diff(time[begin - 1:end + 1]).max() > MAX_GAP * np.median(np.diff(time)):
         return None
-    quarters: FloatArray = np.diff(times)
-    return quarters
+    return np.diff(times)
 
 
 @dataclass(frozen=True)

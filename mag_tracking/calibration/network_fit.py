@@ -321,9 +321,8 @@ class NormalEquations:
     def _lost_information(self, CB: FloatArray) -> FloatArray:
         """Information (N, N) on [sensors, shared] that is lost by eliminating the poses."""
         N = len(self.g)
-        lost: FloatArray = (np.swapaxes(CB, 0, 1).reshape(N, -1)
-                            @ np.swapaxes(self.C, 0, 1).reshape(N, -1).T)
-        return lost
+        return (np.swapaxes(CB, 0, 1).reshape(N, -1)
+                @ np.swapaxes(self.C, 0, 1).reshape(N, -1).T)
 
 
 def solve(problem: GeometryProblem, iterations: int) -> tuple[Unknowns, Weights, Prediction, bool]:

@@ -294,8 +294,9 @@ def reading_faults(fields: FloatArray, stamps: IntArray | None = None) -> Readin
         kept if stamps is None else with_lost_readings(kept, stamps)))
 
 
-def isolated_readings(values: FloatArray) -> IntArray:
-    """Indices of readings (n,), not beside NaN, that differ from two neighbours that agree."""
+def isolated_readings(values: FloatArray, min_height: float = 0.0) -> IntArray:
+    """Indices of single readings (n,), not beside NaN, that differ by more than `min_height` from
+    two neighbours that agree with each other."""
     if len(values) < 5:
         return np.zeros(0, dtype=np.int64)
     change = np.diff(values)
@@ -304,9 +305,9 @@ def isolated_readings(values: FloatArray) -> IntArray:
     adjacent_change = np.maximum(adjacent_change, np.abs(change_before + change_after))
     height = np.minimum(np.abs(change_before), np.abs(change_after))
     smallest_change = np.min(np.abs(change), where=np.abs(change) > 0.0, initial=np.inf)
-    indices: IntArray = 2 + np.flatnonzero((np.sign(change_before) == -np.sign(change_after)) & (
-        height > MIN_ISOLATION * np.maximum(adjacent_change, smallest_change)) & (height > 0.0))
-    return indices
+    return 2 + np.flatnonzero((np.sign(change_before) == -np.sign(change_after)) & (
+        height > MIN_ISOLATION * np.maximum(adjacent_change, smallest_change))
+        & (height > min_height))
 
 
 def saturated_readings(fields: FloatArray, max_run: float = MAX_RUN) -> BoolArray:

@@ -163,8 +163,7 @@ def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
     axis; `ratio` is 9.2 in T10. T10 eq. (5.20)-(5.24): eq. (5.23) prints the squared norm of R
     instead of the norm; moment and noise in eq. (5.22) are too small by a factor of about 450.
     """
-    distance: FloatArray = np.cbrt(_K_DIPOLE * moment / (noise_std * np.sqrt(ratio)))
-    return distance
+    return np.cbrt(_K_DIPOLE * moment / (noise_std * np.sqrt(ratio)))
 
 
 def _inverse_root(J: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -184,8 +184,7 @@ def _class_indices(labels: IntArray) -> IntArray:
     """Class index (n,) of each hypothesis; hypotheses with equal `labels` have equal indices."""
     if labels.ndim == 1:
         return labels
-    classes: IntArray = np.unique(labels, axis=0, return_inverse=True)[1].reshape(-1)
-    return classes
+    return np.unique(labels, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _compacted(a: FloatArray, rows: IntArray) -> FloatArray:

@@ -204,5 +204,4 @@ def identify(vehicles: Sequence[EnrolledVehicle], moment: FloatArray, covariance
 
 def _wrapped(angle: FloatArray | float) -> FloatArray:
     """Angle wrapped to the interval from -pi to pi."""
-    wrapped: FloatArray = np.angle(np.exp(1j * np.asarray(angle)))
-    return wrapped
+    return np.angle(np.exp(1j * np.asarray(angle)))

@@ -133,8 +133,7 @@ class MarginalWhitener:
 
     def __call__(self, A: FloatArray) -> FloatArray:
         """Return `A`, (..., n_y, k) or (n_y,), multiplied by the inverse root of I + C C'."""
-        whitened: FloatArray = A - (self._U * self._attenuation) @ (self._U.T @ A)
-        return whitened
+        return A - (self._U * self._attenuation) @ (self._U.T @ A)
 
     def correction_factor(self, A: FloatArray) -> FloatArray:
         """Factor F(A) (q, k) of the low-rank correction in A' inv(I + C C') B = A'B - F(A)'

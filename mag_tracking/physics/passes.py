@@ -232,5 +232,4 @@ class SteadyPass:
         D = core.steady_derivatives(
             self.all_parameters(theta), p @ self._moment_transform.T, self.offsets, self.t,
             self.positions, self.M, self.clock)
-        free: FloatArray = D[:, :, self.free]
-        return free
+        return D[:, :, self.free]

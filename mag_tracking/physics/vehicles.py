@@ -59,8 +59,7 @@ def ellipsoid_moment(semi_axes: Sequence[float] | FloatArray, mu_r: float, headi
     p1, p2 = (volume * kappa / (1.0 + kappa * L) for L in demagnetisation_factors(a / b))
     axis = np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=-1)
     axial_field = np.sum(axis * earth_field, axis=-1, keepdims=True)
-    moment: FloatArray = (p2 * earth_field + (p1 - p2) * axial_field * axis) / MU0
-    return moment
+    return (p2 * earth_field + (p1 - p2) * axial_field * axis) / MU0
 
 
 MAX_TURN_RATE = 1.0
@@ -143,5 +142,4 @@ class RowVehicle:
     def turn_variance(self, speed: FloatArray) -> FloatArray:
         """Stationary variance [rad²/s²] of the turn rate at a horizontal speed."""
         min_speed = self.turn_acceleration / MAX_TURN_RATE
-        variance: FloatArray = np.square(self.turn_acceleration / np.maximum(speed, min_speed))
-        return variance
+        return np.square(self.turn_acceleration / np.maximum(speed, min_speed))
