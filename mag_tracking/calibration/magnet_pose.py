@@ -1,14 +1,12 @@
 """Position and direction of a magnet of known moment from one reading of a calibrated network."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import BoolArray, FloatArray
-from mag_tracking.inference.least_squares import project_out_linear, refine
+from mag_tracking.inference.least_squares import ResidualAndJacobian, project_out_linear, refine
 from mag_tracking.network import SensorNetwork
 from mag_tracking.physics.dipole import dipole_jacobians, sensor_fields
 
@@ -20,18 +18,6 @@ EXACT_COST = 1e-9
 """Maximum sum of squared residuals of exact readings, which rounding keeps above zero."""
 MAX_COST = 100.0
 """Maximum normalised cost; a larger cost means that the readings do not fit the dipole."""
-_Problem: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""Function that maps states (n, 9) to residuals (n, n_y) and Jacobians (n, n_y, 9)."""
-
-
-class PoseSettings(NamedTuple):
-    """Error model of the readings of a magnet."""
-
-    field_error: float = 0.01
-    """Error of sensors and dipole model relative to the field."""
-    ambient_std: float = 1e-7
-    """[T] Standard deviation of the change of the ambient field since the biases were estimated,
-    per axis; the change is the same at all sensors."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +42,14 @@ class MagnetPose:
 
 
 def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low: ArrayLike,
-                  high: ArrayLike, settings: PoseSettings) -> MagnetPose:
+                  high: ArrayLike, field_error: float, ambient_std: float) -> MagnetPose:
     """Estimate the pose of a dipole of known moment from one reading of all sensors.
 
     The best points of a grid in the box between the corners `low` and `high` (3,) [m, world frame]
     are refined. `field` (n, 3) [T, sensor frame] is corrected for bias and gain; NaN if not
-    measured. Raises ValueError for an invalid reading,
-    moment or box, or a sensor without `noise_std`. PHD15 Paper A eq. (3).
+    measured. `field_error` is that of sensors and dipole model relative to the field, `ambient_std`
+    [T] per axis that of the ambient field, which is the same at all sensors. Raises ValueError for
+    an invalid reading, moment or box, or a sensor without `noise_std`. PHD15 Paper A eq. (3).
     """
     field, low, high = (np.asarray(a, dtype=float) for a in (field, low, high))
     if not (np.isfinite(high - low).all() and (high > low).all()):
@@ -76,8 +63,8 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
                           f'number of measured axes is {n_values}; more than {N_UNKNOWNS} are '
                           'required')
     squared_norm = np.nansum(np.square(field), axis=1)[:, None]
-    std = np.sqrt(np.square(np.array(network.noise_std)) + settings.field_error**2 * squared_norm)
-    problem = _residual_function(network, field, std, is_measured, moment, settings.ambient_std)
+    std = np.sqrt(np.square(np.array(network.noise_std)) + field_error**2 * squared_norm)
+    problem = _residual_function(network, field, std, is_measured, moment, ambient_std)
     starts = _starting_states(network, field, std, is_measured, low, high)
     x, cost, covariance, converged = refine(problem, starts, MAX_STEPS, 1e-9)
     best = int(np.argmin(cost))
@@ -86,7 +73,8 @@ def locate_magnet(network: SensorNetwork, field: FloatArray, moment: float, low:
 
 
 def _residual_function(network: SensorNetwork, field: FloatArray, std: FloatArray,
-                       is_measured: BoolArray, moment: float, ambient_std: float) -> _Problem:
+                       is_measured: BoolArray, moment: float,
+                       ambient_std: float) -> ResidualAndJacobian:
     """Create the residual function of x = [position, axis (not normalised), ambient field in units
     of `ambient_std` (T)]."""
     y = (field / std)[is_measured]

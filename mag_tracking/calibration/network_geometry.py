@@ -30,8 +30,8 @@ from mag_tracking.network import SensorNetwork
 
 COARSE_ERROR = 0.1
 """Assumed error relative to the field in the first stage, while the poses are inaccurate."""
-INITIAL_POSE_SETTINGS = magnet_pose.PoseSettings(field_error=COARSE_ERROR, ambient_std=1e-6)
-"""Settings of the search for the initial poses, while the biases are inaccurate."""
+COARSE_AMBIENT_STD = 1e-6
+"""[T] Assumed change of the ambient field in the search for the initial poses."""
 
 
 @dataclass(frozen=True)
@@ -293,8 +293,8 @@ def _initial_poses(network: SensorNetwork, field: FloatArray, moment: float, low
     median = np.zeros(field.shape[1:])
     for j, a in zip(*np.nonzero((~np.isnan(field)).any(axis=0)), strict=True):
         median[j, a] = np.nanmedian(field[:, j, a])
-    poses = [magnet_pose.locate_magnet(network, B - median, moment, low, high,
-                                       INITIAL_POSE_SETTINGS) for B in field]
+    poses = [magnet_pose.locate_magnet(network, B - median, moment, low, high, COARSE_ERROR,
+                                       COARSE_AMBIENT_STD) for B in field]
     rows = np.flatnonzero([pose.converged for pose in poses])
     positions, axes = (np.array([getattr(poses[k], name) for k in rows]).reshape(-1, 3)
                        for name in ('position', 'axis'))
