@@ -26,7 +26,8 @@ def order_criteria(fits: Sequence[PassFit]) -> FloatArray:
     cost_scale = max(1.0, highest_order.normalised_cost)
     criteria: FloatArray = np.array([f.cost / cost_scale + f.n_unknowns * np.log(f.data.n_values)
                                      if f.determined else np.inf for f in fits])
-    return criteria - criteria.min()
+    relative: FloatArray = criteria - criteria.min()
+    return relative
 
 
 def choose_order(fits: Sequence[PassFit]) -> PassFit | None:

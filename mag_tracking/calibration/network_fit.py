@@ -321,8 +321,9 @@ class NormalEquations:
     def _lost_information(self, CB: FloatArray) -> FloatArray:
         """Information (N, N) on [sensors, shared] that is lost by eliminating the poses."""
         N = len(self.g)
-        return (np.swapaxes(CB, 0, 1).reshape(N, -1)
-                @ np.swapaxes(self.C, 0, 1).reshape(N, -1).T)
+        lost: FloatArray = (np.swapaxes(CB, 0, 1).reshape(N, -1)
+                            @ np.swapaxes(self.C, 0, 1).reshape(N, -1).T)
+        return lost
 
 
 def solve(problem: GeometryProblem, iterations: int) -> tuple[Unknowns, Weights, Prediction, bool]:

@@ -112,8 +112,8 @@ class Survey:
         self._accelerations: dict[str, deque[tuple[int, FloatArray]]] = {
             name: deque(maxlen=MAX_ACCELERATIONS) for name in network.names}
 
-    def feed(self, sample: AccelerationSample) -> None:
-        """Add an acceleration, or reject and count it if it is invalid."""
+    def feed(self, sample: AccelerationSample) -> list[NetworkSurvey]:
+        """Add an acceleration, or reject and count it if it is invalid; return an empty list."""
         recorded = self._accelerations.get(sample.sensor)
         if recorded is None:
             self.counts[f'rejected: acceleration of unknown sensor {sample.sensor}'] += 1
@@ -129,6 +129,14 @@ class Survey:
         else:
             recorded.append((sample.stamp_ns, sample.acceleration))
             self.counts['accelerations'] += 1
+        return []
+
+    def idle(self) -> None:
+        """Do nothing: no work is deferred."""
+
+    def flush(self) -> list[NetworkSurvey]:
+        """Return an empty list: no record is buffered."""
+        return []
 
     def solve(self, fields: Mapping[str, FloatArray], date: str) -> NetworkSurvey:
         """Compute orientations and clock offsets from fields and the accelerations added so far.

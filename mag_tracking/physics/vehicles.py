@@ -59,7 +59,8 @@ def ellipsoid_moment(semi_axes: Sequence[float] | FloatArray, mu_r: float, headi
     p1, p2 = (volume * kappa / (1.0 + kappa * L) for L in demagnetisation_factors(a / b))
     axis = np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=-1)
     axial_field = np.sum(axis * earth_field, axis=-1, keepdims=True)
-    return (p2 * earth_field + (p1 - p2) * axial_field * axis) / MU0
+    moment: FloatArray = (p2 * earth_field + (p1 - p2) * axial_field * axis) / MU0
+    return moment
 
 
 MAX_TURN_RATE = 1.0

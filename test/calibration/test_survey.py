@@ -58,7 +58,7 @@ def surveyed(network=None, rotations=ROTATIONS, change=None, fields=None, settin
     survey = Survey(network, settings or SurveySettings())
     for name, accelerations in readings.items():
         for stamp, a in accelerations:
-            survey.feed(AccelerationSample(stamp, name, a))
+            assert survey.feed(AccelerationSample(stamp, name, a)) == []
     if fields is None:
         fields = {name: R.inv().apply(EARTH) for name, R in
                   zip(network.names, rotations, strict=True)}
@@ -72,7 +72,7 @@ def warnings(result):
 
 def test_orientations_and_clock_offsets_are_found():
     result, survey = surveyed()
-    assert dict(survey.counts) == {'accelerations': 1200}
+    assert survey.flush() == [] and dict(survey.counts) == {'accelerations': 1200}
     assert warnings(result) == {} and result.disagreements == ()
     assert result.reference == 'mag_1' and result.sensors[0].lag is None
     for j, R in enumerate(ROTATIONS):
