@@ -149,7 +149,11 @@ class RunningBackground(BackgroundLevel):
         Unlike after `resume`, another level must last for the full `relearn` time to replace it. No
         effect if the noise of all axes is unknown.
         """
-        covariance = self.without_unknown_noise(covariance)
+        # The noise of a constant axis is unknown if its steps are, or are too fine to observe.
+        steps = corrected_steps(self._sensors)
+        is_unknown = (covariance.diagonal() <= core.MIN_STD**2) & ~(
+            np.isfinite(steps) & (steps > 0.0))
+        covariance = np.where(is_unknown[:, None] | is_unknown, np.nan, covariance)
         if not np.isnan(covariance).all():
             self.resume(level, covariance)
             self._relearns_soon = False

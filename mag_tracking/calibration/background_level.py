@@ -83,13 +83,6 @@ class BackgroundLevel:
         is_dead = ~np.isfinite(steps) | (steps == 0.0) & (variance <= core.MIN_STD**2)
         return np.where(is_dead[:, None] | is_dead, np.nan, noise)
 
-    def without_unknown_noise(self, covariance: FloatArray) -> FloatArray:
-        """Covariance with NaN for constant axes whose steps are unknown or too fine to observe."""
-        steps = corrected_steps(self._sensors)
-        is_unknown = (covariance.diagonal() <= core.MIN_STD**2) & ~(
-            np.isfinite(steps) & (steps > 0.0))
-        return np.where(is_unknown[:, None] | is_unknown, np.nan, covariance)
-
     @property
     def covariance(self) -> FloatArray | None:
         """Noise (3, 3) T² of one sample with quantisation; None if unknown, NaN if unreported."""

@@ -9,17 +9,13 @@ or not positive (semi)definite raise ValueError.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mag_tracking.arrays import BoolArray, FloatArray
-from mag_tracking.inference.matrices import (
-    leading_broadcast,
-    triangular_factor,
-    unit_diagonal,
-    whitened,
-)
+from mag_tracking.inference.matrices import leading_broadcast, unit_diagonal, whitened
 
 RANK_TOLERANCE = 1e-12
 """Eigenvalues at or below this fraction of the largest eigenvalue count as zero."""
@@ -91,7 +87,9 @@ def bound(information: ArrayLike, prior: ArrayLike | None = None) -> FloatArray:
     is_exact = np.isposinf(np.diagonal(prior))
     free = np.ix_(~is_exact, ~is_exact)
     unit_diagonal('prior', prior[free])
-    scale, root, kernel = _inverse_root(J[free] + prior[free])
+    scale, w, V = unit_diagonal('information', J[free] + prior[free])
+    zero = w <= RANK_TOLERANCE * w.max(initial=0.0)
+    root, kernel = V[:, ~zero] / np.sqrt(w[~zero]), V[:, zero]
     P = root @ root.T / (scale[:, None] * scale)
     is_unobservable = _is_in_kernel(kernel)
     P[is_unobservable] = P[:, is_unobservable] = np.nan
@@ -139,7 +137,9 @@ def path_bound(F: ArrayLike, Q: ArrayLike, H: ArrayLike, C: ArrayLike | None,
         # The scale of `unit_diagonal` is 1 at zero variance; an exactly known state must remain so.
         L = np.sqrt(np.diagonal(P))[:, None] * V * np.sqrt(np.maximum(w, 0.0))
         # P = L L' becomes L (I + L'A'A L)^-1 L'; QR avoids squares and subtractions.
-        R = triangular_factor(np.vstack([A[k].reshape(-1, n_x) @ L, np.eye(n_x)]))
+        # The type stub of NumPy lists only the pair (Q, R).
+        R = cast(FloatArray, np.linalg.qr(np.vstack([A[k].reshape(-1, n_x) @ L, np.eye(n_x)]),
+                                          mode='r'))
         G = np.linalg.solve(R.T, L.T)
         P = covariances[k] = G.T @ G
     return covariances
@@ -164,14 +164,6 @@ def snr_range(moment: float | FloatArray, noise_std: float | FloatArray,
     instead of the norm; moment and noise in eq. (5.22) are too small by a factor of about 450.
     """
     return np.cbrt(_K_DIPOLE * moment / (noise_std * np.sqrt(ratio)))
-
-
-def _inverse_root(J: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scale of J (n,) to unit diagonal, a root G (n, rank) of the pseudo-inverse G G' of the scaled
-    matrix, and an orthonormal basis (n, n - rank) of its kernel."""
-    scale, w, V = unit_diagonal('information', J)
-    zero = w <= RANK_TOLERANCE * w.max(initial=0.0)
-    return scale, V[:, ~zero] / np.sqrt(w[~zero]), V[:, zero]
 
 
 def _is_in_kernel(kernel: FloatArray) -> BoolArray:

@@ -1,7 +1,6 @@
 """Matrix validation, scaling to unit diagonal, whitening and pseudo-inverses."""
 
 from contextlib import AbstractContextManager
-from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -71,12 +70,6 @@ def unit_diagonal(name: str, A: FloatArray) -> tuple[FloatArray, FloatArray, Flo
     raise_for_invalid(name, 'positive semidefinite', A,
                       (w < -1e-9).any(-1) | (diagonal < 0.0).any(-1))
     return scale, w, V
-
-
-def triangular_factor(A: FloatArray) -> FloatArray:
-    """Upper triangular factor R (min(m, n), n) of the QR decomposition A = Q R."""
-    # The type stub of NumPy lists only the pair (Q, R).
-    return cast(FloatArray, np.linalg.qr(A, mode='r'))
 
 
 def ignoring_overflow() -> AbstractContextManager[None]:
