@@ -41,13 +41,11 @@ class SignatureModel:
     method: str
     """Name of the selected training method."""
     mean: FloatArray
-    """(n_features,) mean features of the training set."""
     scale: FloatArray
-    """(n_features,) standard deviations of these features."""
+    """(n_features,) means and standard deviations of the features of the training set."""
     weights: FloatArray
-    """(n_classes, n_features) weights of the scaled features."""
     offsets: FloatArray
-    """(n_classes,) offsets of the logits."""
+    """Weights (n_classes, n_features) of scaled features, offsets (n_classes,) of the logits."""
     temperature: float
     """Divisor of the logits. It corrects overconfidence due to a small training set."""
     centres: FloatArray
@@ -65,17 +63,12 @@ class SignatureModel:
         logits = (z @ self.weights.T + self.offsets) / self.temperature
         return np.asarray(softmax(logits, axis=1))
 
-    def is_known(self, x: FloatArray) -> FloatArray:
-        """Whether each signature is within `limit` of the nearest class centre."""
-        known: FloatArray = _squared_distances((x - self.mean) / self.scale, self.centres,
-                                               self.precision).min(axis=1) <= self.limit
-        return known
-
     def names(self, x: FloatArray) -> list[str]:
-        """Most probable class of each signature, or `unknown`."""
+        """Most probable class of each signature, or `unknown` beyond `limit` of all classes."""
         best = self.posterior(x).argmax(axis=1)
-        return [self.classes[k] if known else UNKNOWN
-                for k, known in zip(best.tolist(), self.is_known(x).tolist(), strict=True)]
+        distances = _squared_distances((x - self.mean) / self.scale, self.centres, self.precision)
+        return [self.classes[k] if distance <= self.limit else UNKNOWN for k, distance in zip(
+            best.tolist(), distances.min(axis=1).tolist(), strict=True)]
 
 
 @dataclass(frozen=True)
